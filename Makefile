@@ -1,0 +1,43 @@
+# `make demo` and `make test` set up everything they need; the rest builds on the same environment.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: demo test test-all bench lock forget-kernels clean
+
+$(READY): pyproject.toml requirements.lock
+	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --requirement requirements.lock
+	$(BIN)/pip install --quiet --no-deps --editable .
+	touch $@
+
+demo: $(READY)
+	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
+	$(BIN)/sweep figures results/quickstart.zarr
+
+# A compiled kernel's cache does not notice a change in a kernel that it calls: begin without it.
+test: $(READY) forget-kernels
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+test-all: $(READY) forget-kernels
+	$(BIN)/pytest -m ''
+
+bench: $(READY)
+	$(BIN)/python benchmarks/bench.py
+
+forget-kernels:
+	find sweep -name '*.nb[ci]' -delete
+
+clean:
+	rm -rf .venv results build *.egg-info
+
+lock:
+	$(PYTHON) -m venv .venv-lock
+	.venv-lock/bin/pip install --quiet --editable '.[test]'
+	(echo '# Exact versions of every dependency, tests and linters included; `make lock` renews it.'; \
+	 .venv-lock/bin/pip freeze --exclude-editable) > requirements.lock
+	rm -rf .venv-lock
