@@ -1,0 +1,103 @@
+"""Many close lines as few: Chebyshev anterpolation of a band-limited kernel.
+
+As a function of a line's position, the spectrum's kernel is band-limited: pi r radians per bin,
+r = L/N. Lines within +-h bins of their centre are therefore equivalent to J lines at Chebyshev
+nodes, J = 8 + some 1.3 pi h, to 1e-13 of the summed amplitudes: a tight footprint of 109
+beamlets costs some ten lines.
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+"""Liberties that let reductions vectorise; nan and infinity keep their meaning."""
+
+MOST_NODES = 64
+"""Equivalent lines at the most; wider bundles are left as they are."""
+
+
+def _bessel_bound(z: float, order: int) -> float:
+    """Bound 2 (z/2)^J / J! on what a Chebyshev series of e^{i z x} leaves out after J terms."""
+    return 2 * math.exp(order * math.log(max(z, 1e-300) / 2) - math.lgamma(order + 1))
+
+
+@lru_cache(maxsize=1)
+def node_limits() -> np.ndarray:
+    """Largest pi h that J equivalent lines serve to 1e-13, (MOST_NODES + 1,); entry 0 is void."""
+    limits = np.zeros(MOST_NODES + 1)
+    for nodes in range(1, MOST_NODES + 1):
+        low, high = 0.0, 400.0
+        for _ in range(80):
+            middle = (low + high) / 2
+            low, high = (middle, high) if _bessel_bound(middle, nodes) < 1e-13 else (low, middle)
+        limits[nodes] = low
+    return limits
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, work):
+    """Few lines with the same spectrum as n lines: Chebyshev moments put onto Chebyshev nodes.
+
+    Parameters
+    ----------
+    delta, re, im : (n,) float64
+        Positions [bins from a common origin] and complex weights.
+    band : float
+        Half bandwidth of the kernel in radians per bin: pi r for amplitudes, 2 pi r for powers.
+    limits : (m,) float64
+        :func:`node_limits`.
+    out_delta, out_re, out_im : (>= max(n, MOST_NODES),) float64
+        The equivalent lines.
+    work : (5, >= max(n, MOST_NODES)) float64
+        Scratch.
+
+    Returns
+    -------
+    int
+        Number of equivalent lines; n with the lines themselves where that is no more.
+    """
+    low, high = delta[0], delta[0]
+    for b in range(n):
+        low = min(low, delta[b])
+        high = max(high, delta[b])
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    nodes = 1
+    while nodes < limits.size and limits[nodes] < band * half:
+        nodes += 1
+    if nodes >= n or nodes >= limits.size:
+        for b in range(n):
+            out_delta[b], out_re[b], out_im[b] = delta[b], re[b], im[b]
+        return n
+    x, previous, current = work[0], work[1], work[2]
+    inverse = 1.0 / half if half > 0.0 else 0.0
+    for b in range(n):
+        x[b] = (delta[b] - middle) * inverse
+        previous[b] = 1.0
+        current[b] = x[b]
+    chebyshev, following_node = work[3], work[4]
+    for i in range(nodes):
+        chebyshev[i] = 1.0
+        following_node[i] = math.cos(math.pi * (i + 0.5) / nodes)
+        out_re[i] = 0.0
+        out_im[i] = 0.0
+        out_delta[i] = middle + half * following_node[i]
+    for j in range(nodes):
+        moment_re, moment_im = 0.0, 0.0
+        for b in range(n):
+            moment_re += re[b] * previous[b]
+            moment_im += im[b] * previous[b]
+            following = 2.0 * x[b] * current[b] - previous[b]
+            previous[b] = current[b]
+            current[b] = following
+        share = (1.0 if j == 0 else 2.0) / nodes
+        for i in range(nodes):
+            out_re[i] += share * chebyshev[i] * moment_re
+            out_im[i] += share * chebyshev[i] * moment_im
+            x_i = (out_delta[i] - middle) * inverse
+            after = 2.0 * x_i * following_node[i] - chebyshev[i]
+            chebyshev[i] = following_node[i]
+            following_node[i] = after
+    return nodes

@@ -1,0 +1,89 @@
+"""The spectral lines of one segment: where each beamlet's beat lies, how strong, in what phase."""
+
+import math
+
+from numba import njit
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.elementary import (
+    fraction_of_cycle,
+    product_fraction,
+    quotient,
+    sincos_cycles,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def folded_origin(centre, fft_size):
+    """Bin nearest to where a line at ``centre`` bins appears, and what folding made of it.
+
+    Returns
+    -------
+    origin : int
+        0..N/2.
+    turns : float
+        Whole FFT lengths to take off before the sign.
+    sign : float
+        -1 where the image is what appears, and the phase is conjugated; else +1.
+    """
+    turns = math.floor(centre / fft_size + 0.5) * fft_size
+    sign = -1.0 if centre - turns < 0.0 else 1.0
+    return math.floor(sign * (centre - turns) + 0.5), turns, sign
+
+
+@njit(cache=True, error_model="numpy")
+def segment_lines(segment, chirp, optics, record, offset, amplitude, n, delta, re, im):
+    """Lines of a segment: positions and complex weights C_b of :mod:`sweep.model.spectrum`.
+
+    Parameters
+    ----------
+    segment : (float, float)
+        Chirp sign s and carrier f_seg [Hz].
+    chirp : (float, float, float, float)
+        Chirp rate S [Hz/s], range R_0 [m], Doppler ratio beta = 2 v_r / c, beat amplitude for a
+        relative amplitude of 1 [V, before the receiver's poles].
+    optics : (float, float)
+        Poles of the receiver [Hz].
+    record : (float, int, int, float)
+        Sample rate [Hz], FFT size N, window length L, acquisition delay t_0 [s].
+    offset, amplitude : (n,) float64
+        (R_b - R_0)/R_0 and relative amplitude of each beamlet.
+    delta, re, im : (n,) float64
+        Result: bins from the returned origin, and C_b.
+
+    Returns
+    -------
+    int
+        Origin: the bin nearest to the beam's centre, 0..N/2.
+    """
+    sign, carrier = segment
+    rate, range_0, beta, scale = chirp
+    sample_rate, fft_size, length, start = record
+    bins = fft_size / sample_rate
+    per_metre = sign * rate * (2.0 / SPEED_OF_LIGHT) * (1.0 + beta)
+    centre_frequency = carrier * beta - per_metre * range_0
+    centre = centre_frequency * bins
+    origin, turns, fold = folded_origin(centre, fft_size)
+    delta_0 = fold * (centre - turns) - origin
+    high, low = quotient(2.0 * carrier, SPEED_OF_LIGHT)
+    phase_0 = -product_fraction(high, low, range_0) + fraction_of_cycle(centre_frequency * start)
+    half_ratio = 0.5 * (length / fft_size)
+    turn_0 = (length * origin % (2 * fft_size)) / (2.0 * fft_size)
+    square = 0.5 * sign * rate
+    cross = 1.0 / optics[0] + 1.0 / optics[1]
+    product = 1.0 / (optics[0] * optics[1])
+    for b in range(n):
+        further = range_0 * offset[b]
+        beat = -per_metre * further
+        delay = (range_0 + further) * (2.0 / SPEED_OF_LIGHT)
+        phase = phase_0 - product_fraction(high, low, further)
+        phase += fraction_of_cycle(square * delay * delay) + beat * start
+        delta[b] = delta_0 + fold * beat * bins
+        sine, cosine = sincos_cycles(fold * phase + turn_0 + half_ratio * delta[b])
+        frequency = centre_frequency + beat
+        p = 1.0 - frequency * frequency * product
+        q = fold * frequency * cross
+        weight = 0.5 * scale * amplitude[b] / (p * p + q * q)
+        re[b] = weight * (cosine * p + sine * q)
+        im[b] = weight * (sine * p - cosine * q)
+    return origin

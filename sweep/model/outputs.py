@@ -1,0 +1,84 @@
+"""What an evaluation yields for each point: names, units, meaning."""
+
+from dataclasses import dataclass
+
+NO_DOPPLER = "nan for direct detection, which has no optical Doppler segment"
+
+
+@dataclass(frozen=True)
+class Output:
+    """A quantity: its units ("1" where it has none), its name in words, a further comment."""
+
+    units: str
+    long_name: str
+    comment: str = ""
+
+
+def _pd(segment: str, comment: str = "") -> Output:
+    return Output("1", f"probability of detection, {segment}", comment)
+
+
+def _miss(segment: str, comment: str = "") -> Output:
+    return Output("1", f"probability of a miss, {segment}", f"1 - pd with its digits. {comment}")
+
+
+def _snr(segment: str, comment: str = "") -> Output:
+    text = "power of the strongest bin over the mean noise power of a bin, after the FFT"
+    return Output("1", f"signal-to-noise ratio, {segment}", f"{text}. {comment}".strip())
+
+
+OUTPUTS: dict[str, Output] = {
+    "pd_up": _pd("up-chirp"),
+    "pd_down": _pd("down-chirp"),
+    "pd_doppler": _pd("Doppler segment", NO_DOPPLER),
+    "pd_shot": _pd("shot", "up- and down-chirp both detected"),
+    "miss_up": _miss("up-chirp"),
+    "miss_down": _miss("down-chirp"),
+    "miss_doppler": _miss("Doppler segment", NO_DOPPLER),
+    "miss_shot": _miss("shot"),
+    "pfa_bin": Output("1", "probability of false alarm in one bin, from noise alone"),
+    "pfa_segment": Output(
+        "1",
+        "probability of at least one false alarm in the up-chirp segment, from noise alone",
+        "over the bins counted less those that the detection occupies; leakage is apart",
+    ),
+    "pfa_shot": Output(
+        "1",
+        "probability of a false alarm in the up- and in the down-chirp segment, from noise alone",
+        "what Tables 4.3 to 4.5 of the thesis print",
+    ),
+    "log10_pfa_bin": Output("1", "log10 of pfa_bin", "finite where pfa_bin underflows"),
+    "log10_pfa_segment": Output("1", "log10 of pfa_segment"),
+    "log10_pfa_shot": Output("1", "log10 of pfa_shot"),
+    "p_leakage_up": Output(
+        "1", "probability that leaked signal raises a further group, up-chirp", "over noise alone"
+    ),
+    "p_leakage_down": Output(
+        "1", "probability that leaked signal raises a further group, down-chirp", "over noise alone"
+    ),
+    "snr_up": _snr("up-chirp"),
+    "snr_down": _snr("down-chirp"),
+    "snr_doppler": _snr("Doppler segment", NO_DOPPLER),
+    "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
+    "range_error": Output(
+        "m", "reported less true range, without noise", "peak bins of the three segments resolved"
+    ),
+    "radial_velocity_error": Output(
+        "m s-1", "reported less true radial velocity, without noise", "positive when closing"
+    ),
+}
+
+
+def _count(what: str) -> Output:
+    return Output("1", f"number of draws with {what}")
+
+
+DRAW_OUTPUTS: dict[str, Output] = {
+    "n_detected_up": _count("a detection in the up-chirp segment"),
+    "n_detected_down": _count("a detection in the down-chirp segment"),
+    "n_detected_doppler": _count("a detection in the Doppler segment"),
+    "n_detected_shot": _count("a detection in both chirp segments"),
+    "n_false_alarm_up": _count("a false alarm in the up-chirp segment"),
+    "n_false_alarm_down": _count("a false alarm in the down-chirp segment"),
+    "n_false_alarm_shot": _count("a false alarm in both chirp segments"),
+}

@@ -1,0 +1,150 @@
+"""The compiled loop over points: three segments each, from lines to detections."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sweep.model.detection import assess
+from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.lines import segment_lines
+from sweep.model.marcum import marcum_q1_pair
+from sweep.model.spectrum import bin_magnitudes
+
+SIGNS = (1.0, 0.0, -1.0)
+
+ROOM = 15
+"""Rows of scratch that :func:`segment_spectrum` needs."""
+
+SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
+"""Rows of the result: what is found in each segment's spectrum."""
+
+
+@njit(cache=True, error_model="numpy")
+def reach_of(level, weights, envelope, reach):
+    """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
+    if not weights > 0.0:
+        return 1.0
+    low, high = 0, envelope.size - 1
+    if envelope[high] * weights > level:
+        return np.inf
+    while low < high:
+        middle = (low + high) // 2
+        if envelope[middle] * weights > level:
+            low = middle + 1
+        else:
+            high = middle
+    return reach[low]
+
+
+@njit(cache=True, error_model="numpy")
+def segment_spectrum(segment, p, offset, amplitude, level, power, kernel, room):
+    """|X| of the bins in which a segment's lines stand above a level, into room's first row.
+
+    Parameters
+    ----------
+    segment : int
+        0 up, 1 Doppler, 2 down.
+    p : (13,) float64
+        The point's column of :meth:`sweep.model.shot.Shots.point_table`.
+    offset, amplitude : (beamlets,) float64
+        (R_b - R_0)/R_0 and relative beat amplitude.
+    level : float
+        Bins whose magnitude is sure to stay below it are left out; 0 keeps all.
+    power : bool
+        Whether beamlets add as powers.
+    kernel : tuple
+        :meth:`sweep.model.shot.Shots.kernel`.
+    room : (ROOM, >= max(beamlets, MOST_NODES, N // 2 + 1)) float64
+        Scratch; the result in row 0.
+
+    Returns
+    -------
+    low, count : int
+        First bin, number of bins.
+    """
+    sizes, shape, sidelobes, limits, tangent = kernel
+    fft_size, length = sizes
+    n = offset.size
+    delta, re, im = room[12], room[13], room[14]
+    origin = segment_lines(
+        (SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
+        (p[6], fft_size, length, p[7]), offset, amplitude, n, delta, re, im,
+    )  # fmt: skip
+    if power:
+        for b in range(n):
+            re[b] = re[b] * re[b] + im[b] * im[b]
+            im[b] = 0.0
+    few_delta, few_re, few_im = room[4], room[5], room[6]
+    band = math.pi * length / fft_size * (2.0 if power else 1.0)
+    few = equivalent_lines(
+        delta, re, im, n, band, limits, few_delta, few_re, few_im, room[7:12]
+    )  # fmt: skip
+    low, high = _bins_above(
+        level, few_delta, few_re, few_im, few, origin, power, sizes, sidelobes
+    )  # fmt: skip
+    bin_magnitudes(
+        low, high, origin, few_delta, few_re, few_im, few, sizes, shape, power, tangent,
+        room[0], room[1], room[7:10],
+    )  # fmt: skip
+    return low, high - low + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
+    """First and last bin, within 0..N/2, that n lines can lift above a level."""
+    fft_size, length = sizes
+    window_sum, envelope, reach = sidelobes
+    total = 0.0
+    lowest, highest = delta[0], delta[0]
+    for j in range(n):
+        total += abs(re[j]) if power else math.hypot(re[j], im[j])
+        lowest, highest = min(lowest, delta[j]), max(highest, delta[j])
+    total = math.sqrt(total) if power else total
+    beyond = reach_of(level, total * window_sum, envelope, reach) * fft_size / length + 2.0
+    half = fft_size // 2
+    low, high = origin + lowest - beyond, origin + highest + beyond
+    first = 0 if low < 0 else min(math.floor(low), half)
+    last = half if high > half else max(math.ceil(high), 0)
+    return first, max(first, last)
+
+
+@njit(cache=True, error_model="numpy")
+def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, out):
+    """Every point's segments: detection probability, peak, exempt bins, leakage.
+
+    Parameters
+    ----------
+    points : (13, n) float64
+        :meth:`sweep.model.shot.Shots.point_table`.
+    row : (n,) int64
+        The point's row in the geometry.
+    offset, amplitude : (rows, beamlets) float64
+        (R_b - R_0)/R_0 and relative beat amplitude.
+    segments : (3,) bool
+        Segments to evaluate.
+    power, kernel
+        As in :func:`segment_spectrum`.
+    out : (3, 6, n) float64
+        Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
+    """
+    fft_size = kernel[0][0]
+    room = np.empty((ROOM, max(offset.shape[1], MOST_NODES, fft_size // 2 + 1)))
+    exempt = np.empty(fft_size // 2 + 1, np.bool_)
+    for i in range(points.shape[1]):
+        p = points[:, i].copy()
+        sigma, level, floor = p[10], p[11], p[12]
+        for s in range(3):
+            if not segments[s]:
+                continue
+            low, count = segment_spectrum(
+                s, p, offset[row[i]], amplitude[row[i]], floor * sigma, power, kernel, room
+            )
+            peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
+            found, missed = marcum_q1_pair(room[0, peak] / sigma, level / sigma)
+            out[s, 0, i] = found
+            out[s, 1, i] = missed
+            out[s, 2, i] = room[0, peak]
+            out[s, 3, i] = (low + peak) * p[6] / fft_size
+            out[s, 4, i] = exempted
+            out[s, 5, i] = leakage

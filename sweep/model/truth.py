@@ -1,0 +1,88 @@
+"""The slow, obviously right simulation: every beamlet, every sample, the whole FFT.
+
+The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 2, sample by
+sample; the records add up, are windowed and transformed. Every fast path is held against this.
+It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
+kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+
+from sweep.model import receiver, window
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.preparation import Shots
+from sweep.model.waveform import SIGNS
+
+
+def spectrum(shots: Shots, i: int, segment: int, *, range_walk: bool = True) -> np.ndarray:
+    """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
+
+    Parameters
+    ----------
+    segment : int
+        0 up, 1 Doppler, 2 down.
+    range_walk : bool
+        Whether the terms of the phase in t^2 are kept: the frequency drift while the target
+        moves. The fast path leaves them out.
+
+    Notes
+    -----
+    With incoherent phases: the root of the mean of |X|^2 over independent uniform phases.
+    """
+    w = window.samples(shots.window.name, shots.window.length)
+    half = shots.fft_size // 2 + 1
+    total = np.zeros(shots.window.length, complex)
+    power = np.zeros(half)
+    for beamlet in range(shots.offset.shape[1]):
+        signal = analytic_record(shots, i, segment, beamlet, range_walk=range_walk)
+        total += signal
+        if shots.incoherent:
+            spectrum = np.fft.fft(w * signal, shots.fft_size) / 2
+            power += abs(spectrum[:half]) ** 2 + abs(spectrum[-np.arange(half)]) ** 2
+    if shots.incoherent:
+        return np.sqrt(power)
+    return np.abs(np.fft.rfft(w * total.real, shots.fft_size))
+
+
+def analytic_record(
+    shots: Shots, i: int, segment: int, beamlet: int, *, range_walk: bool = True
+) -> np.ndarray:
+    """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled."""
+    sign, carrier = SIGNS[segment], float(_at(shots.carriers[segment], i))
+    beta, rate = float(_at(shots.beta, i)), float(_at(shots.chirp_rate, i))
+    range_0 = float(shots.range[i])
+    further = range_0 * float(shots.offset[shots.row[i], beamlet])
+    t = float(_at(shots.acquisition_delay, i)) + np.arange(shots.window.length) / float(
+        shots.sample_rate[i]
+    )
+    delay_0 = 2 * (range_0 + further) / SPEED_OF_LIGHT
+    change = -beta * t  # tau(t) - tau_0
+    chirped = change * (2 * delay_0 + change) / 2 - t * (delay_0 + change)
+    if not range_walk:
+        chirped = delay_0 * (change - t)
+    cycles = -carrier * change + sign * rate * chirped
+    start = _start_phase(sign, carrier, rate, range_0, further)
+    beat = carrier * beta - sign * rate * delay_0 * (1 + beta)
+    gain = receiver.transfer(
+        np.array(beat),
+        detector_bandwidth=_at(shots.detector_bandwidth, i),
+        amplifier_bandwidth=_at(shots.amplifier_bandwidth, i),
+        transimpedance=np.array(1.0),
+    )
+    amplitude = _at(shots.beat_scale, i) * shots.amplitude[shots.row[i], beamlet]
+    return amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start))
+
+
+def _start_phase(sign: int, carrier: float, rate: float, range_0: float, further: float) -> float:
+    """-f tau_0 + s S tau_0^2 / 2, the phase at t = 0 [cycles], in exact fractions."""
+    delay = 2 * (Fraction(range_0) + Fraction(further)) / Fraction(SPEED_OF_LIGHT)
+    phase = -Fraction(carrier) * delay + sign * Fraction(rate) * delay**2 / 2
+    return float(phase - round(phase))
+
+
+def _at(column: np.ndarray, i: int) -> np.ndarray:
+    """Point i of a column that may be one value for all."""
+    column = np.asarray(column)
+    return column[i] if column.ndim else column

@@ -1,0 +1,65 @@
+"""What all tests share: the instrument of the thesis's Table 4.1, and hypothesis without deadlines."""
+
+from math import pi
+
+import pytest
+from hypothesis import settings
+
+# The first call of a compiled kernel may compile it, which no deadline should count.
+settings.register_profile("sweep", deadline=None, derandomize=True)
+settings.load_profile("sweep")
+
+TABLE_4_1 = {
+    "instrument.laser.wavelength": 1550e-9,
+    "instrument.laser.power": 1.0,
+    "instrument.laser.beam_divergence": 50e-6,
+    "instrument.chirp.bandwidth": 1e9,
+    "instrument.chirp.start_frequency": 5.5e9,
+    "instrument.chirp.duration": 500e-6,
+    "instrument.telescope.aperture": 25e-3,
+    "instrument.telescope.optical_efficiency": 1.0,
+    "instrument.receiver.architecture": "homodyne",
+    "instrument.receiver.local_oscillator_power": 1e-3,
+    "instrument.receiver.mixing_efficiency": 1.0,
+    "instrument.receiver.apd_gain": 1.0,
+    "instrument.receiver.excess_noise_factor": 1.0,
+    "instrument.receiver.responsivity": 1.1,
+    "instrument.receiver.detector_bandwidth": 400e6,
+    "instrument.receiver.optical_passband": 25e-9,
+    "instrument.receiver.noise_equivalent_power": 5e-12,
+    "instrument.receiver.transimpedance": 7e3,
+    "instrument.receiver.amplifier_bandwidth": 400e6,
+    "instrument.receiver.amplifier_noise_current": 25e-9,
+    "instrument.receiver.noise_figure": 1.0,
+    "instrument.receiver.modulation_index": 1.0,
+    "instrument.receiver.load_resistance": 50.0,
+    "instrument.receiver.temperature": 290.0,
+    "instrument.processing.sample_rate": 600e6,
+    "instrument.processing.fft_size": 2**17,
+    "instrument.processing.window": "hamming",
+    "instrument.processing.tnr": 10.0,
+    "instrument.processing.acquisition_delay": 0.0,
+    "instrument.processing.bins_counted": "half",
+    "target.range": 2000.0,
+    "target.grazing_angle": pi / 2,
+    "target.radial_velocity": 150.0,
+    "target.reflectance": 0.1,
+    "target.reflectance_law": "thesis",
+    "target.solar_irradiance": 0.0,
+    "footprint.beamlets": 109,
+    "footprint.phases": "coherent",
+    "accuracy.leakage_floor": 0.1,
+}
+"""The instrument of [T] Table 4.1 with the target that PHYSICS section 3 reads into its figures."""
+
+_PATHS = {path.rsplit(".", 1)[1]: path for path in TABLE_4_1}
+
+
+@pytest.fixture(scope="session")
+def table_4_1():
+    """Parameters of Table 4.1, any of them replaced: ``table_4_1(range=3500.0, power=3.0)``."""
+
+    def parameters(**changes):
+        return TABLE_4_1 | {_PATHS[name]: value for name, value in changes.items()}
+
+    return parameters

@@ -1,0 +1,248 @@
+import csv
+import math
+from pathlib import Path
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import i0e
+
+from sweep.model.marcum import (
+    excess_crossing,
+    marcum_q1,
+    marcum_q1_pair,
+    marcum_q1_scalar,
+)
+
+REFERENCE = Path(__file__).parents[2] / "../shared/reference/marcum_q1.csv"
+ACCURACY = 2e-15  # what the docstrings promise
+SMALLEST = mp.mpf("1e-305")  # below, float64 itself runs out of digits
+
+SMALLEST_STEP = mp.mpf("5e-324")
+
+LEVELS = [1e-8, 0.3, 1.19, 1.21, 5.4, 5.5, 31.0, 1e4]
+HARD_POINTS = [
+    *((a, b) for a in (0.0, 1e-5, 1.0, 5.477) for b in (1e-160, 1e-9, 0.5, 1.2, 6.55, 38.0, 1e3)),
+    *((a, b) for a in (0.0, 0.05, 0.1) for b in (0.1, 0.11, 0.15)),
+    *((x, x) for x in LEVELS),
+    *((x, x * (1 + 1e-13)) for x in LEVELS),
+    *((x + 9.0, x) for x in LEVELS),
+    *((x, x + 9.0) for x in LEVELS),
+    *((x, x + 38.5) for x in LEVELS),
+    *((x + 37.5, x) for x in LEVELS),
+    *((30.0 / x, x) for x in (1.0, 2.0, 8.0, 40.0)),
+    (20.0, 70.0), (1e4, 1.0), (1e4, 2e4), (1e8, 1e8), (1e8, 1e8 + 1), (1e8 + 30, 1e8), (1e-3, 1e8),
+]  # fmt: skip
+FAINT = [1e-150, 1e-20, 1e-8, 1e-3, 0.03, 0.14, 0.3, 0.49, 0.52, 0.9, 1.99, 2.01, 5.0, 30.0]
+EXCESS_POINTS = [
+    *((a, b) for a in FAINT for b in (1e-9, 0.1, 1.0, 2.0, 6.55, 14.4, 37.0)),
+    # Either side of where the sum changes its length: ab at both ends of each length.
+    *((a, ab / a) for a in (0.14, 0.49, 0.7, 1.9) for ab in (0.322, 0.324, 1.67, 1.68, 2.8)),
+    *((a, ab / a) for a in (0.14, 0.49, 0.7, 1.9) for ab in (3.63, 3.64, 5.6, 7.99, 8.01)),
+]
+without_deadline = settings(deadline=None)  # the first call may compile
+amplitudes = st.floats(0.0, 60.0)
+
+
+def gauss(function, edges):
+    """Integral of a smooth function between consecutive edges."""
+    return mp.quad(function, edges, method="gauss-legendre")
+
+
+def rice_tails(a, b):
+    """(Q1, 1-Q1) to 20 digits or more: the density of the Rice distribution, integrated.
+
+    Over its value at b, since the quadrature stops at an absolute error.
+    """
+    a, b = mp.mpf(a), mp.mpf(b)
+    steps = [2**i / max(mp.mpf(1), abs(b - a)) for i in range(-1, 8)]
+
+    def density(r):
+        return r * mp.exp(-((r - a) ** 2) / 2 - a * r) * mp.besseli(0, a * r)
+
+    def ratio(r):
+        return density(r) / at_b
+
+    at_b = density(b)
+    if b > a and b > 1:
+        q = at_b * gauss(ratio, [b, *(b + step for step in steps)])
+        return q, 1 - q
+    edges = [0, *(b - step for step in reversed(steps) if step < b), b]
+    p = at_b * b * gauss(lambda t: ratio(b * t), [edge / b for edge in edges])
+    return 1 - p, p
+
+
+def worst_error(values, q, p):
+    """Worst relative error of (q, p, log_q, log_p) among those that float64 can hold."""
+    logs = [mp.log(q) if q < 0.5 else mp.log1p(-p), mp.log(p) if p < 0.5 else mp.log1p(-q)]
+    return max(
+        float(abs(mp.mpf(float(value)) / exact - 1))
+        for value, exact in zip(values, [q, p, *logs], strict=True)
+        if abs(exact) > SMALLEST
+    )
+
+
+@pytest.mark.skipif(not REFERENCE.exists(), reason="the reference points are not at hand")
+def test_all_four_values_agree_with_thirty_digit_reference_points():
+    with REFERENCE.open() as lines, mp.workdps(40):
+        rows = list(csv.DictReader(lines))
+        found = marcum_q1([float(r["a"]) for r in rows], [float(r["b"]) for r in rows])
+        for i, row in enumerate(rows):
+            exact = mp.mpf(row["Q"]), mp.mpf(row["one_minus_Q"])
+            assert worst_error([v[i] for v in found], *exact) < ACCURACY, (row["a"], row["b"])
+
+
+@pytest.mark.parametrize(("a", "b"), HARD_POINTS)
+def test_all_four_values_agree_with_the_integral_of_the_rice_density(a, b):
+    # The density holds exp(-ab) I0(ab), which takes as many further digits as ab has.
+    with mp.workdps(25 if a * b < 1e5 else 42):
+        assert worst_error(marcum_q1_scalar(a, b), *rice_tails(a, b)) < ACCURACY
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.0, 40.0), (10.0, 60.0), (60.0, 10.0), (1e4, 2e4)])
+def test_logarithms_stay_finite_where_the_probability_underflows(a, b):
+    q, p, log_q, log_p = marcum_q1_scalar(a, b)
+    assert min(q, p) < 1e-300
+    assert -1e9 < min(log_q, log_p) < -690
+    assert max(q, p) == 1.0
+
+
+@given(st.floats(0.0, 38.0))
+@without_deadline
+def test_without_signal_the_crossing_probability_is_that_of_rayleigh_noise(b):
+    q, p, log_q, _ = marcum_q1_scalar(0.0, b)
+    with mp.workdps(30):
+        half = mp.mpf(b) ** 2 / 2
+        for value, exact in ((q, mp.exp(-half)), (p, -mp.expm1(-half)), (log_q, -half)):
+            assert abs(value - exact) <= ACCURACY * abs(exact) + SMALLEST_STEP
+
+
+@given(amplitudes, amplitudes)
+@without_deadline
+def test_both_tails_are_probabilities_that_sum_to_one(a, b):
+    q, p, log_q, log_p = marcum_q1_scalar(a, b)
+    assert 0.0 <= q <= 1.0
+    assert 0.0 <= p <= 1.0
+    assert abs(q + p - 1.0) <= 2.3e-16
+    assert log_q <= 0.0
+    assert log_p <= 0.0
+
+
+@given(amplitudes, amplitudes, amplitudes)
+@without_deadline
+def test_crossing_grows_with_the_signal_and_shrinks_with_the_threshold(a, b, c):
+    low, high = sorted((a, c))
+    slack = 2 * ACCURACY
+    weak, strong = marcum_q1_scalar(low, b), marcum_q1_scalar(high, b)
+    assert strong[0] >= weak[0] * (1 - slack)
+    assert strong[1] <= weak[1] * (1 + slack)
+    assert strong[2] >= weak[2] * (1 + slack)
+    assert strong[3] <= weak[3] * (1 - slack)
+    low, high = sorted((b, c))
+    lax, strict = marcum_q1_scalar(a, low), marcum_q1_scalar(a, high)
+    assert strict[0] <= lax[0] * (1 + slack)
+    assert strict[1] >= lax[1] * (1 - slack)
+    assert strict[2] <= lax[2] * (1 - slack)
+    assert strict[3] >= lax[3] * (1 + slack)
+
+
+@given(amplitudes, amplitudes)
+@settings(deadline=None, max_examples=300)
+def test_exchange_of_signal_and_threshold_gives_the_bessel_function(a, b):
+    # Q1(a,b) + Q1(b,a) = 1 + exp(-(a^2+b^2)/2) I0(ab), with 1 - Q1(b,a) taken to the right. The
+    # right side is only as good as exp(-(a-b)^2/2) with a rounded square, and i0e.
+    a, b = sorted((a, b))
+    q = marcum_q1_scalar(a, b)[0]
+    p = marcum_q1_scalar(b, a)[1]
+    half = 0.5 * (b - a) ** 2
+    right = math.exp(-half) * i0e(a * b)
+    assert abs((q - p) - right) <= (2 * ACCURACY + 3e-16 * half) * (q + right) + 1e-307
+
+
+def test_limits_at_zero_and_infinity():
+    assert marcum_q1_scalar(5.0, 0.0) == (1.0, 0.0, 0.0, -math.inf)
+    assert marcum_q1_scalar(math.inf, 5.0) == (1.0, 0.0, 0.0, -math.inf)
+    assert marcum_q1_scalar(math.inf, 0.0) == (1.0, 0.0, 0.0, -math.inf)
+    assert marcum_q1_scalar(5.0, math.inf) == (0.0, 1.0, -math.inf, 0.0)
+    assert marcum_q1_scalar(0.0, math.inf) == (0.0, 1.0, -math.inf, 0.0)
+    assert excess_crossing(0.0, math.inf) == 0.0
+    assert excess_crossing(math.inf, 3.0) == pytest.approx(-math.expm1(-4.5), rel=1e-15)
+
+
+def test_huge_arguments_neither_overflow_nor_lose_the_half():
+    assert marcum_q1_scalar(1e200, 1e200)[:2] == (0.5, 0.5)
+    assert marcum_q1_scalar(1e200, 1.1e200) == (0.0, 1.0, -math.inf, 0.0)
+    assert marcum_q1_scalar(1e150, 1e-150)[:2] == (1.0, 0.0)
+    assert marcum_q1_scalar(1e-300, 1e300)[:2] == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(("a", "b"), [(-1.0, 1.0), (1.0, -1e-9), (math.nan, 1.0), (1.0, math.nan)])
+def test_arguments_outside_the_domain_are_refused(a, b):
+    with pytest.raises(ValueError, match="a >= 0"):
+        marcum_q1(a, b)
+    assert all(math.isnan(value) for value in marcum_q1_scalar(a, b))
+    assert all(math.isnan(value) for value in marcum_q1_pair(a, b))
+    assert math.isnan(excess_crossing(a, b))
+
+
+def test_two_infinite_arguments_are_refused():
+    with pytest.raises(ValueError, match="no limit"):
+        marcum_q1([1.0, math.inf], math.inf)
+    assert math.isnan(marcum_q1_pair(math.inf, math.inf)[0])
+
+
+def test_arrays_broadcast_and_equal_the_scalar_forms():
+    a, b = np.linspace(0.0, 12.0, 7)[:, None], np.linspace(0.1, 9.0, 5)
+    found = marcum_q1(a, b)
+    assert found.q.shape == (7, 5)
+    assert marcum_q1(1.0, 2.0).log_p.shape == ()
+    for i in range(7):
+        for j in range(5):
+            values = marcum_q1_scalar(a[i, 0], b[j])
+            assert tuple(v[i, j] for v in found) == values
+            assert marcum_q1_pair(a[i, 0], b[j]) == values[:2]
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.4, 1.0), (2.0, 2.5), (4.0, 6.55), (8.0, 6.55)])
+def test_signal_in_gaussian_noise_crosses_as_often_as_stated(a, b):
+    # Noise of unit variance per quadrature; 5 sigma of a count of 400 000.
+    number = 400_000
+    x, y = np.random.default_rng(1).standard_normal((2, number))
+    q = float(marcum_q1(a, b).q)
+    count = np.count_nonzero(np.hypot(x + a, y) > b)
+    assert abs(count - number * q) < 5 * math.sqrt(number * q * (1 - q))
+
+
+@pytest.mark.parametrize(("a", "b"), EXCESS_POINTS)
+def test_excess_crossing_is_the_integral_of_the_slope_over_the_signal(a, b):
+    # dQ1/da = b exp(-(a^2+b^2)/2) I1(ab), a route with neither a difference nor that series.
+    with mp.workdps(25):
+        threshold = mp.mpf(b)
+
+        def slope(s):
+            decay = mp.exp(-((s - threshold) ** 2) / 2 - s * threshold)
+            return threshold * decay * mp.besseli(1, s * threshold)
+
+        # Over the largest slope, since the quadrature stops at an absolute error.
+        end, peak = mp.mpf(a), slope(mp.mpf(min(a, b)))
+        nearest = [mp.mpf(b + offset) / end for offset in (-8, -4, 0, 4, 8) if 0 < b + offset < a]
+        exact = peak * end * gauss(lambda t: slope(end * t) / peak, [0, *nearest, 1])
+        assert exact > 0
+        error = abs(mp.mpf(excess_crossing(a, b)) - exact)
+        assert error < ACCURACY * exact + SMALLEST_STEP
+
+
+def test_excess_crossing_of_a_faint_signal_is_its_power_times_the_noise_density():
+    # exp(-b^2/2) a^2 b^2 / 4 for a -> 0: power, not amplitude.
+    for b in (0.5, 6.55, 20.0):
+        expected = math.exp(-(b**2) / 2) * (1e-9 * b) ** 2 / 4
+        assert excess_crossing(1e-9, b) == pytest.approx(expected, rel=1e-13)
+
+
+@given(st.floats(0.0, 12.0), st.floats(0.0, 20.0))
+@without_deadline
+def test_excess_and_noise_crossing_add_up_to_the_crossing(a, b):
+    q, noise = marcum_q1_scalar(a, b)[0], marcum_q1_scalar(0.0, b)[0]
+    assert excess_crossing(a, b) + noise == pytest.approx(q, rel=3 * ACCURACY)

@@ -1,0 +1,193 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+from scipy import stats
+
+from sweep.model import philox
+from sweep.model.philox import normal_pair, philox4x64, point_keys, uniform, uniform4
+
+FIVE_SIGMA = 5.73e-7  # two-sided chance of a normal variable beyond 5
+without_deadline = settings(deadline=None)  # the first call may compile
+words = st.integers(0, 2**64 - 1).map(np.uint64)
+numbers = st.integers(0, 2**40)
+KEY = np.uint64(0x0123456789ABCDEF), np.uint64(0xFEDCBA9876543210)
+
+
+def numpys_block(key, counter):
+    """Four raw outputs of numpy's generator at a counter, which it raises by 1 beforehand."""
+    before = (sum(int(word) << (64 * i) for i, word in enumerate(counter)) - 1) % 2**256
+    generator = np.random.Philox(key=int(key[0]) + (int(key[1]) << 64), counter=before)
+    return tuple(int(word) for word in generator.random_raw(4))
+
+
+@njit
+def uniforms(key0, key1, first_draw, stream, n_draws, n_indices):
+    values = np.empty((n_draws, n_indices))
+    for i in range(n_draws):
+        for j in range(n_indices):
+            values[i, j] = uniform(key0, key1, first_draw + i, stream, j)
+    return values
+
+
+@njit
+def normals(key0, key1, stream, n_draws, n_pairs):
+    values = np.empty((n_draws, n_pairs, 2))
+    for i in range(n_draws):
+        for j in range(n_pairs):
+            values[i, j] = normal_pair(key0, key1, i, stream, j)
+    return values
+
+
+@given(st.tuples(words, words), st.tuples(words, words, words, words))
+@without_deadline
+def test_every_block_equals_numpys_bit_for_bit(key, counter):
+    assert philox4x64(*key, *counter) == numpys_block(key, counter)
+
+
+def test_known_answers_of_the_authors_library_are_met():
+    # Random123's kat_vectors for philox4x64-10: all bits zero, all bits one.
+    zero, ones = np.uint64(0), np.uint64(2**64 - 1)
+    assert philox4x64(zero, zero, zero, zero, zero, zero) == (
+        0x16554D9ECA36314C, 0xDB20FE9D672D0FDC, 0xD7E772CEE186176B, 0x7E68B68AEC7BA23B,
+    )  # fmt: skip
+    assert philox4x64(ones, ones, ones, ones, ones, ones) == (
+        0x87B092C3013FE90B, 0x438C3C67BE8D0224, 0x9CC7D7C69CD777B6, 0xA09CAEBF594F0BA0,
+    )  # fmt: skip
+
+
+@given(st.tuples(words, words), numbers, st.integers(0, 100), numbers)
+@without_deadline
+def test_a_uniform_is_addressed_by_block_draw_and_stream(key, draw, stream, index):
+    raw = numpys_block(key, (index // 4, 0, draw, stream))[index % 4]
+    found = uniform(*key, draw, stream, index)
+    assert found == uniform4(*key, draw, stream, index // 4)[index % 4]
+    assert found == (raw // 2**12 * 2 + 1) / 2**53  # whole numbers: the division is exact
+
+
+def test_uniforms_never_reach_zero_or_one():
+    lowest = philox._open_unit(np.uint64(0))
+    highest = philox._open_unit(np.uint64(2**64 - 1))
+    assert 0.0 < lowest == 2.0**-53
+    assert highest == 1.0 - lowest < 1.0
+
+
+def test_uniforms_are_uniform_over_draws_and_over_indices():
+    values = uniforms(*KEY, 10**6, philox.STREAM_DETECTION_UP, 50_000, 4)
+    for sample in (values[:, 0], values[:, 3], values[:40].ravel(), values.ravel()):
+        assert stats.kstest(sample, "uniform").pvalue > FIVE_SIGMA
+
+
+@pytest.mark.parametrize("lag", [1, 2, 4, 16])
+def test_neighbours_in_draw_index_stream_and_key_are_uncorrelated(lag):
+    n = 30_000
+    base = uniforms(*KEY, 0, 1, n, 1).ravel()
+    others = [
+        uniforms(*KEY, lag, 1, n, 1).ravel(),
+        uniforms(*KEY, 0, 1, n, lag + 1)[:, lag],
+        uniforms(*KEY, 0, 1 + lag, n, 1).ravel(),
+        uniforms(KEY[0] + np.uint64(lag), KEY[1], 0, 1, n, 1).ravel(),
+        uniforms(KEY[0], KEY[1] ^ np.uint64(lag), 0, 1, n, 1).ravel(),
+    ]
+    for other in others:
+        # The correlation coefficient of n independent pairs has a deviation of 1/sqrt(n).
+        assert abs(np.corrcoef(base, other)[0, 1]) < 5 / math.sqrt(n)
+
+
+def test_noise_pairs_are_normal_and_independent():
+    values = normals(*KEY, philox.STREAM_NOISE_UP, 50_000, 2)
+    for sample in (*values.reshape(-1, 4).T, values.ravel()):
+        assert stats.kstest(sample, "norm").pvalue > FIVE_SIGMA
+    columns = values.reshape(-1, 4)
+    for table in (columns, columns**2):
+        correlation = np.corrcoef(table.T) - np.eye(4)
+        assert np.abs(correlation).max() < 5 / math.sqrt(len(table))
+
+
+def test_noise_magnitude_crosses_as_rayleigh_noise_does():
+    # sigma = 1 per quadrature, so P(|X| > b) = exp(-b^2/2): not exp(-b^2).
+    magnitude = np.hypot(*normals(*KEY, philox.STREAM_NOISE_DOWN, 200_000, 1)[:, 0].T)
+    for b in (0.5, 1.5, 3.0):
+        p = math.exp(-(b**2) / 2)
+        sigma = math.sqrt(p * (1 - p) / magnitude.size)
+        assert abs((magnitude > b).mean() - p) < 5 * sigma
+
+
+@given(numbers, numbers)
+@without_deadline
+def test_a_noise_pair_comes_from_its_own_two_uniforms(draw, index):
+    x, y = normal_pair(*KEY, draw, 7, index)
+    u, v = uniform(*KEY, draw, 7, 2 * index), uniform(*KEY, draw, 7, 2 * index + 1)
+    assert math.exp(-(x * x + y * y) / 2) == pytest.approx(u, rel=1e-13)
+    assert math.atan2(y, x) / (2 * math.pi) % 1.0 == pytest.approx(v, abs=1e-14)
+
+
+def test_streams_have_numbers_of_their_own():
+    streams = [value for name, value in vars(philox).items() if name.startswith("STREAM_")]
+    assert len(streams) == len(set(streams)) > 0
+    assert all(0 <= stream < 2**64 for stream in streams)
+
+
+def test_keys_are_those_of_a_checksum_made_outside_python():
+    # b2sum -l 128 of: length and text of domain and seed (lengths 8 bytes), three doubles.
+    expected = "4b55ef377d438e2710c5661d8d02a1b2"
+    keys = point_keys([[1.5, -0.0, -2e9]], domain="test", seed=42)
+    assert keys.dtype == np.uint64
+    assert keys.astype("<u8").tobytes().hex() == expected
+
+
+def test_a_points_key_depends_on_its_row_and_not_on_its_place():
+    rows = np.random.default_rng(2).normal(size=(50, 6))
+    keys = point_keys(rows, domain="grid", seed=3)
+    order = np.random.default_rng(3).permutation(50)
+    assert keys.shape == (50, 2)
+    assert np.array_equal(point_keys(rows[order], domain="grid", seed=3), keys[order])
+    assert np.array_equal(point_keys(rows[7:9], domain="grid", seed=3), keys[7:9])
+    assert np.array_equal(point_keys(np.asfortranarray(rows), domain="grid", seed=3), keys)
+
+
+def test_any_change_of_row_domain_or_seed_changes_the_key():
+    row = [1.0, 2.0, 0.0]
+    variants = [
+        ([1.0, 2.0, 0.0], "a", 1),
+        ([2.0, 1.0, 0.0], "a", 1),
+        ([1.0, 2.0, 5e-324], "a", 1),
+        ([1.0, np.nextafter(2.0, 3.0), 0.0], "a", 1),
+        ([1.0, 2.0], "a", 1),
+        (row, "b", 1),
+        (row, "a1", 1),
+        (row, "a", 11),
+        (row, "a", 2**70),
+    ]
+    keys = {tuple(point_keys([r], domain=d, seed=s)[0]) for r, d, s in variants}
+    assert len(keys) == len(variants)
+
+
+def test_negative_zero_is_the_point_zero():
+    keys = point_keys([[0.0, 1.0], [-0.0, 1.0]], domain="a", seed=0)
+    assert np.array_equal(keys[0], keys[1])
+
+
+def test_keys_of_neighbouring_points_share_half_their_bits():
+    rows = np.arange(2000.0)[:, None]
+    keys = point_keys(rows, domain="range", seed=0)
+    flipped = np.bitwise_count(keys[1:] ^ keys[:-1]).sum()
+    n = 1999 * 128
+    # Chained differences of independent fair bits are themselves independent fair bits.
+    assert abs(flipped - n / 2) < 5 * math.sqrt(n) / 2
+
+
+def test_no_points_have_no_keys():
+    assert point_keys(np.empty((0, 3)), domain="a", seed=0).shape == (0, 2)
+
+
+def test_rows_that_name_no_point_are_refused():
+    with pytest.raises(ValueError, match="nan"):
+        point_keys([[1.0, math.nan]], domain="a", seed=0)
+    with pytest.raises(ValueError, match=r"shape \(n, m\)"):
+        point_keys([1.0, 2.0], domain="a", seed=0)
+    with pytest.raises(ValueError, match="seed"):
+        point_keys([[1.0]], domain="a", seed=-1)
