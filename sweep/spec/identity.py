@@ -1,0 +1,121 @@
+"""What makes a study this study: its content in SI values, and the hash of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from sweep.spec.axes import Axis, Member
+from sweep.spec.fields import parameter_rules
+
+LISTED_VALUES = 64
+
+
+def axis_identity(axis: Axis) -> dict[str, Any]:
+    """Content of an axis: its values where they are few, else their number, ends and digest."""
+    return {"name": axis.name, "members": {m.path: _member_identity(m) for m in axis.members}}
+
+
+def _member_identity(member: Member) -> dict[str, Any]:
+    """Content of one parameter along an axis."""
+    number, words = len(member.values), isinstance(member.values, tuple)
+    if number <= LISTED_VALUES:
+        return {"values": list(member.values) if words else np.asarray(member.values).tolist()}
+    if words:
+        content = "\0".join(map(str, member.values)).encode()
+    else:
+        content = (np.asarray(member.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
+    first, last = np.asarray(member.values)[[0, -1]].tolist()
+    digest = hashlib.blake2b(content, digest_size=16).hexdigest()
+    return {"number": number, "first": first, "last": last, "digest": digest}
+
+
+def canonical(value: Any) -> Any:
+    """Value in the one form that its equals share: whole floats as integers, keys in order."""
+    if isinstance(value, Mapping):
+        return {str(key): canonical(value[key]) for key in sorted(value)}
+    if isinstance(value, list | tuple):
+        return [canonical(item) for item in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    return value
+
+
+def digest(identity: Mapping[str, Any]) -> str:
+    """Hash of an identity: 128 bits of BLAKE2b over its canonical JSON, in hex."""
+    text = json.dumps(
+        canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
+    )
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+class Identified(Protocol):
+    """Something with an identity: a spec."""
+
+    def identity(self) -> dict[str, Any]:
+        """Content in SI values."""
+        ...
+
+
+def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, Any]) -> list[str]:
+    """Lines ``path: value -> value`` for all that differs between two studies.
+
+    Parameters
+    ----------
+    a, b : Spec or mapping
+        Specs or their identities, as `Spec.identity` gives them or as they come back from JSON.
+    """
+    left, right = (
+        _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)
+    )
+    lines = []
+    for path in [*left, *(path for path in right if path not in left)]:
+        if left.get(path) != right.get(path):
+            old, new = (_told(path, side.get(path)) for side in (left, right))
+            lines.append(f"{path}: {old} -> {new}")
+    return lines
+
+
+def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Leaves of an identity by dotted path; the values of an axis count as one leaf."""
+    flat: dict[str, Any] = {}
+    flat |= identity.get("parameters", {})
+    for key, value in identity.items():
+        if key == "parameters":
+            continue
+        if key == "axes":
+            flat["axes"] = [axis["name"] for axis in value]
+            for axis in value:
+                flat |= {f"axes.{axis['name']}.{path}": m for path, m in axis["members"].items()}
+        elif isinstance(value, Mapping):
+            flat |= {f"{key}.{inner}": leaf for inner, leaf in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _told(path: str, value: Any) -> str:
+    """A leaf of an identity in words."""
+    rules = parameter_rules()
+    rule = rules.get(path) or next(
+        (rules[known] for known in rules if path.endswith("." + known)), None
+    )
+    units = f" {rule.units}" if rule is not None and rule.units else ""
+    if value is None:
+        return "(none)"
+    if path == "axes":
+        return ", ".join(value) or "(none)"
+    if isinstance(value, Mapping) and "values" in value:
+        return "[" + ", ".join(map(_number, value["values"])) + "]" + units
+    if isinstance(value, Mapping):
+        ends = f"{_number(value['first'])} to {_number(value['last'])}{units}"
+        return f"{value['number']} values from {ends} (digest {value['digest'][:8]})"
+    return _number(value) + units
+
+
+def _number(value: Any) -> str:
+    return repr(value) if isinstance(value, float) else str(value)

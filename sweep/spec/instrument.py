@@ -1,0 +1,255 @@
+"""The instrument of a study: laser, chirp, telescope, receiver and processing.
+
+Values are SI inside; what users write carries units.
+"""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict
+
+from sweep.spec.rules import Choice, Numeric
+from sweep.spec.window_rule import Window
+
+ARCHITECTURES = ("homodyne", "heterodyne", "direct")
+
+
+class Part(BaseModel):
+    """A section of a spec: frozen, and with no field but its own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Laser(Part):
+    """Transmitter: wavelength, power and beam."""
+
+    wavelength: Annotated[
+        float, Numeric(about="Optical wavelength", si_unit="m", example="1550 nm", above="0 m")
+    ]
+    power: Annotated[
+        float, Numeric(about="Transmitted optical power", si_unit="W", example="1 W", above="0 W")
+    ]
+    beam_divergence: Annotated[
+        float,
+        Numeric(
+            about="Full angle of the beam, for a Gaussian beam between its 1/e^2 points",
+            si_unit="rad",
+            example="50 urad",
+            above="0 rad",
+            at_most="90 deg",
+        ),
+    ]
+
+
+class Chirp(Part):
+    """Linear frequency sweep of one segment."""
+
+    bandwidth: Annotated[
+        float,
+        Numeric(about="Frequency swept in one chirp", si_unit="Hz", example="1 GHz", above="0 Hz"),
+    ]
+    start_frequency: Annotated[
+        float,
+        Numeric(
+            about="Frequency at which the chirp starts",
+            si_unit="Hz",
+            example="5.5 GHz",
+            at_least="0 Hz",
+        ),
+    ]
+    duration: Annotated[
+        float, Numeric(about="Length of one segment", si_unit="s", example="500 us", above="0 s")
+    ]
+
+
+class Telescope(Part):
+    """Receiving optics."""
+
+    aperture: Annotated[
+        float, Numeric(about="Diameter of the aperture", si_unit="m", example="25 mm", above="0 m")
+    ]
+    optical_efficiency: Annotated[
+        float,
+        Numeric(
+            about="Fraction of the collected light that reaches the detector",
+            example="0.8",
+            at_least="0",
+            at_most="1",
+        ),
+    ] = 1.0
+
+
+class Receiver(Part):
+    """Detector, local oscillator and amplifiers."""
+
+    responsivity: Annotated[
+        float,
+        Numeric(about="Responsivity at unit gain", si_unit="A/W", example="1.1 A/W", above="0 A/W"),
+    ]
+    detector_bandwidth: Annotated[
+        float,
+        Numeric(
+            about="Electrical bandwidth of the detector",
+            si_unit="Hz",
+            example="400 MHz",
+            above="0 Hz",
+        ),
+    ]
+    optical_passband: Annotated[
+        float,
+        Numeric(about="Width of the optical filter", si_unit="m", example="25 nm", at_least="0 m"),
+    ]
+    noise_equivalent_power: Annotated[
+        float,
+        Numeric(
+            about="Noise-equivalent power density of the detector",
+            si_unit="W/Hz^0.5",
+            example="5 pW/rtHz",
+            at_least="0 W/Hz^0.5",
+        ),
+    ]
+    transimpedance: Annotated[
+        float,
+        Numeric(
+            about="Gain of the transimpedance amplifier",
+            si_unit="ohm",
+            example="7 kohm",
+            above="0 ohm",
+        ),
+    ]
+    amplifier_bandwidth: Annotated[
+        float,
+        Numeric(
+            about="Electrical bandwidth of the amplifier",
+            si_unit="Hz",
+            example="400 MHz",
+            above="0 Hz",
+        ),
+    ]
+    amplifier_noise_current: Annotated[
+        float,
+        Numeric(
+            about="Input-referred noise current of the amplifier, rms over its bandwidth",
+            si_unit="A",
+            example="25 nA",
+            at_least="0 A",
+        ),
+    ]
+    architecture: Annotated[
+        str, Choice(about="How the echo is detected", options=ARCHITECTURES)
+    ] = "homodyne"
+    local_oscillator_power: Annotated[
+        float,
+        Numeric(
+            about="Power of the local oscillator; direct detection has none",
+            si_unit="W",
+            example="1 mW",
+            above="0 W",
+        ),
+    ] = 1e-3
+    mixing_efficiency: Annotated[
+        float,
+        Numeric(
+            about="Efficiency at which echo and local oscillator mix",
+            example="0.7",
+            above="0",
+            at_most="1",
+        ),
+    ] = 1.0
+    apd_gain: Annotated[
+        float,
+        Numeric(
+            about="Avalanche gain; 1 for a PIN diode", example="10", at_least="1", at_most="1e9"
+        ),
+    ] = 1.0
+    excess_noise_factor: Annotated[
+        float,
+        Numeric(
+            about="Excess noise factor of the avalanche", example="2.5", at_least="1", at_most="1e9"
+        ),
+    ] = 1.0
+    noise_figure: Annotated[
+        float,
+        Numeric(
+            about="Noise figure of the radio-frequency stages; heterodyne only",
+            si_unit="dB",
+            example="3 dB",
+            at_least="0 dB",
+            at_most="300 dB",
+        ),
+    ] = 1.0
+    modulation_index: Annotated[
+        float,
+        Numeric(
+            about="Depth of the intensity modulation; direct only",
+            example="0.9",
+            above="0",
+            at_most="1",
+        ),
+    ] = 1.0
+    load_resistance: Annotated[
+        float,
+        Numeric(
+            about="Load whose thermal noise limits direct detection; direct only",
+            si_unit="ohm",
+            example="50 ohm",
+            above="0 ohm",
+        ),
+    ] = 50.0
+    temperature: Annotated[
+        float,
+        Numeric(
+            about="Temperature of the load; direct only", si_unit="K", example="290 K", above="0 K"
+        ),
+    ] = 290.0
+
+
+class Processing(Part):
+    """Sampling, transform and threshold."""
+
+    sample_rate: Annotated[
+        float, Numeric(about="Rate of the ADC", si_unit="Hz", example="600 MHz", above="0 Hz")
+    ]
+    fft_size: Annotated[
+        int,
+        Numeric(
+            about="Points of the FFT", example="2^17", at_least="2", at_most="2^30", whole=True
+        ),
+    ]
+    tnr: Annotated[
+        float,
+        Numeric(
+            about="Threshold over the standard deviation of a noise-only bin's magnitude",
+            example="10",
+            above="0",
+            at_most="1e6",
+        ),
+    ]
+    window: Annotated[
+        str, Window(about="Window function, by scipy.signal's name, with its parameters")
+    ] = "hamming"
+    acquisition_delay: Annotated[
+        float,
+        Numeric(
+            about="Time from the start of a segment to its first sample",
+            si_unit="s",
+            example="70 us",
+            at_least="0 s",
+        ),
+    ] = 0.0
+    bins_counted: Annotated[
+        str,
+        Choice(
+            about="Bins that may raise a false alarm: half the FFT, as a real record has, or all",
+            options=("half", "all"),
+        ),
+    ] = "half"
+
+
+class Instrument(Part):
+    """A Doppler lidar."""
+
+    laser: Laser
+    chirp: Chirp
+    telescope: Telescope
+    receiver: Receiver
+    processing: Processing

@@ -1,0 +1,114 @@
+"""A user's mistakes in a spec: what is wrong, where it stands, and what to write instead."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+Location = tuple[str | int, ...]
+
+_LONGEST_VALUE = 60
+
+
+@dataclass(frozen=True, order=True)
+class Mistake:
+    """One mistake in a spec.
+
+    Parameters
+    ----------
+    path : str
+        Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``;
+        empty for the file as a whole.
+    rule : str
+        The rule broken, as the end of a sentence about the path.
+    value : str
+        The value as the user wrote it; empty where there is none.
+    suggestion : str
+        A near miss or a remedy; empty where there is none.
+    line : int or None
+        Line in the file, from 1.
+    file : str
+        The file that holds the mistake; empty for a spec that came from no file.
+    """
+
+    path: str
+    rule: str
+    value: str = ""
+    suggestion: str = ""
+    line: int | None = None
+    file: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
+        said = f"{self.path}: {self.rule}" if self.path else self.rule
+        wrote = f" (you wrote {self.value})" if self.value else ""
+        return place + said + wrote + (f"; {self.suggestion}" if self.suggestion else "")
+
+
+class SpecError(Exception):
+    """Everything that is wrong with a spec, at once.
+
+    Parameters
+    ----------
+    mistakes : iterable of Mistake
+        The mistakes, in the order in which to show them.
+    """
+
+    def __init__(self, mistakes: Iterable[Mistake]) -> None:
+        self.mistakes = list(mistakes)
+        super().__init__(self.mistakes)
+
+    def __str__(self) -> str:
+        if len(self.mistakes) == 1:
+            return str(self.mistakes[0])
+        lines = [f"{len(self.mistakes)} mistakes:", *(f"  {mistake}" for mistake in self.mistakes)]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A mistake whose place in the file is still to be looked up.
+
+    Parameters
+    ----------
+    location : tuple of str or int
+        Keys and list indices that lead to it.
+    rule, suggestion : str
+        As in `Mistake`.
+    written : object
+        The value as read from the file; ``ABSENT`` where there is none to show.
+    """
+
+    location: Location
+    rule: str
+    suggestion: str = ""
+    written: object = None
+
+
+ABSENT = object()
+
+
+def dotted(location: Location) -> str:
+    """Path of keys and indices as text: ``axes.target.range[2]``."""
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def shown(written: object) -> str:
+    """A written value on one short line; empty for ``ABSENT`` and for whole sections."""
+    if written is ABSENT or isinstance(written, dict | list | tuple):
+        return ""
+    if written is None:
+        return "nothing"
+    text = repr(written) if isinstance(written, str) else str(written)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."
+
+
+def near_miss(name: str, known: Iterable[str], *, otherwise: str = "") -> str:
+    """Suggestion of the known name that `name` resembles, else a remedy."""
+    names = list(known)
+    close = [k for k in names if k.lower() == name.lower()] or get_close_matches(name, names, n=1)
+    return f"did you mean '{close[0]}'?" if close else otherwise

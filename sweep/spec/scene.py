@@ -1,0 +1,160 @@
+"""What an instrument looks at, how closely it is computed, and how a study is run."""
+
+from typing import Annotated
+
+from sweep.spec.instrument import Part
+from sweep.spec.rules import Choice, Numeric, Text
+
+
+class Target(Part):
+    """A flat plane, seen at an angle."""
+
+    range: Annotated[
+        float, Numeric(about="Distance to the target", si_unit="m", example="2 km", above="0 m")
+    ]
+    grazing_angle: Annotated[
+        float,
+        Numeric(
+            about="Angle between beam and surface, 90 deg along the normal",
+            si_unit="rad",
+            example="15 deg",
+            above="0 deg",
+            at_most="90 deg",
+        ),
+    ]
+    reflectance: Annotated[
+        float,
+        Numeric(about="Fraction of light scattered back", example="0.1", at_least="0", at_most="1"),
+    ]
+    reflectance_law: Annotated[
+        str,
+        Choice(
+            about="How it scatters: Lambertian, or without a cosine as the thesis has it",
+            options=("lambert", "thesis"),
+        ),
+    ] = "lambert"
+    radial_velocity: Annotated[
+        float,
+        Numeric(
+            about="Speed along the line of sight, positive when closing",
+            si_unit="m/s",
+            example="150 m/s",
+            at_least="-1000 km/s",
+            at_most="1000 km/s",
+        ),
+    ] = 0.0
+    solar_irradiance: Annotated[
+        float,
+        Numeric(
+            about="Spectral irradiance of sunlight on the target",
+            si_unit="W/m^3",
+            example="0.5 W/m^2/nm",
+            at_least="0 W/m^3",
+        ),
+    ] = 0.0
+
+
+class Footprint(Part):
+    """The spot on the target, as a sum of beamlets."""
+
+    beamlets: Annotated[
+        int,
+        Numeric(
+            about="Number of beamlets", example="109", at_least="1", at_most="100000", whole=True
+        ),
+    ] = 109
+    phases: Annotated[
+        str,
+        Choice(
+            about="Whether the beamlets' optical phases follow the surface or average out",
+            options=("coherent", "incoherent"),
+        ),
+    ] = "incoherent"
+
+
+class Accuracy(Part):
+    """How far the computation goes; part of a study's identity."""
+
+    leakage_floor: Annotated[
+        float,
+        Numeric(
+            about="Bins whose leaked signal is under this many noise sigmas count as noise alone",
+            example="0.1",
+            above="0",
+            at_most="1000",
+        ),
+    ] = 0.1
+
+
+class Draws(Part):
+    """Random realisations of each point."""
+
+    number: Annotated[
+        int,
+        Numeric(
+            about="Draws a point; 0 computes probabilities alone",
+            example="10000",
+            at_least="0",
+            at_most="1e12",
+            whole=True,
+        ),
+    ] = 0
+    batch: Annotated[
+        int,
+        Numeric(
+            about="Draws that are counted together",
+            example="100",
+            at_least="1",
+            at_most="1e9",
+            whole=True,
+        ),
+    ] = 100
+    method: Annotated[
+        str,
+        Choice(
+            about="Draw against the probabilities, or add noise to the bins",
+            options=("probabilities", "noise"),
+        ),
+    ] = "probabilities"
+
+
+class Storage(Part):
+    """How results are cut up in the store; part of a study's identity."""
+
+    block_points: Annotated[
+        int,
+        Numeric(
+            about="Points that one block holds at most",
+            example="32768",
+            at_least="1",
+            at_most="1e9",
+            whole=True,
+        ),
+    ] = 32768
+
+
+class Execution(Part):
+    """How a study is run; never part of its identity, as it changes no result."""
+
+    workers: Annotated[
+        int,
+        Numeric(
+            about="Worker processes; 0 for one a core",
+            example="4",
+            at_least="0",
+            at_most="100000",
+            whole=True,
+        ),
+    ] = 0
+    threads: Annotated[
+        int,
+        Numeric(
+            about="Threads of one worker", example="1", at_least="1", at_most="10000", whole=True
+        ),
+    ] = 1
+    scheduler: Annotated[
+        str,
+        Text(
+            about="Address of a running Dask scheduler, 'none' for a plain loop; empty starts one"
+        ),
+    ] = ""

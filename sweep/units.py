@@ -1,0 +1,286 @@
+"""Quantities with units at the edges: text such as ``25 mm`` in, SI floats out.
+
+Numbers stay exact fractions until the last step, so that every spelling of a quantity gives the
+same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; it is imported on
+first use.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+from difflib import get_close_matches
+from fractions import Fraction
+from functools import cache, lru_cache
+from typing import Any
+
+LONGEST_TEXT = 100
+DECIBEL = "dB"
+
+_NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
+_POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>\d{1,3})"
+_VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>[^\d\s.+\-].*)?", re.ASCII)
+_FACTOR = re.compile(r"(?P<name>[A-Za-z]+|%)(?:(?:\^|\*\*)?(?P<exponent>[+-]?\d(?:\.5)?))?")
+_NOT_FINITE = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
+_ROOT_OF = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
+_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
+
+# Units that a near miss is looked for in, by the SI unit they measure.
+_PREFIXED = {
+    "m": "nm um mm cm m km",
+    "s": "ns us ms s",
+    "Hz": "Hz kHz MHz GHz THz",
+    "W": "pW nW uW mW W kW",
+    "rad": "urad mrad rad deg arcmin arcsec",
+    "A": "pA nA uA mA A",
+    "ohm": "ohm kohm Mohm",
+    "K": "K degC",
+    "m/s": "mm/s m/s km/s km/h",
+    "A/W": "mA/W A/W",
+    "W/Hz^0.5": "fW/rtHz pW/rtHz nW/rtHz W/rtHz",
+    "W/m^3": "W/m^2/nm mW/m^2/nm W/m^2/um",
+    DECIBEL: "dB",
+    "": "%",
+}
+
+
+class QuantityError(ValueError):
+    """A written quantity that cannot be read: the rule it breaks and what to do about it.
+
+    Parameters
+    ----------
+    rule : str
+        The rule broken, as the end of the sentence "this field ...".
+    suggestion : str
+        A near miss or a remedy, empty where there is none.
+    """
+
+    def __init__(self, rule: str, suggestion: str = "") -> None:
+        super().__init__(f"{rule}; {suggestion}" if suggestion else rule)
+        self.rule = rule
+        self.suggestion = suggestion
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit as the user wrote it and its way to SI: ``si = factor * value + offset``.
+
+    Decibels are power ratios: ``si = 10 ** (value / 10)``.
+    """
+
+    text: str
+    factor: Fraction = Fraction(1)
+    offset: Fraction = Fraction(0)
+
+    @property
+    def decibel(self) -> bool:
+        """Whether values of this unit are logarithms of power ratios."""
+        return self.text == DECIBEL
+
+    def to_si(self, value: Fraction) -> float:
+        """SI value of `value` in this unit, correctly rounded.
+
+        Raises
+        ------
+        QuantityError
+            Where the value exceeds what a float holds.
+        """
+        try:
+            if self.decibel:
+                return float(10.0 ** (float(value) / 10.0))
+            return float(self.factor * value + self.offset)
+        except OverflowError:
+            raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
+
+
+def read_number(written: object) -> tuple[Fraction, Unit]:
+    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
+
+    Raises
+    ------
+    QuantityError
+        Where it is no finite number, or carries a unit other than ``%``.
+    """
+    value, unit = _split(written)
+    if unit not in ("", "%"):
+        raise QuantityError("is a pure number and takes no unit", f"write e.g. '{_show(value)}'")
+    return value, Unit(unit, Fraction(1, 100)) if unit else Unit("")
+
+
+def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
+    """Exact value and unit of a written quantity, such as ``"25 mm"``.
+
+    Parameters
+    ----------
+    written : object
+        What the user wrote.
+    si_unit : str
+        Unit that the quantity is measured in inside, which fixes its dimension; ``"dB"`` for a
+        power ratio written in decibels.
+    example : str
+        A good value, shown where the unit is missing.
+
+    Raises
+    ------
+    QuantityError
+        For a missing, unknown or unfit unit and anything that is not a finite number.
+    """
+    value, text = _split(written)
+    if not text:
+        raise QuantityError("needs a unit", f"write e.g. '{example}'")
+    return value, read_unit(text, si_unit=si_unit, example=example)
+
+
+@lru_cache(maxsize=4096)
+def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
+    """Unit of the given text, if it measures what `si_unit` measures.
+
+    Raises
+    ------
+    QuantityError
+        For an unknown unit, or one of another dimension.
+    """
+    if DECIBEL in (si_unit, text):
+        if si_unit == text:
+            return Unit(DECIBEL)
+        raise QuantityError(*_unfit(text, si_unit, example))
+    factors = _factors(text)
+    if factors is None:
+        raise QuantityError(
+            f"has the unit '{text}', which cannot be read", f"write e.g. '{example}'"
+        )
+    for name, _ in factors:
+        if _root(name) is None:
+            raise QuantityError(f"has an unknown unit '{name}'", _near_miss(name, si_unit, example))
+    scale, offset, dimension = _combined(factors)
+    if_si, _, wanted = _combined(_factors(si_unit) or [])
+    if dimension != wanted:
+        raise QuantityError(*_unfit(text, si_unit, example))
+    return Unit(_plain(factors), scale / if_si, offset / if_si)
+
+
+def _unfit(text: str, si_unit: str, example: str) -> tuple[str, str]:
+    """Rule and suggestion for a unit of the wrong dimension."""
+    return f"needs a unit like {si_unit}, and '{text}' is none", f"write e.g. '{example}'"
+
+
+def _split(written: object) -> tuple[Fraction, str]:
+    """Exact number and unit text (empty where none) of what was written."""
+    if isinstance(written, bool) or not isinstance(written, int | float | str):
+        raise QuantityError("must be a number, with its unit where it has one")
+    text = _spelled(str(written))
+    if len(text) > LONGEST_TEXT:
+        raise QuantityError(f"must be at most {LONGEST_TEXT} characters long")
+    if _NOT_FINITE.match(text):
+        raise QuantityError("must be a finite number")
+    match = _VALUE.fullmatch(text)
+    if match is None:
+        raise QuantityError("must be a number, with its unit where it has one")
+    unit = (match["unit"] or "").strip()
+    if match["base"]:
+        return Fraction(int(match["base"]) ** int(match["exponent"])), unit
+    return Fraction(match["number"]), unit
+
+
+def _spelled(text: str) -> str:
+    """Text in plain letters: ``25 µm`` as ``25 um``, ``pW/√Hz`` as ``pW/Hz^0.5``."""
+    text = unicodedata.normalize("NFKC", text[: 2 * LONGEST_TEXT])
+    for symbol, letters in _SPELLINGS.items():
+        text = text.replace(symbol, letters)
+    return _ROOT_OF.sub(lambda match: f"{match[1] or match[2]}^0.5", text)
+
+
+def _show(value: Fraction) -> str:
+    """A number as a user would write it."""
+    return f"{float(value):.12g}"
+
+
+def _factors(text: str) -> list[tuple[str, Fraction]] | None:
+    """Names and exponents of a unit's factors; None where the text is no unit."""
+    factors = []
+    sign = 1
+    for piece in re.split(r"(\*(?!\*)|/|(?<=[A-Za-z0-9]) +(?=[A-Za-z]))", text.replace("**", "^")):
+        operator = piece.strip()
+        if operator in ("", "*", "/"):
+            sign = -1 if operator == "/" else 1
+            continue
+        match = _FACTOR.fullmatch(operator)
+        if match is None:
+            return None
+        factors.append((match["name"], sign * Fraction(match["exponent"] or 1)))
+    return factors
+
+
+def _plain(factors: list[tuple[str, Fraction]]) -> str:
+    """One spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``."""
+    text = ""
+    for name, exponent in factors:
+        operator = "/" if exponent < 0 and text else "*" if text else ""
+        size = abs(exponent) if operator == "/" else exponent
+        text += operator + name + ("" if size == 1 else f"^{float(size):g}")
+    return text
+
+
+@cache
+def _registry() -> Any:
+    """Pint's registry, in exact fractions."""
+    import pint
+
+    return pint.UnitRegistry(non_int_type=Fraction)
+
+
+@cache
+def _root(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
+    """Factor, offset and dimension of one unit in pint's root units; None where unknown."""
+    registry = _registry()
+    try:
+        unit = registry.parse_units("percent" if name == "%" else name)
+        zero, one = (registry.Quantity(Fraction(i), unit).to_root_units() for i in (0, 1))
+    except (AttributeError, ValueError, TypeError, ArithmeticError):
+        return None
+    dimension = {str(key): Fraction(power) for key, power in one.unit_items()}
+    offset = Fraction(zero.magnitude)
+    return Fraction(one.magnitude) - offset, offset, tuple(sorted(dimension.items()))
+
+
+def _combined(
+    factors: list[tuple[str, Fraction]],
+) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
+    """Factor, offset and dimension of a product of units, all of them known."""
+    scale, offset = Fraction(1), Fraction(0)
+    dimension: dict[str, Fraction] = {}
+    for name, exponent in factors:
+        root = _root(name)
+        assert root is not None
+        factor, offset, powers = root
+        scale *= _power(factor, exponent)
+        for key, power in powers:
+            dimension[key] = dimension.get(key, Fraction(0)) + power * exponent
+    # A temperature's zero matters to a temperature, not to a unit that it is a factor of.
+    return (
+        scale,
+        offset if len(factors) == 1 else Fraction(0),
+        {k: p for k, p in dimension.items() if p},
+    )
+
+
+def _power(factor: Fraction, exponent: Fraction) -> Fraction:
+    """Power of a positive fraction, to 50 digits where the exponent is a half."""
+    if exponent.denominator == 1:
+        return factor ** int(exponent)
+    with localcontext() as context:
+        context.prec = 50
+        root = (Decimal(factor.numerator) / Decimal(factor.denominator)).sqrt()
+    return Fraction(root) ** int(2 * exponent)
+
+
+def _near_miss(name: str, si_unit: str, example: str) -> str:
+    """Suggestion for an unknown unit: the usual one that it resembles, or an example."""
+    usual = _spelled(_PREFIXED.get(si_unit, si_unit))
+    names = sorted(set(re.findall(r"[A-Za-z%]+", usual)))
+    same = [known for known in names if known.lower() == name.lower()]
+    close = same or get_close_matches(name, names, n=10, cutoff=0.5)
+    close.sort(key=lambda known: (len(known) != len(name), known[0] != name[0]))
+    return f"did you mean '{close[0]}'?" if close else f"write e.g. '{example}'"

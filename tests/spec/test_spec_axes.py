@@ -1,0 +1,191 @@
+import time
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from written_specs import written
+
+from sweep.spec import Spec
+
+
+def axes_of(**kinds):
+    return Spec.from_mapping(written(axes=kinds)).axes
+
+
+def member(path, values):
+    return Spec.from_mapping(written(axes={path: values})).axes[0].members[0]
+
+
+def test_a_list_keeps_the_users_unit_beside_si():
+    power = member("instrument.laser.power", ["1 W", "3000 mW", "5 W"])
+    assert (power.name, power.units) == ("power", "W")
+    assert power.values.tolist() == power.display.tolist() == [1.0, 3.0, 5.0]
+
+
+def test_display_values_are_in_the_unit_of_the_first_value():
+    angle = member("target.grazing_angle", ["15 deg", "0.5 rad", "90 deg"])
+    assert angle.units == "deg"
+    assert angle.display[[0, 2]].tolist() == [15.0, 90.0]
+    assert angle.display[1] == pytest.approx(np.degrees(0.5), rel=1e-15)
+    assert angle.values[1] == 0.5
+
+
+def test_units_have_one_plain_spelling():
+    path = "instrument.receiver.noise_equivalent_power"
+    for spelling in ("5 pW/rtHz", "5 pW/√Hz", "5 pW/sqrt(Hz)", "5 pW/Hz^0.5"):
+        assert member(path, [spelling]).units == "pW/Hz^0.5"
+    assert member("target.grazing_angle", ["15°"]).units == "deg"
+    assert member("instrument.laser.beam_divergence", ["50 µrad"]).units == "urad"
+
+
+def test_decibels_are_shown_as_such_and_spaced_as_such():
+    figure = member("instrument.receiver.noise_figure", {"linear": ["0 dB", "20 dB"], "number": 3})
+    assert figure.units == "dB"
+    assert figure.display.tolist() == [0.0, 10.0, 20.0]
+    assert figure.values.tolist() == [1.0, 10.0, 100.0]
+
+
+def test_temperatures_step_in_celsius():
+    step = {"step": ["-10 degC", "20 degC", "10 degC"]}
+    temperature = member("instrument.receiver.temperature", step)
+    assert temperature.values.tolist() == [263.15, 273.15, 283.15, 293.15]
+    assert temperature.display.tolist() == [-10.0, 0.0, 10.0, 20.0]
+
+
+@given(
+    st.integers(1, 200), st.integers(1, 50), st.integers(1, 60),
+    st.sampled_from(["mm", "m", "um", "ft"]), st.sampled_from([1, 10, 1000]),
+)  # fmt: skip
+def test_a_step_gives_the_floats_of_its_values_written_out(start, step, number, unit, parts):
+    def text(value):
+        return f"{value}e-{len(str(parts)) - 1} {unit}"
+
+    numbers = [start + step * i for i in range(number)]
+    generated = member("target.range", {"step": [text(start), text(numbers[-1]), text(step)]})
+    listed = member("target.range", [text(value) for value in numbers])
+    assert generated == listed
+    assert generated.display.tolist() == [float(Fraction(value, parts)) for value in numbers]
+
+
+def test_degrees_stepped_are_the_floats_of_degrees_written_out():
+    generated = member("target.grazing_angle", {"step": ["1 deg", "90 deg", "0.1 deg"]})
+    listed = member("target.grazing_angle", [f"{i / 10} deg" for i in range(10, 901)])
+    assert generated == listed
+    assert len(generated.values) == 891
+
+
+def test_a_step_ends_on_its_last_value_and_never_past_it():
+    assert member("target.range", {"step": ["0.1 m", "1 m", "0.1 m"]}).values[-1] == 1.0
+    assert member("target.range", {"step": ["1 m", "10 m", "4 m"]}).values.tolist() == [1, 5, 9]
+    assert member("target.range", {"step": ["9 m", "1 m", "-4 m"]}).values.tolist() == [9, 5, 1]
+
+
+def test_linear_values_are_evenly_spaced_with_exact_ends():
+    values = member("target.range", {"linear": ["1 m", "10 km"], "number": 10000}).values
+    assert values.tolist() == np.arange(1.0, 10001.0).tolist()
+
+
+def test_ends_of_a_generator_may_differ_in_unit():
+    mixed = member("target.range", {"linear": ["1 m", "10 km"], "number": 4})
+    plain = member("target.range", {"linear": ["1 m", "10000 m"], "number": 4})
+    assert mixed == plain
+
+
+def test_log_values_have_one_ratio_and_exact_ends_in_whatever_unit():
+    metres = member("target.range", {"log": ["3 m", "10 km"], "number": 50})
+    millimetres = member("target.range", {"log": ["3000 mm", "10000000 mm"], "number": 50})
+    ratios = metres.values[1:] / metres.values[:-1]
+    assert np.ptp(ratios) < 1e-13
+    assert metres.values[[0, -1]].tolist() == [3.0, 10000.0]
+    assert metres.values.tolist() == millimetres.values.tolist()
+    assert millimetres.display[[0, -1]].tolist() == [3000.0, 1e7]
+
+
+def test_decades_come_out_clean():
+    decades = member("target.range", {"log": ["1 mm", "1 km"], "number": 7})
+    assert decades.values.tolist() == [0.001, 0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
+    assert decades.display.tolist() == [1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6]
+
+
+def test_whole_fields_take_whole_values_only_and_stay_whole():
+    for written_values in (["2^16", "2^17", "2^18"], {"log": ["2^16", "2^18"], "number": 3},
+                           [65536, 131072.0, "262144"]):  # fmt: skip
+        sizes = member("instrument.processing.fft_size", written_values)
+        assert sizes.values.dtype == np.int64
+        assert sizes.values.tolist() == sizes.display.tolist() == [65536, 131072, 262144]
+        assert sizes.units == ""
+
+
+def test_a_list_may_hold_generators():
+    values = member("target.range", ["1 m", {"step": ["5 m", "7 m", "1 m"]}, "1 km"]).values
+    assert values.tolist() == [1.0, 5.0, 6.0, 7.0, 1000.0]
+
+
+def test_words_make_an_axis():
+    window = member("instrument.processing.window", ["hann", "kaiser( 8.6 )"])
+    assert window.values == ("hann", "kaiser(8.6)")
+    assert window.display.tolist() == ["hann", "kaiser(8.6)"]
+    assert window.units == ""
+
+
+def test_zipped_pieces_are_laid_end_to_end_with_single_values_repeated():
+    (cut,) = axes_of(
+        cut={
+            "zip": [
+                {"target.range": {"step": ["5 m", "7 m", "1 m"]}, "target.grazing_angle": "15 deg"},
+                {"target.range": "3.5 km", "target.grazing_angle": ["1 deg", "2 deg"]},
+                {"target.range": "9 m", "target.grazing_angle": "90 deg"},
+            ]
+        }
+    )
+    assert (cut.name, cut.size, cut.zipped) == ("cut", 6, True)
+    distance, angle = cut.members
+    assert (distance.name, distance.units) == ("range", "m")
+    assert distance.values.tolist() == [5.0, 6.0, 7.0, 3500.0, 3500.0, 9.0]
+    assert angle.display.tolist() == [15.0, 15.0, 15.0, 1.0, 2.0, 90.0]
+
+
+def test_a_zipped_axis_may_hold_words_and_repeat_points():
+    (pair,) = axes_of(
+        pair={"zip": {"instrument.processing.window": ["hann", "hann", "hamming"],
+                      "footprint.phases": "coherent", "target.range": "1 m"}}
+    )  # fmt: skip
+    assert pair.members[0].values == ("hann", "hann", "hamming")
+    assert pair.members[1].values == ("coherent",) * 3
+    assert pair.members[2].values.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_axes_keep_the_order_of_the_file_and_their_plain_names():
+    axes = axes_of(**{"target.range": ["1 m"], "instrument.processing.tnr": [1, 5]})
+    assert [(axis.name, axis.size) for axis in axes] == [("range", 1), ("tnr", 2)]
+    assert not axes[0].zipped
+
+
+def test_a_field_on_an_axis_need_not_be_written_twice():
+    spec = Spec.from_mapping(
+        written({"target.range": ...}, axes={"target.range": {"step": ["5 m", "9 m", "1 m"]}})
+    )
+    assert spec.parameters()["target.range"] == 5.0
+
+
+def test_arrays_of_an_axis_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        member("target.range", ["1 m", "2 m"]).values[0] = 3.0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"step": ["1 mm", "10 km", "1 mm"]},
+        {"linear": ["1 m", "10 km"], "number": 10**7},
+        {"log": ["1 m", "10 km"], "number": 10**7},
+    ],
+)
+def test_ten_million_values_take_seconds(values):
+    start = time.perf_counter()
+    spec = Spec.from_mapping(written(axes={"target.range": values}))
+    assert (spec.axes[0].size, len(spec.id)) == (10**7, 32)
+    assert time.perf_counter() - start < 30.0  # one by one in Python it would be minutes
+    assert len(spec.to_json()) < 5000

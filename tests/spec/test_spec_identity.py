@@ -1,0 +1,259 @@
+import json
+import pickle
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from written_specs import written
+
+import sweep.spec.experiment
+from sweep.spec import Spec, difference
+from sweep.spec.fields import SECTIONS, parameter_rules
+
+AXES = {
+    "target.range": {"step": ["1 m", "100 m", "1 m"]},
+    "instrument.laser.power": ["1 W", "3 W"],
+}
+
+CUT = {"zip": [{"target.grazing_angle": ["1 deg", "2 deg"], "footprint.beamlets": 7}]}
+
+
+def spec(changes=None, **sections):
+    return Spec.from_mapping(written(changes, **sections))
+
+
+@pytest.mark.parametrize(
+    ("path", "spellings"),
+    [
+        ("instrument.telescope.aperture", ["25 mm", "0.025 m", "2.5 cm", "2.5e1 mm", "25000 µm"]),
+        ("instrument.laser.beam_divergence", ["50 urad", "0.05 mrad", "5e-5 rad"]),
+        ("instrument.chirp.bandwidth", ["1 GHz", "1000 MHz", "10^9 Hz", "1e9 Hz"]),
+        ("instrument.processing.fft_size", ["2^17", 131072, "131072", 131072.0, "2**17"]),
+        ("instrument.processing.tnr", [10, 10.0, "10", "1e1"]),
+        ("instrument.processing.window", ["rectangular", "boxcar", "rect", " Rectangular "]),
+        ("instrument.receiver.noise_equivalent_power", ["5 pW/rtHz", "5e-12 W/sqrt(Hz)"]),
+        ("target.reflectance", [0.1, "0.1", "10 %"]),
+        ("target.radial_velocity", ["10 m/s", "36 km/h", "0.01 km/s"]),
+        ("instrument.receiver.temperature", ["293.15 K", "20 degC"]),
+    ],
+)
+def test_the_spelling_of_a_value_leaves_the_id_alone(path, spellings):
+    assert len({spec({path: spelling}).id for spelling in spellings}) == 1
+
+
+@given(st.integers(1, 10**6))
+def test_the_unit_of_a_length_leaves_the_id_alone(micrometres):
+    path = "instrument.telescope.aperture"
+    ids = {
+        spec({path: f"{micrometres} um"}).id,
+        spec({path: f"{micrometres}e-3 mm"}).id,
+        spec({path: f"{micrometres}e-6 m"}).id,
+    }
+    assert len(ids) == 1
+
+
+def test_the_way_an_axis_is_written_leaves_the_id_alone():
+    ways = [
+        {"step": ["1 m", "100 m", "1 m"]},
+        {"linear": ["1 m", "0.1 km"], "number": 100},
+        [f"{i} m" for i in range(1, 101)],
+        ["100 cm", {"step": ["2 m", "100 m", "100 cm"]}],
+    ]
+    assert len({spec(axes={"target.range": way}).id for way in ways}) == 1
+
+
+def shuffled(mapping, random):
+    """The mapping with every mapping in it but its axes in another order."""
+    keys = list(mapping)
+    random.shuffle(keys)
+    return {
+        key: shuffled(mapping[key], random)
+        if isinstance(mapping[key], dict) and key != "axes"
+        else mapping[key]
+        for key in keys
+    }
+
+
+@settings(deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_the_order_of_keys_leaves_the_id_alone(random):
+    mapping = written(axes=AXES, seed=3)
+    assert Spec.from_mapping(shuffled(mapping, random)).id == Spec.from_mapping(mapping).id
+
+
+def test_the_order_of_axes_is_part_of_the_id_as_it_lays_out_the_arrays():
+    assert spec(axes=AXES).id != spec(axes=dict(reversed(AXES.items()))).id
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"title": "Another"},
+        {"question": "Why?"},
+        {"execution": {"workers": 7, "threads": 2, "scheduler": "tcp://somewhere:8786"}},
+        {"figures": [{"kind": "slices", "variable": "pd_shot", "x": "range"}]},
+        {"target.range": "77 m"},  # an axis overrides it
+    ],
+)
+def test_what_changes_no_result_leaves_the_id_alone(changes):
+    assert spec(changes, axes=AXES).id == spec(axes=AXES).id
+
+
+def other_value(path):
+    """A good value of a parameter that is not the one of the base study."""
+    special = {
+        "instrument.receiver.architecture": "direct",
+        "instrument.processing.window": "hann",
+        "instrument.processing.bins_counted": "all",
+        "target.reflectance_law": "thesis",
+        "footprint.phases": "coherent",
+        "target.grazing_angle": "14 deg",
+        "instrument.laser.beam_divergence": "51 urad",
+        "instrument.processing.sample_rate": "601 MHz",
+        "instrument.chirp.duration": "501 us",
+        "instrument.receiver.mixing_efficiency": 0.3,
+        "instrument.telescope.optical_efficiency": 0.3,
+        "instrument.receiver.modulation_index": 0.3,
+        "target.reflectance": 0.3,
+        "instrument.processing.acquisition_delay": "1 us",
+        "accuracy.leakage_floor": 0.2,
+    }
+    rule = parameter_rules()[path]
+    return special.get(path) or f"77 {rule.si_unit}".strip()
+
+
+@pytest.mark.parametrize("path", sorted(parameter_rules()))
+def test_every_parameter_is_part_of_the_id(path):
+    changed = spec({path: other_value(path)})
+    assert changed.id != spec().id
+    (line,) = difference(spec(), changed)
+    assert line.startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"seed": 1}, {"draws.number": 5}, {"draws.batch": 5}, {"draws.method": "noise"},
+                {"storage.block_points": 5}]
+)  # fmt: skip
+def test_draws_seed_and_blocks_are_part_of_the_id(changes):
+    assert spec(changes).id != spec().id
+
+
+def test_the_models_version_is_part_of_the_id(monkeypatch):
+    before, id_before = spec().identity(), spec().id
+    monkeypatch.setattr(sweep.spec.experiment, "VERSION", "another")
+    assert spec().id != id_before
+    (line,) = difference(before, spec())
+    assert line.startswith("model: ") and line.endswith("-> another")
+
+
+def test_the_id_is_the_same_in_another_process():
+    code = (
+        "import json, sys; from sweep.spec import Spec;"
+        "print(Spec.from_mapping(json.load(sys.stdin)).id)"
+    )
+    mapping = written(axes=AXES)
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        input=json.dumps(mapping),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout.strip() == Spec.from_mapping(mapping).id
+
+
+def test_difference_tells_each_change_with_its_unit():
+    a = spec(axes=AXES)
+    b = spec(
+        {"target.reflectance": 0.2, "seed": 4, "instrument.telescope.aperture": "50 mm"},
+        axes={
+            "instrument.laser.power": ["1 W", "5 W"],
+            "target.range": {"step": ["1 m", "99 m", "1 m"]},
+        },
+    )
+    lines = difference(a, json.loads(json.dumps(b.identity())))
+    assert "instrument.telescope.aperture: 0.025 m -> 0.05 m" in lines
+    assert "target.reflectance: 0.1 -> 0.2" in lines
+    assert "seed: 0 -> 4" in lines
+    assert "axes: range, power -> power, range" in lines
+    assert "axes.power.instrument.laser.power: [1, 3] W -> [1, 5] W" in lines
+    (ranges,) = [line for line in lines if line.startswith("axes.range")]
+    assert "100 values from 1 to 100 m" in ranges and "99 values from 1 to 99 m" in ranges
+    assert len(lines) == 6
+    assert difference(a, a.identity()) == []
+
+
+def test_an_axis_added_is_told():
+    lines = difference(spec(), spec(axes={"target.range": ["1 m"]}))
+    assert lines == ["target.range: 2000 m -> (none)", "axes: (none) -> range",
+                     "axes.range.target.range: (none) -> [1] m"]  # fmt: skip
+
+
+def test_a_stored_spec_comes_back_the_same():
+    original = spec(
+        {"target.range": ..., "instrument.receiver.noise_figure": "3 dB"},
+        axes=AXES | {"cut": CUT},
+        figures=[{"kind": "surface", "variable": "pd_shot", "x": "range", "y": "power",
+                  "where": {"grazing_angle": ["1 deg"]}}],
+        question="Ψ?", seed=5, draws={"number": "1e3"},
+    )  # fmt: skip
+    text = original.to_json()
+    again = Spec.from_stored(text)
+    assert again == original and hash(again) == hash(original)
+    assert again.id == original.id
+    assert again.axes == original.axes
+    assert again.figures == original.figures
+    assert again.parameters() == original.parameters()
+    assert again.to_json() == text
+
+
+def test_a_stored_spec_says_everything_itself():
+    mapping = spec().to_yaml_mapping()
+    for path in parameter_rules():
+        part = mapping
+        for name in path.split("."):
+            part = part[name]
+    assert {"draws", "seed", "storage"} <= set(mapping)
+    assert "execution" not in spec({"execution.workers": 3}).to_yaml_mapping()
+
+
+def test_specs_travel_to_workers():
+    original = spec(axes=AXES)
+    assert pickle.loads(pickle.dumps(original)) == original
+
+
+def test_parameters_are_all_there_in_si():
+    parameters = spec(
+        {"target.grazing_angle": "15 deg", "instrument.receiver.noise_figure": "10 dB"}
+    ).parameters()
+    assert set(parameters) == set(parameter_rules())
+    assert {path.split(".")[0] for path in parameters} == set(SECTIONS)
+    assert parameters["instrument.receiver.noise_equivalent_power"] == 5e-12
+    assert parameters["instrument.receiver.noise_figure"] == 10.0
+    assert parameters["instrument.receiver.local_oscillator_power"] == 1e-3
+    assert parameters["instrument.processing.fft_size"] == 131072
+    assert isinstance(parameters["instrument.processing.fft_size"], int)
+    assert parameters["instrument.processing.window"] == "hamming"
+
+
+def test_parameters_at_another_point_are_read_like_a_spec():
+    base = spec()
+    at = base.parameters_at({"range": "3 km", "instrument.laser.power": "5 W", "window": "hann"})
+    assert (at["target.range"], at["instrument.laser.power"]) == (3000.0, 5.0)
+    assert at["instrument.processing.window"] == "hann"
+    assert base.parameters()["target.range"] == 2000.0
+
+
+def test_a_written_coordinate_is_found_in_the_unit_of_its_axis():
+    cut = {"zip": {"target.grazing_angle": ["15 deg", "85 deg"], "target.range": "3.5 km"}}
+    study = spec(axes={"cut": cut, "footprint.phases": ["coherent"]})
+    assert (
+        study.coordinate_value("grazing_angle", "15 deg")
+        == study.member("grazing_angle").display[0]
+    )
+    assert study.coordinate_value("range", "3500 m") == 3.5
+    assert study.coordinate_value("phases", "coherent") == "coherent"
+    with pytest.raises(KeyError):
+        study.coordinate_value("power", "1 W")

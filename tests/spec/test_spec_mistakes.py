@@ -1,0 +1,292 @@
+import pickle
+
+import pytest
+import yaml
+from written_specs import written
+
+from sweep.spec import Spec, SpecError, load
+
+
+def mistakes_of(mapping):
+    with pytest.raises(SpecError) as caught:
+        Spec.from_mapping(mapping)
+    return caught.value.mistakes
+
+
+def axes(**kinds):
+    return {"axes": {path.replace("__", "."): values for path, values in kinds.items()}}
+
+
+FIELDS = [
+    ("instrument.laser.power", "-1 W", "must be greater than 0 W"),
+    ("instrument.laser.power", 1, "needs a unit (you wrote 1); write e.g. '1 W'"),
+    ("instrument.laser.power", "1 V", "needs a unit like W"),
+    ("instrument.laser.power", None, "must be a number"),
+    ("instrument.laser.power", ["1 W"], "must be a number"),
+    ("instrument.laser.power", True, "must be a number"),
+    ("instrument.laser.power", "nan W", "must be a finite number"),
+    ("instrument.laser.power", ..., "is missing; write e.g. 'power: 1 W'"),
+    ("instrument.laser.beam_divergence", "0 rad", "must be greater than 0 rad"),
+    ("instrument.laser.watts", "1 W", "is no field; the fields here are wavelength"),
+    ("instrument.laser.powr", "1 W", "is no field; did you mean 'power'?"),
+    ("instrument.laser.aperture", "1 m", "did you mean 'instrument.telescope.aperture'?"),
+    ("instrument.laser", "bright", "must be a mapping of fields to values"),
+    ("instrument.laser", ..., "is missing; write 'laser:' with wavelength"),
+    ("instrument.chirp.duration", "0 s", "must be greater than 0 s"),
+    ("instrument.telescope.aperture", "25 mn", "did you mean 'mm'?"),
+    ("instrument.telescope.optical_efficiency", 1.01, "must be at most 1"),
+    ("instrument.telescope.optical_efficiency", "0.5 W", "takes no unit"),
+    ("instrument.receiver.architecture", "homodine", "did you mean 'homodyne'?"),
+    ("instrument.receiver.apd_gain", 0.5, "must be at least 1"),
+    ("instrument.receiver.mixing_efficiency", 0, "must be greater than 0"),
+    ("instrument.receiver.noise_figure", "-1 dB", "must be at least 0 dB"),
+    ("instrument.receiver.noise_figure", 2, "needs a unit (you wrote 2); write e.g. '3 dB'"),
+    ("instrument.receiver.temperature", "-300 degC", "must be greater than 0 K"),
+    ("instrument.processing.fft_size", 1, "must be at least 2"),
+    ("instrument.processing.fft_size", 100.5, "must be a whole number"),
+    ("instrument.processing.fft_size", "2 GHz", "takes no unit"),
+    ("instrument.processing.tnr", 0, "must be greater than 0"),
+    ("instrument.processing.window", "haming", "did you mean 'hamming'?"),
+    ("instrument.processing.window", "kaiser", "parameters that this window does not take"),
+    ("instrument.processing.window", "kaiser(x)", "must be the name of a window"),
+    ("instrument.processing.window", 3, "must be the name of a window"),
+    ("instrument.processing.acquisition_delay", "-1 us", "must be at least 0 s"),
+    ("target.reflectance", 1.1, "must be at most 1"),
+    ("target.reflectance", -0.1, "must be at least 0"),
+    ("target.grazing_angle", "0 deg", "must be greater than 0 deg"),
+    ("target.grazing_angle", "90.1 deg", "must be at most 90 deg"),
+    ("target.grazing_angle", 15, "write e.g. '15 deg'"),
+    ("target.range", ..., "write e.g. 'range: 2 km', or put it on an axis"),
+    ("target.radial_velocity", "2e6 m/s", "must be at most 1000 km/s"),
+    ("footprint.beamlets", 0, "must be at least 1"),
+    ("footprint.phases", "random", "must be one of coherent, incoherent"),
+    ("accuracy.leakage_floor", 0, "must be greater than 0"),
+    ("draws.number", -1, "must be at least 0"),
+    ("draws.method", "luck", "must be one of probabilities, noise"),
+    ("storage.block_points", 0, "must be at least 1"),
+    ("seed", 1.5, "must be a whole number"),
+    ("seed", -1, "must be at least 0"),
+    ("title", ..., "is missing"),
+    ("title", ["A"], "must be text"),
+    ("target", ..., "is missing; write 'target:' with range"),
+    ("foorprint", {}, "did you mean 'footprint'?"),
+    ("figures", "all", "must be a list"),
+    ("axes", ["range"], "must be a mapping"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value", "words"), FIELDS)
+def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, words):
+    (mistake,) = mistakes_of(written({path: value}))
+    assert mistake.path == path
+    assert words in str(mistake)
+
+
+AXES = [
+    ({"target.rnge": ["1 m"]}, "target.rnge", "did you mean 'target.range'?"),
+    ({"range": ["1 m"]}, "range", "did you mean 'target.range'?"),
+    ({"seed": [1, 2]}, "seed", "is no parameter; axes take fields"),
+    ({"target": ["1 m"]}, "target", "is no parameter"),
+    ({"target.range": []}, "target.range", "holds no value"),
+    ({"target.range": "1 m"}, "target.range", "must be a list or a generator"),
+    ({"target.range": None}, "target.range", "must be a list or a generator"),
+    ({"target.range": ["1 m", 2]}, "target.range[1]", "needs a unit"),
+    ({"target.range": ["1 m", "-2 m"]}, "target.range[1]", "must be greater than 0 m"),
+    ({"target.range": ["1 m", "100 cm"]}, "target.range", "holds 1.0 m more than once"),
+    ({"target.range": ["1 m", ["2 m"]]}, "target.range[1]", "must be a number"),
+    ({"target.range": {"linear": ["1 m", "9 m"]}}, "target.range", "lacks the number of values"),
+    ({"target.range": {"linear": ["1 m", "9 m"], "number": 1}}, "target.range.number",
+     "at least 2"),
+    ({"target.range": {"linear": ["1 m", "9 m"], "number": 1e12}}, "target.range.number",
+     "must be at most 20000000"),
+    ({"target.range": {"linear": ["1 m"], "number": 9}}, "target.range.linear",
+     "a list of 2 values"),
+    ({"target.range": {"linear": ["1 m", "1 m"], "number": 9}}, "target.range.linear",
+     "begins and ends with the same value"),
+    ({"target.range": {"linear": ["1 m", "9 m"], "number": 9, "ends": 1}}, "target.range.ends",
+     "is no part of 'linear'"),
+    ({"target.range": {"linaer": ["1 m", "9 m"], "number": 9}}, "target.range",
+     "did you mean 'linear'?"),
+    ({"target.range": {"linear": ["1 m", "9 m"], "log": 1, "number": 9}}, "target.range",
+     "must have exactly one of linear, log and step"),
+    ({"target.range": {"linear": ["0 m", "9 m"], "number": 9}}, "target.range.linear[0]",
+     "must be greater than 0 m"),
+    ({"target.reflectance": {"log": [0, 1], "number": 9}}, "target.reflectance.log",
+     "must begin and end above zero"),
+    ({"target.range": {"step": ["1 m", "9 m"]}}, "target.range.step", "a list of 3 values"),
+    ({"target.range": {"step": ["1 m", "9 m", "0 m"]}}, "target.range.step", "has a step of zero"),
+    ({"target.range": {"step": ["1 m", "9 m", "-1 m"]}}, "target.range.step",
+     "leads away from its end"),
+    ({"target.range": {"step": ["1 m", "9 m", "1"]}}, "target.range.step[2]", "needs a unit"),
+    ({"target.range": {"step": ["1 m", "9 km", "1 nm"]}}, "target.range.step",
+     "take a larger step"),
+    ({"instrument.processing.fft_size": {"linear": [2, 5], "number": 3}},
+     "instrument.processing.fft_size.linear", "values that are not whole"),
+    ({"instrument.processing.fft_size": {"log": [2, 5], "number": 3}},
+     "instrument.processing.fft_size.log", "values that are not whole"),
+    ({"instrument.receiver.noise_figure": {"log": ["1 dB", "5 dB"], "number": 3}},
+     "instrument.receiver.noise_figure.log", "logarithms already"),
+    ({"footprint.phases": ["coherent", "choerent"]}, "footprint.phases[1]",
+     "did you mean 'coherent'?"),
+    ({"footprint.phases": {"linear": [1, 2], "number": 2}}, "footprint.phases", "list them"),
+    ({"instrument.processing.window": ["boxcar", "rect"]}, "instrument.processing.window",
+     "holds rectangular more than once"),
+    ({"cut": {"zip": []}}, "cut.zip", "holds no piece"),
+    ({"cut": {"zip": [{}]}}, "cut.zip[0]", "must be a mapping of paths to values"),
+    ({"cut": {"zip": [{"target.range": "1 m"}], "by": 1}}, "cut.by", "is no part of a zipped axis"),
+    ({"a.b": {"zip": [{"target.range": "1 m"}]}}, "a.b", "is no name for an axis"),
+    ({"batch": {"zip": [{"target.range": "1 m"}]}}, "batch", "is no name for an axis"),
+    ({"cut": {"zip": [{"target.range": ["1 m", "2 m"], "target.reflectance": [0.1]}]}},
+     "cut.zip[0]", "as many values of each: target.range has 2, target.reflectance has 1"),
+    ({"cut": {"zip": [{"target.range": "1 m"}, {"target.reflectance": 1}]}}, "cut.zip[1]",
+     "the same parameters as the first piece"),
+    ({"cut": {"zip": {"target.rnge": "1 m"}}}, "cut.zip.target.rnge",
+     "did you mean 'target.range'?"),
+    ({"cut": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}},
+      "target.range": ["1 m", "2 m"]}, "target.range", "which the axis 'cut' sets too"),
+    ({"power": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}},
+      "instrument.laser.power": ["1 W"]}, "power", "bears the name of a coordinate"),
+    ({"range": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}}}, "range",
+     "bears the name of a coordinate"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("axes", "path", "words"), AXES)
+def test_a_wrong_axis_is_reported_once_with_path_rule_and_remedy(axes, path, words):
+    (mistake,) = mistakes_of(written(axes=axes))
+    assert mistake.path == f"axes.{path}"
+    assert words in str(mistake)
+
+
+def test_a_generator_that_leaves_the_bounds_says_where():
+    step = {"step": ["1 deg", "90 deg", "1 deg"]}
+    assert Spec.from_mapping(written(axes={"target.grazing_angle": step})).axes[0].size == 90
+    (mistake,) = mistakes_of(
+        written(axes={"instrument.receiver.apd_gain": {"linear": [1, 2e9], "number": 3}})
+    )
+    assert mistake.path == "axes.instrument.receiver.apd_gain.linear[1]"
+
+
+FIGURES = [
+    ({"kind": "surfce"}, "figures[0].kind", "did you mean 'surface'?"),
+    ({"variable": "pd_shot"}, "figures[0]", "lacks its kind"),
+    ({"kind": "slices", "variable": "pd_shot"}, "figures[0].x", "is missing"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "rnge"}, "figures[0].x",
+     "did you mean 'range'?"),
+    ({"kind": "slices", "variable": "pd_shoot", "x": "range"}, "figures[0].variable",
+     "did you mean 'pd_shot'?"),
+    ({"kind": "slices", "variable": "n_detected_up", "x": "range"}, "figures[0].variable",
+     "this study has none"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "range", "bye": "range"}, "figures[0].bye",
+     "did you mean 'by'?"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "range", "where": {"range": "3 W"}},
+     "figures[0].where.range", "needs a unit like m"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "range", "where": {"tnr": 3}},
+     "figures[0].where.tnr", "is no coordinate of this study"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "range", "where": 3}, "figures[0].where",
+     "must be a mapping of coordinates"),
+    ({"kind": "slices", "variable": "pd_shot", "x": "range", "name": "../x"}, "figures[0].name",
+     "take letters"),
+    ({"kind": "threshold_table", "by": "range", "printed": [[1, "x"]]}, "figures[0].printed",
+     "must be a number"),
+    ("surface", "figures[0]", "must be a mapping"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("figure", "path", "words"), FIGURES)
+def test_a_wrong_figure_is_reported_with_path_rule_and_remedy(figure, path, words):
+    mapping = written(axes={"target.range": ["1 m", "2 m"]}, figures=[figure])
+    (mistake,) = mistakes_of(mapping)
+    assert mistake.path == path
+    assert words in str(mistake)
+
+
+def test_two_figures_of_one_file_are_refused():
+    figure = {"kind": "slices", "variable": "pd_shot", "x": "range"}
+    (mistake,) = mistakes_of(written(axes={"target.range": ["1 m"]}, figures=[figure, figure]))
+    assert mistake.path == "figures[1]"
+    assert "give it a name" in str(mistake)
+
+
+TEN = """\
+title: Ten mistakes
+instrument:
+  laser: {wavelength: 1550, power: -1 W, beam_divergence: 50 urad}
+  chirp: {bandwith: 1 GHz, start_frequency: 5.5 ghz, duration: 500 us}
+  telescope: {aperture: 25 mn}
+  receiver: {responsivity: 1.1 A/W, detector_bandwidth: 400 MHz, optical_passband: 25 nm,
+             noise_equivalent_power: 5 pW/rtHz, transimpedance: 7 kohm,
+             amplifier_bandwidth: 400 MHz, amplifier_noise_current: 25 nA}
+  processing: {sample_rate: 600 MHz, fft_size: 2^17, tnr: 10, window: haming}
+target: {range: 2 km, grazing_angle: 95 deg, reflectance: 0.1, reflectance: 0.2}
+axes:
+  target.rnge: [1 m]
+  instrument.laser.power: [1 W, 3 W, 3]
+"""
+
+
+def test_ten_mistakes_in_one_file_are_reported_at_once_with_their_lines(tmp_path):
+    path = tmp_path / "ten.yaml"
+    path.write_text(TEN)
+    with pytest.raises(SpecError) as caught:
+        load(path)
+    found = {(mistake.line, mistake.path) for mistake in caught.value.mistakes}
+    assert found == {
+        (3, "instrument.laser.wavelength"),
+        (3, "instrument.laser.power"),
+        (4, "instrument.chirp.bandwidth"),
+        (4, "instrument.chirp.bandwith"),
+        (4, "instrument.chirp.start_frequency"),
+        (5, "instrument.telescope.aperture"),
+        (9, "instrument.processing.window"),
+        (10, "target.grazing_angle"),
+        (10, "target.reflectance"),
+        (12, "axes.target.rnge"),
+        (13, "axes.instrument.laser.power[2]"),
+    }
+    text = str(caught.value)
+    assert text.startswith("11 mistakes:")
+    assert (
+        f"{path}:5: instrument.telescope.aperture: has an unknown unit 'mn' (you wrote '25 mn')"
+        in text
+    )
+
+
+def test_no_message_speaks_pydantics_language():
+    for path, value, _ in FIELDS:
+        for mistake in mistakes_of(written({path: value})):
+            for words in (
+                "Input should",
+                "pydantic",
+                "type=",
+                "https://",
+                "Extra inputs",
+                "Field ",
+            ):
+                assert words not in str(mistake)
+
+
+def test_mistakes_of_axes_fields_and_combinations_come_together():
+    mapping = written(
+        {"instrument.chirp.duration": "1 us", "target.reflectance": 2}, axes={"seed": [1]}
+    )
+    paths = {mistake.path for mistake in mistakes_of(mapping)}
+    assert paths == {"instrument.chirp.duration", "target.reflectance", "axes.seed"}
+
+
+def test_an_axis_that_stands_in_for_a_field_is_blamed_alone():
+    mapping = written({"target.range": ...}, axes={"target.range": [5, "6 m"]})
+    (mistake,) = mistakes_of(mapping)
+    assert mistake.path == "axes.target.range[0]"
+
+
+def test_a_spec_error_survives_pickling_as_workers_need():
+    error = SpecError(mistakes_of(written({"seed": -1})))
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_the_mapping_given_is_left_as_it_was():
+    mapping = written({"target.range": ...}, axes={"target.range": ["5 m", "6 m"]})
+    before = yaml.safe_dump(mapping)
+    Spec.from_mapping(mapping)
+    assert yaml.safe_dump(mapping) == before

@@ -1,0 +1,174 @@
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from written_specs import BASE, written
+
+from sweep.spec import Spec, SpecError, load
+
+
+def write(path, mapping):
+    path.write_text(yaml.safe_dump(mapping, sort_keys=False))
+    return path
+
+
+def refusal(path):
+    with pytest.raises(SpecError) as caught:
+        load(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"title: [", "bad.yaml:1: is no valid YAML"),
+        (b"title: a\n\tb: c", "is no valid YAML"),
+        (b"", "must hold a mapping"),
+        (b"- 1", "must hold a mapping"),
+        (b"just words", "must hold a mapping"),
+        (b"\xff\xfe\x00", "is no UTF-8 text"),
+        (b"title: a\x00b", "is no valid YAML"),
+        (b"a: " + b"[" * 5000, "nested too deeply"),
+        (b"a: " + b"{a: " * 5000, "nested too deeply"),
+        (b"a: " + b"x" * 1_000_001, "is larger than"),
+        (b"a: &a [*a]", "holds too many values"),
+        (b"a: *nowhere", "is no valid YAML"),
+        (b"a: 1\n---\nb: 2", "is no valid YAML"),
+        (b"? [1, 2]\n: 3", "has a key that is no word"),
+        (b"? {a: 1}\n: 3", "has a key that is no word"),
+        (b"title: !!python/object/apply:os.system [echo]", "tags are not read"),
+        (b"title: !!python/name:os.system x", "tags are not read"),
+        (b"title: !mine x", "tags are not read"),
+    ],
+)
+def test_a_file_that_is_no_spec_is_a_users_mistake_and_no_traceback(tmp_path, content, words):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    assert words in refusal(path)
+
+
+def test_aliases_that_explode_are_refused(tmp_path):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 8)]
+    path = tmp_path / "bombs.yaml"
+    path.write_text("\n".join(lines))
+    assert "holds too many values" in refusal(path)
+
+
+def test_a_missing_file_suggests_its_neighbour(tmp_path):
+    write(tmp_path / "threshold.yaml", BASE)
+    assert "does not exist; did you mean 'threshold.yaml'?" in refusal(tmp_path / "treshold.yaml")
+
+
+def test_a_directory_is_refused(tmp_path):
+    assert "is a directory" in refusal(tmp_path)
+
+
+def test_a_key_given_twice_is_refused_with_both_lines(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text(yaml.safe_dump(BASE) + "seed: 1\n" + "seed: 2\n")
+    number = path.read_text().count("\n")
+    assert f"seed: is given twice, on lines {number - 1} and {number}" in refusal(path)
+
+
+def test_numbers_mean_what_they_say_whatever_yaml_makes_of_them(tmp_path):
+    text = yaml.safe_dump(written({"instrument.processing.tnr": 10}))
+    for spelling, value in (("1e1", 10.0), ("010", 10.0), ("'1.5e+1'", 15.0), ("2^4", 16.0)):
+        path = tmp_path / "numbers.yaml"
+        path.write_text(text.replace("tnr: 10", f"tnr: {spelling}"))
+        assert load(path).instrument.processing.tnr == value
+    path.write_text(text.replace("tnr: 10", "tnr: 1:30"))
+    assert "is a pure number and takes no unit (you wrote '1:30')" in refusal(path)
+
+
+def instrument_file(tmp_path):
+    folder = tmp_path / "instruments"
+    folder.mkdir(exist_ok=True)
+    return write(folder / "lidar.yaml", BASE["instrument"])
+
+
+def test_an_instrument_kept_in_a_file_is_the_same_study_as_one_written_out(tmp_path):
+    instrument_file(tmp_path)
+    inline = write(tmp_path / "inline.yaml", BASE)
+    named = write(tmp_path / "named.yaml", BASE | {"instrument": "instruments/lidar.yaml"})
+    assert load(named).id == load(inline).id
+    assert load(named).to_yaml_mapping() == load(inline).to_yaml_mapping()
+
+
+def test_an_instrument_is_overridden_field_by_field(tmp_path):
+    instrument_file(tmp_path)
+    reference = {"file": "instruments/lidar.yaml", "telescope": {"aperture": "50 mm"},
+                 "processing": {"window": "hann"}}  # fmt: skip
+    spec = load(write(tmp_path / "study.yaml", BASE | {"instrument": reference}))
+    expected = written(
+        {"instrument.telescope.aperture": "50 mm", "instrument.processing.window": "hann"}
+    )
+    assert spec.id == Spec.from_mapping(expected).id
+
+
+def test_a_mistake_in_the_instrument_file_names_that_file_and_its_line(tmp_path):
+    file = instrument_file(tmp_path)
+    file.write_text(file.read_text().replace("power: 1 W", "power: 1 V"))
+    line = file.read_text().splitlines().index("  power: 1 V") + 1
+    study = write(tmp_path / "study.yaml", BASE | {"instrument": "instruments/lidar.yaml"})
+    assert f"{file}:{line}: instrument.laser.power: needs a unit like W" in refusal(study)
+
+
+def test_a_mistake_in_an_override_names_the_study(tmp_path):
+    instrument_file(tmp_path)
+    reference = {"file": "instruments/lidar.yaml", "laser": {"power": "1 V"}}
+    study = write(tmp_path / "study.yaml", BASE | {"instrument": reference})
+    assert f"{study}:5: instrument.laser.power" in refusal(study)
+
+
+@pytest.mark.parametrize(
+    ("reference", "path", "words"),
+    [
+        ("instruments/lidr.yaml", "instrument", "did you mean 'lidar.yaml'?"),
+        ({"file": "instruments"}, "instrument.file", "is a directory"),
+        ({"file": 3}, "instrument.file", "must be the path of a YAML file"),
+        (7, "instrument", "must be a mapping"),
+    ],
+)
+def test_an_instrument_that_cannot_be_read_is_reported_once(tmp_path, reference, path, words):
+    instrument_file(tmp_path)
+    study = write(tmp_path / "study.yaml", BASE | {"instrument": reference, "seed": -1})
+    with pytest.raises(SpecError) as caught:
+        load(study)
+    assert {mistake.path for mistake in caught.value.mistakes} == {path, "seed"}
+    assert words in str(caught.value)
+
+
+json_like = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3)
+    | st.dictionaries(
+        st.sampled_from(["title", "axes", "zip", "target", "range", "target.range", "instrument",
+                         "laser", "figures", "kind", "linear", "number", "log", "step", "x"]),
+        inner, max_size=4,
+    ),
+    max_leaves=12,
+)  # fmt: skip
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.sampled_from(["title", "instrument", "target", "axes", "figures", "draws", "seed",
+                     "target.range", "instrument.laser",
+                     "instrument.processing.window", "footprint"]),
+    json_like,
+)  # fmt: skip
+def test_whatever_stands_in_a_field_a_spec_loads_or_lists_mistakes(path, value):
+    try:
+        Spec.from_mapping(written({path: value}))
+    except SpecError as error:
+        assert error.mistakes and str(error)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.text(alphabet=st.sampled_from("ab:-[]{}&*!|>?%@'\"#, \n\t1.e^"), max_size=60))
+def test_whatever_stands_in_a_file_it_loads_or_lists_mistakes(tmp_path_factory, text):
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(text)
+    with pytest.raises(SpecError):
+        load(path)

@@ -1,0 +1,163 @@
+import math
+import subprocess
+import sys
+from fractions import Fraction
+
+import mpmath
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sweep.units import QuantityError, read_number, read_quantity
+
+with mpmath.workdps(40):
+    FIFTEEN_DEGREES = float(mpmath.pi / 12)
+
+
+def si(written: object, si_unit: str) -> float:
+    number, unit = read_quantity(written, si_unit=si_unit, example="7 of them")
+    return unit.to_si(number)
+
+
+@pytest.mark.parametrize(
+    ("written", "si_unit", "value"),
+    [
+        ("25 mm", "m", 0.025),
+        ("2.5 cm", "m", 0.025),
+        ("25mm", "m", 0.025),
+        ("1550 nm", "m", 1.55e-6),
+        ("2 km", "m", 2000.0),
+        ("25 millimeter", "m", 0.025),
+        ("50 urad", "rad", 5e-5),
+        ("50 µrad", "rad", 5e-5),
+        ("50 μrad", "rad", 5e-5),
+        ("15 deg", "rad", FIFTEEN_DEGREES),
+        ("15°", "rad", FIFTEEN_DEGREES),
+        ("90 deg", "rad", math.pi / 2),
+        ("1 GHz", "Hz", 1e9),
+        ("600 MHz", "Hz", 6e8),
+        ("2^3 kHz", "Hz", 8000.0),
+        ("1e3 Hz", "Hz", 1000.0),
+        ("500 us", "s", 5e-4),
+        ("5 pW/rtHz", "W/Hz^0.5", 5e-12),
+        ("5 pW/sqrt(Hz)", "W/Hz^0.5", 5e-12),
+        ("5 pW/√Hz", "W/Hz^0.5", 5e-12),
+        ("5 pW/√(Hz)", "W/Hz^0.5", 5e-12),
+        ("5 pW/Hz^0.5", "W/Hz^0.5", 5e-12),
+        ("5 pW*Hz^-0.5", "W/Hz^0.5", 5e-12),
+        ("0.5 W/m^2/nm", "W/m^3", 5e8),
+        ("0.5 W/m²/nm", "W/m^3", 5e8),
+        ("0.5 W m^-2 nm^-1", "W/m^3", 5e8),
+        ("7 kohm", "ohm", 7000.0),
+        ("7 kΩ", "ohm", 7000.0),
+        ("25 nA", "A", 2.5e-8),
+        ("10 m/s", "m/s", 10.0),
+        ("36 km/h", "m/s", 10.0),
+        ("-10 m/s", "m/s", -10.0),
+        ("−10 m/s", "m/s", -10.0),
+        ("1.1 A/W", "A/W", 1.1),
+        ("290 K", "K", 290.0),
+        ("20 degC", "K", 293.15),
+        ("20 °C", "K", 293.15),
+        ("0 dB", "dB", 1.0),
+        ("10 dB", "dB", 10.0),
+    ],
+)
+def test_a_written_quantity_gives_exactly_its_si_value(written, si_unit, value):
+    assert si(written, si_unit) == value
+
+
+def test_three_decibels_are_a_power_ratio_and_no_amplitude_ratio():
+    assert si("3 dB", "dB") == pytest.approx(1.99526231496888, rel=1e-14)
+
+
+@given(st.integers(-(10**9), 10**9))
+def test_all_spellings_of_a_length_are_one_float(micrometres):
+    value = float(Fraction(micrometres, 10**6))
+    digits = f"{abs(micrometres):07d}"
+    sign = "-" if micrometres < 0 else ""
+    assert si(f"{micrometres} um", "m") == value
+    assert si(f"{micrometres}e-3 mm", "m") == value
+    assert si(f"{micrometres}E-4cm", "m") == value
+    assert si(f"{micrometres}e-9 km", "m") == value
+    assert si(f"{sign}{digits[:-6]}.{digits[-6:]} m", "m") == value
+
+
+@given(st.integers(1, 360))
+def test_degrees_agree_with_radians_to_one_ulp(degrees):
+    assert abs(si(f"{degrees} deg", "rad") - math.radians(degrees)) <= math.ulp(
+        math.radians(degrees)
+    )
+
+
+@pytest.mark.parametrize(
+    ("written", "si_unit", "words"),
+    [
+        ("25", "m", "needs a unit; write e.g. '7 of them'"),
+        (25, "m", "needs a unit"),
+        (0.025, "m", "needs a unit"),
+        ("25 mn", "m", "unknown unit 'mn'; did you mean 'mm'?"),
+        ("600 Mhz", "Hz", "did you mean 'MHz'?"),
+        ("1 ghz", "Hz", "did you mean 'GHz'?"),
+        ("50 urda", "rad", "did you mean 'urad'?"),
+        ("5 pW/rtHzz", "W/Hz^0.5", "did you mean 'Hz'?"),
+        ("1 parsnip", "m", "write e.g. '7 of them'"),
+        ("3 W", "m", "needs a unit like m, and 'W' is none"),
+        ("5 pW/Hz", "W/Hz^0.5", "needs a unit like W/Hz^0.5"),
+        ("5 %", "rad", "needs a unit like rad"),
+        ("10 rpm", "Hz", "needs a unit like Hz"),
+        ("3 dB", "m", "needs a unit like m"),
+        ("3 W", "dB", "needs a unit like dB"),
+        ("nan m", "m", "must be a finite number"),
+        ("inf m", "m", "must be a finite number"),
+        (".inf", "m", "must be a finite number"),
+        (float("nan"), "m", "must be a finite number"),
+        ("1e999 m", "m", "that a float holds"),
+        ("1e4000 dB", "dB", "that a float holds"),
+        ("1 m; import os", "m", "cannot be read"),
+        ("__import__('os')", "m", "must be a number"),
+        ("1 m()", "m", "cannot be read"),
+        ("9^999 m", "m", "that a float holds"),
+        ("1 m^99999999", "m", "cannot be read"),
+        ("1 " + "m" * 200, "m", "at most 100 characters"),
+        ("", "m", "must be a number"),
+        (True, "m", "must be a number"),
+        (None, "m", "must be a number"),
+        ([1], "m", "must be a number"),
+        ("1,5 m", "m", "cannot be read"),
+    ],
+)
+def test_a_quantity_that_cannot_be_read_says_why_and_what_to_write(written, si_unit, words):
+    with pytest.raises(QuantityError) as caught:
+        si(written, si_unit)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [(1, 1), ("2^17", 131072), ("2**17", 131072), ("1e9", 10**9), (1e9, 10**9), ("10 %", 0.1),
+     (0.1, Fraction(1, 10)), ("-0.5", -0.5)],
+)  # fmt: skip
+def test_pure_numbers_are_read_exactly(written, value):
+    number, unit = read_number(written)
+    assert unit.factor * number == (Fraction(1, 10) if value == 0.1 else value)
+
+
+def test_a_pure_number_takes_no_unit():
+    with pytest.raises(QuantityError, match="takes no unit"):
+        read_number("3 W")
+
+
+@given(st.text(max_size=120))
+def test_any_text_is_a_quantity_or_a_quantity_error(text):
+    for si_unit in ("m", "W/Hz^0.5", "dB", "K"):
+        try:
+            value = si(text, si_unit)
+        except QuantityError:
+            continue
+        assert math.isfinite(value)
+
+
+def test_importing_the_package_and_its_units_leaves_pint_alone():
+    code = "import sys, sweep, sweep.units; sys.exit('pint' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
