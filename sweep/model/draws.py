@@ -120,7 +120,7 @@ def _tally(counts, i, batch, found, alarm):
     counts[6, i, batch] += alarm[0] & alarm[2]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _draw_probabilities(keys, ends, found, alarm, found_stream, alarm_stream, counts):
     """Uniform numbers against the probabilities of each segment."""
     hit, false = np.zeros(3, np.int64), np.zeros(3, np.int64)
@@ -134,7 +134,7 @@ def _draw_probabilities(keys, ends, found, alarm, found_stream, alarm_stream, co
                 _tally(counts, i, batch, hit, false)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _draw_noise(
     keys, ends, points, row, offset, amplitude, segments, power, counted, kernel, noise, maximum,
     counts,

@@ -134,19 +134,7 @@ def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
     architecture = str(p[RECEIVER + "architecture"])
     shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
     row, offset, echo = _geometry(p, size)
-    power_scale = link.echo_power_scale(
-        power=p[LASER + "power"],
-        aperture=p[TELESCOPE + "aperture"],
-        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
-        reflectance=p["target.reflectance"],
-        range=p["target.range"],
-    )
-    current_scale = link.beat_scale(
-        architecture,
-        echo_power_scale=power_scale,
-        **_receiver(p, "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity"),
-        **_receiver(p, "modulation_index"),
-    )
+    power_scale, current_scale = _link_scales(architecture, p)
     sources = _noise_sources(architecture, p, power_scale * echo.sum(axis=1)[row])
     variance = np.asarray(sum(sources.values()))
     energy = np.asarray(shape.energy)
@@ -183,6 +171,24 @@ def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
         row=row,
         offset=offset,
         amplitude=echo if architecture == "direct" else np.sqrt(echo),
+    )
+
+
+def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Echo power [W] per backscatter of 1/sr, and the beat photocurrent [A] of that."""
+    power_scale = link.echo_power_scale(
+        power=p[LASER + "power"],
+        aperture=p[TELESCOPE + "aperture"],
+        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
+        reflectance=p["target.reflectance"],
+        range=p["target.range"],
+    )
+    names = (
+        "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity",
+        "modulation_index",
+    )  # fmt: skip
+    return power_scale, link.beat_scale(
+        architecture, echo_power_scale=power_scale, **_receiver(p, *names)
     )
 
 

@@ -109,7 +109,7 @@ def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
     return first, max(first, last)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, out):
     """Every point's segments: detection probability, peak, exempt bins, leakage.
 

@@ -1,0 +1,122 @@
+"""One table in one run: the fast path against the truth, its rate, and what the engine adds.
+
+Run with `make bench`. Times are this machine's and drift; quote the ratios.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import sweep
+from sweep.model import shot, truth
+from sweep.model.preparation import prepare
+from sweep.model.spectra import segment_spectrum
+from sweep.spec import Spec
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+REPEATS = 3
+
+
+def best(function, *arguments) -> float:
+    """Shortest wall time [s] of a few calls, after one that may compile."""
+    function(*arguments)
+    times = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        function(*arguments)
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def study() -> Spec:
+    """The published range-angle study at three powers: a minute on two cores."""
+    import yaml
+
+    mapping = yaml.safe_load((EXPERIMENTS / "range_angle.yaml").read_text())
+    mapping["axes"]["instrument.laser.power"] = ["1 W", "3 W", "5 W"]
+    return Spec.from_mapping(mapping, base=EXPERIMENTS)
+
+
+def against_truth(table: Table, parameters: dict) -> None:
+    """Time and error of the fast path beside the time-domain record, shot by shot."""
+    for range_, grazing in ((200.0, 85.0), (2000.0, 45.0), (5000.0, 15.0), (10000.0, 2.0)):
+        point = parameters | {"target.range": range_, "target.grazing_angle": np.radians(grazing)}
+        ((_, shots),) = prepare(point)
+        begun = time.perf_counter()
+        exact = [truth.spectrum(shots, 0, s, range_walk=False) for s in range(3)]
+        slow = time.perf_counter() - begun
+        error = max(
+            np.abs(segment_spectrum(shots, 0, s)[1] - exact[s]).max() / exact[s].max()
+            for s in range(3)
+        )
+        many = point | {"target.range": np.full(2000, range_)}
+        fast = best(shot.evaluate, many) / 2000
+        table.add_row(
+            f"truth / fast, one shot at {range_:.0f} m, {grazing:.0f} deg",
+            f"{slow / fast:,.0f} x",
+            f"{slow:.2f} s against {fast * 1e6:.1f} us; |X| within {error:.0e} of the peak",
+        )
+
+
+def rate(table: Table, parameters: dict) -> None:
+    """Points a second of one core, over the grid of the published study."""
+    generator = np.random.default_rng(1)
+    points = parameters | {
+        "target.range": generator.integers(1, 10_001, 20_000).astype(float),
+        "target.grazing_angle": np.radians(generator.integers(1, 91, 20_000).astype(float)),
+    }
+    seconds = best(shot.evaluate, points)
+    table.add_row(
+        "points a second, one core",
+        f"{20_000 / seconds:,.0f}",
+        f"{seconds / 20_000 * 1e6:.1f} us a point of three segments and 109 beamlets",
+    )
+
+
+def engine(table: Table, console: Console) -> None:
+    """Share of the wall time that is not kernel, for a study of a minute on all cores."""
+    spec = study()
+    with tempfile.TemporaryDirectory() as directory:
+        begun = time.perf_counter()
+        outcome = sweep.run(spec, store=Path(directory) / "bench.zarr")
+        wall = time.perf_counter() - begun
+    workers = workers_started()
+    kernel = (outcome.work_seconds - outcome.write_seconds) / workers
+    table.add_row(
+        f"wall time that is not kernel, {outcome.points:,} points, {workers} workers",
+        f"{1 - kernel / wall:.1%}",
+        f"{wall:.1f} s in all; kernels {kernel:.1f} s, "
+        f"writing {outcome.write_seconds / workers:.1f} s a worker; start-up is in it",
+    )
+    table.add_row(
+        "points a second, all cores, stored",
+        f"{outcome.points / wall:,.0f}",
+        "from the call to the finished store",
+    )
+    console.print(f"{outcome.points_done:,} points stored")
+
+
+def workers_started() -> int:
+    """Workers that `sweep.run` starts: one a core."""
+    from sweep.tasks.cluster import cores
+
+    return cores()
+
+
+def main() -> None:
+    """Measure and print."""
+    console = Console(width=130)
+    table = Table("what", "figure", "how")
+    parameters = sweep.load(EXPERIMENTS / "range_angle.yaml").parameters()
+    against_truth(table, parameters)
+    rate(table, parameters)
+    engine(table, console)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""The house's rules, held by walking every module's imports and sizes."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "sweep"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+MAY_IMPORT = {
+    "units": {"units"},
+    "model": {"model"},
+    "spec": {"spec", "model", "units"},
+    "tasks": {"tasks", "spec", "model", "units"},
+    "analysis": {"analysis", "spec", "model", "units"},
+    "cli": {"cli", "tasks", "analysis", "spec", "model", "units"},
+    "__init__": {"tasks", "analysis", "spec"},
+}
+"""Imports run one way; analysis reads stores and knows nothing of how they are computed."""
+
+NOT_IN_THE_MODEL = {
+    "click", "dask", "distributed", "logging", "os", "pathlib", "pint", "pydantic", "rich",
+    "xarray", "yaml", "zarr",
+}  # fmt: skip
+"""Pure physics: arrays in, arrays out."""
+
+LARGEST_MODULE = 400
+LARGEST_FUNCTION = 50
+
+
+def _imports(path: Path) -> set[str]:
+    """Dotted names that a module imports, wherever in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            raise AssertionError(f"{path}: relative import; write the whole name")
+    return names
+
+
+def _layer(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def _module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=_module_name)
+def test_imports_run_one_way(path):
+    layers = {name.split(".")[1] for name in _imports(path) if name.startswith("sweep.")}
+    assert layers <= MAY_IMPORT[_layer(path)]
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if _layer(p) == "model"], ids=_module_name)
+def test_the_model_knows_no_framework(path):
+    assert not {name.split(".")[0] for name in _imports(path)} & NOT_IN_THE_MODEL
+
+
+def test_no_import_cycle():
+    names = {_module_name(path): path for path in MODULES}
+    graph = {name: {i for i in _imports(path) if i in names} for name, path in names.items()}
+    done: set[str] = set()
+
+    def visit(name, trail):
+        assert name not in trail, f"cycle: {' -> '.join([*trail, name])}"
+        if name not in done:
+            for other in graph[name] - {name}:
+                visit(other, [*trail, name])
+            done.add(name)
+
+    for name in names:
+        visit(name, [])
+
+
+@pytest.mark.parametrize("path", MODULES, ids=_module_name)
+def test_modules_and_functions_stay_small(path):
+    text = path.read_text()
+    assert text.count("\n") <= LARGEST_MODULE
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            length = body[-1].end_lineno - body[0].lineno + 1 if body else 0
+            assert length <= LARGEST_FUNCTION, f"{node.name}: {length} lines"
+
+
+def test_the_walk_sees_what_it_must():
+    """A rule that looks at nothing would pass: the walk finds the package and its imports."""
+    assert len(MODULES) > 30
+    assert "sweep.model.preparation" in _imports(PACKAGE / "model" / "shot.py")
