@@ -1,9 +1,15 @@
 """The beam's footprint as beamlets: where they point, what they weigh, and where they meet a plane.
 
 A Gaussian beam of full divergence Theta (between the 1/e^2 intensity points) has the standard
-deviation Theta/4 on each axis. The pattern is a hexagonal lattice cut by a circle, weighted by
-the beam, then mapped linearly so that its mean and covariance are the beam's own exactly: the
-beam keeps its pointing, its size and its power whatever the number of beamlets.
+deviation Theta/4 on each axis. A pattern of points in a circle is weighted by the beam, then
+mapped linearly so that its mean and covariance are the beam's own exactly: the beam keeps its
+pointing, its size and its power whatever the number of beamlets.
+
+Two patterns. Where beamlets add as powers, a hexagonal lattice is the better quadrature. Where
+they add as amplitudes with the phases of a smooth plane, a lattice cancels: off normal incidence
+its phases step evenly from row to row, and the sum is nearly nothing but at grating lobes. A
+sunflower has no rows; its sum fades like the random one that rough ground would give, which is
+what [T 4.2] describes (first dips of Pd at some 4 km).
 """
 
 import math
@@ -19,13 +25,15 @@ _TILT = 0.191
 
 
 @lru_cache(maxsize=16)
-def beamlets(number: int) -> tuple[np.ndarray, np.ndarray]:
+def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.ndarray]:
     """Directions and weights of a Gaussian beam's beamlets.
 
     Parameters
     ----------
     number : int
         Beamlets, at least 1; [T 3.3.1] uses 109, a full hexagonal lattice in a circle.
+    pattern : str
+        ``hexagonal`` or ``sunflower``.
 
     Returns
     -------
@@ -35,13 +43,11 @@ def beamlets(number: int) -> tuple[np.ndarray, np.ndarray]:
     weights : (number,) ndarray
         Power fractions; they sum to 1.
     """
-    lattice = _hexagonal_lattice(number)
     if number == 1:
-        return lattice, np.ones(1)
+        return np.zeros((2, 1)), np.ones(1)
     if number == 2:
         return np.array([[0.0, 0.0], [-1.0, 1.0]]), np.array([0.5, 0.5])
-    spacing = REACH * math.sqrt(2 * math.pi / (math.sqrt(3) * number))
-    offsets = lattice * spacing
+    offsets = _PATTERNS[pattern](number)
     weights = np.exp(-0.5 * (offsets**2).sum(axis=0))
     weights /= weights.sum()
     offsets = offsets - (offsets @ weights)[:, None]
@@ -49,8 +55,8 @@ def beamlets(number: int) -> tuple[np.ndarray, np.ndarray]:
     return (vectors / np.sqrt(values)) @ vectors.T @ offsets, weights
 
 
-def _hexagonal_lattice(number: int) -> np.ndarray:
-    """The points of a unit hexagonal lattice nearest to one of its points, (2, number)."""
+def _hexagonal(number: int) -> np.ndarray:
+    """The points of a hexagonal lattice nearest to one of its points, (2, number)."""
     reach = 2 + math.ceil(math.sqrt(number))
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     squared = i * i + i * j + j * j  # whole numbers, so that shells are told apart exactly
@@ -59,11 +65,26 @@ def _hexagonal_lattice(number: int) -> np.ndarray:
     i, j = i[nearest], j[nearest]
     x, y = i + 0.5 * j, math.sqrt(0.75) * j
     c, s = math.cos(_TILT), math.sin(_TILT)
-    return np.array([c * x - s * y, s * x + c * y])
+    spacing = REACH * math.sqrt(2 * math.pi / (math.sqrt(3) * number))
+    return spacing * np.array([c * x - s * y, s * x + c * y])
+
+
+def _sunflower(number: int) -> np.ndarray:
+    """Points of equal areas of the circle, each turned by the golden angle, (2, number)."""
+    k = np.arange(number) + 0.5
+    radius, angle = REACH * np.sqrt(k / number), k * math.pi * (3 - math.sqrt(5))
+    return np.array([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+_PATTERNS = {"hexagonal": _hexagonal, "sunflower": _sunflower}
 
 
 def plane_footprint(
-    *, grazing_angle: np.ndarray, beam_divergence: np.ndarray, number: int
+    *,
+    grazing_angle: np.ndarray,
+    beam_divergence: np.ndarray,
+    number: int,
+    pattern: str = "hexagonal",
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Beamlets of a beam on a flat plane, per unit of range along the beam's axis.
 
@@ -75,8 +96,8 @@ def plane_footprint(
         Angle between axis and plane [rad], 0 < . <= pi/2.
     beam_divergence : (n,) ndarray
         Full 1/e^2 angle [rad].
-    number : int
-        Beamlets.
+    number, pattern
+        Of :func:`beamlets`.
 
     Returns
     -------
@@ -87,7 +108,7 @@ def plane_footprint(
     weights : (n, number) ndarray
         Power fractions; 0, with offset 0, for a beamlet that passes over the horizon.
     """
-    (across, along), share = beamlets(number)
+    (across, along), share = beamlets(number, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4
     sine = np.sin(np.asarray(grazing_angle, float))[:, None]
     cosine = np.cos(np.asarray(grazing_angle, float))[:, None]

@@ -147,7 +147,7 @@ def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
         window=shape,
         fft_size=int(p[PROCESSING + "fft_size"]),
         bins_counted=str(p[PROCESSING + "bins_counted"]),
-        incoherent=str(p["footprint.phases"]) == "incoherent" and architecture != "direct",
+        incoherent=_incoherent(p),
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,
         bandwidth=p[CHIRP + "bandwidth"],
@@ -192,6 +192,12 @@ def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.nda
     )
 
 
+def _incoherent(p: Mapping[str, np.ndarray]) -> bool:
+    """Whether beamlets add as powers; direct detection adds their radio-frequency beats."""
+    coherent = str(p["footprint.phases"]) == "coherent"
+    return not coherent and str(p[RECEIVER + "architecture"]) != "direct"
+
+
 def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
     return {name: p[RECEIVER + name] for name in names}
 
@@ -205,7 +211,10 @@ def _geometry(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, ...]:
         np.stack([np.atleast_1d(grazing), np.atleast_1d(divergence)]), axis=1, return_inverse=True
     )
     offset, cos_incidence, weights = footprint.plane_footprint(
-        grazing_angle=shapes[0], beam_divergence=shapes[1], number=int(p["footprint.beamlets"])
+        grazing_angle=shapes[0],
+        beam_divergence=shapes[1],
+        number=int(p["footprint.beamlets"]),
+        pattern="hexagonal" if _incoherent(p) else "sunflower",
     )
     law = str(p["target.reflectance_law"])
     echo = weights * reflectance.backscatter(law, cos_incidence) / (1 + offset) ** 2
