@@ -83,7 +83,7 @@ def draw(
         for index, shots in prepare(parameters):
             group = np.zeros((len(DRAW_OUTPUTS), index.size, len(batch_sizes)), np.int64)
             _draw_noise(
-                keys[index], ends, shots.point_table(), shots.row, shots.offset, shots.amplitude,
+                keys[index], ends, shots.point_table(), shots.row, shots.footprint,
                 shots.segments, shots.incoherent, _base_count(shots), shots.kernel(), _NOISE,
                 _MAXIMUM, group,
             )  # fmt: skip
@@ -136,12 +136,12 @@ def _draw_probabilities(keys, ends, found, alarm, found_stream, alarm_stream, co
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_noise(
-    keys, ends, points, row, offset, amplitude, segments, power, counted, kernel, noise, maximum,
+    keys, ends, points, row, footprint, segments, power, counted, kernel, noise, maximum,
     counts,
 ):  # fmt: skip
     """Noise in every bin: drawn where signal is, by its largest value elsewhere."""
     fft_size = kernel[0][0]
-    room = np.empty((ROOM, max(offset.shape[1], MOST_NODES, fft_size // 2 + 1)))
+    room = np.empty((ROOM, max(footprint[0].shape[1], MOST_NODES, fft_size // 2 + 1)))
     exempt = np.empty(fft_size // 2 + 1, np.bool_)
     draws = ends[-1] - ends[0]
     hit, false = np.zeros((draws, 3), np.int64), np.zeros((draws, 3), np.int64)
@@ -151,9 +151,7 @@ def _draw_noise(
         for s in range(3):
             if not segments[s]:
                 continue
-            _, count = segment_spectrum(
-                s, p, offset[row[i]], amplitude[row[i]], floor * sigma, power, kernel, room
-            )
+            _, count = segment_spectrum(s, p, footprint, row[i], floor * sigma, power, kernel, room)
             peak, exempted, _ = assess(room[0], count, sigma, level, floor, exempt)
             others = counted[0] - (exempted if counted[1] else 0.0)
             signals = room[0, :count] / sigma

@@ -32,7 +32,7 @@ def folded_origin(centre, fft_size):
 
 
 @njit(cache=True, error_model="numpy")
-def segment_lines(segment, chirp, optics, record, offset, amplitude, n, delta, re, im):
+def segment_lines(segment, chirp, optics, record, offset, doppler, amplitude, delta, re, im):
     """Lines of a segment: positions and complex weights C_b of :mod:`sweep.model.spectrum`.
 
     Parameters
@@ -40,15 +40,15 @@ def segment_lines(segment, chirp, optics, record, offset, amplitude, n, delta, r
     segment : (float, float)
         Chirp sign s and carrier f_seg [Hz].
     chirp : (float, float, float, float)
-        Chirp rate S [Hz/s], range R_0 [m], Doppler ratio beta = 2 v_r / c, beat amplitude for a
-        relative amplitude of 1 [V, before the receiver's poles].
+        Chirp rate S [Hz/s]; range R_0 [m] and Doppler ratio beta_0 = 2 v_r / c on the beam's
+        axis; beat amplitude for a relative amplitude of 1 [V, before the receiver's poles].
     optics : (float, float)
         Poles of the receiver [Hz].
     record : (float, int, int, float)
         Sample rate [Hz], FFT size N, window length L, acquisition delay t_0 [s].
-    offset, amplitude : (n,) float64
-        (R_b - R_0)/R_0 and relative amplitude of each beamlet.
-    delta, re, im : (n,) float64
+    offset, doppler, amplitude : (n,) float64
+        (R_b - R_0)/R_0, beta_b - beta_0 and relative amplitude of each beamlet.
+    delta, re, im : (>= n,) float64
         Result: bins from the returned origin, and C_b.
 
     Returns
@@ -60,8 +60,8 @@ def segment_lines(segment, chirp, optics, record, offset, amplitude, n, delta, r
     rate, range_0, beta, scale = chirp
     sample_rate, fft_size, length, start = record
     bins = fft_size / sample_rate
-    per_metre = sign * rate * (2.0 / SPEED_OF_LIGHT) * (1.0 + beta)
-    centre_frequency = carrier * beta - per_metre * range_0
+    per_metre = sign * rate * (2.0 / SPEED_OF_LIGHT)
+    centre_frequency = carrier * beta - per_metre * (1.0 + beta) * range_0
     centre = centre_frequency * bins
     origin, turns, fold = folded_origin(centre, fft_size)
     delta_0 = fold * (centre - turns) - origin
@@ -72,9 +72,10 @@ def segment_lines(segment, chirp, optics, record, offset, amplitude, n, delta, r
     square = 0.5 * sign * rate
     cross = 1.0 / optics[0] + 1.0 / optics[1]
     product = 1.0 / (optics[0] * optics[1])
-    for b in range(n):
+    for b in range(offset.size):
         further = range_0 * offset[b]
-        beat = -per_metre * further
+        shift = (1.0 + beta) * further + (range_0 + further) * doppler[b]
+        beat = carrier * doppler[b] - per_metre * shift
         delay = (range_0 + further) * (2.0 / SPEED_OF_LIGHT)
         phase = phase_0 - product_fraction(high, low, further)
         phase += fraction_of_cycle(square * delay * delay) + beat * start

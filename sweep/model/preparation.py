@@ -61,6 +61,7 @@ class Shots:
     leakage_floor: np.ndarray
     row: np.ndarray
     offset: np.ndarray
+    doppler: np.ndarray
     amplitude: np.ndarray
 
     @property
@@ -72,6 +73,11 @@ class Shots:
     def beta(self) -> np.ndarray:
         """Doppler ratio 2 v_r / c."""
         return 2 * self.radial_velocity / SPEED_OF_LIGHT
+
+    @property
+    def footprint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude of beamlets, (rows, beamlets)."""
+        return self.offset, self.doppler, self.amplitude
 
     @property
     def segments(self) -> np.ndarray:
@@ -170,6 +176,7 @@ def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
         leakage_floor=p["accuracy.leakage_floor"],
         row=row,
         offset=offset,
+        doppler=np.zeros_like(offset),
         amplitude=echo if architecture == "direct" else np.sqrt(echo),
     )
 

@@ -38,7 +38,7 @@ def reach_of(level, weights, envelope, reach):
 
 
 @njit(cache=True, error_model="numpy")
-def segment_spectrum(segment, p, offset, amplitude, level, power, kernel, room):
+def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
     """|X| of the bins in which a segment's lines stand above a level, into room's first row.
 
     Parameters
@@ -47,8 +47,9 @@ def segment_spectrum(segment, p, offset, amplitude, level, power, kernel, room):
         0 up, 1 Doppler, 2 down.
     p : (13,) float64
         The point's column of :meth:`sweep.model.shot.Shots.point_table`.
-    offset, amplitude : (beamlets,) float64
-        (R_b - R_0)/R_0 and relative beat amplitude.
+    footprint, row : tuple of (rows, beamlets) float64, int
+        (R_b - R_0)/R_0, beta_b - beta_0 and relative beat amplitude of each beamlet; the point's
+        row in them.
     level : float
         Bins whose magnitude is sure to stay below it are left out; 0 keeps all.
     power : bool
@@ -65,11 +66,12 @@ def segment_spectrum(segment, p, offset, amplitude, level, power, kernel, room):
     """
     sizes, shape, sidelobes, limits, tangent = kernel
     fft_size, length = sizes
+    offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
     n = offset.size
     delta, re, im = room[12], room[13], room[14]
     origin = segment_lines(
         (SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-        (p[6], fft_size, length, p[7]), offset, amplitude, n, delta, re, im,
+        (p[6], fft_size, length, p[7]), offset, doppler, amplitude, delta, re, im,
     )  # fmt: skip
     if power:
         for b in range(n):
@@ -110,7 +112,7 @@ def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, out):
+def evaluate_segments(points, row, footprint, segments, power, kernel, out):
     """Every point's segments: detection probability, peak, exempt bins, leakage.
 
     Parameters
@@ -119,8 +121,8 @@ def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, o
         :meth:`sweep.model.shot.Shots.point_table`.
     row : (n,) int64
         The point's row in the geometry.
-    offset, amplitude : (rows, beamlets) float64
-        (R_b - R_0)/R_0 and relative beat amplitude.
+    footprint : tuple of (rows, beamlets) float64
+        As in :func:`segment_spectrum`.
     segments : (3,) bool
         Segments to evaluate.
     power, kernel
@@ -129,7 +131,7 @@ def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, o
         Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
     """
     fft_size = kernel[0][0]
-    room = np.empty((ROOM, max(offset.shape[1], MOST_NODES, fft_size // 2 + 1)))
+    room = np.empty((ROOM, max(footprint[0].shape[1], MOST_NODES, fft_size // 2 + 1)))
     exempt = np.empty(fft_size // 2 + 1, np.bool_)
     for i in range(points.shape[1]):
         p = points[:, i].copy()
@@ -138,7 +140,7 @@ def evaluate_segments(points, row, offset, amplitude, segments, power, kernel, o
             if not segments[s]:
                 continue
             low, count = segment_spectrum(
-                s, p, offset[row[i]], amplitude[row[i]], floor * sigma, power, kernel, room
+                s, p, footprint, row[i], floor * sigma, power, kernel, room
             )
             peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
             found, missed = marcum_q1_pair(room[0, peak] / sigma, level / sigma)

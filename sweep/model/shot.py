@@ -70,7 +70,7 @@ def find(shots: Shots) -> np.ndarray:
     """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS."""
     out = np.full((3, 6, shots.range.size), np.nan)
     evaluate_segments(
-        shots.point_table(), shots.row, shots.offset, shots.amplitude, shots.segments,
+        shots.point_table(), shots.row, shots.footprint, shots.segments,
         shots.incoherent, shots.kernel(), out,
     )  # fmt: skip
     return out

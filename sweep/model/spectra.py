@@ -26,11 +26,10 @@ def segment_spectrum(
     bins : (m,) int ndarray
     magnitude : (m,) ndarray
     """
-    row = shots.row[i]
     width = max(shots.offset.shape[1], MOST_NODES, shots.fft_size // 2 + 1)
     room = np.empty((segments.ROOM, width))
     low, count = segments.segment_spectrum(
-        segment, shots.point_table()[:, i].copy(), shots.offset[row], shots.amplitude[row], level,
+        segment, shots.point_table()[:, i].copy(), shots.footprint, shots.row[i], level,
         shots.incoherent, shots.kernel(), room,
     )  # fmt: skip
     return np.arange(low, low + count), room[0, :count].copy()

@@ -51,7 +51,8 @@ def analytic_record(
 ) -> np.ndarray:
     """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled."""
     sign, carrier = SIGNS[segment], float(_at(shots.carriers[segment], i))
-    beta, rate = float(_at(shots.beta, i)), float(_at(shots.chirp_rate, i))
+    beta = float(_at(shots.beta, i)) + float(shots.doppler[shots.row[i], beamlet])
+    rate = float(_at(shots.chirp_rate, i))
     range_0 = float(shots.range[i])
     further = range_0 * float(shots.offset[shots.row[i], beamlet])
     t = float(_at(shots.acquisition_delay, i)) + np.arange(shots.window.length) / float(
