@@ -1,0 +1,34 @@
+"""Monte Carlo sweeps of FMCW Doppler lidar performance.
+
+`load` a spec, `run` it into a store, `open` the store as an xarray Dataset.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import version as _version
+from typing import Any
+
+__version__ = _version("sweep")
+
+#: Where each public name comes from; imported on first use, so that `import sweep` stays cheap.
+_HOMES = {
+    "load": "sweep.spec",
+    "run": "sweep.tasks.driver",
+    "resume": "sweep.tasks.driver",
+    "open": "sweep.analysis.opening",
+}
+
+__all__ = ["__version__", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    """Public names, from where they live."""
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'sweep' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Public names."""
+    return sorted([*globals(), *_HOMES])

@@ -1,0 +1,318 @@
+"""The `sweep` command: reads what is asked for, hands it on, prints what comes back."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from sweep.tasks.session import Outcome
+
+FAILED, MISTAKE, INCOMPLETE = 1, 2, 3
+
+SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+STORE = click.argument("store", type=click.Path(path_type=Path))
+WORKERS = click.option(
+    "--workers", type=click.IntRange(min=1), help="Workers to start on this machine [all cores]."
+)
+SCHEDULER = click.option(
+    "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
+)
+
+
+class Commands(click.Group):
+    """Commands whose users' mistakes end in plain words and exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; what is not a mistake of the user's keeps its traceback."""
+        try:
+            return super().invoke(ctx)
+        except (click.exceptions.Exit, click.ClickException, click.Abort):
+            raise
+        except Exception as error:
+            from sweep.spec import SpecError
+            from sweep.tasks.errors import TaskError
+
+            if not isinstance(error, (SpecError, TaskError)):
+                raise
+            click.echo(str(error), err=True)
+            ctx.exit(MISTAKE)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="sweep")
+def main() -> None:
+    """Sweep an FMCW Doppler lidar's parameters and store how well it detects.
+
+    A study is a short YAML file, its result a Zarr store. A session may go:
+
+    \b
+      sweep plan experiments/quickstart.yaml      how much work is it?
+      sweep run experiments/quickstart.yaml       do it, on all cores
+      sweep status results/quickstart.zarr        how far is it? (any time)
+      sweep resume results/quickstart.zarr        go on after an interruption
+      sweep figures results/quickstart.zarr       draw it
+
+    Ctrl-C once finishes what runs and stops; nothing that is written is lost.
+
+    Exit codes: 0 done, 1 failed, 2 a mistake in what was asked, 3 incomplete (resume goes on).
+    """  # noqa: D301
+
+
+@main.command()
+@SPEC
+@click.option(
+    "--store", type=click.Path(path_type=Path), help="Where to [results/<name of the spec>.zarr]."
+)
+@WORKERS
+@SCHEDULER
+@click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+def run(
+    spec: Path, store: Path | None, workers: int | None, scheduler: str | None, overwrite: bool
+) -> None:
+    """Compute the study SPEC into a Zarr store.
+
+    \b
+      sweep run experiments/quickstart.yaml
+      sweep run experiments/range_angle.yaml --store /data/range_angle.zarr --workers 8
+      sweep run experiments/range_angle.yaml --scheduler tcp://10.0.0.5:8786
+      sweep run experiments/quickstart.yaml --scheduler none --overwrite
+    """  # noqa: D301
+    from sweep.spec import load
+    from sweep.tasks import driver
+
+    outcome = driver.run(
+        load(spec),
+        store=store or Path("results") / f"{spec.stem}.zarr",
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
+    )
+    _conclude(outcome, _shown(outcome.store))
+
+
+@main.command()
+@STORE
+@click.option(
+    "--spec",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Go on only if the store holds this study.",
+)
+@WORKERS
+@SCHEDULER
+def resume(store: Path, spec: Path | None, workers: int | None, scheduler: str | None) -> None:
+    """Compute what STORE lacks: what was interrupted, what failed, what was lost.
+
+    \b
+      sweep resume results/range_angle.zarr
+      sweep resume results/range_angle.zarr --spec experiments/range_angle.yaml --workers 4
+    """  # noqa: D301
+    from sweep.spec import load
+    from sweep.tasks import driver
+
+    outcome = driver.resume(
+        store, spec=load(spec) if spec else None, workers=workers, scheduler=scheduler
+    )
+    _conclude(outcome, store)
+
+
+def _shown(path: Path) -> Path:
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _conclude(outcome: Outcome, store: Path) -> None:
+    """Say what a run has come to, and leave with its exit code."""
+    from sweep.tasks.progress import duration
+
+    if outcome.blocks_done:
+        _print_summary(store)
+    click.echo(
+        f"{store}: {outcome.points_done:,} of {outcome.points:,} points, "
+        f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
+        f"in {duration(outcome.seconds)}"
+    )
+    if outcome.complete:
+        click.echo(f"sweep figures {store}  draws it.")
+        return
+    for failure in outcome.failures[:5]:
+        click.echo(f"block {failure.block} failed: {failure.error}", err=True)
+    left = outcome.blocks - outcome.blocks_done
+    why = outcome.stopped or f"{len(outcome.failures)} blocks failed"
+    click.echo(
+        f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.\n"
+        f"sweep resume {store}  goes on.",
+        err=True,
+    )
+    sys.exit(INCOMPLETE)
+
+
+def _print_summary(store: Path) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from sweep.tasks.summary import DETECTED, summary
+
+    part, rows = summary(store)
+    table = Table(title="Probability of detection", title_justify="left", box=SIMPLE_HEAD)
+    table.add_column(escape(part), justify="right")
+    for heading in ("points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            row.part,
+            f"{row.points:,}",
+            f"{100 * row.detected:.1f} %",
+            f"{row.pd_shot:.4g}",
+            f"{row.pd_doppler:.4g}",
+        )
+    Console().print(table)
+
+
+@main.command()
+@SPEC
+@WORKERS
+def plan(spec: Path, workers: int | None) -> None:
+    """Say what SPEC would take: points, blocks, bytes, time and memory. Nothing is written.
+
+    The time comes from about a second of computing points of the study itself.
+    """
+    from sweep.spec import load
+    from sweep.tasks.plan import plan as planned
+    from sweep.tasks.progress import duration
+
+    study = load(spec)
+    p = planned(study, workers=workers)
+    shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items()) or "the point"
+    for name, text in (
+        ("points", f"{p.points:,}"),
+        ("blocks", f"{p.blocks:,} of at most {shape}"),
+        ("chunks", f"{p.chunks:,} files"),
+        ("bytes", f"{_bytes(p.bytes)} before compression"),
+        ("time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"),
+        ("time", f"about {duration(p.seconds)} on {p.workers} workers"),
+        ("memory", f"about {_bytes(p.worker_memory)} a worker"),
+    ):
+        click.echo(f"{name:>12}  {text}")
+
+
+def _bytes(count: int) -> str:
+    size, unit = float(count), "B"
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            break
+        size /= 1000
+    return f"{size:.3g} {unit}"
+
+
+@main.command()
+@STORE
+def status(store: Path) -> None:
+    """Say how far STORE is, also while it runs somewhere else."""
+    from sweep.tasks.progress import duration
+    from sweep.tasks.status import status as read
+
+    s = read(store)
+    left = duration((s.points - s.points_done) / s.rate) if s.rate else "unknown"
+    click.echo(f"{s.title or store}\nstudy {s.study_id}")
+    click.echo(
+        f"{s.points_done:,} of {s.points:,} points, {s.blocks_done:,} of {s.blocks:,} blocks"
+    )
+    if s.holder_lives and s.holder:
+        click.echo(f"running: process {s.holder.pid} on {s.holder.host}, {left} left")
+    elif s.complete:
+        click.echo("complete")
+    else:
+        click.echo(f"not running; sweep resume {store}  goes on.")
+    for block, failure in sorted(s.failures.items()):
+        click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
+
+
+@main.command()
+@SPEC
+@click.option(
+    "--at",
+    "at",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A parameter's value; as often as needed.",
+)
+@click.option("--noise/--no-noise", default=True, help="Draw the noise of one shot, or only lines.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of that noise [the spec's].")
+@click.option(
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Directory of the figure [results/<name of the spec>].",
+)
+def shot(
+    spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None
+) -> None:
+    """Simulate one shot of SPEC: spectra, threshold, detections, noise budget.
+
+    \b
+      sweep shot experiments/single_shot_2000m.yaml
+      sweep shot experiments/range_angle.yaml --at range=2km --at grazing_angle=45deg
+    """  # noqa: D301
+    from sweep.analysis.shot_figure import report
+    from sweep.spec import load
+
+    study = load(spec)
+    text, files = report(
+        study,
+        at=_assignments(at),
+        directory=output or Path("results") / spec.stem,
+        noise=noise,
+        seed=study.seed if seed is None else seed,
+    )
+    click.echo(text)
+    _list(files)
+
+
+def _assignments(texts: tuple[str, ...]) -> dict[str, str]:
+    assignments = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name.strip() and equals and value.strip()):
+            raise click.BadParameter(
+                f"{text!r} is not NAME=VALUE, as in range=2km", param_hint="--at"
+            )
+        assignments[name.strip()] = value.strip()
+    return assignments
+
+
+def _list(files: list[Path]) -> None:
+    for file in files:
+        click.echo(_shown(file))
+
+
+@main.command()
+@STORE
+@click.option(
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Directory of the figures [NAME-figures beside NAME.zarr].",
+)
+def figures(store: Path, output: Path | None) -> None:
+    """Draw the figures and tables that the study in STORE asks for."""
+    from sweep.tasks.identity import read
+
+    read(store)
+    from sweep.analysis.figures import draw
+
+    beside = store.with_name(f"{store.name.removesuffix('.zarr')}-figures")
+    _list(draw(store, output or beside))
+
+
+@main.command()
+def schema() -> None:
+    """Print the JSON Schema of specs, for editors that check while one types."""
+    import json
+
+    from sweep.spec import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))

@@ -1,0 +1,19 @@
+"""Errors of stores and clusters, worded for who runs studies."""
+
+from __future__ import annotations
+
+
+class TaskError(Exception):
+    """A study that can't be run as asked: the text says why and what to do."""
+
+
+class StoreError(TaskError):
+    """A store that can't be used as asked."""
+
+
+class ClusterError(TaskError):
+    """A scheduler or workers that can't be had."""
+
+
+class SchedulerLost(Exception):
+    """A scheduler that went away with work still out; what was committed stays."""

@@ -1,0 +1,222 @@
+"""The grid of a study: points in rows along the axes, cut into blocks that are whole chunks.
+
+Everything here is lazy: a block is worked out from its number when it is asked for, so that a grid
+of any size costs the length of its axes and no more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sweep.spec import Axis, Spec
+
+Value = float | int | str | np.ndarray
+
+#: Parameters that move the beamlets over the target; every other one only scales or reads lines
+#: that are already placed, and is cheap once they are.
+GEOMETRIC = ("target.range", "target.grazing_angle", "target.radial_velocity")
+GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
+
+
+def is_geometric(axis: Axis) -> bool:
+    """Whether any member of an axis changes where the beamlets fall."""
+    return any(
+        member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
+        for member in axis.members
+    )
+
+
+def block_shape(
+    sizes: tuple[int, ...], geometric: tuple[bool, ...], block_points: int
+) -> tuple[int, ...]:
+    """Points of a block along each axis.
+
+    Radiometric axes are kept whole before geometric ones, and the last axis before the first, as
+    far as the block has room: a block then holds every radiometric variation of the geometry that
+    it places.
+
+    Parameters
+    ----------
+    sizes
+        Points along each axis.
+    geometric
+        Whether each axis changes the geometry.
+    block_points
+        Most points in a block [1], at least 1.
+
+    Returns
+    -------
+    tuple of int
+        Each in 1..size; their product is at most `block_points`.
+    """
+    order = sorted(range(len(sizes)), key=lambda k: (geometric[k], -k))
+    shape, room = [1] * len(sizes), block_points
+    for k in order:
+        shape[k] = min(sizes[k], room)
+        room //= shape[k]
+    return tuple(shape)
+
+
+class Grid:
+    """Points of a study and the blocks they are computed in.
+
+    Parameters
+    ----------
+    spec
+        The study; its parameters, axes and `storage.block_points` decide everything.
+    """
+
+    def __init__(self, spec: Spec) -> None:
+        self.spec = spec
+        self._fixed: dict[str, float | int | str] = dict(spec.parameters())
+        self._axes = tuple(spec.axes)
+        self.dims = tuple(axis.name for axis in self._axes)
+        self.shape = tuple(int(axis.size) for axis in self._axes)
+        self.geometric = tuple(is_geometric(axis) for axis in self._axes)
+        self.block_shape = block_shape(self.shape, self.geometric, spec.storage.block_points)
+        self.blocks_along = tuple(
+            -(-size // chunk) for size, chunk in zip(self.shape, self.block_shape, strict=True)
+        )
+
+    @property
+    def points(self) -> int:
+        """Number of points of the whole grid."""
+        return math.prod(self.shape)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks of the whole grid."""
+        return math.prod(self.blocks_along)
+
+    def position(self, block: int) -> tuple[int, ...]:
+        """Position of a block among the blocks, also the key of its chunk.
+
+        Raises
+        ------
+        IndexError
+            Where there is no such block.
+        """
+        if not 0 <= block < self.n_blocks:
+            raise IndexError(f"block {block} of a grid of {self.n_blocks}")
+        position = []
+        for count in reversed(self.blocks_along):
+            block, along = divmod(block, count)
+            position.append(along)
+        return tuple(reversed(position))
+
+    def block(self, block: int) -> tuple[slice, ...]:
+        """Slices of a block along each axis, cut at the edge of the grid."""
+        return tuple(
+            slice(p * chunk, min((p + 1) * chunk, size))
+            for p, chunk, size in zip(
+                self.position(block), self.block_shape, self.shape, strict=True
+            )
+        )
+
+    def extent(self, block: int) -> tuple[int, ...]:
+        """Points of a block along each axis."""
+        return tuple(s.stop - s.start for s in self.block(block))
+
+    def block_size(self, block: int) -> int:
+        """Number of points of a block."""
+        return math.prod(self.extent(block))
+
+    def points_in(self, blocks: np.ndarray) -> int:
+        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
+        numbers = np.flatnonzero(blocks)
+        points = np.ones(len(numbers), dtype=np.int64)
+        positions = np.unravel_index(numbers, self.blocks_along) if self.shape else ()
+        for along, chunk, size in zip(positions, self.block_shape, self.shape, strict=True):
+            points *= np.minimum((along + 1) * chunk, size) - along * chunk
+        return int(points.sum())
+
+    def parameters(self, block: int) -> dict[str, Value]:
+        """Parameters of the points of a block, by dotted path.
+
+        Returns
+        -------
+        dict
+            SI scalars and strings where all points agree, arrays (n,) along which the points of
+            the block run in C order where an axis varies them.
+        """
+        slices = self.block(block)
+        index = [along.ravel() for along in np.indices(self.extent(block))]
+        return self._select([s.start + along for s, along in zip(slices, index, strict=True)])
+
+    def parameters_at(self, points: np.ndarray) -> dict[str, Value]:
+        """Parameters of points given by their numbers in C order over the whole grid, (n,)."""
+        return self._select(list(np.unravel_index(points, self.shape)) if self.shape else [])
+
+    def _select(self, indices: list[np.ndarray]) -> dict[str, Value]:
+        selected: dict[str, Value] = dict(self._fixed)
+        for values, along in zip(self._values, indices, strict=True):
+            for path, array in values.items():
+                selected[path] = array[along]
+        return selected
+
+    @cached_property
+    def _values(self) -> list[dict[str, np.ndarray]]:
+        return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+
+    def point_rows(self, block: int) -> np.ndarray:
+        """Canonical rows of the parameters of a block's points (`canonical_rows`)."""
+        return canonical_rows(self.parameters(block), self.block_size(block))
+
+    def geometry_order(self, block: int) -> np.ndarray:
+        """Order of a block's points that brings equal geometry together.
+
+        Returns
+        -------
+        ndarray of int (n,)
+            Numbers of the points in C order over the block, sorted so that radiometric axes run
+            fastest.
+        """
+        numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
+        axes = sorted(range(len(self.shape)), key=lambda k: (not self.geometric[k], k))
+        return numbers.transpose(axes).ravel()
+
+
+def canonical_rows(parameters: Mapping[str, Value], count: int) -> np.ndarray:
+    """Rows of float64 that say what a point is by its values alone.
+
+    A row holds every parameter, in the order of the sorted paths: which of them are axes, in what
+    order and with which neighbours does not show. Strings stand as 62 bits of their hash.
+
+    Parameters
+    ----------
+    parameters
+        Scalars, strings or arrays (count,) by dotted path.
+    count
+        Number of points.
+
+    Returns
+    -------
+    ndarray of float64 (count, number of parameters)
+    """
+    rows = np.empty((count, len(parameters)), dtype=np.uint64)
+    for column, path in enumerate(sorted(parameters)):
+        rows[:, column] = _bits(parameters[path])
+    return rows.view(np.float64)
+
+
+def _bits(value: Value) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind == "U":
+        names, inverse = np.unique(array, return_inverse=True)
+        hashes = np.array([_hashed(str(name)) for name in names], dtype=np.uint64)
+        return hashes[inverse].reshape(array.shape)
+    return (array.astype(np.float64) + 0.0).view(np.uint64)  # -0.0 and 0.0 are the same value
+
+
+@lru_cache(maxsize=256)
+def _hashed(text: str) -> int:
+    # 62 bits: with the upper two clear it is no nan, which no row may hold
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 2

@@ -1,0 +1,116 @@
+"""Whether a store is the one that a study belongs in; if not, why, in so many words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sweep.tasks import versions
+from sweep.tasks.errors import StoreError
+from sweep.tasks.store import LAYOUT
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+REQUIRED = ("spec", "study_id", "model_version", "software", "layout")
+
+
+def read(path: Path) -> tuple[dict[str, Any], Spec]:
+    """Attributes of a store and the spec that it holds.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or not one of this program's, or one it can't read.
+    """
+    from sweep.spec import Spec, SpecError
+
+    attributes = read_attributes(path)
+    try:
+        return attributes, Spec.from_stored(attributes["spec"])
+    except (SpecError, ValueError) as error:
+        raise StoreError(
+            f"{path} holds a spec that this version of sweep can't read:\n{error}"
+        ) from error
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Attributes of a store, by its group's metadata alone.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or not one of this program's.
+    """
+    if not path.exists():
+        raise StoreError(f"there is no store at {path}")
+    try:
+        document = json.loads((path / "zarr.json").read_text())
+        attributes = document["attributes"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise StoreError(f"{path} is not a Zarr store of sweep's") from None
+    if not isinstance(attributes, dict) or any(key not in attributes for key in REQUIRED):
+        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
+    if attributes["layout"] != LAYOUT:
+        raise StoreError(
+            f"{path} is laid out as version {attributes['layout']}; this sweep writes {LAYOUT}"
+        )
+    return attributes
+
+
+def refuse_other_study(path: Path, attributes: dict[str, Any], held: Spec, asked: Spec) -> None:
+    """Refuse a store that holds another study than the one asked for.
+
+    Raises
+    ------
+    StoreError
+        With the differences, field by field.
+    """
+    from sweep.spec import difference
+
+    if attributes["study_id"] == asked.id:
+        return
+    refuse_other_versions(path, attributes, where="this machine")  # the version is in the id too
+    lines = "\n".join(f"  {line}" for line in difference(held.identity(), asked.identity()))
+    raise StoreError(
+        f"{path} holds another study (in the store -> in the spec):\n{lines}\n"
+        "Name another --store, or --overwrite this one."
+    )
+
+
+def refuse_other_versions(path: str | Path, attributes: dict[str, Any], *, where: str) -> None:
+    """Refuse a store begun with another model or other software: the bits could differ.
+
+    Raises
+    ------
+    StoreError
+        With both versions of each.
+    """
+    lines = versions.differences(attributes["software"])
+    if attributes["model_version"] != versions.model():
+        lines.insert(
+            0, f"model: {attributes['model_version']} in the store, {versions.model()} here"
+        )
+    if lines:
+        listed = "\n".join(f"  {line}" for line in lines)
+        raise StoreError(
+            f"{path} was begun with other versions than {where} has:\n{listed}\n"
+            "Its results could not be told apart from new ones. Install those versions to resume "
+            "it, or run the study anew into another store."
+        )
+
+
+def refuse_altered(path: Path, attributes: dict[str, Any], held: Spec) -> None:
+    """Refuse a store whose spec no longer is the one that its id was made from.
+
+    Raises
+    ------
+    StoreError
+        With both ids.
+    """
+    if held.id != attributes["study_id"]:
+        raise StoreError(
+            f"{path} holds a spec with id {held.id} but says {attributes['study_id']}: "
+            "its attributes were changed after it was made"
+        )

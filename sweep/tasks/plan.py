@@ -1,0 +1,115 @@
+"""What a study will take, before anything runs: points, blocks, bytes, time, memory."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import psutil
+
+from sweep.tasks import cluster, store
+from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_points, select
+from sweep.tasks.grid import Grid
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+#: Time that measuring may take [s], and places of the grid that it looks at.
+MEASURING = 1.0
+PLACES = 16
+
+#: What a worker takes to start [s], and to write a chunk [s].
+START = 3.0
+WRITE_CHUNK = 2e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a study will take."""
+
+    points: int
+    blocks: int
+    block_shape: dict[str, int]  # points along each axis
+    chunks: int
+    bytes: int  # before compression, of all results
+    workers: int
+    seconds_a_point: float  # on one worker, measured
+    seconds: float  # of the whole study, estimated
+    worker_memory: int  # bytes, estimated
+
+
+def plan(spec: Spec, *, workers: int | None = None) -> Plan:
+    """What a study will take, from its size and a second of measuring its own points.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    workers
+        Workers it would run on; default those of the spec, else all cores.
+    """
+    grid, names = Grid(spec), store.output_names(spec)
+    workers = workers or spec.execution.workers or cluster.cores()
+    each = measured(spec, grid)
+    writing = grid.n_blocks * len(names) * WRITE_CHUNK
+    busy = min(workers, grid.n_blocks)
+    return Plan(
+        points=grid.points,
+        blocks=grid.n_blocks,
+        block_shape=dict(zip(grid.dims, grid.block_shape, strict=True)),
+        chunks=grid.n_blocks * len(names),
+        bytes=grid.points * point_bytes(spec, names),
+        workers=workers,
+        seconds_a_point=each,
+        seconds=START + (grid.points * each + writing) / busy,
+        worker_memory=worker_memory(spec, grid, names),
+    )
+
+
+def point_bytes(spec: Spec, names: list[str]) -> int:
+    """Bytes of one point's results: a float64 an output, an int64 a batch of each count."""
+    from sweep.model.outputs import OUTPUTS
+
+    counted = sum(name not in OUTPUTS for name in names)
+    return 8 * (len(names) - counted + counted * len(batch_sizes(spec)))
+
+
+def worker_memory(spec: Spec, grid: Grid, names: list[str]) -> int:
+    """Bytes a worker takes: as this process does with the model loaded, and two copies of a block's
+    results, its own and the one being encoded.
+    """
+    block = grid.block_size(0) * point_bytes(spec, names)
+    return psutil.Process().memory_info().rss + 2 * block
+
+
+def measured(spec: Spec, grid: Grid) -> float:
+    """Time a point takes on one core [s], measured on points spread over the grid.
+
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will.
+    """
+    compile_kernels(grid)
+    points, begun = 0, time.perf_counter()
+    rows = 1
+    while time.perf_counter() - begun < MEASURING / 2:
+        points = 0
+        round_begun = time.perf_counter()
+        for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
+            points += _evaluate_some(spec, grid, int(block), rows)
+        taken = time.perf_counter() - round_begun
+        if points >= grid.points or taken > MEASURING / 4:
+            break
+        rows *= 4
+    return taken / points
+
+
+def _evaluate_some(spec: Spec, grid: Grid, block: int, rows: int) -> int:
+    sharing = 1
+    for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
+        sharing *= 1 if geometric else size
+    sets = grid.geometry_order(block).reshape(-1, sharing)
+    few = np.unique(np.linspace(0, len(sets) - 1, rows).astype(np.int64))
+    chosen = sets[few].ravel()
+    evaluate_points(spec, select(grid.parameters(block), chosen), len(chosen))
+    return len(chosen)

@@ -1,0 +1,156 @@
+"""How far a run is: a bar in a terminal, a plain line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+#: Seconds between lines without a terminal.
+LINE_EVERY = 30.0
+
+
+class Progress(Protocol):
+    """What a run tells of itself while it goes on."""
+
+    def begin(self, *, points: int, done: int) -> None:
+        """The run begins, with so many points of the study done already."""
+
+    def advance(self, *, points: int, failed: int) -> None:
+        """Points that were committed and blocks that were given up; both 0 as time passes."""
+
+    def say(self, text: str) -> None:
+        """Something to know, in words."""
+
+    def end(self) -> None:
+        """The run is over."""
+
+
+def chosen(progress: bool | Progress) -> Progress:
+    """The progress asked for: none, the one given, or what standard error can show."""
+    if progress is True:
+        return Bar() if sys.stderr.isatty() else Lines()
+    return Silent() if progress is False else progress
+
+
+class Silent:
+    """No progress shown."""
+
+    def begin(self, *, points: int, done: int) -> None:
+        """Nothing."""
+
+    def advance(self, *, points: int, failed: int) -> None:
+        """Nothing."""
+
+    def say(self, text: str) -> None:
+        """Nothing."""
+
+    def end(self) -> None:
+        """Nothing."""
+
+
+class Lines:
+    """One line at the start, every 30 s and at the end, for logs.
+
+    Parameters
+    ----------
+    every
+        Time between lines [s].
+    """
+
+    def __init__(self, every: float = LINE_EVERY) -> None:
+        self._every = every
+        self._points = self._done = self._before = self._failed = 0
+        self._begun = self._said = time.monotonic()
+
+    def begin(self, *, points: int, done: int) -> None:
+        """First line."""
+        self._points, self._done, self._before = points, done, done
+        self._begun = time.monotonic()
+        self._line()
+
+    def advance(self, *, points: int, failed: int) -> None:
+        """Another line where it is time for one."""
+        self._done += points
+        self._failed += failed
+        if time.monotonic() - self._said >= self._every:
+            self._line()
+
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        print(text, file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Last line."""
+        self._line()
+
+    def _line(self) -> None:
+        self._said = time.monotonic()
+        rate = (self._done - self._before) / max(self._said - self._begun, 1e-9)
+        parts = [f"{self._done:,} of {self._points:,} points"]
+        if rate > 0:
+            parts.append(f"{rate:,.0f} points/s")
+            if self._done < self._points:
+                parts.append(f"{duration((self._points - self._done) / rate)} left")
+        if self._failed:
+            parts.append(f"{self._failed} blocks failed")
+        self.say(", ".join(parts))
+
+
+class Bar:
+    """A bar with points, rate, time left and failures, on standard error."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            BarColumn(),
+            TextColumn("{task.completed:,.0f} of {task.total:,.0f} points"),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("[red]{task.fields[failures]}"),
+            console=Console(stderr=True),
+        )
+        self._task: TaskID | None = None
+        self._points = self._failed = 0
+        self._begun = time.monotonic()
+
+    def begin(self, *, points: int, done: int) -> None:
+        """The bar appears."""
+        self._begun = time.monotonic()
+        self._task = self._bar.add_task("", total=points, completed=done, rate="", failures="")
+        self._bar.start()
+
+    def advance(self, *, points: int, failed: int) -> None:
+        """The bar moves."""
+        self._points += points
+        self._failed += failed
+        if self._task is None or not (points or failed):
+            return
+        rate = self._points / max(time.monotonic() - self._begun, 1e-9)
+        failures = f"{self._failed} blocks failed" if self._failed else ""
+        self._bar.update(
+            self._task, advance=points, rate=f"{rate:,.0f} points/s", failures=failures
+        )
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def end(self) -> None:
+        """The bar stays as it is."""
+        self._bar.stop()
+
+
+def duration(seconds: float) -> str:
+    """A time in words: `45 s`, `3 min 20 s`, `5 h 02 min`."""
+    whole = int(seconds + 0.5)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

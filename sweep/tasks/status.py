@@ -1,0 +1,74 @@
+"""How far a store is, seen from any process, whoever works on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sweep.tasks import identity, journal, lock
+from sweep.tasks.grid import Grid
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """How far a store is."""
+
+    store: Path
+    title: str
+    study_id: str
+    points: int
+    points_done: int
+    blocks: int
+    blocks_done: int
+    failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
+    holder: lock.Holder | None  # who writes to it
+    holder_lives: bool
+    rate: float  # points a second in the last run, 0 where none committed anything
+
+    @property
+    def complete(self) -> bool:
+        """Whether every block is committed."""
+        return self.blocks_done == self.blocks
+
+
+def status(store: str | Path) -> Status:
+    """How far a store is.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store of sweep's.
+    """
+    path = Path(store)
+    attributes, spec = identity.read(path)
+    grid = Grid(spec)
+    done = journal.committed(path, grid)
+    holder = lock.holder(path)
+    return Status(
+        store=path,
+        title=attributes.get("title", ""),
+        study_id=attributes["study_id"],
+        points=grid.points,
+        points_done=grid.points_in(done),
+        blocks=grid.n_blocks,
+        blocks_done=int(np.count_nonzero(done)),
+        failures={b: f for b, f in journal.failures(path).items() if b < done.size and not done[b]},
+        holder=holder,
+        holder_lives=holder is not None and lock.is_live(path, holder),
+        rate=_rate(path),
+    )
+
+
+def _rate(path: Path) -> float:
+    begun = [s["time"] for s in journal.sessions(path) if s.get("event") == "begun"]
+    if not begun:
+        return 0.0
+    points, last = 0, begun[-1]
+    for receipt in journal.read_lines(journal.receipts_path(path)):
+        if receipt.get("time", 0.0) >= begun[-1]:
+            points += receipt["points"]
+            last = max(last, receipt["time"])
+    return points / (last - begun[-1]) if points else 0.0

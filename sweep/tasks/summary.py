@@ -1,0 +1,105 @@
+"""The table at the end of a run: how probable detection is over the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sweep.tasks import identity
+from sweep.tasks.grid import Grid
+
+if TYPE_CHECKING:
+    from sweep.spec import Axis
+
+#: Probability of detection above which a point counts as detected.
+DETECTED = 0.9
+
+#: Rows of the table beside the one for the whole grid.
+MOST_ROWS = 10
+
+
+@dataclass(frozen=True)
+class Row:
+    """Detection over one part of the grid; NaN points, not computed, are left out."""
+
+    part: str
+    points: int
+    detected: float  # fraction of points with pd_shot above `DETECTED`
+    pd_shot: float  # medians
+    pd_doppler: float
+
+
+def summary(store: str | Path) -> tuple[str, list[Row]]:
+    """Heading and rows of the table.
+
+    Returns
+    -------
+    heading : str
+        Name and unit of the slowest axis; empty without axes.
+    rows : list of Row
+        One for each part of that axis, and a last one for the whole grid.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store of sweep's.
+    """
+    import zarr
+
+    path = Path(store)
+    _, spec = identity.read(path)
+    grid = Grid(spec)
+    shot, doppler = (
+        np.asarray(zarr.open_array(path / name, mode="r")[...])
+        for name in ("pd_shot", "pd_doppler")
+    )
+    rows = [
+        _row(name, shot[part], doppler[part])
+        for name, part in (_parts(spec.axes[0]) if grid.shape else ())
+    ]
+    heading = _heading(spec.axes[0]) if grid.shape else ""
+    return heading, [*rows, _row("all", shot, doppler)]
+
+
+def _heading(axis: Axis) -> str:
+    """Name of an axis, with the unit of its values."""
+    if len(axis.members) > 1 or not axis.members[0].units:
+        return axis.name
+    return f"{axis.name} [{axis.members[0].units}]"
+
+
+def _parts(axis: Axis) -> Iterator[tuple[str, slice]]:
+    """Parts of an axis: its values, or stretches of them where there are many."""
+    edges = np.linspace(0, axis.size, min(axis.size, MOST_ROWS) + 1).astype(int)
+    for start, stop in pairwise(edges):
+        yield _name(axis, start, stop), slice(start, stop)
+
+
+def _name(axis: Axis, start: int, stop: int) -> str:
+    """Values of a part of an axis; numbers of its points where it has several parameters."""
+    values = range(axis.size) if len(axis.members) > 1 else axis.members[0].display
+    ends = dict.fromkeys([_shown(values[start]), _shown(values[stop - 1])])
+    return "..".join(ends)
+
+
+def _shown(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _row(part: str, shot: np.ndarray, doppler: np.ndarray) -> Row:
+    known = ~np.isnan(shot)
+    shot, doppler = shot[known], doppler[known]
+    if not shot.size:
+        return Row(part, 0, float("nan"), float("nan"), float("nan"))
+    return Row(
+        part,
+        int(shot.size),
+        float(np.mean(shot > DETECTED)),
+        float(np.median(shot)),
+        float(np.median(doppler)),
+    )

@@ -1,0 +1,143 @@
+"""What runs on a worker: blocks evaluated, written, and answered for with receipts."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import threading
+import time
+import traceback
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sweep.tasks import store, versions
+from sweep.tasks.errors import StoreError
+from sweep.tasks.evaluate import Evaluate, evaluate_block
+from sweep.tasks.grid import Grid
+from sweep.tasks.journal import Failure, Receipt
+
+#: Errors of the place that results go to: every further block would meet them too.
+STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM}
+
+
+#: Studies that a worker holds open at once.
+STUDIES_OPEN = 4
+
+
+@dataclass
+class Answer:
+    """What became of the blocks of one task."""
+
+    receipts: list[Receipt] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study opened for computing its blocks."""
+
+    grid: Grid
+    arrays: store.Arrays
+
+
+_studies: dict[tuple[str, str], Study] = {}
+_opening = threading.Lock()
+
+
+def study(path: str, study_id: str) -> Study:
+    """The study of a store, opened once a process.
+
+    Raises
+    ------
+    StoreError
+        Where the store holds another study, or was begun with other software than is here.
+    """
+    with _opening:
+        if (path, study_id) not in _studies:
+            if len(_studies) >= STUDIES_OPEN:
+                _studies.clear()
+            _studies[path, study_id] = _open(path, study_id)
+        return _studies[path, study_id]
+
+
+def _open(path: str, study_id: str) -> Study:
+    from sweep.tasks.identity import read, refuse_other_versions
+
+    attributes, spec = read(Path(path))
+    _refuse_another(path, study_id)
+    refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
+    grid = Grid(spec)
+    return Study(grid, store.Arrays(path, store.output_names(spec)))
+
+
+def _refuse_another(path: str, study_id: str) -> None:
+    """Refuse a store that was put in the place of the one that a task was sent for."""
+    from sweep.tasks.identity import read_attributes
+
+    held = read_attributes(Path(path))["study_id"]
+    if held != study_id:
+        raise StoreError(f"{path} now holds study {held}, not {study_id}")
+
+
+def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None) -> Answer:
+    """Evaluate and write blocks, each on its own: one that raises does not stop the next.
+
+    Parameters
+    ----------
+    path, study_id
+        The store and the study that it must hold.
+    blocks
+        Numbers of the blocks.
+    evaluate
+        What computes a block in place of `evaluate_block`, with the same results.
+
+    Raises
+    ------
+    StoreError, OSError
+        Where the store can't be written at all.
+    """
+    answer = Answer()
+    opened = study(path, study_id)
+    for block in blocks:
+        try:
+            answer.receipts.append(_one(opened, block, evaluate or evaluate_block))
+        except StoreError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+                raise
+            answer.failures.append(failure(block, error))
+    return answer
+
+
+def _one(opened: Study, block: int, evaluate: Evaluate) -> Receipt:
+    grid = opened.grid
+    begun = time.perf_counter()
+    results = evaluate(grid.spec, grid, block)
+    evaluated = time.perf_counter()
+    _refuse_another(str(opened.arrays.path), grid.spec.id)  # its driver may be long dead
+    digest = opened.arrays.write(grid, block, results)
+    ended = time.perf_counter()
+    return Receipt(
+        block=block,
+        points=grid.block_size(block),
+        digest=digest,
+        seconds=round(ended - begun, 6),
+        write_seconds=round(ended - evaluated, 6),
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        versions=versions.software(),
+    )
+
+
+def failure(block: int, error: BaseException) -> Failure:
+    """Record of a block's error, as met in this process."""
+    lines = traceback.format_exception(type(error), error, error.__traceback__)
+    return Failure(
+        block=block,
+        error=f"{type(error).__name__}: {error}",
+        traceback="".join(lines)[-8000:],
+        host=socket.gethostname(),
+        pid=os.getpid(),
+    )

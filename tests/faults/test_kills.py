@@ -1,0 +1,194 @@
+"""Processes killed in the midst of a study, and what resuming makes of it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from small import evaluated, logged, receipts, small, tree
+
+from sweep.tasks.driver import resume, run
+from sweep.tasks.status import status
+
+BLOCKS = 12
+SLOW = 0.15
+
+#: A client of its own: runs the small study, slowed down and logged.
+CLIENT = """
+import sys
+from pathlib import Path
+from small import logged, small
+from sweep.tasks.driver import run
+
+if __name__ == "__main__":
+    store, log, slow, scheduler = sys.argv[1:]
+    place = {"scheduler": scheduler} if scheduler else {"workers": 2}
+    evaluate = logged(Path(log), float(slow))
+    outcome = run(small(), store=store, evaluate=evaluate, progress=False, **place)
+    print(outcome.stopped)
+"""
+
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": str(Path(__file__).parents[1] / "tasks"),
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s",
+}
+
+
+@contextmanager
+def process(*command: str):
+    """A process of our own in a session of its own, gone at the end."""
+    child = subprocess.Popen(
+        command,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield child
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        child.wait()
+        child.stdout.close()
+
+
+@contextmanager
+def client_process(tmp_path: Path, scheduler: str = ""):
+    script = tmp_path / "client.py"
+    script.write_text(CLIENT)
+    paths = [str(tmp_path / name) for name in ("small.zarr", "log")]
+    with process(sys.executable, str(script), *paths, str(SLOW), scheduler) as child:
+        yield child
+
+
+@contextmanager
+def dask_cluster(tmp_path: Path):
+    """A scheduler and two workers, each a process; their address and the processes."""
+    file = tmp_path / "scheduler.json"
+    common = ["--scheduler-file", str(file), "--host", "127.0.0.1"]
+    worker = dask("worker", *common, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+    with (
+        process(*dask("scheduler", *common, "--port", "0", "--no-dashboard")) as head,
+        process(*worker) as one,
+        process(*worker) as two,
+    ):
+        yield address(file), head, [one, two]
+
+
+def dask(command: str, *options: str) -> list[str]:
+    return [sys.executable, "-m", f"distributed.cli.dask_{command}", *options]
+
+
+def address(file: Path) -> str:
+    import json
+
+    wait_for(lambda: file.exists() and file.stat().st_size > 0)
+    return json.loads(file.read_text())["address"]
+
+
+def wait_for(condition, timeout: float = 40.0) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    path = tmp_path_factory.mktemp("undisturbed") / "small.zarr"
+    assert run(small(), store=path, scheduler="none", progress=False).complete
+    return tree(path)
+
+
+def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    """Resume, and see that the store is the undisturbed one and committed work was not repeated."""
+    store = tmp_path / "small.zarr"
+    committed = receipts(store)
+    assert 0 < len(committed) < BLOCKS
+    assert not status(store).holder_lives
+    log = tmp_path / "resumed"
+    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
+    assert outcome.complete
+    assert sorted(evaluated(log)) == sorted(set(range(BLOCKS)) - set(committed))
+    assert sorted(receipts(store)) == list(range(BLOCKS))
+    before = Counter(evaluated(tmp_path / "log"))
+    assert all(before[block] == 1 for block in committed)
+    assert tree(store) == undisturbed
+
+
+def test_the_client_killed_with_its_workers(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    with client_process(tmp_path) as client:
+        wait_for(lambda: len(receipts(store)) >= 3)
+        os.kill(client.pid, signal.SIGKILL)
+        client.wait()
+    finish(tmp_path, undisturbed)
+
+
+def test_the_client_killed_while_its_cluster_lives_on(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    with dask_cluster(tmp_path) as (scheduler, _, _):
+        with client_process(tmp_path, scheduler) as client:
+            wait_for(lambda: len(receipts(store)) >= 3)
+            os.kill(client.pid, signal.SIGKILL)
+            client.wait()
+        finish(tmp_path, undisturbed)
+
+
+def test_a_worker_killed_its_blocks_go_to_the_other_one(tmp_path, undisturbed):
+    store, log = tmp_path / "small.zarr", tmp_path / "log"
+    with (
+        dask_cluster(tmp_path) as (scheduler, _, workers),
+        client_process(tmp_path, scheduler) as client,
+    ):
+        wait_for(lambda: len(receipts(store)) >= 3)
+        os.kill(workers[0].pid, signal.SIGKILL)
+        committed = receipts(store)
+        client.communicate()
+        assert client.returncode == 0
+    assert sorted(receipts(store)) == list(range(BLOCKS))
+    assert tree(store) == undisturbed
+    assert all(Counter(evaluated(log))[block] == 1 for block in committed)
+
+
+def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    with (
+        dask_cluster(tmp_path) as (scheduler, head, _),
+        client_process(tmp_path, scheduler) as client,
+    ):
+        wait_for(lambda: len(receipts(store)) >= 3)
+        os.kill(head.pid, signal.SIGKILL)
+        output, _ = client.communicate(timeout=40)
+        assert "the scheduler is gone" in output
+        assert client.returncode == 0
+    finish(tmp_path, undisturbed)
+
+
+def test_a_plain_loop_killed(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    with client_process(tmp_path, "none") as client:
+        wait_for(lambda: len(receipts(store)) >= 3)
+        os.kill(client.pid, signal.SIGKILL)
+        client.wait()
+    finish(tmp_path, undisturbed)
+
+
+def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    with client_process(tmp_path) as client:
+        wait_for(lambda: len(receipts(store)) >= 2)
+        os.killpg(client.pid, signal.SIGINT)
+        output, _ = client.communicate(timeout=40)
+        assert output.strip().splitlines()[-1] == "interrupted"
+        assert "/sweep/" not in output  # no traceback of ours
+    assert set(evaluated(tmp_path / "log")) == set(receipts(store))
+    finish(tmp_path, undisturbed)

@@ -1,0 +1,292 @@
+import errno
+import json
+import math
+import os
+import signal
+from collections import Counter
+
+import dask
+import numpy as np
+import pytest
+import xarray as xr
+from distributed import Client, LocalCluster
+from small import STUDY, copied, deadly, evaluated, failing, logged, quiet, receipts, small, tree
+
+from sweep.tasks import session, store
+from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid import Grid
+from sweep.tasks.status import status
+from sweep.tasks.store import Arrays
+from sweep.tasks.worker import work
+
+
+def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
+    dataset = xr.open_zarr(undisturbed)
+    assert bool(dataset.pd_shot.notnull().all())
+    assert np.ptp(dataset.pd_shot.values) > 0
+    assert sorted(receipts(undisturbed)) == list(range(12))
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        {"workers": 1},
+        {"workers": 2},
+        {"workers": 2, "processes": False},
+        {"workers": 4, "processes": False},
+    ],
+    ids=["1 process", "2 processes", "2 threads", "4 threads"],
+)
+def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
+    undisturbed, tmp_path, place
+):
+    outcome = quiet(small(), tmp_path / "small.zarr", **place)
+    assert outcome.complete and outcome.blocks_computed == 12
+    assert sorted(receipts(outcome.store)) == list(range(12))
+    assert tree(outcome.store) == tree(undisturbed)
+
+
+def test_the_values_are_the_same_bit_for_bit_in_blocks_of_another_size(undisturbed, tmp_path):
+    whole = quiet(small(storage={"block_points": 1000}), tmp_path / "whole.zarr")
+    single = quiet(small(storage={"block_points": 1}), tmp_path / "single.zarr")
+    assert (whole.blocks, single.blocks) == (1, 72)
+    expected = xr.open_zarr(undisturbed)
+    for other in (whole, single):
+        found = xr.open_zarr(other.store)
+        assert set(found.data_vars) == set(expected.data_vars)
+        for name in expected.data_vars:
+            assert found[name].values.tobytes() == expected[name].values.tobytes(), name
+
+
+def test_counts_of_draws_do_not_depend_on_blocks_workers_or_axes(tmp_path):
+    draws = {"number": 70, "batch": 30}
+    plain = quiet(small(draws=draws), tmp_path / "plain.zarr")
+    threads = quiet(small(draws=draws), tmp_path / "t.zarr", workers=2, processes=False)
+    assert tree(plain.store) == tree(threads.store)
+    expected = xr.open_zarr(plain.store)
+    assert expected.batch_draws.values.tolist() == [30, 30, 10]
+    assert 0 < expected.n_detected_up.values.sum() < 70 * 72
+    blocks = quiet(small(draws=draws, storage={"block_points": 5}), tmp_path / "blocks.zarr")
+    np.testing.assert_array_equal(
+        xr.open_zarr(blocks.store).n_detected_up.values, expected.n_detected_up.values
+    )
+    axes = {path: values for path, values in STUDY["axes"].items() if "power" not in path}
+    one_watt = quiet(small(draws=draws, axes=axes), tmp_path / "one_watt.zarr")
+    np.testing.assert_array_equal(
+        xr.open_zarr(one_watt.store).n_detected_up.values, expected.n_detected_up.values[0]
+    )
+
+
+def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        outcome = quiet(small(), tmp_path / "small.zarr", client=client)
+        again = quiet(small(), tmp_path / "again.zarr", client=client)
+        assert client.status == "running"
+    assert tree(outcome.store) == tree(again.store) == tree(undisturbed)
+
+
+class StopAfter:
+    """Progress that asks a plain loop to stop after some points, as Ctrl-C would."""
+
+    def __init__(self, points: int) -> None:
+        self.points, self.said = points, []
+
+    def begin(self, *, points, done): ...
+
+    def advance(self, *, points, failed):
+        self.points -= points
+        if points and -6 < self.points <= 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def say(self, text):
+        self.said.append(text)
+
+    def end(self): ...
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
+    undisturbed, tmp_path, place
+):
+    path, log = tmp_path / "small.zarr", tmp_path / "log"
+    progress = StopAfter(18)
+    outcome = run(small(), store=path, progress=progress, evaluate=logged(log), **place)
+    assert not outcome.complete and outcome.stopped == "interrupted"
+    assert 3 <= outcome.blocks_done < 12
+    assert len(evaluated(log)) == outcome.blocks_done  # what was begun was committed
+    assert any("stopping" in text for text in progress.said)
+    resumed = resume(path, progress=False, scheduler="none", evaluate=logged(log))
+    assert resumed.complete and resumed.blocks_computed == 12 - outcome.blocks_done
+    assert Counter(evaluated(log)) == Counter(range(12))
+    assert tree(path) == tree(undisturbed)
+
+
+def test_what_is_complete_is_not_computed_again(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    log = tmp_path / "log"
+    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
+    assert outcome.complete and outcome.blocks_computed == 0
+    assert evaluated(log) == []
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty"])
+def test_a_block_whose_chunk_is_missing_or_empty_is_computed_again(undisturbed, tmp_path, damage):
+    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    chunk = store / "pd_up" / "c" / "0" / "5" / "0"
+    chunk.unlink() if damage == "missing" else chunk.write_bytes(b"")
+    assert status(store).blocks_done == 11
+    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
+    assert outcome.complete and evaluated(log) == [5]
+    assert tree(store) == tree(undisturbed)
+
+
+def test_a_block_whose_receipt_was_torn_is_computed_again(undisturbed, tmp_path):
+    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    path = store / ".sweep" / "receipts.jsonl"
+    path.write_bytes(path.read_bytes()[:-20])
+    last = receipts(undisturbed)[-1]
+    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
+    assert outcome.complete and evaluated(log) == [last]
+    assert sorted(receipts(store)) == list(range(12))
+    assert tree(store) == tree(undisturbed)
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
+    undisturbed, tmp_path, place
+):
+    path, log = tmp_path / "small.zarr", tmp_path / "log"
+    outcome = run(small(), store=path, progress=False, evaluate=failing({2, 7}, log), **place)
+    assert not outcome.complete and outcome.blocks_done == 10
+    assert sorted(failure.block for failure in outcome.failures) == [2, 7]
+    expected = Counter({**dict.fromkeys(range(12), 1), 2: 2, 7: 2})
+    assert Counter(evaluated(log)) == expected
+    recorded = status(path).failures
+    assert recorded[2]["error"] == "ValueError: nothing good comes of block 2"
+    assert "Traceback" in recorded[7]["traceback"]
+    assert resume(path, progress=False, scheduler="none").complete
+    assert status(path).failures == {}
+    assert tree(path) == tree(undisturbed)
+
+
+def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
+    path = tmp_path / "small.zarr"
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
+        outcome = run(small(), store=path, progress=False, workers=2, evaluate=deadly({4}))
+    assert [failure.block for failure in outcome.failures] == [4]
+    assert outcome.failures[0].error.startswith("KilledWorker")
+    assert outcome.blocks_done == 11
+    assert resume(path, progress=False, scheduler="none").complete
+    assert tree(path) == tree(undisturbed)
+
+
+def test_a_study_of_which_every_block_fails_is_given_up_early(tmp_path):
+    spec, log = small(storage={"block_points": 1}), tmp_path / "log"
+    outcome = run(
+        spec,
+        store=tmp_path / "small.zarr",
+        progress=False,
+        scheduler="none",
+        evaluate=failing(set(range(72)), log),
+    )
+    assert len(outcome.failures) == session.HOPELESS
+    assert "all failed" in outcome.stopped
+
+
+def full_disk(spec, grid, block):
+    """The model, on a machine whose disk is full from block 3 on."""
+    from sweep.tasks.evaluate import evaluate_block
+
+    if block >= 3:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return evaluate_block(spec, grid, block)
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(undisturbed, tmp_path, place):
+    path = tmp_path / "small.zarr"
+    outcome = run(small(), store=path, progress=False, evaluate=full_disk, **place)
+    assert "No space left" in outcome.stopped and not outcome.complete
+    assert set(receipts(path)) <= {0, 1, 2}
+    assert resume(path, progress=False, scheduler="none").complete
+    assert tree(path) == tree(undisturbed)
+
+
+def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(tmp_path):
+    path, old = tmp_path / "small.zarr", small(seed=5)
+    store.create(path, old, Grid(old))
+
+    def replaced_meanwhile(spec, grid, block):
+        from sweep.tasks.evaluate import evaluate_block
+
+        store.remove(path)
+        store.create(path, small(seed=6), Grid(small(seed=6)))
+        return evaluate_block(spec, grid, block)
+
+    with pytest.raises(StoreError, match=f"now holds study {small(seed=6).id}, not {old.id}"):
+        work(str(path), old.id, [0], replaced_meanwhile)
+    assert not list(path.glob("*/c/0/0/0"))
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
+    undisturbed, tmp_path, monkeypatch, times
+):
+    path, lost = tmp_path / "small.zarr", []
+    write = Arrays.write
+
+    def forgetful(self, grid, block, results):
+        if block == 3 and len(lost) < times:
+            lost.append(block)
+            return "0" * 32
+        return write(self, grid, block, results)
+
+    monkeypatch.setattr(Arrays, "write", forgetful)
+    outcome = quiet(small(), path)
+    assert len(lost) == times
+    assert receipts(path).count(3) == (1 if times == 1 else 0)
+    assert outcome.complete == (times == 1)
+    assert all("not in the store here" in failure.error for failure in outcome.failures)
+    assert resume(path, progress=False, scheduler="none").complete
+    assert tree(path) == tree(undisturbed)
+
+
+def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
+    spec = small(storage={"block_points": 1})
+    most = []
+
+    class Watching:
+        def begin(self, *, points, done): ...
+
+        def advance(self, *, points, failed):
+            most.append(len(client.futures))
+
+        def say(self, text): ...
+
+        def end(self): ...
+
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        outcome = run(spec, store=tmp_path / "s.zarr", client=client, progress=Watching())
+    assert outcome.complete and outcome.blocks == 72
+    assert max(most) <= 2 * 2 + 1
+
+
+def test_receipts_say_what_was_done_where_and_with_what(undisturbed):
+    lines = (undisturbed / ".sweep" / "receipts.jsonl").read_text().splitlines()
+    for record in map(json.loads, lines):
+        assert record["points"] == 6
+        assert 0 < record["write_seconds"] < record["seconds"]
+        assert record["host"] and record["pid"] and record["versions"]["numpy"]
+        assert len(record["digest"]) == 32
+    assert math.isclose(sum(json.loads(line)["points"] for line in lines), 72)

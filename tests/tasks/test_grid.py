@@ -1,0 +1,138 @@
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+from small import STUDY, small
+
+from sweep.tasks.evaluate import point_keys
+from sweep.tasks.grid import Grid, block_shape, canonical_rows
+
+
+def points_of(grid: Grid) -> np.ndarray:
+    """Numbers of the points of every block, laid end to end."""
+    numbers = np.arange(grid.points).reshape(grid.shape)
+    return np.concatenate([numbers[grid.block(i)].ravel() for i in range(grid.n_blocks)])
+
+
+@pytest.mark.parametrize("block_points", [1, 5, 7, 36, 1000])
+def test_blocks_hold_every_point_once(block_points):
+    grid = Grid(small(storage={"block_points": block_points}))
+    assert sorted(points_of(grid)) == list(range(grid.points)) == list(range(72))
+    assert max(grid.block_size(i) for i in range(grid.n_blocks)) <= block_points
+    assert sum(grid.block_size(i) for i in range(grid.n_blocks)) == grid.points
+    marked = np.zeros(grid.n_blocks, bool)
+    marked[::2] = True
+    assert grid.points_in(marked) == sum(grid.block_size(i) for i in range(0, grid.n_blocks, 2))
+
+
+def test_a_block_keeps_radiometric_axes_whole_before_geometric_ones():
+    assert block_shape((3, 10_000, 90), (False, True, True), 32768) == (3, 121, 90)
+    assert block_shape((10_000, 90, 3, 3), (True, True, False, False), 32768) == (40, 90, 3, 3)
+    assert block_shape((50_000, 4), (False, True), 32768) == (32768, 1)
+    assert block_shape((), (), 10) == ()
+    assert Grid(small()).block_shape == (2, 1, 3)
+
+
+def test_parameters_of_a_block_are_those_of_its_points_in_c_order():
+    spec = small()
+    grid = Grid(spec)
+    by_name = {m.path: np.asarray(m.values) for axis in spec.axes for m in axis.members}
+    whole = np.meshgrid(*by_name.values(), indexing="ij")
+    for i in range(grid.n_blocks):
+        parameters = grid.parameters(i)
+        for path, values in zip(by_name, whole, strict=True):
+            np.testing.assert_array_equal(parameters[path], values[grid.block(i)].ravel())
+        assert parameters["target.reflectance"] == 0.02
+
+
+def test_members_of_a_zipped_axis_run_together():
+    axes = {
+        "cut": {
+            "zip": [
+                {"target.range": ["1 km", "2 km"], "target.grazing_angle": "15 deg"},
+                {"target.range": "3 km", "target.grazing_angle": ["30 deg", "60 deg", "90 deg"]},
+            ]
+        }
+    }
+    grid = Grid(small(axes=axes, storage={"block_points": 5}))
+    assert grid.dims == ("cut",)
+    parameters = grid.parameters(0)
+    np.testing.assert_allclose(parameters["target.range"], [1e3, 2e3, 3e3, 3e3, 3e3])
+    degrees = np.degrees(parameters["target.grazing_angle"])
+    np.testing.assert_allclose(degrees, [15, 15, 30, 60, 90])
+
+
+def test_a_study_without_axes_is_one_point_in_one_block():
+    grid = Grid(small(axes={}))
+    assert (grid.points, grid.n_blocks, grid.block(0), grid.block_size(0)) == (1, 1, (), 1)
+    assert grid.point_rows(0).shape[0] == 1
+
+
+def test_geometry_order_brings_equal_geometry_together_and_drops_nothing():
+    grid = Grid(small(storage={"block_points": 36}))
+    order, parameters = grid.geometry_order(0), grid.parameters(0)
+    assert sorted(order) == list(range(grid.block_size(0)))
+    ranges = parameters["target.range"][order]
+    angles = parameters["target.grazing_angle"][order]
+    changes = np.count_nonzero((np.diff(ranges) != 0) | (np.diff(angles) != 0))
+    assert changes + 1 == len(set(zip(ranges, angles, strict=True)))
+
+
+def rows_by_point(grid: Grid) -> dict[tuple, bytes]:
+    """Canonical row of each point, by range, angle and power."""
+    rows = {}
+    for i in range(grid.n_blocks):
+        p, n = grid.parameters(i), grid.block_size(i)
+        names = ("target.range", "target.grazing_angle", "instrument.laser.power")
+        columns = [np.broadcast_to(p[name], (n,)) for name in names]
+        for key, row in zip(zip(*columns, strict=True), grid.point_rows(i), strict=True):
+            rows[key] = row.tobytes()
+    return rows
+
+
+def test_a_points_row_follows_from_its_values_not_from_axes_order_or_blocks():
+    whole = rows_by_point(Grid(small()))
+    axes = dict(reversed(list(STUDY["axes"].items())))
+    turned = rows_by_point(Grid(small(axes=axes, storage={"block_points": 5})))
+    assert whole == turned
+    assert len(set(whole.values())) == 72
+    del axes["instrument.laser.power"]
+    one_watt = rows_by_point(Grid(small(axes=axes)))  # 1 W is now a parameter, not an axis
+    assert len(one_watt) == 36
+    assert all(whole[point] == row for point, row in one_watt.items())
+
+
+def test_words_and_signed_zeros_are_canonical():
+    one = canonical_rows({"a": "hamming", "b": 0.0}, 2)
+    other = canonical_rows({"b": np.array([-0.0, 0.0]), "a": np.array(["hamming", "hann"])}, 2)
+    assert one[0].tobytes() == other[0].tobytes()
+    assert one[1].tobytes() != other[1].tobytes()
+
+
+def test_keys_of_points_differ_by_point_and_by_seed():
+    rows = Grid(small()).point_rows(0)
+    keys, again = point_keys(rows, 3), point_keys(rows[::-1], 3)
+    assert keys.dtype == np.uint64 and keys.shape == (len(rows), 2)
+    np.testing.assert_array_equal(keys, again[::-1])
+    both = np.concatenate([keys, point_keys(rows, 4)])
+    assert len(np.unique(both, axis=0)) == 2 * len(rows)
+
+
+def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
+    axes = {
+        "target.range": {"linear": ["1 m", "10 km"], "number": 10_000},
+        "target.radial_velocity": {"linear": ["0 m/s", "100 m/s"], "number": 1000},
+    }
+    spec = small(axes=axes, storage={"block_points": 1})
+    tracemalloc.start()
+    grid = Grid(spec)
+    assert math.prod(grid.shape) == grid.n_blocks == 10_000_000
+    last = grid.parameters(grid.n_blocks - 1)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert last["target.range"] == pytest.approx(10e3)
+    assert last["target.radial_velocity"] == pytest.approx(100.0)
+    assert peak < 1_000_000
+    with pytest.raises(IndexError):
+        grid.block(grid.n_blocks)

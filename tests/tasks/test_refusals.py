@@ -1,0 +1,133 @@
+import json
+
+import pytest
+import xarray as xr
+from small import STUDY, copied, everything, quiet, small, tree
+
+from sweep.tasks import driver, session, versions
+from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import ClusterError, StoreError
+from sweep.tasks.lock import Lock
+from sweep.tasks.status import status
+
+
+def altered(store, **changes):
+    """Attributes of a store, changed behind its back."""
+    path = store / "zarr.json"
+    document = json.loads(path.read_text())
+    document["attributes"].update(changes)
+    path.write_text(json.dumps(document))
+
+
+def test_resuming_with_a_changed_spec_is_refused_with_the_differences(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    before = everything(store)
+    other = small(seed=4, target={**STUDY["target"], "reflectance": 0.2})
+    with pytest.raises(StoreError) as refusal:
+        resume(store, spec=other, progress=False, scheduler="none")
+    assert "seed: 3 -> 4" in str(refusal.value)
+    assert "target.reflectance: 0.02 -> 0.2" in str(refusal.value)
+    with pytest.raises(StoreError, match="seed: 3 -> 4"):
+        quiet(other, store)
+    assert everything(store) == before
+
+
+def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    spec = small(title="Another title", execution={"workers": 7})
+    assert resume(store, spec=spec, progress=False, scheduler="none").blocks_computed == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "shown"),
+    [
+        ({"software": {**versions.software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
+        ({"model_version": "0.0"}, "model: 0.0 in the store, "),
+        ({"study_id": "0" * 32}, "attributes were changed"),
+        ({"layout": 99}, "laid out as version 99"),
+        ({"spec": "{"}, "can't read"),
+    ],
+    ids=["software", "model", "id", "layout", "spec"],
+)
+def test_resuming_with_other_versions_or_altered_attributes_is_refused(
+    undisturbed, tmp_path, changes, shown
+):
+    store = copied(undisturbed, tmp_path)
+    altered(store, **changes)
+    before = everything(store)
+    with pytest.raises(StoreError, match=shown):
+        resume(store, progress=False, scheduler="none")
+    assert everything(store) == before
+
+
+def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
+    theirs = xr.Dataset({"a": ("x", [1.0])})
+    theirs.to_zarr(tmp_path / "theirs.zarr", zarr_format=3, consolidated=False)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "text").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    before = everything(tmp_path)
+    for name, shown in (("theirs.zarr", "not one that"), ("notes", "not a"), ("file", "not a")):
+        with pytest.raises(StoreError, match=shown):
+            resume(tmp_path / name, progress=False)
+        for overwrite in (False, True):
+            with pytest.raises(StoreError, match=shown):
+                run(small(), store=tmp_path / name, progress=False, overwrite=overwrite)
+    with pytest.raises(StoreError, match="there is no store"):
+        resume(tmp_path / "absent", progress=False)
+    assert everything(tmp_path) == before
+
+
+def test_a_run_into_a_store_of_the_same_study_points_to_resume_and_overwrite(undisturbed):
+    before = everything(undisturbed)
+    with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep resume .*--overwrite"):
+        quiet(small(), undisturbed)
+    assert everything(undisturbed) == before
+
+
+def test_overwriting_puts_another_study_in_the_place_of_an_old_one(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    outcome = quiet(small(seed=9), store, scheduler="none", overwrite=True)
+    assert outcome.complete and outcome.blocks_computed == 12
+    assert status(store).study_id == small(seed=9).id
+    assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
+
+
+def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    held = Lock(store)
+    with pytest.raises(StoreError, match="is being written by process"):
+        resume(store, progress=False, scheduler="none")
+    with pytest.raises(StoreError, match="is being written by process"):
+        quiet(small(), store, scheduler="none", overwrite=True)
+    assert status(store).holder_lives
+    held.release()
+    assert status(store).holder is None
+
+
+def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monkeypatch):
+    store = copied(undisturbed, tmp_path)
+    (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
+    before = tree(store)
+    monkeypatch.setattr(driver.identity, "refuse_other_versions", refusing_on_workers)
+    with pytest.raises(StoreError, match="worker on"):
+        resume(store, progress=False, workers=1, processes=False)
+    assert tree(store) == before
+
+
+def refusing_on_workers(path, attributes, *, where):
+    """As if the workers, and only they, had other software."""
+    if where.startswith("worker"):
+        raise StoreError(f"other versions on the {where}")
+
+
+def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(session.cluster, "CONNECT_TIMEOUT", 0.5)
+    with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:9"):
+        run(
+            small(),
+            store=tmp_path / "small.zarr",
+            scheduler="tcp://127.0.0.1:9",
+            progress=False,
+        )
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,336 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from sweep.cli import main
+from sweep.spec import Spec
+from sweep.tasks import driver, progress, session
+from sweep.tasks.lock import Lock
+
+STUDY = """\
+title: A small study
+instrument:
+  laser: {wavelength: 1550 nm, power: 1 W, beam_divergence: 50 urad}
+  chirp: {bandwidth: 1 GHz, start_frequency: 5.5 GHz, duration: 500 us}
+  telescope: {aperture: 25 mm}
+  receiver:
+    responsivity: 1.1 A/W
+    detector_bandwidth: 400 MHz
+    optical_passband: 25 nm
+    noise_equivalent_power: 5 pW/Hz^0.5
+    transimpedance: 7 kohm
+    amplifier_bandwidth: 400 MHz
+    amplifier_noise_current: 25 nA
+  processing: {sample_rate: 600 MHz, fft_size: 2^14, tnr: 8}
+target: {range: 2 km, grazing_angle: 60 deg, radial_velocity: 20 m/s, reflectance: 0.01}
+footprint: {beamlets: 9}
+axes:
+  target.range: {linear: [10 m, 5 km], number: 40}
+  instrument.laser.power: [1 W, 3 W]
+seed: 3
+storage: {block_points: 8}
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A directory of one's own with a spec, small.yaml, in it."""
+    (tmp_path / "small.yaml").write_text(STUDY)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def sweep(*arguments: str):
+    """The command in this process; an error that is not a user's mistake is raised."""
+    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
+
+
+def refused(result, *shown: str) -> None:
+    """A user's mistake: exit code 2, plain words on standard error, nothing on standard output."""
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+    for text in shown:
+        assert text in result.stderr
+
+
+def test_run_makes_a_store_named_after_the_spec_and_prints_a_table(here):
+    result = sweep("run", "small.yaml", "--scheduler", "none")
+    assert result.exit_code == 0
+    assert (here / "results" / "small.zarr" / "zarr.json").exists()
+    assert "pd_shot > 0.9" in result.stdout and "median pd_doppler" in result.stdout
+    assert "range [m]" in result.stdout and "10..393.8" in result.stdout
+    assert "results/small.zarr: 80 of 80 points, computed 10 of 10 blocks" in result.stdout
+    assert "80 of 80 points" in result.stderr
+
+
+def test_the_summary_counts_what_the_store_holds(here):
+    import numpy as np
+    import xarray as xr
+
+    from sweep.tasks.summary import summary
+
+    sweep("run", "small.yaml", "--scheduler", "none")
+    heading, rows = summary(here / "results" / "small.zarr")
+    assert heading == "range [m]"
+    shot = xr.open_zarr(here / "results" / "small.zarr").pd_shot
+    assert [row.points for row in rows] == [8] * 10 + [80]
+    first = shot.isel(range=slice(0, 4)).values
+    assert rows[0].detected == np.count_nonzero(first > 0.9) / 8
+    assert rows[-1].pd_shot == np.median(shot.values)
+    assert 0 < rows[-1].detected < 1
+
+
+def test_a_second_run_is_refused_and_says_how_to_go_on_or_begin_anew(here):
+    sweep("run", "small.yaml", "--scheduler", "none")
+    refused(sweep("run", "small.yaml", "--scheduler", "none"), "sweep resume", "--overwrite")
+    assert sweep("run", "small.yaml", "--scheduler", "none", "--overwrite").exit_code == 0
+
+
+def test_a_changed_spec_is_refused_with_what_changed(here):
+    sweep("run", "small.yaml", "--scheduler", "none")
+    (here / "other.yaml").write_text(STUDY.replace("seed: 3", "seed: 4"))
+    store = "results/small.zarr"
+    refused(sweep("run", "other.yaml", "--store", store), "seed: 3 -> 4")
+    refused(sweep("resume", store, "--spec", "other.yaml"), "seed: 3 -> 4")
+    assert sweep("resume", store, "--spec", "small.yaml", "--scheduler", "none").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [
+        (["run", "absent.yaml"], "does not exist"),
+        (["run", "wrong.yaml"], "telescope"),
+        (["plan", "wrong.yaml"], "telescope"),
+        (["run", "small.yaml", "--workers", "0"], "--workers"),
+        (["run", "small.yaml", "--scheduler", "nonsense"], "no Dask scheduler answers at nonsense"),
+        (["resume", "absent.zarr"], "there is no store at"),
+        (["status", "notes"], "is not a Zarr store"),
+        (["figures", "notes"], "is not a Zarr store"),
+        (["run", "small.yaml", "--store", "notes"], "is not a Zarr store"),
+        (["run", "small.yaml", "--store", "notes", "--overwrite"], "is not a Zarr store"),
+        (["run", "small.yaml", "--store", "notes/text/small.zarr"], "can't be made"),
+        (["runn", "small.yaml"], "runn"),
+    ],
+)
+def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
+    (here / "notes").mkdir()
+    (here / "notes" / "text").write_text("mine")
+    (here / "wrong.yaml").write_text(STUDY.replace("25 mm", "25"))
+    refused(sweep(*arguments), shown)
+    assert sorted(path.name for path in here.iterdir() if path.name != "results") == [
+        "notes",
+        "small.yaml",
+        "wrong.yaml",
+    ]
+    assert (here / "notes" / "text").read_text() == "mine"
+
+
+def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch):
+    def poisoned(spec, grid, block):
+        from sweep.tasks.evaluate import evaluate_block
+
+        if block == 4:
+            raise ValueError("no good")
+        return evaluate_block(spec, grid, block)
+
+    whole = driver.run
+
+    def run(*arguments, **keywords):
+        return whole(*arguments, **keywords, evaluate=poisoned)
+
+    monkeypatch.setattr(driver, "run", run)
+    result = sweep("run", "small.yaml", "--scheduler", "none")
+    assert result.exit_code == 3
+    assert "block 4 failed: ValueError: no good" in result.stderr
+    assert "1 of 10 blocks left" in result.stderr
+    assert "sweep resume results/small.zarr" in result.stderr
+    shown = sweep("status", "results/small.zarr").stdout
+    assert "72 of 80 points, 9 of 10 blocks" in shown
+    assert "block 4 failed on" in shown and "sweep resume" in shown
+    assert sweep("resume", "results/small.zarr", "--scheduler", "none").exit_code == 0
+    assert "complete" in sweep("status", "results/small.zarr").stdout
+
+
+def test_status_tells_who_is_at_work(here):
+    sweep("run", "small.yaml", "--scheduler", "none")
+    (here / "results" / "small.zarr" / "pd_up" / "c" / "3" / "0").unlink()
+    held = Lock(here / "results" / "small.zarr")
+    shown = sweep("status", "results/small.zarr").stdout
+    held.release()
+    assert "72 of 80 points, 9 of 10 blocks" in shown
+    assert f"running: process {os.getpid()} on" in shown
+
+
+def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):
+    def broken(*arguments, **keywords):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(driver, "run", broken)
+    result = CliRunner().invoke(main, ["run", "small.yaml"])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, RuntimeError)
+
+
+def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
+    from sweep.model.outputs import OUTPUTS
+
+    result = sweep("plan", "small.yaml", "--workers", "2")
+    assert result.exit_code == 0
+    lines = dict(line.strip().split("  ", 1) for line in result.stdout.splitlines())
+    assert lines["points"] == "80"
+    assert lines["blocks"] == "10 of at most 4 range x 2 power"
+    assert lines["chunks"] == f"{10 * len(OUTPUTS)} files"
+    assert lines["bytes"] == f"{80 * 8 * len(OUTPUTS) / 1000:.3g} kB before compression"
+    assert lines["time"].endswith("on 2 workers")
+    assert [path.name for path in here.iterdir()] == ["small.yaml"]
+
+
+def test_plan_of_ten_million_points_takes_seconds(here):
+    text = STUDY.replace("number: 40", "number: 100000").replace(
+        "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100}"
+    )
+    (here / "large.yaml").write_text(text.replace("block_points: 8", "block_points: 1"))
+    begun = time.monotonic()
+    result = sweep("plan", "large.yaml")
+    assert "10,000,000 of at most 1 range x 1 power" in result.stdout
+    assert time.monotonic() - begun < 20
+
+
+def test_shot_hands_on_values_and_prints_the_report_and_its_files(here, monkeypatch):
+    asked = {}
+
+    def report(spec, **keywords):
+        asked.update(keywords, spec=spec)
+        return "a report", [Path("results/small/shot.png")]
+
+    module = types.SimpleNamespace(report=report)
+    monkeypatch.setitem(sys.modules, "sweep.analysis.shot_figure", module)
+    result = sweep(
+        "shot", "small.yaml", "--at", "range=2km", "--at", "grazing_angle = 45 deg", "--no-noise"
+    )
+    assert result.exit_code == 0
+    assert result.stdout.split("\n") == ["a report", "results/small/shot.png", ""]
+    assert asked["at"] == {"range": "2km", "grazing_angle": "45 deg"}
+    assert (asked["noise"], asked["seed"]) == (False, 3)
+    assert isinstance(asked["spec"], Spec)
+    refused(sweep("shot", "small.yaml", "--at", "range"), "is not NAME=VALUE")
+
+
+def test_figures_go_beside_the_store_or_where_asked(here, monkeypatch):
+    sweep("run", "small.yaml", "--scheduler", "none")
+
+    def draw(store, directory):
+        return [directory / "surface.png"]
+
+    module = types.SimpleNamespace(draw=draw)
+    monkeypatch.setitem(sys.modules, "sweep.analysis.figures", module)
+    beside = sweep("figures", "results/small.zarr")
+    assert beside.stdout == "results/small-figures/surface.png\n"
+    asked = sweep("figures", "results/small.zarr", "--output", "elsewhere")
+    assert asked.stdout == "elsewhere/surface.png\n"
+
+
+def test_schema_prints_a_json_schema_that_names_the_sections():
+    schema = json.loads(sweep("schema").stdout)
+    assert {"instrument", "target", "axes"} <= schema["properties"].keys()
+
+
+def test_help_teaches_with_examples():
+    text = sweep("--help").stdout
+    for command in ("run", "plan", "status", "resume", "shot", "figures", "schema"):
+        assert command in text
+    assert "3 incomplete" in text
+    assert "sweep run experiments/quickstart.yaml\n" in sweep("run", "--help").stdout
+
+
+def test_importing_the_package_and_asking_for_help_stay_cheap():
+    code = (
+        "import sys, sweep, sweep.cli; sweep.__version__;"
+        "print([m for m in ('numpy', 'dask', 'zarr', 'numba', 'pydantic') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_package_offers_load_run_and_resume(here):
+    import sweep as package
+
+    spec = package.load("small.yaml")
+    outcome = package.run(spec, store="s.zarr", scheduler="none", progress=False)
+    assert outcome.complete and outcome.points == 80
+    assert package.resume("s.zarr", scheduler="none", progress=False).blocks_computed == 0
+    assert {"load", "run", "open"} <= set(dir(package))
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = package.nothing
+
+
+def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
+    (here / "long.yaml").write_text(STUDY.replace("number: 40", "number: 4000"))
+    command = [sys.executable, "-c", "from sweep.cli import main; main()"]
+    long = subprocess.Popen(
+        [*command, "run", "long.yaml", "--workers", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    receipts = here / "results" / "long.zarr" / ".sweep" / "receipts.jsonl"
+    deadline = time.monotonic() + 40
+    while not (receipts.exists() and receipts.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(long.pid, signal.SIGINT)
+    output, errors = long.communicate(timeout=40)
+    assert long.returncode == 3
+    assert "sweep resume results/long.zarr" in errors
+    assert "/sweep/" not in errors  # no traceback of ours
+    assert "dashboard http://127.0.0.1:" in errors
+    assert "Probability of detection" in output
+
+
+def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys):
+    lines = progress.Lines(every=0.0)
+    lines.begin(points=100, done=20)
+    lines.advance(points=30, failed=0)
+    lines.advance(points=0, failed=2)
+    lines.end()
+    shown = capsys.readouterr().err.splitlines()
+    assert shown[0] == "20 of 100 points"
+    assert shown[1].startswith("50 of 100 points, ")
+    assert shown[-1].endswith("2 blocks failed")
+    patient = progress.Lines()
+    patient.begin(points=100, done=0)
+    for _ in range(50):
+        patient.advance(points=1, failed=0)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.6, "1 min 00 s"), (200, "3 min 20 s"), (7320, "2 h 02 min")],
+)
+def test_durations_are_said_in_words(seconds, text):
+    assert progress.duration(seconds) == text
+
+
+def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(here):
+    spec = Spec.from_mapping(
+        {**_mapping(), "execution": {"workers": 3, "scheduler": "none"}}, base=here
+    )
+    assert session.Place().for_spec(spec).scheduler == "none"
+    assert session.Place(workers=2).for_spec(spec) == session.Place(workers=2)
+    assert session.Place().for_spec(spec).workers == 3
+
+
+def _mapping() -> dict:
+    import yaml
+
+    return yaml.safe_load(STUDY)
