@@ -304,8 +304,7 @@ def figures(store: Path, output: Path | None) -> None:
     read(store)
     from sweep.analysis.figures import draw
 
-    beside = store.with_name(f"{store.name.removesuffix('.zarr')}-figures")
-    _list(draw(store, output or beside))
+    _list(draw(store, output))
 
 
 @main.command()

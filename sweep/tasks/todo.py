@@ -21,13 +21,24 @@ class Todo:
     def __init__(self, done: np.ndarray) -> None:
         self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
         self._fresh = _numbers(done)
-        self._again: deque[int] = deque()
+        self._suspects: deque[int] = deque()
+        self._returned: deque[int] = deque()
         self._failed_once: set[int] = set()
 
-    def take(self, count: int) -> list[int]:
-        """Up to `count` blocks for one task; one that failed before comes by itself."""
-        if self._again:
-            return [self._again.popleft()]
+    def take(self, count: int, *, suspects: bool = True) -> list[int]:
+        """Up to `count` blocks for one task; one that failed before comes by itself.
+
+        Parameters
+        ----------
+        count
+            Most blocks.
+        suspects
+            Whether a block that failed before may come.
+        """
+        if self._suspects and suspects:
+            return [self._suspects.popleft()]
+        if self._returned:
+            return [self._returned.popleft()]
         blocks = list(islice(self._fresh, count))
         self.left -= len(blocks)
         return blocks
@@ -37,12 +48,12 @@ class Todo:
         if block in self._failed_once:
             return False
         self._failed_once.add(block)
-        self._again.append(block)
+        self._suspects.append(block)
         return True
 
     def put_back(self, blocks: list[int]) -> None:
         """Put blocks back whose answer was lost, by no fault of theirs."""
-        self._again.extend(blocks)
+        self._returned.extend(blocks)
 
     def attempt(self, block: int) -> int:
         """How often a block has failed so far."""

@@ -132,12 +132,19 @@ class Window:
             slots = self._slots.now()
             while len(self._flying) < 2 * slots:
                 count = self._pace.blocks_a_task(self._todo.left, slots)
-                if not (blocks := self._todo.take(count)):
+                if not (blocks := self._todo.take(count, suspects=not self._suspect_flies())):
                     return
                 self._send(blocks)
         except (OSError, CancelledError, RuntimeError) as error:
             self._check()
             raise SchedulerLost(str(error)) from error
+
+    def _suspect_flies(self) -> bool:
+        """Whether a block that failed before is out: two at once could blame each other's deed.
+
+        Tasks on a worker that one of them kills all count as failed; a second failure is final.
+        """
+        return any(self._todo.attempt(blocks[0]) for _, blocks in self._flying.values())
 
     def _send(self, blocks: list[int]) -> None:
         job = self._job

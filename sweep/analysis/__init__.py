@@ -1,0 +1,1 @@
+"""What a store says: datasets, figures and tables. Reads stores, runs nothing."""

@@ -1,0 +1,65 @@
+"""Pictures: sheets to draw on, their looks, and files made of them."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Sheet
+
+DPI = 150
+SCALE = "viridis"
+NOT_COMPUTED = "0.75"
+"""Grey of what is not there: nan, or a point not computed yet."""
+
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+"""Colours that stay apart for the colour-blind (Okabe and Ito 2008), for lines."""
+
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
+
+
+def sheet(width: float, height: float) -> Sheet:
+    """An empty sheet, width and height in inches."""
+    figure = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def panels(
+    width: float, height: float, rows: int, columns: int, **options: Any
+) -> tuple[Sheet, list[Axes]]:
+    """A sheet with a grid of axes, listed row by row."""
+    figure = sheet(width, height)
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    return figure, list(axes.ravel())
+
+
+def empty(message: str) -> Sheet:
+    """A sheet that says why there is nothing on it."""
+    figure = sheet(8.0, 2.0)
+    figure.text(0.5, 0.5, message, ha="center", va="center", color="0.3")
+    return figure
+
+
+def title(figure: Sheet, text: str) -> None:
+    """Title of a whole sheet."""
+    figure.suptitle(text, fontsize=11, fontweight="bold")
+
+
+def caption(figure: Sheet, text: str) -> None:
+    """Small print at the foot of a sheet, broken into lines that fit it."""
+    if text:
+        characters = int(figure.get_figwidth() * 15)
+        figure.supxlabel(
+            "\n".join(textwrap.wrap(text, characters)), fontsize=8, color="0.25", x=0.02, ha="left"
+        )
+
+
+def save(figure: Sheet, path: Path) -> Path:
+    """The sheet as a PNG file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, format="png")
+    return path

@@ -1,0 +1,138 @@
+"""Cuts through a study, as the thesis makes them: along range at an angle, or along angle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sweep.analysis import labels
+from sweep.analysis.selection import Points
+
+if TYPE_CHECKING:
+    from sweep.spec import Axis, Member, Spec
+
+RANGE, GRAZING_ANGLE = "target.range", "target.grazing_angle"
+PUBLISHED = ((GRAZING_ANGLE, "15 deg"), (GRAZING_ANGLE, "85 deg"), (RANGE, "3500 m"))
+NEAREST = "5 m"
+"""Nearer ranges are left out of means: there the echo's own shot noise counts [T 4.2]."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """One coordinate at a value, the other along the cut; both empty for a whole study."""
+
+    name: str
+    held: str
+    value: object
+    along: str
+
+    def of(self, found: Points) -> Points:
+        """Points of the cut, each once."""
+        return once(found.where(self.held, [self.value])) if self.held else found
+
+
+def coordinate_of(spec: Spec, path: str) -> Member | None:
+    """The parameter of a path where it is on an axis."""
+    try:
+        return spec.member(path)
+    except KeyError:
+        return None
+
+
+def cuts(spec: Spec) -> list[Cut]:
+    """Cuts that a study makes through range and grazing angle.
+
+    Those of its zipped axis; else the published three that its grid holds; else the whole.
+    """
+    ranges, angles = coordinate_of(spec, RANGE), coordinate_of(spec, GRAZING_ANGLE)
+    whole = [Cut("all", "", None, ranges.name if ranges else angles.name if angles else "")]
+    if ranges is None or angles is None:
+        return whole
+    members = {RANGE: ranges, GRAZING_ANGLE: angles}
+    zipped = next((axis for axis in spec.axes if {ranges, angles} <= set(axis.members)), None)
+    held = _pieces(zipped) if zipped else _published(spec, members)
+    found = [
+        Cut(
+            labels.quantity(value, member.units).replace("°", " deg"),
+            member.name,
+            value,
+            angles.name if member is ranges else ranges.name,
+        )
+        for member, value in held
+    ]
+    return found or whole
+
+
+def _published(spec: Spec, members: dict[str, Member]) -> list[tuple[Member, object]]:
+    """The published cuts that lie on the grid."""
+    pairs = ((members[path], spec.coordinate_value(path, text)) for path, text in PUBLISHED)
+    return [(m, value) for m, value in pairs if np.isclose(m.display, float(value)).any()]
+
+
+def _pieces(axis: Axis) -> list[tuple[Member, object]]:
+    """Stretches of a zipped axis in which one parameter stays and another varies, in order."""
+    members = [m for m in axis.members if m.path in (RANGE, GRAZING_ANGLE)]
+    pieces: list[tuple[Member, object]] = []
+    start = 0
+    while start < axis.size:
+        lengths = [_constant(member.display[start:]) for member in members]
+        longest = int(np.argmax(lengths))
+        piece = (members[longest], members[longest].display[start].item())
+        if piece not in pieces:
+            pieces.append(piece)
+        start += lengths[longest]
+    return pieces
+
+
+def _constant(values: np.ndarray) -> int:
+    """Number of leading values that are equal."""
+    different = values != values[0]
+    return int(np.argmax(different)) if different.any() else values.size
+
+
+def once(found: Points) -> Points:
+    """Points without repetition of all their coordinates."""
+    columns = [c.values for c in found.coordinates.values() if not c.index]
+    codes = np.stack([np.unique(c, return_inverse=True)[1].ravel() for c in columns])
+    return found.at(np.sort(np.unique(codes, axis=1, return_index=True)[1]))
+
+
+def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) -> Points:
+    """Points farther than a distance (or at it), where range is on an axis."""
+    member = coordinate_of(spec, RANGE)
+    if member is None:
+        return found
+    least = float(spec.coordinate_value(RANGE, distance))
+    ranges = found.coordinates[member.name].values
+    return found.at(ranges >= least if included else ranges > least)
+
+
+def bands(spec: Spec, along: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Decades of range, or bands of angle, that hold any of the values: name and mask of each."""
+    member = spec.member(along)
+    angle = member.path == GRAZING_ANGLE
+    si = np.asarray(member.values, float)[_position(member, values)]
+    si = np.rad2deg(si) if angle else si
+    unit = "deg" if angle else "m"
+    limits = [0.0, 15.0, 30.0, 60.0, 90.0] if angle else [10.0**k for k in range(-1, 8)]
+    masks = [
+        (f"{a:g}-{b:g} {unit}", (si > a * (1 + 1e-12)) & (si <= b * (1 + 1e-12)))
+        for a, b in pairwise(limits)
+    ]
+    return [(name, mask) for name, mask in masks if mask.any()]
+
+
+def _position(member: Member, values: np.ndarray) -> np.ndarray:
+    """Index along an axis of each value of its coordinate."""
+    order = np.argsort(member.display, kind="stable")
+    return order[np.searchsorted(member.display[order], values)]
+
+
+def si_value(member: Member, value: object) -> float | int | str:
+    """SI value of a coordinate's value."""
+    if isinstance(member.values, tuple):
+        return str(value)
+    return member.values[_position(member, np.array([value]))[0]].item()

@@ -1,0 +1,134 @@
+"""False alarms of a shot as in Tables 4.3 to 4.5 of the thesis: ours, and beside what it prints.
+
+Noise alone in closed form and by the model; the study's mean, in which the echo's own shot noise
+raises the noise a little; the printed figure and the noise variance that it implies; and leakage,
+which those tables leave out: extra groups raised by the signal's own sidelobes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.analysis import noise_only
+from sweep.analysis.cuts import NEAREST, Cut, beyond, cuts, si_value
+from sweep.analysis.leakage import Leakage, leakage
+from sweep.analysis.selection import Points, split
+from sweep.model.shot import evaluate
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+VARIABLES = ["pfa_shot", "pfa_segment", "p_leakage_up", "p_leakage_down"]
+MOST_ROWS = 100
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Noise alone at one setting of the instrument."""
+
+    tnr: float
+    bins: int
+    closed_form: float
+    model: float
+    model_bin: float
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of one column: a setting of the instrument in one cut."""
+
+    row: str
+    column: str
+    along: str
+    units: str
+    points: int
+    reference: Reference
+    mean: float
+    printed: float
+    leakage: Leakage
+
+    def excess(self, probability: float) -> float:
+        """Noise variance above the threshold's that a false-alarm probability implies."""
+        return noise_only.variance_excess_of_shot(
+            probability, self.reference.tnr, self.reference.bins
+        )
+
+
+def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
+    """Noise alone, in closed form and by the model with a target that reflects nothing.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    setting
+        SI values by dotted path that differ from the study's own.
+    """
+    first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
+    parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
+    processing = "instrument.processing."
+    size, tnr = int(parameters[processing + "fft_size"]), float(parameters[processing + "tnr"])
+    bins = size if parameters[processing + "bins_counted"] == "all" else size // 2
+    found = evaluate(parameters)
+    return Reference(
+        tnr=tnr,
+        bins=bins,
+        closed_form=noise_only.shot_probability(tnr, bins),
+        model=float(found["pfa_shot"].item()),
+        model_bin=float(found["pfa_bin"].item()),
+    )
+
+
+def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, Any], Points]]:
+    """Points apart by `by` and what else varies but range and angle: name, SI values, points."""
+    cut_names = {cut.along for cut in cuts(spec)} | {cut.held for cut in cuts(spec)}
+    names = [by, *(n for n in found.varying() if n != by and n not in cut_names)]
+    members = [spec.member(name) for name in names]
+    return [
+        (
+            name,
+            {m.path: si_value(m, part.coordinates[m.name].values[0]) for m in members},
+            part,
+        )
+        for name, part in split(found, names, MOST_ROWS)[0]
+    ]
+
+
+def entries(
+    found: Points, spec: Spec, *, by: str, printed: Sequence[Sequence[float]] = ()
+) -> list[Entry]:
+    """Every row and column of a table of false alarms.
+
+    Parameters
+    ----------
+    found, spec
+        Points of a study with `VARIABLES`, and the study.
+    by
+        Coordinate of the rows.
+    printed
+        Published figures, a row for each row and a column for each cut.
+    """
+    result = []
+    for i, (name, setting, part) in enumerate(settings(found, spec, by)):
+        alone = reference(spec, setting)
+        for j, cut in enumerate(cuts(spec)):
+            points = beyond(cut.of(part), spec, NEAREST)
+            published = printed[i][j] if i < len(printed) and j < len(printed[i]) else math.nan
+            result.append(_entry(points, spec, cut, name, alone, float(published)))
+    return result
+
+
+def _entry(
+    found: Points, spec: Spec, cut: Cut, row: str, alone: Reference, printed: float
+) -> Entry:
+    mean = float(np.nanmean(found.variables["pfa_shot"])) if found.size else math.nan
+    units = found.coordinates[cut.along].units if cut.along else ""
+    return Entry(
+        row, cut.name, cut.along, units, found.size, alone, mean, printed,
+        leakage(found, spec, cut.along),
+    )  # fmt: skip

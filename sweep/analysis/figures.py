@@ -1,0 +1,130 @@
+"""All figures and tables of a study, as its spec asks for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from sweep.analysis import canvas, false_alarms, labels, mean_table, slices, surface_figure, tables
+from sweep.analysis.defaults import default_figures
+from sweep.analysis.opening import open as open_store
+from sweep.analysis.selection import Points, confined, points
+from sweep.analysis.tabular import Page
+from sweep.spec import FalseAlarmTable, Figure, Slices, Spec, Surface, Table, ThresholdTable
+
+
+@dataclass(frozen=True)
+class Study:
+    """A store opened, with the spec that it holds."""
+
+    dataset: xr.Dataset
+    spec: Spec
+
+    @classmethod
+    def of(cls, store_path: str | Path) -> Study:
+        """The study in a store."""
+        dataset = open_store(store_path)
+        return cls(dataset, Spec.from_stored(dataset.attrs["spec"]))
+
+    @property
+    def note(self) -> str:
+        """What a picture's foot says of where it comes from."""
+        attributes = self.dataset.attrs
+        note = (
+            f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
+            f"model {attributes['model_version']}"
+        )
+        done, number = attributes["points_committed"], attributes["points"]
+        return note if done >= number else f"{note}: {done:,} of {number:,} points computed"
+
+    def points(self, *variables: str) -> Points:
+        """All points, with some variables."""
+        return points(self.dataset, list(variables))
+
+    def words(self, variable: str) -> str:
+        """A variable's name in words, with its units."""
+        attributes = self.dataset[variable].attrs
+        return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
+
+
+def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Path]:
+    """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
+
+    Parameters
+    ----------
+    store_path
+        The store, complete or not.
+    directory
+        Where to; by default beside the store, ``NAME-figures`` for ``NAME.zarr``.
+
+    Returns
+    -------
+    list of Path
+        The files written: PNG of figures, TXT and CSV of tables.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a study.
+    """
+    store_path = Path(store_path)
+    beside = store_path.with_name(f"{store_path.name.removesuffix('.zarr')}-figures")
+    directory = beside if directory is None else Path(directory)
+    study = Study.of(store_path)
+    figures = study.spec.figures or default_figures(study.spec)
+    if not figures:
+        return mean_table.outputs_page(study.dataset).save(directory, "outputs")
+    return [path for figure in figures for path in _made(study, figure, directory)]
+
+
+def _made(study: Study, figure: Figure, directory: Path) -> list[Path]:
+    """Files of one figure."""
+    if isinstance(figure, Surface | Slices):
+        sheet = _sheet(study, figure)
+        return [canvas.save(sheet, directory / f"{figure.stem}.png")]
+    return _page(study, figure).save(directory, figure.stem)
+
+
+def _sheet(study: Study, figure: Surface | Slices) -> canvas.Sheet:
+    found = confined(study.points(figure.variable), study.spec, figure.where)
+    held = [
+        f"{labels.coordinate(name)} {value}"
+        for name, value in figure.where.items()
+        if not isinstance(value, tuple)
+    ]
+    if not found.size:
+        return canvas.empty(f"{study.spec.title}: no point of the study has {', '.join(held)}")
+    options: dict[str, Any] = {
+        "x": figure.x,
+        "variable": figure.variable,
+        "long_name": study.words(figure.variable),
+        "title": "\n".join(filter(None, [study.spec.title, figure.title])),
+        "note": labels.joined([", ".join(held), study.note]),
+    }
+    if isinstance(figure, Surface):
+        return surface_figure.draw(found, y=figure.y, **options)
+    return slices.draw(found, by=figure.by, **options)
+
+
+def _page(study: Study, figure: Table | FalseAlarmTable | ThresholdTable) -> Page:
+    title = figure.title or study.spec.title
+    if isinstance(figure, Table):
+        return mean_table.mean_page(
+            study.points(figure.variable),
+            study.spec,
+            figure.model_dump(),
+            str(study.dataset[figure.variable].attrs.get("units", "")),
+            title,
+        )
+    if isinstance(figure, ThresholdTable):
+        found = study.points("pfa_bin")
+        return tables.threshold_page(
+            found, study.spec, by=figure.by, printed=figure.printed, title=title
+        )
+    found = study.points(*false_alarms.VARIABLES)
+    return tables.false_alarm_page(
+        found, study.spec, by=figure.by, printed=figure.printed, title=title
+    )

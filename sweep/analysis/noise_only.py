@@ -1,0 +1,47 @@
+"""False alarms of noise alone, in closed form, and what a published figure says of the noise.
+
+A bin of noise crosses the threshold of TNR standard deviations of its magnitude with probability
+p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a shot raise a false alarm in N bins each with
+probability (1 - (1 - p)^N)^2: what Tables 4.3 to 4.5 of the thesis print.
+"""
+
+from __future__ import annotations
+
+import math
+
+
+def bin_exponent(tnr: float) -> float:
+    """X = (4 - pi)/4 TNR^2, minus the logarithm of a bin's false-alarm probability."""
+    return (4 - math.pi) / 4 * tnr**2
+
+
+def bin_probability(tnr: float) -> float:
+    """Probability that a bin of noise alone crosses the threshold [Table 4.2], 0..1."""
+    return math.exp(-bin_exponent(tnr))
+
+
+def shot_probability(tnr: float, bins: float) -> float:
+    """Probability that both of two segments of so many bins raise a false alarm, 0..1."""
+    p = bin_probability(tnr)
+    return 1.0 if p >= 1.0 else math.expm1(bins * math.log1p(-p)) ** 2
+
+
+def variance_excess_of_bin(probability: float, tnr: float) -> float:
+    """Noise variance over the one that the threshold was set by, less one, from a bin's chance.
+
+    exp(-x / (1 + e)) = probability, solved for e; nan where no e does.
+    """
+    if not 0.0 < probability < 1.0:
+        return math.nan
+    return -bin_exponent(tnr) / math.log(probability) - 1
+
+
+def variance_excess_of_shot(probability: float, tnr: float, bins: float) -> float:
+    """The same from the probability of a false alarm in both segments of a shot.
+
+    (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability, solved for e; nan where no e does.
+    """
+    if not 0.0 < probability < 1.0:
+        return math.nan
+    of_bin = -math.expm1(math.log1p(-math.sqrt(probability)) / bins)
+    return variance_excess_of_bin(of_bin, tnr)

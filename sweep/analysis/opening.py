@@ -1,0 +1,156 @@
+"""A store as an xarray Dataset, with how much of it is there."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+BATCH = "batch"
+BATCH_DRAWS = "batch_draws"
+NOT_COUNTED = -1
+"""What a count holds where its block is not computed."""
+
+
+class NotAStoreError(ValueError):
+    """A path at which there is no store of a study."""
+
+
+def open(path: str | Path) -> xr.Dataset:
+    """The store of a study as a dataset.
+
+    Dimensions bear the names of the study's axes, coordinates are in the units that the study was
+    written in, and every variable has its units and what it is. Arrays are read when they are
+    needed. What is not computed yet is nan; -1 for counts of draws, which are summed over their
+    batches; their number is `n_draws`.
+
+    Parameters
+    ----------
+    path
+        The store, complete or not.
+
+    Returns
+    -------
+    xarray.Dataset
+        Its attributes are the store's and: `started`, `finished` (UTC; empty where there is
+        nothing to tell), `points`, `points_committed`, `blocks` and `blocks_committed`.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a study.
+    """
+    path = Path(path)
+    attributes = read_attributes(path)
+    dataset = xr.open_zarr(path, consolidated="consolidated_metadata" in _document(path))
+    if BATCH in dataset.dims:
+        dataset = merged(dataset)
+    dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
+    return dataset.assign_attrs(progress(path, attributes, _points(dataset, attributes)))
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Attributes of a store, from its group's metadata.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is none, with the stores that are near.
+    """
+    if not path.exists():
+        raise NotAStoreError(f"there is no store at {path}{_near(path)}")
+    try:
+        attributes = _document(path)["attributes"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}") from None
+    if not isinstance(attributes, dict) or not {"spec", "study_id", "block_shape"} <= set(
+        attributes
+    ):
+        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    return attributes
+
+
+def _document(path: Path) -> dict[str, Any]:
+    return json.loads((path / "zarr.json").read_text())
+
+
+def _near(path: Path) -> str:
+    """Remark on the stores in a directory or beside a path; empty where there are none."""
+    directory = path if path.is_dir() else path.parent
+    names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return f"; stores near it: {shown}" if names else ""
+
+
+def merged(dataset: xr.Dataset) -> xr.Dataset:
+    """Counts of draws summed over their batches, and their number `n_draws`.
+
+    A count is -1 where any of its batches is.
+    """
+    counts = {name: array for name, array in dataset.data_vars.items() if BATCH in array.dims}
+    sums = {
+        name: array.sum(BATCH, keep_attrs=True).where(
+            (array != NOT_COUNTED).all(BATCH), NOT_COUNTED
+        )
+        for name, array in counts.items()
+    }
+    number = dataset[BATCH_DRAWS].sum(BATCH)
+    number.attrs = {"units": "1", "long_name": "number of draws of each point"}
+    return dataset.drop_dims(BATCH).assign(sums).assign(n_draws=number)
+
+
+def progress(path: Path, attributes: dict[str, Any], points: tuple[int, ...]) -> dict[str, Any]:
+    """Times and amount of what is committed, as attributes.
+
+    Parameters
+    ----------
+    path, attributes
+        The store and its attributes.
+    points
+        Shape of the grid.
+    """
+    receipts = {r["block"]: r for r in _records(path / ".sweep" / "receipts.jsonl") if "block" in r}
+    sessions = list(_records(path / ".sweep" / "sessions.jsonl"))
+    blocks = math.prod(
+        math.ceil(n / block) for n, block in zip(points, attributes["block_shape"], strict=True)
+    )
+    times = [r["time"] for r in receipts.values() if "time" in r]
+    started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s] or times
+    complete = len(receipts) >= blocks
+    return {
+        "started": _utc(min(started)) if started else "",
+        "finished": _utc(max(times)) if complete and times else "",
+        "points": math.prod(points),
+        "points_committed": sum(r.get("points", 0) for r in receipts.values()),
+        "blocks": blocks,
+        "blocks_committed": len(receipts),
+    }
+
+
+def _points(dataset: xr.Dataset, attributes: dict[str, Any]) -> tuple[int, ...]:
+    """Shape of the grid, as long as the shape of a block."""
+    rank = len(attributes["block_shape"])
+    return next(array.shape for name, array in dataset.data_vars.items() if len(array.dims) == rank)
+
+
+def _records(path: Path) -> Iterator[dict[str, Any]]:
+    """Whole lines of a log, in order."""
+    if not path.exists():
+        return
+    with path.open(encoding="utf-8", errors="replace") as log:
+        for line in log:
+            try:
+                record = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            if isinstance(record, dict):
+                yield record
+
+
+def _utc(time: float) -> str:
+    return datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")

@@ -1,0 +1,200 @@
+"""Tables of false alarms as the thesis prints them, ours beside its: Tables 4.2 to 4.5."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.analysis import labels, noise_only
+from sweep.analysis.cuts import NEAREST, beyond
+from sweep.analysis.false_alarms import Entry, entries, reference, settings
+from sweep.analysis.leakage import HELD
+from sweep.analysis.selection import Points
+from sweep.analysis.tabular import Block, Cell, Page, percent
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+
+def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
+    """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate.
+
+    Parameters
+    ----------
+    found, spec
+        Points with the variables of `false_alarms.VARIABLES`, and the study.
+    by
+        Coordinate of the rows.
+    printed
+        Published figures, a row for each row and a column for each cut.
+    title
+        What stands over the page.
+    """
+    all_entries = entries(found, spec, by=by, printed=printed)
+    blocks = [
+        _false_alarm_block(all_entries),
+        _leakage_block(all_entries),
+        *_origin_blocks(all_entries),
+    ]
+    return Page(title, blocks, _notes(all_entries), [_record(e) for e in all_entries])
+
+
+def _false_alarm_block(found: list[Entry]) -> Block:
+    published = any(e.printed == e.printed for e in found)
+    columns = [
+        "setting", "cut", "points", "closed form", "noise only", "study's mean", "excess of mean",
+    ]  # fmt: skip
+    columns += ["printed", "printed/closed", "excess of printed"] if published else []
+    rows = [_false_alarm_row(e)[: len(columns)] for e in found]
+    return Block("Probability of a false alarm in both chirp segments, from noise", columns, rows)
+
+
+def _false_alarm_row(e: Entry) -> list[Cell]:
+    return [
+        e.row,
+        e.column,
+        e.points,
+        f"{e.reference.closed_form:.6e}",
+        f"{e.reference.model:.6e}",
+        f"{e.mean:.6e}",
+        percent(e.excess(e.mean), ".1e"),
+        _or_dash(e.printed, ".3e"),
+        _or_dash(e.printed / e.reference.closed_form, ".3f"),
+        percent(e.excess(e.printed), ".4f"),
+    ]
+
+
+def _leakage_block(found: list[Entry]) -> Block:
+    columns = (
+        "setting", "cut", "up: mean", "up: median", "down: mean", "down: median", "shot: mean",
+        "shot: median",
+    )  # fmt: skip
+    rows = [
+        (
+            e.row, e.column, *(f"{x:.3e}" for pair in zip(e.leakage.mean, e.leakage.median,
+            strict=True) for x in pair), f"{e.leakage.shot_mean:.3e}",
+            f"{e.leakage.shot_median:.3e}",
+        )
+        for e in found
+    ]  # fmt: skip
+    return Block("Leakage: extra groups raised by the signal's own sidelobes", columns, rows)
+
+
+def _origin_blocks(found: list[Entry]) -> list[Block]:
+    """Where leakage comes from: a table for each set of bands."""
+    blocks = []
+    for names in dict.fromkeys(tuple(e.leakage.shares) for e in found if e.leakage.shares):
+        own = [e for e in found if tuple(e.leakage.shares) == names]
+        rows = [
+            (
+                e.row, e.column, f"{e.leakage.holders:,} of {e.points:,}",
+                f"{e.leakage.holders_from:g}..{e.leakage.holders_to:g} {e.units}",
+                *(percent(share, ".1f") for share in e.leakage.shares.values()),
+            )
+            for e in own
+        ]  # fmt: skip
+        heading = (
+            f"Where leakage comes from: points that hold {HELD:.0%} of it, and its share in bands "
+            f"of {labels.coordinate(own[0].along)}"
+        )
+        columns = ("setting", "cut", "points", "between", *names)
+        blocks.append(Block(heading, columns, rows))
+    return blocks
+
+
+def _notes(found: list[Entry]) -> list[str]:
+    bins = ", ".join(labels.number(n) for n in sorted({e.reference.bins for e in found}))
+    return [
+        f"closed form: (1 - (1 - p)^N)^2, p = exp(-(4 - pi)/4 TNR^2), N = {bins}.",
+        *_common_notes(),
+        "With bins_counted 'half' the model leaves out the bins of the detection, the closed form",
+        "  none. Shot (leakage): noise or leakage raises an extra group in both chirp segments.",
+    ]
+
+
+def _record(e: Entry) -> dict[str, Cell]:
+    """One line of the CSV file."""
+    return {
+        "setting": e.row,
+        "cut": e.column,
+        "points": e.points,
+        "tnr": e.reference.tnr,
+        "bins": e.reference.bins,
+        "closed_form": e.reference.closed_form,
+        "noise_only": e.reference.model,
+        "study_mean": e.mean,
+        "study_variance_excess": e.excess(e.mean),
+        "printed": e.printed,
+        "printed_over_closed_form": e.printed / e.reference.closed_form,
+        "printed_variance_excess": e.excess(e.printed),
+        "p_leakage_up_mean": e.leakage.mean[0],
+        "p_leakage_up_median": e.leakage.median[0],
+        "p_leakage_down_mean": e.leakage.mean[1],
+        "p_leakage_down_median": e.leakage.median[1],
+        "shot_with_leakage_mean": e.leakage.shot_mean,
+        "shot_with_leakage_median": e.leakage.shot_median,
+        "leakage_holders": e.leakage.holders,
+        "leakage_along": e.along,
+        "leakage_from": e.leakage.holders_from,
+        "leakage_to": e.leakage.holders_to,
+        "leakage_shares": "; ".join(f"{k}: {v:.4f}" for k, v in e.leakage.shares.items()),
+    }
+
+
+def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
+    """Table 4.2: false alarms of a bin, a row for each threshold.
+
+    Parameters
+    ----------
+    found, spec
+        Points with `pfa_bin`, and the study.
+    by, printed, title
+        Coordinate of the rows; published figures, one for each; what stands over the page.
+    """
+    records: list[dict[str, Cell]] = []
+    for i, (name, setting, part) in enumerate(settings(found, spec, by)):
+        alone = reference(spec, setting)
+        closed = noise_only.bin_probability(alone.tnr)
+        published = float(printed[i]) if i < len(printed) else math.nan
+        values = beyond(part, spec, NEAREST).variables["pfa_bin"]
+        known = values[np.isfinite(values)]
+        records.append(
+            {
+                "setting": name,
+                "tnr": alone.tnr,
+                "closed_form": closed,
+                "noise_only": alone.model_bin,
+                "study_mean": float(known.mean()) if known.size else math.nan,
+                "printed": published,
+                "printed_over_closed_form": published / closed,
+                "printed_variance_excess": noise_only.variance_excess_of_bin(published, alone.tnr),
+            }
+        )
+    columns = ("setting", "closed form", "noise only", "study's mean", "printed", "printed/closed",
+               "excess of printed")  # fmt: skip
+    rows = [
+        (
+            r["setting"], *(f"{r[key]:.6e}" for key in ("closed_form", "noise_only", "study_mean")),
+            _or_dash(r["printed"], ".3g"), _or_dash(r["printed_over_closed_form"], ".3f"),
+            percent(float(r["printed_variance_excess"])),
+        )
+        for r in records
+    ]  # fmt: skip
+    heading = "Probability that a bin of noise crosses the threshold"
+    notes = ["closed form: exp(-(4 - pi)/4 TNR^2)", *_common_notes()]
+    return Page(title, [Block(heading, columns, rows)], notes, records)
+
+
+def _or_dash(value: Cell, form: str) -> str:
+    return format(float(value), form) if value == value else "-"
+
+
+def _common_notes() -> list[str]:
+    return [
+        "noise only: the model with a reflectance of 0.",
+        f"study's mean: over points beyond {NEAREST} of range, the echo's own shot noise included.",
+        "excess: noise variance above the one that sets the threshold, as a figure implies.",
+        "  Nothing is tuned to the printed figures.",
+    ]

@@ -1,0 +1,188 @@
+import csv
+
+import numpy as np
+import pytest
+from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
+
+from sweep.analysis import cuts, false_alarms, leakage, tables
+from sweep.analysis.opening import open as open_store
+from sweep.analysis.selection import Column, Points, points
+
+PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4.62e-9, 4.45e-9))
+
+
+@pytest.fixture(scope="module")
+def power(tmp_path_factory):
+    path = stored(tmp_path_factory.mktemp("power"), POWERS)
+    return points(open_store(path), false_alarms.VARIABLES), study(POWERS), open_store(path)
+
+
+@pytest.fixture(scope="module")
+def entries(power):
+    found, spec, _ = power
+    return false_alarms.entries(found, spec, by="power", printed=PRINTED)
+
+
+def test_rows_are_the_settings_and_columns_the_three_cuts(entries):
+    assert [(e.row, e.column) for e in entries[:4]] == [
+        ("power 1 W", "15 deg"),
+        ("power 1 W", "85 deg"),
+        ("power 1 W", "3500 m"),
+        ("power 3 W", "15 deg"),
+    ]
+    assert [e.printed for e in entries] == [figure for row in PRINTED for figure in row]
+
+
+def test_noise_alone_is_the_closed_form_and_knows_nothing_of_power(entries):
+    for entry in entries:
+        assert entry.reference.bins == 2**17
+        assert entry.reference.model == pytest.approx(entry.reference.closed_form, rel=1e-9)
+    assert len({entry.reference.model for entry in entries}) == 1
+
+
+def test_noise_alone_follows_the_setting_of_its_row():
+    spec = study({"instrument.processing.fft_size": ["2^16", "2^18"], "cut": CUTS})
+    sizes = [
+        false_alarms.reference(spec, {"instrument.processing.fft_size": n}) for n in (2**16, 2**18)
+    ]
+    assert [size.bins for size in sizes] == [2**16, 2**18]
+    # 16 times the pairs of bins, to first order in N p = 1e-4
+    assert sizes[1].model / sizes[0].model == pytest.approx(16.0, rel=2e-4)
+
+
+def test_half_the_bins_give_a_quarter_of_the_alarms():
+    processing = INSTRUMENT["processing"] | {"bins_counted": "half"}
+    spec = study({}, instrument=INSTRUMENT | {"processing": processing})
+    found = false_alarms.reference(spec, {})
+    assert found.bins == 2**16
+    # the model leaves out the bins of the strongest line and its neighbours: 3 of 65,536
+    assert found.model == pytest.approx(found.closed_form, rel=2 * 3 / 2**16)
+
+
+def test_means_leave_out_ranges_up_to_5_m_and_count_no_point_twice(power, entries):
+    _, _, dataset = power
+    at_1_w = dataset.isel(power=0)
+    chosen = (at_1_w.grazing_angle == 15) & (at_1_w.range > 5)
+    pfa = at_1_w.pfa_shot.values[chosen.values]
+    where = at_1_w.range.values[chosen.values]
+    # 3500 m at 15 deg lies on two cuts
+    assert where.size == 19 and entries[0].points == 18
+    _, first = np.unique(where, return_index=True)
+    assert entries[0].mean == pytest.approx(pfa[first].mean(), rel=1e-14)
+
+
+def test_the_echos_own_shot_noise_grows_with_power_and_is_all_that_the_mean_has_over_noise(entries):
+    excesses = [e.excess(e.mean) for e in entries if e.column == "85 deg"]
+    assert 0 < excesses[0] < excesses[1] < excesses[2]
+    # shot noise is proportional to the light collected
+    assert excesses[2] / excesses[0] == pytest.approx(5.0, rel=1e-3)
+
+
+def test_the_printed_figures_imply_an_excess_between_a_tenth_and_one_percent(entries):
+    assert all(0.001 < entry.excess(entry.printed) < 0.01 for entry in entries)
+    assert entries[0].excess(4.45e-9) == pytest.approx(0.0029, abs=1e-4)
+
+
+def made_points(ranges, up, down):
+    noise = np.full(len(ranges), 1e-4)
+    variables = {
+        "p_leakage_up": np.array(up),
+        "p_leakage_down": np.array(down),
+        "pfa_segment": noise,
+        "pfa_shot": noise * 2e-4,
+    }
+    return Points(variables, {"range": Column(np.array(ranges), "m")})
+
+
+def test_leakage_is_told_by_mean_median_and_the_points_that_hold_it():
+    spec = study({"target.range": ["5 m", "20 m", "300 m", "4 km"]})
+    found = made_points([5.0, 20.0, 300.0, 4000.0], [0.0, 0.0, 0.06, 0.02], [0.0, 0.0, 0.03, 0.0])
+    result = leakage.leakage(found, spec, "range")
+    assert result.mean == pytest.approx((0.02, 0.0075))
+    assert result.median == pytest.approx((0.01, 0.0))
+    assert (result.holders, result.holders_from, result.holders_to) == (2, 300.0, 4000.0)
+    expected = {"1-10 m": 0.0, "10-100 m": 0.0, "100-1000 m": 9 / 11, "1000-10000 m": 2 / 11}
+    assert result.shares == pytest.approx(expected)
+
+
+def test_a_shot_counts_noise_or_leakage_in_each_of_both_segments():
+    spec = study({"target.range": ["5 m", "20 m"]})
+    result = leakage.leakage(made_points([5.0, 20.0], [0.5, 0.0], [0.1, 0.0]), spec, "range")
+    up, down = 1 - 0.5 * (1 - 1e-4), 1 - 0.9 * (1 - 2e-4)
+    assert result.shot_mean == pytest.approx((up * down + 1e-4 * 2e-4) / 2, rel=1e-12)
+
+
+def test_points_not_computed_have_no_leakage_to_tell():
+    spec = study({"target.range": ["5 m", "20 m"]})
+    nothing = [np.nan, np.nan]
+    result = leakage.leakage(made_points([5.0, 20.0], nothing, nothing), spec, "range")
+    assert np.isnan(result.mean[0]) and result.holders == 0
+
+
+def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and_angle():
+    grid = study(
+        {
+            "target.range": ["1 km", "3.5 km"],
+            "target.grazing_angle": ["15 deg", "30 deg"],
+        }
+    )
+    assert [(c.name, c.along) for c in cuts.cuts(grid)] == [
+        ("15 deg", "range"),
+        ("3.5 km", "grazing_angle"),
+    ]
+    assert [c.name for c in cuts.cuts(study({"instrument.laser.power": ["1 W"]}))] == ["all"]
+
+
+def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
+    found, spec, _ = power
+    page = tables.false_alarm_page(found, spec, by="power", printed=PRINTED, title="Table 4.3")
+    text, table = page.save(tmp_path, "table_4_3")
+    written = text.read_text()
+    assert written.startswith("Table 4.3\n=========")
+    assert "3.934721e-09" in written and "4.450e-09" in written and "1.131" in written
+    with table.open() as file:
+        records = list(csv.DictReader(file))
+    assert len(records) == 9
+    assert float(records[0]["printed_over_closed_form"]) == pytest.approx(4.45 / 3.934721, rel=1e-6)
+
+
+def test_the_page_of_a_study_that_nobody_printed_has_no_column_for_it(power):
+    found, spec, _ = power
+    assert (
+        "printed/closed" not in tables.false_alarm_page(found, spec, by="power", title="T").text()
+    )
+
+
+def test_thresholds_have_the_chances_of_table_4_2(tmp_path):
+    axes = {"instrument.processing.tnr": [1, 5, 10, 15], "target.range": ["1 km", "3 km"]}
+    found = points(open_store(stored(tmp_path, axes)), ["pfa_bin"])
+    printed = (0.8, 0.047, 5.06e-10, 1.17e-21)
+    page = tables.threshold_page(found, study(axes), by="tnr", printed=printed, title="Table 4.2")
+    for record, expected in zip(page.records, (0.807, 4.68e-3, 4.79e-10, 1.07e-21), strict=True):
+        assert record["closed_form"] == pytest.approx(expected, rel=2e-3)
+        assert record["noise_only"] == pytest.approx(record["closed_form"], rel=1e-12)
+    assert page.records[2]["printed_variance_excess"] == pytest.approx(0.0026, abs=1e-4)
+    assert [float(r["study_mean"]) >= float(r["noise_only"]) for r in page.records] == [True] * 4
+
+
+def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
+    axes = {
+        "instrument.laser.power": ["1 W", "5 W"],
+        "instrument.processing.fft_size": ["2^16", "2^17"],
+        "target.range": {"log": ["10 m", "1 km"], "number": 3},
+    }
+    found = points(open_store(stored(tmp_path, axes)), false_alarms.VARIABLES)
+    result = false_alarms.entries(found, study(axes), by="power")
+    assert [e.row for e in result][:2] == [
+        "power 1 W, FFT size 2^16",
+        "power 1 W, FFT size 2^17",
+    ]
+    assert [e.reference.bins for e in result] == [2**16, 2**17] * 2
+
+
+def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
+    dataset = open_store(stored(tmp_path, SURFACE))
+    found = points(dataset, ["pfa_shot"])
+    near = cuts.beyond(found, study(SURFACE), "10 m")
+    assert near.size == 23 * 9
+    assert cuts.beyond(found, study(SURFACE), "10 m", included=True).size == 24 * 9

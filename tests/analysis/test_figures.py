@@ -1,0 +1,168 @@
+import numpy as np
+import pytest
+from drawn_studies import POWERS, SURFACE, stored, study
+from matplotlib.collections import PolyCollection
+
+from sweep.analysis import slices
+from sweep.analysis.defaults import default_figures
+from sweep.analysis.figures import draw
+from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.selection import Column, Points
+
+ASKED = [
+    {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
+    {
+        "kind": "slices",
+        "name": "along_range",
+        "variable": "snr_up",
+        "x": "range",
+        "by": "grazing_angle",
+        "where": {"grazing_angle": ["10 deg", "90 deg"]},
+    },
+    {
+        "kind": "table",
+        "name": "means",
+        "variable": "pd_shot",
+        "rows": "grazing_angle",
+        "minimum_range": "1 km",
+    },
+]
+TOGETHER = {"target.range": ["1 km", "3 km"], "instrument.laser.power": ["1 W", "3 W"]}
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
+    return stored(tmp_path_factory.mktemp("asked"), SURFACE, figures=ASKED)
+
+
+def test_every_figure_and_table_of_the_spec_is_made_beside_the_store(asked):
+    files = draw(asked)
+    directory = asked.with_name("study-figures")
+    names = ["pd_shot_surface.png", "along_range.png", "means.txt", "means.csv"]
+    assert files == [directory / name for name in names]
+    assert all(file.stat().st_size > 100 for file in files)
+
+
+def test_figures_go_where_they_are_sent(asked, tmp_path):
+    assert {file.parent for file in draw(asked, tmp_path / "here")} == {tmp_path / "here"}
+
+
+def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
+    import csv
+
+    import sweep
+
+    draw(asked, tmp_path)
+    dataset = sweep.open(asked)
+    with (tmp_path / "means.csv").open() as file:
+        records = {record["row"]: record for record in csv.DictReader(file)}
+    assert set(records) == {f"{angle}°" for angle in range(10, 100, 10)}
+    far = dataset.pd_shot.sel(grazing_angle=30).values[dataset.range.values >= 1000]
+    assert float(records["30°"]["mean"]) == pytest.approx(far.mean(), rel=1e-12)
+    assert float(records["30°"]["median"]) == pytest.approx(np.median(far), rel=1e-12)
+    assert int(records["30°"]["points"]) == far.size
+
+
+def test_a_store_cut_short_is_drawn_with_what_it_has(tmp_path):
+    path = stored(tmp_path, SURFACE, figures=ASKED, storage={"block_points": 40})
+    log = path / ".sweep" / "receipts.jsonl"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
+    for chunk in (path / "pd_shot" / "c").rglob("*"):
+        if chunk.is_file() and chunk.parent.name != "0":
+            chunk.unlink()
+    assert all(file.stat().st_size > 100 for file in draw(path))
+
+
+def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path):
+    figure = ASKED[1] | {"where": {"grazing_angle": "17 deg"}}
+    path = stored(tmp_path, {"target.range": ["1 km"], **SURFACE}, figures=[figure])
+    assert draw(path)[0].stat().st_size > 100
+
+
+def test_a_path_without_a_store_is_refused(tmp_path):
+    with pytest.raises(NotAStoreError):
+        draw(tmp_path / "nothing.zarr")
+
+
+@pytest.mark.parametrize(
+    "axes,kinds",
+    [
+        (SURFACE, ["surface", "surface"]),
+        ({"target.range": ["1 km", "2 km"], "instrument.laser.power": ["1 W"]}, ["slices"] * 2),
+        (POWERS, ["slices"] * 3),
+        ({"instrument.processing.window": ["hann", "hamming"]}, ["table"] * 2),
+        ({}, []),
+    ],
+)
+def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, kinds):
+    assert [figure.kind for figure in default_figures(study(axes))] == kinds
+
+
+@pytest.mark.parametrize(
+    "axes,number",
+    [
+        (SURFACE, 2),
+        (POWERS, 3),
+        ({"instrument.processing.window": ["hann", "hamming"]}, 4),
+        ({}, 2),
+        (
+            {"along": {"zip": TOGETHER}},
+            2,
+        ),
+    ],
+)
+def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):
+    files = draw(stored(tmp_path, axes))
+    assert len(files) == number and all(file.stat().st_size > 100 for file in files)
+
+
+def test_the_default_surface_has_range_across_and_angle_up():
+    turned = dict(reversed(SURFACE.items()))
+    assert [(f.x, f.y) for f in default_figures(study(turned))] == [("range", "grazing_angle")] * 2
+
+
+def line_points(values, by=None):
+    size = len(values)
+    coordinates = {"range": Column(np.arange(1.0, size + 1), "m")}
+    if by is not None:
+        coordinates["power"] = Column(np.asarray(by), "W")
+    return Points({"pd_shot": np.asarray(values, float)}, coordinates)
+
+
+def sliced(found, by=""):
+    return slices.draw(
+        found, x="range", by=by, variable="pd_shot", long_name="pd", title="", note=""
+    )
+
+
+def test_a_line_of_few_points_goes_through_each_of_them():
+    (panel,) = sliced(line_points([1.0, 0.2, 0.9])).axes
+    assert panel.lines[0].get_ydata().tolist() == [1.0, 0.2, 0.9]
+
+
+def test_one_dip_in_ten_thousand_points_of_a_line_reaches_down_in_its_band():
+    values = np.ones(10_000)
+    values[6_173] = 0.0
+    (panel,) = sliced(line_points(values)).axes
+    (band,) = [c for c in panel.collections if isinstance(c, PolyCollection)]
+    corners = band.get_paths()[0].vertices
+    low = corners[corners[:, 1] < 0.5]
+    assert corners[:, 1].min() == 0.0
+    # 20 points share a stretch, of which range is shown in km
+    assert 6.1 < low[:, 0].min() <= low[:, 0].max() < 6.25
+    assert panel.lines[0].get_ydata().min() == pytest.approx(0.95)
+
+
+def test_each_value_of_by_has_its_line_in_the_order_of_the_study():
+    found = line_points([1.0, 0.5, 0.25])
+    three = Points(
+        {"pd_shot": np.concatenate([k * found.variables["pd_shot"] for k in (1.0, 0.5, 0.1)])},
+        {
+            "range": Column(np.tile(found.coordinates["range"].values, 3), "m"),
+            "power": Column(np.repeat([5, 1, 3], 3), "W"),
+        },
+    )
+    (panel,) = sliced(three, by="power").axes
+    texts = [text.get_text() for text in panel.get_legend().get_texts()]
+    assert texts == ["power 5 W", "power 1 W", "power 3 W"]
+    assert [line.get_ydata()[0] for line in panel.lines] == [1.0, 0.5, 0.1]
