@@ -1,0 +1,63 @@
+"""Every experiment in the repository, end to end on a tiny grid: spec, store, figures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.analysis.figures import draw
+from sweep.model.outputs import OUTPUTS
+from sweep.spec import Spec
+
+EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
+KEPT = 3
+"""Values kept of a plain axis; zipped axes keep the first of every run of equal grazing angle."""
+
+
+def _written(member, kept):
+    values = np.asarray(member.display)[kept].tolist()
+    return [f"{value!r} {member.units}".strip() if member.units else value for value in values]
+
+
+def _kept(axis):
+    if not axis.zipped:
+        return np.unique(np.linspace(0, axis.size - 1, min(KEPT, axis.size)).round().astype(int))
+    angles = np.concatenate([m.values for m in axis.members if m.path.endswith("grazing_angle")])
+    starts = np.flatnonzero(np.diff(angles, prepend=np.nan))[:4]
+    return np.unique([*starts, *(starts + 2), axis.size - 1])
+
+
+def _thinned(spec):
+    """The same study with a few values left on every axis."""
+    mapping, axes = spec.to_yaml_mapping(), {}
+    for axis in spec.axes:
+        written = {m.path: _written(m, _kept(axis)) for m in axis.members}
+        axes |= {axis.name: {"zip": [written]}} if axis.zipped else written
+    return Spec.from_mapping(mapping | {"axes": axes})
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_experiment_runs_to_store_and_figures(path, tmp_path):
+    spec = sweep.load(path)
+    assert spec.question
+    assert spec.target.reflectance * spec.instrument.telescope.optical_efficiency == 0.1
+    store = tmp_path / "tiny.zarr"
+    assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
+    dataset = sweep.open(store)
+    assert set(dataset.data_vars) == set(OUTPUTS)
+    for name, variable in dataset.data_vars.items():
+        assert np.isfinite(variable).all(), name
+    for name in OUTPUTS:
+        if name.startswith(("pd_", "miss_", "pfa_", "p_leakage_")):
+            assert ((dataset[name] >= 0) & (dataset[name] <= 1)).all(), name
+    np.testing.assert_allclose(dataset.pd_shot + dataset.miss_shot, 1, atol=1e-14)
+    files = draw(store, tmp_path / "figures")
+    assert len(files) >= len(spec.figures) and all(file.stat().st_size > 0 for file in files)
+
+
+def test_the_published_study_is_there():
+    assert {path.stem for path in EXPERIMENTS} >= {
+        "aperture", "beam_divergence", "fft_size", "quickstart", "range_angle",
+        "single_shot_2000m", "single_shot_45deg", "threshold", "transmit_power",
+    }  # fmt: skip
