@@ -1,4 +1,4 @@
-"""What all tests share: the instrument of the thesis's Table 4.1, and hypothesis without deadlines."""
+"""What all tests share: the thesis's Table 4.1, and hypothesis without deadlines."""
 
 from math import pi
 

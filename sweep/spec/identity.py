@@ -61,6 +61,10 @@ class Identified(Protocol):
         ...
 
 
+MOST_TOLD = 8
+"""Values of an axis that are told one by one."""
+
+
 def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, Any]) -> list[str]:
     """Lines ``path: value -> value`` for all that differs between two studies.
 
@@ -110,7 +114,10 @@ def _told(path: str, value: Any) -> str:
     if path == "axes":
         return ", ".join(value) or "(none)"
     if isinstance(value, Mapping) and "values" in value:
-        return "[" + ", ".join(map(_number, value["values"])) + "]" + units
+        values = [_number(each) for each in value["values"]]
+        if len(values) > MOST_TOLD:
+            values = [*values[:2], "...", values[-1], f"{len(values)} in all"]
+        return "[" + ", ".join(values) + "]" + units
     if isinstance(value, Mapping):
         ends = f"{_number(value['first'])} to {_number(value['last'])}{units}"
         return f"{value['number']} values from {ends} (digest {value['digest'][:8]})"
