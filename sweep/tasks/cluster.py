@@ -72,7 +72,8 @@ def connected(
             yield client
         return
     with _local(workers, threads, processes) as cluster, Client(cluster) as client:
-        say(f"{workers} workers on this machine: dashboard {cluster.dashboard_link}")
+        count = f"{workers} worker{'s' if workers > 1 else ''}"
+        say(f"{count} on this machine: dashboard {cluster.dashboard_link}")
         yield client
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
 HOPELESS = 20
+
+#: Seconds after which the kernels are being compiled and not read.
+COMPILING = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +158,7 @@ class Session:
         """Compute blocks until none is left; why it ended, where it was not that."""
         with Interrupts() as interrupts, ExitStack() as stack:
             try:
-                compile_kernels(self._grid)
+                self._compile()
                 answers = stack.enter_context(self._answers(todo, lambda: interrupts.stopping))
                 self._progress.begin(points=self._grid.points, done=points_before)
                 stack.callback(self._progress.end)
@@ -165,6 +169,17 @@ class Session:
                 return "stopped at once"
             except OSError as error:
                 return f"the store can't be written: {error}"
+
+    def _compile(self) -> None:
+        """Compile the kernels, and say so where that is not a matter of reading them from disk."""
+        notice = threading.Timer(
+            COMPILING, self._progress.say, ["compiling the model's kernels, once: some 20 s"]
+        )
+        notice.start()
+        try:
+            compile_kernels(self._grid)
+        finally:
+            notice.cancel()
 
     @contextmanager
     def _answers(self, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Iterator[Answer]]:
