@@ -1,0 +1,1 @@
+"""The geometry that a moving lidar sees: meshes, the rays cast into them, paths and scanners."""

@@ -1,0 +1,257 @@
+"""Triangle meshes: what a scene's surfaces are made of, cleaned before any ray meets them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model.geometry.ray_plane import areas_vanish
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles around an origin of their own, so that far-off coordinates keep their digits.
+
+    Raises
+    ------
+    ValueError
+        The arrays' shapes do not fit, there is no triangle, a vertex is not finite or does not
+        exist.
+    """
+
+    vertices: np.ndarray
+    """(n, 3) float64 [m], relative to `origin`."""
+    faces: np.ndarray
+    """(m, 3) int32: vertices of each triangle; either winding, since both sides are seen."""
+    surface: np.ndarray
+    """(m,) int16: which of the scene's surfaces each triangle belongs to."""
+    origin: np.ndarray
+    """(3,) float64 [m]: where the vertices' zero lies in the frame of the scene or the body."""
+
+    def __post_init__(self):
+        _require_mesh(self.vertices, self.faces, self.surface)
+        if np.shape(self.origin) != (3,) or not np.isfinite(self.origin).all():
+            raise ValueError("a mesh's origin is three finite coordinates")
+        kinds = {"vertices": np.float64, "faces": np.int32, "surface": np.int16}
+        for name, kind in (kinds | {"origin": np.float64}).items():
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=kind))
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `clean` found and did, in counts."""
+
+    vertices: int
+    """Vertices given."""
+    faces: int
+    """Faces given."""
+    non_finite: int = 0
+    """Faces dropped because a vertex of theirs is not finite (no data)."""
+    degenerate: int = 0
+    """Faces dropped because they have no area: a repeated vertex, or three in one line."""
+    duplicate: int = 0
+    """Faces dropped because an earlier one has the same three corners, in whatever winding."""
+    merged: int = 0
+    """Vertices replaced by an earlier one at the same place."""
+    unreferenced: int = 0
+    """Vertices dropped because no face is left that uses them."""
+    open_edges: int = 0
+    """Edges with a face on one side only: the mesh's rim and holes."""
+    crowded_edges: int = 0
+    """Edges shared by more than two faces."""
+    opposed_edges: int = 0
+    """Edges whose two faces are wound against each other: one of them is inverted."""
+    inside_out: int = 0
+    """1 where a closed and evenly wound mesh has its normals pointing inwards."""
+
+    @property
+    def watertight(self) -> bool:
+        """Whether every edge joins just two faces."""
+        return self.open_edges == 0 and self.crowded_edges == 0
+
+    def text(self) -> str:
+        """One line for people: what was given, and of the rest what is not zero."""
+        said = [
+            f"{getattr(self, field.name)} {_WORDS[field.name]}"
+            for field in fields(self)
+            if field.name in _WORDS and getattr(self, field.name)
+        ]
+        if self.inside_out:
+            said.append("closed, with normals pointing inwards")
+        given = f"{self.faces} faces on {self.vertices} vertices"
+        return "; ".join([given, *(said or ["nothing to mend"])])
+
+
+_WORDS = {
+    "non_finite": "faces without data dropped",
+    "degenerate": "faces without area dropped",
+    "duplicate": "duplicate faces dropped",
+    "merged": "coincident vertices merged",
+    "unreferenced": "unused vertices dropped",
+    "open_edges": "open edges (not watertight)",
+    "crowded_edges": "edges of more than two faces",
+    "opposed_edges": "edges with one side's normal inverted",
+}
+
+
+def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Mesh, Report]:
+    """Mesh fit to be cast at, and what was done to make it so.
+
+    Faces without data, without area or given twice are dropped, coincident vertices merged,
+    unused ones dropped, and the rest centred. Holes, crowded edges and inverted normals change
+    nothing for rays, which see both sides of a face; they are counted. Faces keep their order.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array_like of float
+        Coordinates [m]; not finite where there is no data.
+    faces : (m, 3) array_like of int
+        Vertices of each face, 0..n-1.
+    surface : (m,) array_like of int, or int
+        Surface of each face, or of all.
+
+    Raises
+    ------
+    ValueError
+        The arrays' shapes do not fit, a face names a vertex that does not exist, or no face is
+        left.
+    """
+    points, corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
+    kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
+    _require_shapes(points, corners, kinds)
+    given = {"vertices": len(points), "faces": len(corners)}
+    is_finite = np.asarray(np.isfinite(points).all(axis=1))
+    has_data = is_finite[corners].all(axis=1)
+    corners, kinds = corners[has_data], kinds[has_data]
+    _require_faces(len(corners), len(has_data))
+    points, corners, merged, unused = _compact(points, corners)
+    origin = _round_centre(points)
+    points -= origin
+    has_area = ~areas_vanish(points, corners)
+    first = np.zeros(len(corners), dtype=bool)
+    first[np.flatnonzero(has_area)[_first_of_duplicates(corners[has_area])]] = True
+    _require_faces(int(first.sum()), len(has_data))
+    kept = np.unique(corners[first])
+    corners = np.searchsorted(kept, corners[first])
+    mesh = Mesh(points[kept], corners, kinds[first], origin)
+    counts = {
+        "non_finite": int((~has_data).sum()),
+        "degenerate": int((~has_area).sum()),
+        "duplicate": int(has_area.sum() - first.sum()),
+        "merged": merged,
+        "unreferenced": unused + len(points) - len(kept),
+    }
+    return mesh, Report(**given, **counts, **_edge_counts(mesh))
+
+
+def merge(meshes: Sequence[Mesh]) -> Mesh:
+    """All triangles of several meshes of one frame as one mesh, in the order given.
+
+    Raises
+    ------
+    ValueError
+        There is no mesh.
+    """
+    if not meshes:
+        raise ValueError("there is no mesh to merge")
+    corners = [m.origin + f(m.vertices, axis=0) for m in meshes for f in (np.min, np.max)]
+    origin = _round_centre(np.array(corners))
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    return Mesh(
+        vertices=np.concatenate([m.vertices + (m.origin - origin) for m in meshes]),
+        faces=np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=False)]),
+        surface=np.concatenate([m.surface for m in meshes]),
+        origin=origin,
+    )
+
+
+def _require_shapes(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> None:
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices are of shape (n, 3), not {vertices.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ValueError(f"faces are integers of shape (m, 3), not {faces.dtype} {faces.shape}")
+    if surface.shape != faces.shape[:1]:
+        raise ValueError(f"{len(faces)} faces need as many surfaces, not {surface.shape}")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError(f"a face names a vertex outside 0..{len(vertices) - 1}")
+
+
+def _require_faces(left: int, given: int) -> None:
+    if left == 0:
+        raise ValueError(f"of {given} faces none is left that a ray could hit")
+
+
+def _require_mesh(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> None:
+    _require_shapes(vertices, faces, surface)
+    if len(faces) == 0:
+        raise ValueError("a mesh needs at least one triangle")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a mesh's vertices are finite")
+
+
+def _compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Used vertices, each place once in the order given; numbers merged and unused."""
+    used = np.unique(faces)
+    places = vertices[used] + 0.0  # -0 and 0 are one place
+    by_place = np.lexsort(places.T)
+    is_new = np.ones(len(used), dtype=bool)
+    is_new[1:] = (np.diff(places[by_place], axis=0) != 0.0).any(axis=1)
+    group = np.cumsum(is_new) - 1
+    # lexsort is stable, so the first of a place is the first given.
+    kept = np.sort(by_place[is_new])
+    position = np.empty(len(used), dtype=np.int64)
+    position[by_place] = np.searchsorted(kept, by_place[is_new])[group]
+    faces = position[np.searchsorted(used, faces)]
+    return places[kept], faces, len(used) - len(kept), len(vertices) - len(used)
+
+
+def _round_centre(vertices: np.ndarray) -> np.ndarray:
+    """Middle of the bounding box, chosen so that subtracting it from any vertex is exact.
+
+    Zero along an axis where zero is no farther off than the mesh is large, since small numbers
+    would lose their last digits there. Else rounded to a power of two not below 1/1024 of the
+    extent: a coordinate and the centre are then both multiples of the coordinate's last place,
+    and their difference is no larger than the coordinate.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    extent = float((high - low).max())
+    if extent == 0.0:
+        return np.array(low)
+    step = 2.0 ** np.ceil(np.log2(extent / 1024.0))
+    middle = np.round((0.5 * low + 0.5 * high) / step) * step
+    return np.where(np.abs(middle) > extent, middle, 0.0)
+
+
+def _first_of_duplicates(faces: np.ndarray) -> np.ndarray:
+    """Indices, ascending, of the faces that repeat no earlier one's corners."""
+    corners = np.sort(faces, axis=1)
+    by_corners = np.lexsort(corners.T)
+    is_new = np.ones(len(faces), dtype=bool)
+    is_new[1:] = (np.diff(corners[by_corners], axis=0) != 0).any(axis=1)
+    return np.sort(by_corners[is_new])
+
+
+def _edge_counts(mesh: Mesh) -> dict[str, int]:
+    """Counts of `Report` that are about edges and winding."""
+    start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end)
+    key = low * len(mesh.vertices) + high
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    number = np.diff(first, append=len(key))
+    sense = np.add.reduceat(np.where(start < end, 1, -1)[order], first)
+    opposed = int(((number == 2) & (sense != 0)).sum())
+    counts = {
+        "open_edges": int((number == 1).sum()),
+        "crowded_edges": int((number > 2).sum()),
+        "opposed_edges": opposed,
+    }
+    closed = not any(counts.values())
+    return counts | {"inside_out": int(closed and _volume(mesh) < 0.0)}
+
+
+def _volume(mesh: Mesh) -> float:
+    """Signed volume that a closed mesh encloses, positive with its normals outwards."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)

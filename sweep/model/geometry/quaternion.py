@@ -1,0 +1,157 @@
+"""Unit quaternions (w, x, y, z) as rotations from the body to the world frame.
+
+All functions broadcast over leading dimensions. `multiply(p, q)` turns by q first, then by p.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+_SMALL = 1e-4
+"""Half angle [rad] under which sin(x)/x is its series, good to 1e-18 there."""
+
+
+def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Hamilton product p q, (..., 4)."""
+    pw, px, py, pz = np.moveaxis(np.asarray(p, float), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(np.asarray(q, float), -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: np.ndarray) -> np.ndarray:
+    """Inverse of a unit quaternion, (..., 4)."""
+    return np.asarray(q, float) * [1.0, -1.0, -1.0, -1.0]
+
+
+def normalise(q: np.ndarray) -> np.ndarray:
+    """Quaternion of length 1, (..., 4).
+
+    Raises
+    ------
+    ValueError
+        Where one has no length, or is not finite.
+    """
+    q = np.asarray(q, float)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 0)).all():
+        raise ValueError("a quaternion must be finite and other than zero")
+    return q / length
+
+
+def rotate(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors turned by unit quaternions: body to world, (..., 3)."""
+    q, vector = np.asarray(q, float), np.asarray(vector, float)
+    w, axis = q[..., :1], q[..., 1:]
+    twice = 2 * np.cross(axis, vector)
+    return np.asarray(vector + w * twice + np.cross(axis, twice))
+
+
+def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
+    """Rotation about `vector` by its length [rad], (..., 4)."""
+    vector = np.asarray(vector, float)
+    half = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
+    small = half < _SMALL
+    safe = np.where(small, 1.0, half)
+    sinc = np.where(small, 1 - half**2 / 6, np.sin(safe) / safe)
+    return np.concatenate([np.cos(half), 0.5 * sinc * vector], axis=-1)
+
+
+def to_rotation_vector(q: np.ndarray) -> np.ndarray:
+    """Rotation vector [rad] of the shorter way round, length 0..pi, (..., 3)."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(sine, q[..., :1])
+    small = half < _SMALL
+    safe = np.where(small, 1.0, sine)
+    return np.asarray(np.where(small, 2 + half**2 / 3, 2 * half / safe) * q[..., 1:])
+
+
+def about(axis: int, angle: np.ndarray | float) -> np.ndarray:
+    """Right-handed rotation by `angle` [rad] about axis 0 (x), 1 (y) or 2 (z), (..., 4)."""
+    half = 0.5 * np.asarray(angle, float)
+    q = np.zeros((*half.shape, 4))
+    q[..., 0] = np.cos(half)
+    q[..., 1 + axis] = np.sin(half)
+    return q
+
+
+def from_heading(
+    *,
+    heading: np.ndarray | float,
+    pitch: np.ndarray | float = 0.0,
+    roll: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """Attitude of a body (x forward, y left, z up), (..., 4).
+
+    Parameters
+    ----------
+    heading : array_like
+        Angle of the forward axis from the world's x, counter-clockwise from above [rad].
+    pitch : array_like
+        Nose up [rad]: a right-handed turn about -y, after the heading.
+    roll : array_like
+        Left side up [rad]: a right-handed turn about x, last.
+    """
+    turned = multiply(about(2, heading), about(1, -np.asarray(pitch, float)))
+    return multiply(turned, about(0, roll))
+
+
+def from_axes(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Attitude whose body axes are the given right-handed orthonormal world vectors, (..., 4)."""
+    m = np.stack([x, y, z], axis=-1)
+    trace = np.einsum("...ii", m)
+    diagonal = np.einsum("...ii->...i", m)
+    # Four times the square of each component; dividing by the largest keeps all digits.
+    squares = np.concatenate([1 + trace[..., None], 1 + 2 * diagonal - trace[..., None]], axis=-1)
+    largest = np.argmax(squares, axis=-1)
+    cross = np.stack(
+        [
+            m[..., 2, 1] - m[..., 1, 2],
+            m[..., 0, 2] - m[..., 2, 0],
+            m[..., 1, 0] - m[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    q = np.empty_like(squares)
+    for i in range(4):
+        rows = largest == i
+        q[rows] = _column(m[rows], cross[rows], squares[rows], i)
+    return normalise(q)
+
+
+def _column(m: np.ndarray, cross: np.ndarray, squares: np.ndarray, i: int) -> np.ndarray:
+    """Row i of the matrix 4 q q^T, from the rotation matrix: a multiple of q."""
+    row = np.empty_like(squares)
+    row[:, i] = squares[:, i]
+    if i == 0:
+        row[:, 1:] = cross
+        return row
+    row[:, 0] = cross[:, i - 1]
+    for j in {0, 1, 2} - {i - 1}:
+        row[:, 1 + j] = m[:, i - 1, j] + m[:, j, i - 1]
+    return row
+
+
+def slerp(p: np.ndarray, q: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Rotation a fraction of the shorter way from p to q, at constant rate, (..., 4).
+
+    Parameters
+    ----------
+    p, q : (..., 4) array_like
+        Unit quaternions; q and -q are one rotation.
+    fraction : (...) array_like
+        0 at p, 1 at q.
+    """
+    step = to_rotation_vector(multiply(conjugate(p), q))
+    return multiply(p, from_rotation_vector(step * np.asarray(fraction, float)[..., None]))

@@ -1,0 +1,164 @@
+"""Ground as a grid of heights, and its triangles.
+
+Heights sit at the grid's nodes; row i lies at y = i dy and column j at x = j dx from the grid's
+first node, so a raster that runs southwards has dy < 0. A cell of four nodes becomes two
+triangles. Missing heights (NaN) leave holes; a cell that lacks one node keeps the triangle of the
+other three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sweep.model.geometry.facets import Facets
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """Heights on a grid.
+
+    Parameters
+    ----------
+    heights : (rows, columns) float64 ndarray
+        Height of each node above the origin [m]; NaN where there is none.
+    spacing : (dx, dy) of float
+        Step from column to column and from row to row [m]; either may be negative.
+    origin : (3,) float64 ndarray
+        World position of node (0, 0) at height 0 [m].
+    """
+
+    heights: np.ndarray
+    spacing: tuple[float, float]
+    origin: np.ndarray
+
+    def __post_init__(self) -> None:
+        _check(self.heights, self.spacing)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """World (x least, y least, x largest, y largest) [m]."""
+        rows, columns = self.heights.shape
+        x = sorted((0.0, (columns - 1) * self.spacing[0]))
+        y = sorted((0.0, (rows - 1) * self.spacing[1]))
+        east, north = self.origin[:2]
+        edges = x[0] + east, y[0] + north, x[1] + east, y[1] + north
+        return tuple(float(edge) for edge in edges)  # type: ignore[return-value]
+
+    @property
+    def centre(self) -> np.ndarray:
+        """World position of the middle of the grid, on the ground [m], (3,)."""
+        west, south, east, north = self.bounds
+        x, y = (west + east) / 2, (south + north) / 2
+        return np.array([x, y, self.height_at(np.array(x), np.array(y))])
+
+    def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """World height of the ground [m] at world (x, y) [m], on its triangles.
+
+        NaN outside the grid and in holes.
+        """
+        column = (np.asarray(x, float) - self.origin[0]) / self.spacing[0]
+        row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
+        return np.asarray(on_triangles(self.heights, row, column) + self.origin[2])
+
+    def facets(self, *, surface: int = 0) -> Facets:
+        """Triangles of the ground, facing upwards."""
+        vertices, faces = heightfield(self.heights, spacing=self.spacing)
+        return Facets.of(vertices, faces, surface=surface, origin=self.origin)
+
+
+def heightfield(
+    z: np.ndarray,
+    *,
+    spacing: tuple[float, float],
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    hole: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and upward-facing triangles of a grid of heights.
+
+    Parameters
+    ----------
+    z : (rows, columns) array_like
+        Heights [m]; NaN where there is none.
+    spacing : (dx, dy) of float
+        Step from column to column and from row to row [m]; either may be negative.
+    origin : (3,) array_like
+        Added to every vertex [m]; leave it 0 and keep it beside, where it is large.
+    hole : (rows, columns) bool array_like, optional
+        Further nodes without a height.
+
+    Returns
+    -------
+    vertices : (n, 3) float64 ndarray
+        Nodes that a triangle uses [m].
+    faces : (m, 3) int64 ndarray
+        Counter-clockwise from above.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 2 x 2 nodes, or a step of 0.
+    """
+    z = np.asarray(z, float)
+    _check(z, spacing)
+    present = np.isfinite(z) if hole is None else np.isfinite(z) & ~np.asarray(hole, bool)
+    faces = _triangles(present)
+    if spacing[0] * spacing[1] < 0:
+        faces = faces[:, ::-1]
+    used = np.zeros(z.size, bool)
+    used[faces.ravel()] = True
+    number = np.cumsum(used) - 1
+    row, column = np.divmod(np.flatnonzero(used), z.shape[1])
+    vertices = np.column_stack([column * spacing[0], row * spacing[1], z.ravel()[used]])
+    return vertices + np.asarray(origin, float), number[faces]
+
+
+def _check(z: np.ndarray, spacing: tuple[float, float]) -> None:
+    if np.ndim(z) != 2 or min(np.shape(z)) < 2:
+        raise ValueError(f"heights need at least 2 rows and 2 columns, not shape {np.shape(z)}")
+    if not (np.isfinite(spacing).all() and spacing[0] * spacing[1] != 0):
+        raise ValueError(f"the grid's steps must be finite and other than 0, not {spacing}")
+
+
+def _triangles(present: np.ndarray) -> np.ndarray:
+    """Triangles of all cells, counter-clockwise where rows and columns both increase, (m, 3).
+
+    Whole cells are cut along the diagonal from node (i, j) to (i+1, j+1).
+    """
+    node = np.arange(present.size).reshape(present.shape)
+    # Corners of each cell, counter-clockwise from (i, j).
+    a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
+    here = present.ravel()
+    missing = [~here[corner] for corner in (a, b, c, d)]
+    lacks = sum(gap.astype(np.int8) for gap in missing)
+    lower = np.where(missing[0], d, a), b, c
+    upper = a, np.where(missing[2], b, c), d
+    # One gap at b spoils the lower triangle, one at d the upper; gaps at a and c are bridged above
+    # by the other diagonal, which makes one triangle and leaves the other to be dropped.
+    keep_lower = (lacks == 0) | ((lacks == 1) & (missing[0] | missing[3]))
+    keep_upper = (lacks == 0) | ((lacks == 1) & (missing[1] | missing[2]))
+    return np.concatenate(
+        [
+            np.stack([corner[keep] for corner in corners], axis=1)
+            for corners, keep in ((lower, keep_lower), (upper, keep_upper))
+        ]
+    )
+
+
+def on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Height of the triangulated grid at fractional rows and columns; NaN where it has none."""
+    rows, columns = z.shape
+    i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
+    j = np.clip(np.floor(column), 0, columns - 2).astype(np.int64)
+    v, u = row - i, column - j
+    a, b, c, d = z[i, j], z[i, j + 1], z[i + 1, j + 1], z[i + 1, j]
+    lower = a + u * (b - a) + v * (c - b)
+    upper = a + u * (c - d) + v * (d - a)
+    value = np.where(u >= v, lower, upper)
+    # A cell that lacks one corner is cut along the other diagonal if that is what is left of it.
+    value = np.where(np.isnan(a) & (u + v >= 1), c + (1 - u) * (d - c) + (1 - v) * (b - c), value)
+    value = np.where(np.isnan(c) & (u + v <= 1), a + u * (b - a) + v * (d - a), value)
+    inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
+    return np.where(inside, value, np.nan)

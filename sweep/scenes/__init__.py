@@ -1,0 +1,1 @@
+"""Files that scenes are made of, read into the model's arrays."""

@@ -1,0 +1,173 @@
+"""Heights from georeferenced rasters: whatever rasterio reads, with its scale in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sweep.model.geometry.terrain import Terrain
+from sweep.scenes.degrees import metres_per_degree as degree_of
+from sweep.scenes.errors import SceneError, existing
+
+MOST_CELLS = 50_000_000
+"""Heights read at once at most: 100 million triangles."""
+
+_METRE = {"", "m", "metre", "meter", "metres", "meters"}
+_FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937}
+
+Window = tuple[float, float, float, float]
+
+
+def read_raster(
+    path: str | Path,
+    *,
+    band: int = 1,
+    window: Window | None = None,
+    metres_per_degree: tuple[float, float] | None = None,
+    pixel: float | None = None,
+) -> Terrain:
+    """Terrain of a georeferenced raster, such as a GeoTIFF.
+
+    Nodes lie at the centres of the pixels. Pixels without data are holes. The raster's own scale
+    and offset are applied, and feet are turned into metres.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    band : int
+        Band that holds the heights, from 1.
+    window : (west, south, east, north) of float, optional
+        Part to read, in the raster's own coordinates; all of it by default.
+    metres_per_degree : (east, north) of float, optional
+        Size of a degree, for a raster in degrees of longitude and latitude.
+    pixel : float, optional
+        Size of a pixel [m], for a raster that states no scale; its lower left corner is then the
+        world's origin.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing, no raster, without scale, rotated, in degrees whose size is not
+        stated, too large, or without any height; or a band or window that it does not have.
+    """
+    path = existing(path)
+    with _opened(path) as data:
+        if not 1 <= band <= data.count:
+            raise SceneError(path, f"has {data.count} band(s), not a band {band}", "choose another")
+        transform = _straight(path, data, pixel)
+        east, north = _scale(path, data, metres_per_degree)
+        view = _view(path, data, transform, window)
+        heights = _heights(path, data, band, view)
+    left = transform.c + (view.col_off + 0.5) * transform.a
+    top = transform.f + (view.row_off + 0.5) * transform.e
+    spacing = transform.a * east, transform.e * north
+    return Terrain(heights, spacing, np.array([left * east, top * north, 0.0]))
+
+
+def _opened(path: Path) -> Any:
+    """Dataset of a raster; rasterio's import takes a third of a second and waits for its use."""
+    import rasterio
+
+    try:
+        return rasterio.open(path)
+    except rasterio.errors.RasterioError as error:
+        raise SceneError(
+            path, f"is no raster that can be read ({error})", "convert it to a GeoTIFF"
+        ) from None
+
+
+def _straight(path: Path, data: Any, pixel: float | None) -> Any:
+    """Geotransform of a raster whose rows run along x."""
+    from rasterio import Affine
+
+    transform = data.transform
+    if data.crs is None and transform.is_identity:
+        if pixel is None or not pixel > 0:
+            raise SceneError(
+                path,
+                "states no scale",
+                "state the size of a pixel in metres, or read a grey picture as an image",
+            )
+        return Affine(pixel, 0.0, 0.0, 0.0, -pixel, data.height * pixel)
+    if pixel is not None:
+        raise SceneError(path, "states its own scale", "leave the size of a pixel out")
+    size = max(abs(transform.a), abs(transform.e))
+    if max(abs(transform.b), abs(transform.d)) > 1e-9 * size:
+        raise SceneError(path, "is rotated against its map", "straighten it with gdalwarp")
+    return transform
+
+
+def _scale(path: Path, data: Any, stated: tuple[float, float] | None) -> tuple[float, float]:
+    """Metres of a unit of the raster's coordinates, eastwards and northwards."""
+    if data.crs is not None and data.crs.is_geographic:
+        if stated is None:
+            raise SceneError(
+                path,
+                "is in degrees, which have no fixed size in metres",
+                f"state metres_per_degree, here {_suggestion(data)}, or reproject it with gdalwarp",
+            )
+        if not min(stated) > 0:
+            raise SceneError(path, f"has a degree of {stated} m", "make both sizes positive")
+        return stated
+    if stated is not None:
+        raise SceneError(path, "is not in degrees", "leave metres_per_degree out")
+    factor = 1.0 if data.crs is None else float(data.crs.linear_units_factor[1])
+    return factor, factor
+
+
+def _suggestion(data: Any) -> str:
+    """Size of a degree in the middle of a raster in degrees, on its own ellipsoid."""
+    middle = (data.bounds.bottom + data.bounds.top) / 2
+    described = data.crs.to_dict(projjson=True)
+    datum = described.get("datum") or described.get("datum_ensemble") or {}
+    ellipsoid = datum.get("ellipsoid", {})
+    if "radius" in ellipsoid:
+        sizes = degree_of(middle, radius=float(ellipsoid["radius"]), flattening=0.0)
+    elif "inverse_flattening" in ellipsoid:
+        radius, inverse = ellipsoid["semi_major_axis"], ellipsoid["inverse_flattening"]
+        sizes = degree_of(middle, radius=float(radius), flattening=1 / float(inverse))
+    else:
+        sizes = degree_of(middle)
+    return f"[{sizes[0]:.1f}, {sizes[1]:.1f}]"
+
+
+def _view(path: Path, data: Any, transform: Any, window: Window | None) -> Any:
+    """Rows and columns to read."""
+    from rasterio.windows import Window as Pixels
+
+    view = Pixels(0, 0, data.width, data.height)
+    if window is not None:
+        west, south, east, north = window
+        columns = sorted((x - transform.c) / transform.a for x in (west, east))
+        rows = sorted((y - transform.f) / transform.e for y in (south, north))
+        left, right = (round(min(max(c, 0), data.width)) for c in columns)
+        top, bottom = (round(min(max(r, 0), data.height)) for r in rows)
+        if not (west < east and south < north and right - left > 1 and bottom - top > 1):
+            raise SceneError(
+                path, f"has no ground within {window}", f"it covers {tuple(data.bounds)}"
+            )
+        view = Pixels(left, top, right - left, bottom - top)
+    if view.width * view.height > MOST_CELLS:
+        raise SceneError(
+            path,
+            f"has {view.width:.0f} x {view.height:.0f} heights, more than {MOST_CELLS:.0e}",
+            f"give a window within {tuple(data.bounds)}",
+        )
+    return view
+
+
+def _heights(path: Path, data: Any, band: int, view: Any) -> np.ndarray:
+    """Heights [m], NaN where the raster has no data."""
+    values = data.read(band, window=view, masked=True)
+    heights = np.ma.filled(values.astype(float), np.nan)
+    heights[~np.isfinite(heights)] = np.nan
+    if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
+        raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
+    unit = (data.units[band - 1] or "").strip().lower()
+    if unit not in _METRE and unit not in _FEET:
+        raise SceneError(path, f"has heights in '{unit}'", "convert them to metres with gdal_calc")
+    factor = _FEET.get(unit, 1.0)
+    return (heights * data.scales[band - 1] + data.offsets[band - 1]) * factor

@@ -1,0 +1,181 @@
+"""Flight paths from CSV tables: time, position and attitude, with their units in the header."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sweep.model.geometry.attitude import Attitude, Nadir, Track
+from sweep.model.geometry.platform import Flight, Waypoints
+from sweep.model.geometry.quaternion import from_heading
+from sweep.scenes.errors import SceneError, existing
+from sweep.units import QuantityError, read_unit
+
+COLUMNS = {
+    "time": "s", "x": "m", "y": "m", "z": "m",
+    "qw": "", "qx": "", "qy": "", "qz": "",
+    "heading": "rad", "pitch": "rad", "roll": "rad",
+}  # fmt: skip
+"""Columns and the SI unit of each; quaternions have none."""
+
+_POSITION = ("time", "x", "y", "z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_ANGLES = ("heading", "pitch", "roll")
+_HEADING = re.compile(r"\s*([A-Za-z]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
+_EXAMPLE = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Waypoints of a table.
+
+    Parameters
+    ----------
+    time : (n,) ndarray
+        Rising times [s].
+    position : (n, 3) ndarray
+        Positions [m].
+    attitude : (n, 4) ndarray or None
+        Quaternions (w, x, y, z), body to world; None where the table has no attitude.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    attitude: np.ndarray | None
+
+    def flight(self, *, smooth: bool = True, without_attitude: Attitude | None = None) -> Flight:
+        """The flight through the waypoints.
+
+        Parameters
+        ----------
+        smooth : bool
+            Join positions by a cubic spline; False by straight lines.
+        without_attitude : Attitude, optional
+            Law for a table without attitude; pointing down by default.
+        """
+        law: Attitude = without_attitude or Nadir()
+        if self.attitude is not None:
+            law = Track(self.time, self.attitude)
+        return Flight(Waypoints(self.time, self.position, smooth=smooth), law)
+
+
+def read_waypoints(path: str | Path) -> Table:
+    """Waypoints of a CSV table.
+
+    The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``,
+    ``z [m]``, and for the attitude either ``qw, qx, qy, qz`` (body to world) or ``heading [deg]``
+    (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and ``roll [deg]`` (left side
+    up), of which those left out are 0. Lines that begin with # are passed over.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing or no such table; names the line and what to write.
+    """
+    path = existing(path)
+    lines = _lines(path)
+    if len(lines) < 3:
+        raise SceneError(
+            path,
+            "holds fewer than two waypoints",
+            f"write a header ({_EXAMPLE}) and a line for each",
+        )
+    factors = _header(path, lines[0][1])
+    rows = np.array([_row(path, number, cells, len(factors)) for number, cells in lines[1:]])
+    table = {name: rows[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
+    falls = np.flatnonzero(np.diff(table["time"]) <= 0)
+    if len(falls):
+        raise SceneError(
+            path, f"line {lines[falls[0] + 2][0]}: the time does not rise", "sort the lines by time"
+        )
+    position = np.column_stack([table[name] for name in "xyz"])
+    return Table(table["time"], position, _attitude(path, table))
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and cells of all lines that say something."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise SceneError(path, "is no text in UTF-8", "save the table as CSV") from None
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    numbered = ((reader.line_num, row) for row in reader)
+    return [
+        (number, row)
+        for number, row in numbered
+        if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _header(path: Path, cells: list[str]) -> dict[str, float]:
+    """Columns in their order, with the factor that makes each SI."""
+    factors: dict[str, float] = {}
+    for cell in cells:
+        match = _HEADING.fullmatch(cell)
+        name = match[1].lower() if match else ""
+        if match is None or name not in COLUMNS:
+            raise SceneError(path, f"has an unknown column '{cell.strip()}'", f"use {_EXAMPLE}")
+        if name in factors:
+            raise SceneError(path, f"has two columns '{name}'", "leave one out")
+        factors[name] = _factor(path, name, (match[2] or "").strip())
+    missing = [name for name in _POSITION if name not in factors]
+    if missing:
+        raise SceneError(path, f"has no column '{missing[0]}'", f"add it: {_EXAMPLE}")
+    return factors
+
+
+def _factor(path: Path, name: str, unit: str) -> float:
+    """Factor that makes a column SI."""
+    si = COLUMNS[name]
+    if not si:
+        if unit not in ("", "1"):
+            raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
+        return 1.0
+    try:
+        if not unit:
+            raise QuantityError("has none")
+        return read_unit(unit, si_unit=si, example=f"{name} [{si}]").to_si(1)  # type: ignore[arg-type]
+    except QuantityError as error:
+        raise SceneError(
+            path, f"the unit of column '{name}' {error.rule}", f"write e.g. {name} [{si}]"
+        ) from None
+
+
+def _row(path: Path, number: int, cells: list[str], columns: int) -> list[float]:
+    """Numbers of a line."""
+    if len(cells) != columns:
+        raise SceneError(
+            path, f"line {number} has {len(cells)} cells under {columns} columns", "fill or cut it"
+        )
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        raise SceneError(path, f"line {number} holds no finite numbers", "write plain numbers")
+    return values
+
+
+def _attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Quaternions of the table, (n, 4)."""
+    given = [name for name in _QUATERNION if name in table]
+    angles = {name: table[name] for name in _ANGLES if name in table}
+    if given and angles:
+        raise SceneError(path, "has both a quaternion and angles", "leave one of them out")
+    if angles:
+        zero = np.zeros(len(table["time"]))
+        return from_heading(**{name: angles.get(name, zero) for name in _ANGLES})
+    if not given:
+        return None
+    if len(given) < len(_QUATERNION):
+        raise SceneError(path, "has part of a quaternion", "give qw, qx, qy and qz")
+    q = np.column_stack([table[name] for name in _QUATERNION])
+    length = np.linalg.norm(q, axis=1)
+    if not (np.abs(length - 1) < 1e-3).all():
+        raise SceneError(path, "has quaternions of a length other than 1", "divide them by it")
+    return np.asarray(q / length[:, None])

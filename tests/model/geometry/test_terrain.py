@@ -1,0 +1,231 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sweep.model.geometry.facets import Facets, areas, join
+from sweep.model.geometry.quaternion import about
+from sweep.model.geometry.resampling import refine, smooth, smoothing_width
+from sweep.model.geometry.terrain import Terrain, heightfield
+from sweep.scenes.grids import quantum, read_image
+from sweep.scenes.raster import read_raster
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+GALE = DATA / "gale_crater_hirise_1m.tif"
+APOLLO = DATA / "apollo15_nac_2m.png"
+
+FAR = np.array([8_142_406.3, -276_455.7, -4000.0])
+
+
+def terrain(z, spacing=(2.0, -3.0), origin=(10.0, 20.0, 100.0)):
+    return Terrain(np.asarray(z, float), spacing, np.array(origin))
+
+
+def hilly(rows, columns, seed=1):
+    return np.random.default_rng(seed).normal(size=(rows, columns))
+
+
+def plan_area(vertices, faces):
+    return areas(vertices * [1, 1, 0], faces).sum()
+
+
+def normals(vertices, faces):
+    a, b, c = vertices[faces.T]
+    return np.cross(b - a, c - a)
+
+
+@pytest.mark.parametrize("spacing", [(2.0, 3.0), (2.0, -3.0), (-2.0, 3.0), (-2.0, -3.0)])
+def test_a_grid_becomes_upward_facets_that_tile_its_plan(spacing):
+    vertices, faces = heightfield(hilly(5, 7), spacing=spacing)
+    assert (normals(vertices, faces)[:, 2] > 0).all()
+    assert len(faces) == 2 * 4 * 6
+    assert plan_area(vertices, faces) == pytest.approx(4 * 6 * 6.0, rel=1e-12)
+
+
+def test_the_facets_of_a_whole_grid_form_a_disc():
+    vertices, faces = heightfield(hilly(5, 7), spacing=(1.0, 1.0))
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.sort(pairs, axis=1), axis=0)
+    assert len(vertices) - len(edges) + len(faces) == 1  # Euler
+
+
+def test_a_tilted_plane_has_the_area_of_a_tilted_plane():
+    rows, columns = np.mgrid[:9, :4]
+    vertices, faces = heightfield(0.3 * columns * 2.0 - 0.4 * rows, spacing=(2.0, 1.0))
+    stretch = math.sqrt(1 + 0.3**2 + 0.4**2)
+    assert areas(vertices, faces).sum() == pytest.approx(8 * 6 * stretch, rel=1e-12)
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_a_cell_without_one_corner_keeps_the_triangle_of_the_others(corner):
+    z = np.zeros((2, 2))
+    z[corner] = np.nan
+    vertices, faces = heightfield(z, spacing=(1.0, 1.0))
+    assert len(faces) == 1 and len(vertices) == 3
+    assert normals(vertices, faces)[0, 2] == 1.0
+    assert not any((vertices[:, :2] == corner[::-1]).all(axis=1))
+
+
+def test_a_missing_node_takes_half_of_each_of_its_four_cells():
+    z = hilly(5, 5)
+    z[2, 2] = np.nan
+    vertices, faces = heightfield(z, spacing=(1.0, 1.0))
+    assert plan_area(vertices, faces) == pytest.approx(16 - 2)
+    assert np.isfinite(vertices).all() and len(vertices) == 24
+
+
+def test_a_mask_makes_the_same_holes_as_missing_heights():
+    z, hole = hilly(6, 6), np.random.default_rng(2).random((6, 6)) < 0.2
+    masked = heightfield(z, spacing=(1.0, 1.0), hole=hole)
+    missing = heightfield(np.where(hole, np.nan, z), spacing=(1.0, 1.0))
+    for one, other in zip(masked, missing, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@given(st.integers(0, 2**32), st.sampled_from([(2.0, 3.0), (2.0, -3.0), (-1.0, 0.5)]))
+def test_the_height_at_a_place_is_that_of_the_facet_over_it(seed, spacing):
+    """Against barycentric weights on the triangles themselves, holes included."""
+    generator = np.random.default_rng(seed)
+    z = generator.normal(size=(4, 5))
+    z[generator.random(z.shape) < 0.15] = np.nan
+    ground = terrain(z, spacing)
+    west, south, east, north = ground.bounds
+    x, y = generator.uniform(west, east, 40), generator.uniform(south, north, 40)
+    facets = ground.facets()
+    expected = np.full(40, np.nan)
+    for a, b, c in facets.world[facets.faces]:
+        matrix = np.array([[a[0], b[0], c[0]], [a[1], b[1], c[1]], [1, 1, 1]])
+        weights = np.linalg.solve(matrix, [x, y, np.ones(40)])
+        inside = (weights > 0).all(axis=0)
+        expected[inside] = (weights.T @ [a[2], b[2], c[2]])[inside]
+    np.testing.assert_allclose(ground.height_at(x, y), expected, atol=1e-10)
+
+
+def test_there_is_no_height_beside_the_grid():
+    ground = terrain(np.zeros((3, 3)))
+    west, south, east, north = ground.bounds
+    outside = ground.height_at(np.array([west - 1, east + 1, west]), np.array([south, north, 99]))
+    assert np.isnan(outside).all()
+    assert ground.centre == pytest.approx([12, 17, 100])
+
+
+def test_far_off_ground_has_the_same_facets_to_the_last_bit():
+    z = hilly(6, 6)
+    near, far = terrain(z).facets(), terrain(z, origin=FAR).facets()
+    np.testing.assert_array_equal(near.vertices, far.vertices)
+    np.testing.assert_array_equal(far.origin, FAR)
+
+
+def test_joined_facets_keep_their_place_digits_and_surfaces():
+    shift = np.array([3.0, -4.0, 5.0])
+    one = terrain(hilly(3, 3), origin=FAR).facets(surface=1)
+    other = terrain(hilly(4, 4), origin=FAR + shift).facets(surface=2)
+    both = join([one, other])
+    # Taking the first origin from the second rounds to the spacing of floats at 8e6 m.
+    expected = np.concatenate([one.vertices, other.vertices + shift])
+    np.testing.assert_allclose(both.vertices, expected, rtol=0, atol=2 * np.spacing(8.2e6))
+    triangles = both.vertices[both.faces[len(one.faces) :]]
+    np.testing.assert_allclose(triangles, (other.vertices + shift)[other.faces], atol=1e-8)
+    assert list(np.unique(both.surface, return_counts=True)[1]) == [8, 18]
+
+
+def test_a_placed_object_is_scaled_turned_and_moved_in_that_order():
+    corner = Facets.of([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]])
+    moved = corner.placed(translation=(10, 20, 30), rotation=about(2, math.pi / 2), scale=2.0)
+    np.testing.assert_allclose(moved.world, [[10, 22, 30], [8, 20, 30], [10, 20, 32]], atol=1e-12)
+
+
+def test_facets_become_a_mesh_at_the_same_place():
+    facets = terrain(hilly(5, 5), origin=FAR).facets(surface=3)
+    mesh, report = facets.mesh()
+    np.testing.assert_allclose(
+        np.sort(mesh.vertices + mesh.origin, axis=0), np.sort(facets.world, axis=0), atol=1e-8
+    )
+    assert (mesh.surface == 3).all() and report.faces == len(mesh.faces) == 32
+
+
+def test_refining_keeps_the_given_heights_and_reproduces_cubics():
+    rows, columns = np.mgrid[:6, :7].astype(float)
+    given = terrain(0.1 * rows**3 - 0.2 * columns**2 * rows + columns)
+    fine = refine(given, factor=4)
+    assert fine.heights.shape == (21, 25) and fine.bounds == pytest.approx(given.bounds)
+    np.testing.assert_allclose(fine.heights[::4, ::4], given.heights, atol=1e-11)
+    rows, columns = np.mgrid[:21, :25] / 4
+    expected = 0.1 * rows**3 - 0.2 * columns**2 * rows + columns
+    np.testing.assert_allclose(fine.heights, expected, atol=1e-11)
+
+
+def test_refining_keeps_holes_and_no_more_than_their_cells():
+    z = hilly(8, 8)
+    z[3, 4] = np.nan
+    fine = refine(terrain(z), factor=3).heights
+    missing = np.argwhere(np.isnan(fine))
+    assert missing.min(axis=0) == pytest.approx([7, 10])  # the first node past row 2, column 3
+    assert missing.max(axis=0) == pytest.approx([11, 14])
+    np.testing.assert_allclose(fine[::3, ::3][~np.isnan(z)], z[~np.isnan(z)], atol=1e-12)
+
+
+def test_smoothing_keeps_planes_and_holes_and_spreads_a_step_like_an_error_function():
+    from scipy.special import erf
+
+    z = np.where(np.arange(60) < 30, 0.0, 1.0) + np.zeros((40, 60))
+    z[5, 5] = np.nan
+    smoothed = smooth(terrain(z, spacing=(0.5, 0.5)), width=2.0).heights
+    assert np.isnan(smoothed[5, 5]) and np.isnan(smoothed).sum() == 1
+    x = (np.arange(60) - 29.5) * 0.5
+    expected = 0.5 * (1 + erf(x / (2.0 * math.sqrt(2))))
+    np.testing.assert_allclose(smoothed[30], expected, atol=2e-3)  # a kernel of 4 sigma, sampled
+    assert smooth(terrain(np.full((9, 9), 7.0)), width=3.0).heights == pytest.approx(7.0)
+
+
+def test_the_smoothing_width_brings_the_slope_error_of_grey_levels_to_what_was_asked():
+    """Rough ground rounded to levels against the same ground unrounded, both smoothed."""
+    step, dx, wanted, nodes = 0.2, 2.0, 0.004, 600
+    width = smoothing_width(quantum=step, spacing=dx, slope_error=wanted)
+    assert width > dx
+    z = 5 * step * hilly(nodes, nodes)
+    exact, rounded = terrain(z, (dx, dx)), terrain(step * np.round(z / step), (dx, dx))
+    error = smooth(rounded, width=width).heights - smooth(exact, width=width).heights
+    slopes = np.gradient(error, dx, axis=1)[50:-50, 50:-50]
+    # White noise under a Gaussian has the correlation exp(-d^2 / 4 width^2), of which central
+    # differences, 2 dx wide, miss the part that this factor leaves.
+    ratio = (dx / width) ** 2
+    expected = wanted * math.sqrt((1 - math.exp(-ratio)) / ratio)
+    # 500^2 nodes in patches of 4 pi (width/dx)^2: 0.6 % of statistical error, five times over.
+    assert slopes.std() == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("z", "spacing"), [(np.zeros((1, 5)), (1, 1)), (np.zeros(5), (1, 1)), (np.eye(3), (0, 1))]
+)
+def test_a_grid_without_cells_is_refused(z, spacing):
+    with pytest.raises(ValueError, match=r"row|steps"):
+        heightfield(z, spacing=spacing)
+
+
+@pytest.mark.skipif(not GALE.exists(), reason="the shared terrain is not here")
+def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
+    ground = read_raster(GALE)
+    assert ground.heights.shape == (337, 348) and ground.spacing == (1.0, -1.0)
+    assert ground.heights.min() == pytest.approx(-4472.67, abs=0.005)
+    assert ground.heights.max() == pytest.approx(-4437.88, abs=0.005)
+    facets = ground.facets()
+    assert len(facets.faces) == 2 * 336 * 347
+    assert plan_area(facets.vertices, facets.faces) == pytest.approx(336 * 347, rel=1e-9)
+    assert facets.origin[0] == 8142406.5 and facets.origin[1] == -276455.5
+
+
+@pytest.mark.skipif(not APOLLO.exists(), reason="the shared terrain is not here")
+def test_real_lunar_ground_in_grey_levels_loses_its_terraces_when_smoothed():
+    ground = read_image(APOLLO, pixel=2.0, white=49.0)
+    step = quantum(APOLLO, white=49.0)
+    assert step == pytest.approx(0.192, abs=5e-4)
+    assert ground.bounds == (0.0, 0.0, 512.0, 512.0)
+    smoothed = smooth(ground, width=4.0)
+    flat = (np.diff(ground.heights, axis=1) == 0).mean()
+    assert flat > 0.2  # a fifth of the steps lie on one grey level
+    assert (np.diff(smoothed.heights, axis=1) == 0).mean() < 1e-3
+    assert np.abs(smoothed.heights - ground.heights).mean() < step

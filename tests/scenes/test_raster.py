@@ -1,0 +1,195 @@
+import math
+import warnings
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio import Affine
+
+from sweep.scenes.degrees import metres_per_degree
+from sweep.scenes.errors import SceneError
+from sweep.scenes.raster import read_raster
+
+HEIGHTS = np.arange(20, dtype=np.float32).reshape(4, 5)
+SOUTHWARDS = Affine(2.0, 0.0, 500_000.0, 0.0, -3.0, 4_000_000.0)
+UTM, DEGREES, TEXAN_FEET = "EPSG:32617", "EPSG:4326", "EPSG:2276"
+
+
+@pytest.fixture
+def tiff(tmp_path):
+    """A GeoTIFF with given heights and profile."""
+
+    def write(heights=HEIGHTS, *, name="dem.tif", units=None, scale=None, **profile):
+        profile = {"crs": UTM, "transform": SOUTHWARDS} | profile
+        path = tmp_path / name
+        profile = {key: value for key, value in profile.items() if value is not None}
+        bands = np.atleast_3d(heights.T).T
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(
+                path, "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1],
+                count=len(bands), dtype=bands.dtype, **profile,
+            ) as data:  # fmt: skip
+                data.write(bands)
+                if units:
+                    data.units = (units,)
+                if scale:
+                    data.scales, data.offsets = (scale[0],), (scale[1],)
+        return path
+
+    return write
+
+
+def test_nodes_lie_at_the_centres_of_pixels_with_the_first_row_in_the_north(tiff):
+    ground = read_raster(tiff())
+    np.testing.assert_array_equal(ground.heights, HEIGHTS)
+    assert ground.spacing == (2.0, -3.0)
+    np.testing.assert_array_equal(ground.origin, [500_001.0, 3_999_998.5, 0.0])
+    assert ground.bounds == (500_001.0, 3_999_989.5, 500_009.0, 3_999_998.5)
+    assert ground.height_at(np.array(500_003.0), np.array(3_999_995.5)) == HEIGHTS[1, 1]
+
+
+def test_a_raster_that_runs_northwards_is_read_as_it_lies(tiff):
+    ground = read_raster(tiff(transform=Affine(2, 0, 0, 0, 3, 0)))
+    assert ground.spacing == (2.0, 3.0)
+    assert ground.height_at(np.array(1.0), np.array(1.5)) == HEIGHTS[0, 0]
+
+
+def test_pixels_without_data_are_holes(tiff):
+    heights = HEIGHTS.copy()
+    heights[1, 2], heights[2, 3] = -9999, np.nan
+    ground = read_raster(tiff(heights, nodata=-9999))
+    assert np.isnan(ground.heights[[1, 2], [2, 3]]).all()
+    assert np.isnan(ground.heights).sum() == 2
+
+
+def test_whole_numbers_may_have_holes_too(tiff):
+    heights = HEIGHTS.astype(np.int16)
+    heights[0, 0] = -32768
+    ground = read_raster(tiff(heights, nodata=-32768))
+    assert np.isnan(ground.heights[0, 0]) and ground.heights[3, 4] == 19.0
+
+
+def test_a_stated_scale_and_offset_of_the_heights_are_applied(tiff):
+    ground = read_raster(tiff(scale=(0.5, 1000.0)))
+    np.testing.assert_allclose(ground.heights, HEIGHTS * 0.5 + 1000)
+
+
+def test_feet_become_metres_both_ways(tiff):
+    ground = read_raster(tiff(crs=TEXAN_FEET, units="ft"))
+    survey_foot = 1200 / 3937
+    np.testing.assert_allclose(ground.spacing, (2 * survey_foot, -3 * survey_foot), rtol=1e-9)
+    np.testing.assert_allclose(ground.origin[0], 500_001 * survey_foot, rtol=1e-9)
+    np.testing.assert_allclose(ground.heights, HEIGHTS * 0.3048, rtol=1e-7)
+
+
+def test_a_window_cuts_out_its_part_where_it_lies(tiff):
+    whole = read_raster(tiff())
+    part = read_raster(tiff(), window=(500_002.0, 3_999_991.0, 500_008.0, 3_999_997.0))
+    np.testing.assert_array_equal(part.heights, HEIGHTS[1:3, 1:4])
+    x, y = np.meshgrid([500_003.0, 500_006.5], [3_999_993.0, 3_999_995.0])
+    np.testing.assert_allclose(part.height_at(x, y), whole.height_at(x, y))
+
+
+def test_another_band_can_be_read(tiff):
+    bands = np.stack([HEIGHTS, 2 * HEIGHTS])
+    np.testing.assert_array_equal(read_raster(tiff(bands), band=2).heights, 2 * HEIGHTS)
+
+
+def test_degrees_become_metres_of_a_stated_size(tiff):
+    arc = Affine(1 / 1200, 0.0, -84.0, 0.0, -1 / 1200, 36.5)
+    path = tiff(crs=DEGREES, transform=arc)
+    ground = read_raster(path, metres_per_degree=(90_000.0, 111_000.0))
+    np.testing.assert_allclose(ground.spacing, (75.0, -92.5))
+    with pytest.raises(SceneError, match="degrees") as refused:
+        read_raster(path)
+    # The remedy gives the size on the raster's own ellipsoid, to be copied.
+    said = str(refused.value).split("[")[1].split("]")[0].split(",")
+    assert [float(size) for size in said] == pytest.approx(metres_per_degree(36.498333), abs=0.06)
+
+
+def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
+    moon = rasterio.crs.CRS.from_proj4("+proj=longlat +R=1737400 +no_defs")
+    with pytest.raises(SceneError, match="30323") as refused:
+        read_raster(tiff(crs=moon, transform=Affine(1e-3, 0, 0, 0, -1e-3, 0.01)))
+    assert math.radians(1737400) == pytest.approx(30323.3, abs=0.1)
+    assert "metres_per_degree" in refused.value.remedy
+
+
+def test_a_raster_without_scale_needs_the_size_of_a_pixel(tiff):
+    path = tiff(crs=None, transform=None)
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        ground = read_raster(path, pixel=4.0)
+    assert ground.spacing == (4.0, -4.0) and ground.bounds == (2.0, 2.0, 18.0, 14.0)
+    with (
+        pytest.warns(rasterio.errors.NotGeoreferencedWarning),
+        pytest.raises(SceneError, match="states no scale; state the size of a pixel"),
+    ):
+        read_raster(path)
+
+
+@pytest.mark.parametrize(
+    ("profile", "options", "said"),
+    [
+        ({"transform": Affine(2, 0.1, 0, 0.1, -3, 0)}, {}, "rotated.*gdalwarp"),
+        ({}, {"band": 2}, "1 band"),
+        ({}, {"band": 0}, "1 band"),
+        ({}, {"window": (0.0, 0.0, 10.0, 10.0)}, "no ground within.*covers"),
+        ({}, {"window": (500_008.0, 3_999_991.0, 500_002.0, 3_999_997.0)}, "no ground within"),
+        ({}, {"metres_per_degree": (1.0, 1.0)}, "not in degrees"),
+        ({}, {"pixel": 2.0}, "states its own scale"),
+        ({"nodata": 7.0, "heights": np.full((3, 3), 7.0)}, {}, "too few heights"),
+        ({"units": "fathom"}, {}, "fathom"),
+        ({"crs": DEGREES}, {"metres_per_degree": (0.0, 1.0)}, "positive"),
+    ],
+)
+def test_a_raster_that_can_not_be_used_is_refused_with_file_rule_and_remedy(
+    tiff, profile, options, said
+):
+    path = tiff(**profile)
+    with pytest.raises(SceneError, match=said) as refused:
+        read_raster(path, **options)
+    assert str(refused.value).startswith(str(path)) and refused.value.remedy
+
+
+def test_files_that_are_no_raster_or_not_there_are_refused(tmp_path, tiff):
+    nonsense = tmp_path / "nonsense.tif"
+    nonsense.write_text("no raster")
+    with pytest.raises(SceneError, match="no raster"):
+        read_raster(nonsense)
+    with pytest.raises(SceneError, match=r"does not exist.*there is: nonsense.tif"):
+        read_raster(tmp_path / "dem2.tif")
+    with pytest.raises(SceneError, match="is a folder"):
+        read_raster(tmp_path)
+
+
+def test_a_raster_too_large_to_read_asks_for_a_window(tiff, monkeypatch):
+    monkeypatch.setattr("sweep.scenes.raster.MOST_CELLS", 15)
+    with pytest.raises(SceneError, match="give a window"):
+        read_raster(tiff())
+    assert read_raster(tiff(), window=(5e5, 3_999_988.0, 500_006.0, 4e6)).heights.size == 12
+
+
+def test_a_degree_of_longitude_and_of_latitude_are_those_of_the_ellipsoid():
+    """A degree of latitude is the meridian's length, by quadrature of its curve."""
+    from scipy.integrate import quad
+
+    a, flattening = 6_378_137.0, 1 / 298.257223563
+    b = a * (1 - flattening)
+
+    def point(latitude):
+        # The geodetic latitude is that of the normal to the ellipse.
+        phi = math.radians(latitude)
+        scale = math.hypot(a * math.cos(phi), b * math.sin(phi))
+        return a * a * math.cos(phi) / scale, b * b * math.sin(phi) / scale
+
+    def speed(latitude, step=1e-4):
+        (r0, z0), (r1, z1) = point(latitude - step), point(latitude + step)
+        return math.hypot(r1 - r0, z1 - z0) / (2 * step)
+
+    north, _ = quad(speed, 44.5, 45.5)
+    east = math.radians(point(45.0)[0])
+    assert metres_per_degree(45.0) == pytest.approx((east, north), rel=1e-6)
+    assert metres_per_degree(60.0, radius=1e6, flattening=0.0) == pytest.approx(
+        (math.radians(5e5), math.radians(1e6))
+    )
