@@ -7,6 +7,7 @@ radiometry.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,19 @@ CATEGORIES = (
     "footprint.phases",
     "footprint.beamlets",
 )
+
+
+class Footprints(NamedTuple):
+    """Where beamlets fall and what they send back, in rows that points share."""
+
+    row: np.ndarray
+    """(n,) int64: the row of each point."""
+    offset: np.ndarray
+    """(rows, beamlets): (R_b - R_0) / R_0."""
+    doppler: np.ndarray
+    """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
+    echo: np.ndarray
+    """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,17 +127,11 @@ class Shots:
 
 def prepare(parameters: Parameters) -> Iterator[tuple[np.ndarray, Shots]]:
     """Splits points by category: (indices, :class:`Shots`) for each."""
-    arrays = {path: np.asarray(value) for path, value in parameters.items()}
+    arrays = _arrays(parameters)
     size = max((a.size for a in arrays.values() if a.ndim), default=1)
-    arrays["record"] = waveform.record_length(
-        fft_size=arrays[PROCESSING + "fft_size"],
-        duration=arrays[CHIRP + "duration"],
-        acquisition_delay=arrays[PROCESSING + "acquisition_delay"],
-        sample_rate=arrays[PROCESSING + "sample_rate"],
-    )
     varying = [path for path in (*CATEGORIES, "record") if arrays[path].ndim]
     if not varying:
-        yield np.arange(size), _shots(arrays, size)
+        yield np.arange(size), _shots(arrays, size, _plane(arrays, size))
         return
     codes = [np.unique(arrays[path], return_inverse=True)[1] for path in varying]
     _, member = np.unique(np.stack(codes), axis=1, return_inverse=True)
@@ -132,21 +140,46 @@ def prepare(parameters: Parameters) -> Iterator[tuple[np.ndarray, Shots]]:
         index = np.flatnonzero(member == group)
         chosen = {path: a[index] if a.ndim else a for path, a in arrays.items()}
         chosen |= {path: chosen[path][0] for path in varying}
-        yield index, _shots(chosen, index.size)
+        yield index, _shots(chosen, index.size, _plane(chosen, index.size))
 
 
-def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
-    """Link, noise and geometry of points that share their categories."""
+def prepare_footprints(parameters: Parameters, footprints: Footprints) -> Shots:
+    """Shots whose footprints are given, all of one category.
+
+    Parameters
+    ----------
+    parameters : mapping
+        As for :func:`sweep.model.shot.evaluate`, scalars or (n,) arrays. Ranges and radial
+        velocities are those of the beam's centre; grazing angle and law are not looked at.
+    footprints : Footprints
+        One row number for each of the n points.
+    """
+    return _shots(_arrays(parameters), footprints.row.size, footprints)
+
+
+def _arrays(parameters: Parameters) -> dict[str, np.ndarray]:
+    """Parameters as arrays, with the length of the record among them."""
+    arrays = {path: np.asarray(value) for path, value in parameters.items()}
+    arrays["record"] = waveform.record_length(
+        fft_size=arrays[PROCESSING + "fft_size"],
+        duration=arrays[CHIRP + "duration"],
+        acquisition_delay=arrays[PROCESSING + "acquisition_delay"],
+        sample_rate=arrays[PROCESSING + "sample_rate"],
+    )
+    return arrays
+
+
+def _shots(p: Mapping[str, np.ndarray], size: int, footprints: Footprints) -> Shots:
+    """Link and noise of points that share their categories."""
     architecture = str(p[RECEIVER + "architecture"])
     shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
-    row, offset, echo = _geometry(p, size)
+    row, offset, doppler, echo = footprints
     power_scale, current_scale = _link_scales(architecture, p)
     sources = _noise_sources(architecture, p, power_scale * echo.sum(axis=1)[row])
-    variance = np.asarray(sum(sources.values()))
+    without_echo = np.asarray(sum(v for name, v in sources.items() if name != "signal_shot"))
+    variance = without_echo + sources["signal_shot"]
     energy = np.asarray(shape.energy)
-    quiet = noise.bin_deviation(
-        noise_variance=variance - sources["signal_shot"], window_energy=energy
-    )
+    quiet = noise.bin_deviation(noise_variance=without_echo, window_energy=energy)
     everywhere = np.zeros(size)
     return Shots(
         architecture=architecture,
@@ -176,7 +209,7 @@ def _shots(p: Mapping[str, np.ndarray], size: int) -> Shots:
         leakage_floor=p["accuracy.leakage_floor"],
         row=row,
         offset=offset,
-        doppler=np.zeros_like(offset),
+        doppler=doppler,
         amplitude=echo if architecture == "direct" else np.sqrt(echo),
     )
 
@@ -209,8 +242,8 @@ def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]
     return {name: p[RECEIVER + name] for name in names}
 
 
-def _geometry(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, ...]:
-    """Each point's row, and offset and relative echo [1/sr] of each distinct footprint."""
+def _plane(p: Mapping[str, np.ndarray], size: int) -> Footprints:
+    """Footprints on a flat plane: one row for each distinct grazing angle and divergence."""
     grazing, divergence = np.broadcast_arrays(
         p["target.grazing_angle"], p[LASER + "beam_divergence"]
     )
@@ -225,7 +258,8 @@ def _geometry(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, ...]:
     )
     law = str(p["target.reflectance_law"])
     echo = weights * reflectance.backscatter(law, cos_incidence) / (1 + offset) ** 2
-    return np.broadcast_to(row.ravel(), size).astype(np.int64), offset, echo
+    row = np.broadcast_to(row.ravel(), size).astype(np.int64)
+    return Footprints(row, offset, np.zeros_like(offset), echo)
 
 
 def _noise_sources(

@@ -1,0 +1,180 @@
+"""Eyepoints: what each shot of a flight sees, before any radiometry.
+
+The geometry of a shot - range, incidence, surface and radial velocity at every beamlet - does not
+depend on laser power, receiver or processing. It is worked out once and serves any number of
+radiometric studies [T 3.2].
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model import reflectance
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.footprint import beamlets
+from sweep.model.geometry.jitter import transverse
+from sweep.model.geometry.platform import Flight, State
+from sweep.model.geometry.quaternion import rotate
+from sweep.model.geometry.rays import Bundle, Caster, Pose
+from sweep.model.geometry.scanner import Scanner
+from sweep.model.geometry.surfaces import Surface
+from sweep.model.preparation import Footprints, Parameters, Shots, prepare_footprints
+
+
+class Eyepoints(NamedTuple):
+    """Geometry of n shots of b beamlets; SI, world frame."""
+
+    time: np.ndarray
+    """(n,): start of the measurement [s]."""
+    beam: np.ndarray
+    """(n,) int64: number of the beam."""
+    cycle: np.ndarray
+    """(n,) int64: number of the measurement cycle."""
+    position: np.ndarray
+    """(n, 3): of the instrument [m]."""
+    velocity: np.ndarray
+    """(n, 3): of the instrument [m/s]."""
+    direction: np.ndarray
+    """(n, 3): unit vector along the beam's axis."""
+    range: np.ndarray
+    """(n,): range R_0 of the reference beamlet [m]; inf where nothing is seen."""
+    offset: np.ndarray
+    """(n, b): R_b - R_0 [m]; nan for a beamlet that misses."""
+    radial_velocity: np.ndarray
+    """(n,): of the reference beamlet [m/s], positive when closing; nan where nothing is seen."""
+    velocity_offset: np.ndarray
+    """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
+    cos_incidence: np.ndarray
+    """(n, b): 0..1; nan for a miss."""
+    surface: np.ndarray
+    """(n, b) int16: -1 for a miss."""
+    weight: np.ndarray
+    """(b,): power fractions; they sum to 1."""
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Shots of which any beamlet hits something, (n,) bool."""
+        return np.isfinite(self.range)
+
+
+def observe(
+    index: np.ndarray,
+    *,
+    flight: Flight,
+    scanner: Scanner,
+    caster: Caster,
+    beam_divergence: float,
+    number: int,
+    pattern: str = "hexagonal",
+    bodies: Sequence[Flight | None] | None = None,
+) -> Eyepoints:
+    """Eyepoints of shots by number.
+
+    Parameters
+    ----------
+    index : (n,) int array
+        Numbers of the shots, from 0; any stretch of a flight can be had without the rest.
+    flight, scanner
+        What carries the instrument, and where its beams point in the body frame, and when.
+    caster : Caster
+        The scene.
+    beam_divergence : float
+        Full angle between the 1/e^2 intensity points [rad].
+    number, pattern
+        Of :func:`sweep.model.footprint.beamlets`.
+    bodies : sequence of Flight or None, optional
+        Motion of each of the caster's bodies, None for one at rest; all at rest by default.
+    """
+    shots = scanner.shots(np.asarray(index))
+    time = flight.start + shots.time
+    state = flight.state(time)
+    (across, along), weight = beamlets(number, pattern)
+    rays = _beamlet_directions(state, shots.direction, across, along, beam_divergence / 4)
+    moving = [None if body is None else body.state(time) for body in bodies or ()]
+    poses = [None if body is None else Pose(body.position, body.attitude) for body in moving]
+    bundle = caster.bundle(state.position, rays, poses=poses or None)
+    velocity = _radial_velocity(state, rays, bundle, moving)
+    rows = np.arange(len(time))
+    reference = velocity[rows, np.maximum(bundle.reference, 0)]
+    return Eyepoints(
+        time, shots.beam, shots.cycle, state.position, state.velocity,
+        rotate(state.attitude, shots.direction), bundle.range, bundle.offset, reference,
+        velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
+    )  # fmt: skip
+
+
+def _beamlet_directions(
+    state: State, axis: np.ndarray, across: np.ndarray, along: np.ndarray, sigma: float
+) -> np.ndarray:
+    """Unit vectors of every beamlet in the world frame, (n, b, 3)."""
+    first, second = transverse(axis)
+    body = axis[:, None] + sigma * (
+        across[:, None] * first[:, None] + along[:, None] * second[:, None]
+    )
+    rays = rotate(state.attitude[:, None], body)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+def _radial_velocity(
+    state: State, rays: np.ndarray, bundle: Bundle, moving: Sequence[State | None]
+) -> np.ndarray:
+    """Closing speed of instrument and surface along every beamlet [m/s], (n, b); nan for a miss.
+
+    A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
+    turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
+    """
+    closing = np.einsum("nbi,ni->nb", rays, state.velocity)
+    for body, motion in enumerate(moving):
+        if motion is None:
+            continue
+        hit = np.where(bundle.body == body, bundle.range[:, None] + bundle.offset, 0.0)
+        point = state.position[:, None] + rays * hit[..., None]
+        arm = point - motion.position[:, None]
+        surface = motion.velocity[:, None] + np.cross(motion.rate[:, None], arm)
+        receding = np.einsum("nbi,nbi->nb", rays, surface)
+        closing = np.where(bundle.body == body, closing - receding, closing)
+    return np.where(bundle.valid, closing, np.nan)
+
+
+def prepare_eyepoints(
+    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface]
+) -> Shots:
+    """Radiometry's shots of eyepoints that all see something.
+
+    Parameters
+    ----------
+    eyepoints : Eyepoints
+        n shots, each :attr:`Eyepoints.seen`.
+    parameters : mapping
+        Instrument, footprint and accuracy as for :func:`sweep.model.shot.evaluate`, scalars.
+        Range, velocity, reflectance and law come from the eyepoints and their surfaces.
+    surfaces : sequence of Surface
+        What the surface numbers mean.
+
+    Raises
+    ------
+    ValueError
+        Where a shot sees nothing.
+    """
+    if not eyepoints.seen.all():
+        raise ValueError("a shot that sees nothing has no radiometry: leave it out")
+    hit = eyepoints.surface >= 0
+    relative = np.where(hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
+    doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
+    sent = np.where(hit, eyepoints.weight, 0.0)
+    lit, back = np.zeros(len(hit)), np.zeros(hit.shape)
+    for surface, described in enumerate(surfaces):
+        here = np.where(eyepoints.surface == surface, sent * described.reflectance, 0.0)
+        cosine = np.where(eyepoints.surface == surface, eyepoints.cos_incidence, 0.0)
+        back += here * reflectance.backscatter(described.law, cosine)
+        lit += here.sum(axis=1)
+    footprints = Footprints(np.arange(len(hit)), relative, doppler, back / (1 + relative) ** 2)
+    shots = dict(parameters) | {
+        "target.range": eyepoints.range,
+        "target.radial_velocity": eyepoints.radial_velocity,
+        "target.reflectance": 1.0,
+    }
+    # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
+    shots["target.solar_irradiance"] = np.asarray(parameters["target.solar_irradiance"]) * lit
+    return prepare_footprints(shots, footprints)
