@@ -97,7 +97,9 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     """Probabilities of detection and of a false alarm by segment (up, Doppler, down), (3, n)."""
     found = np.stack([outputs["pd_up"], outputs["pd_doppler"], outputs["pd_down"]])
     noise_up = outputs["pfa_segment"]
-    noise_down = 10 ** (outputs["log10_pfa_shot"] - outputs["log10_pfa_segment"])
+    both, one = outputs["log10_pfa_shot"], outputs["log10_pfa_segment"]
+    some = np.isfinite(one)  # else the detection occupies every bin
+    noise_down = np.where(some, 10 ** (both - np.where(some, one, 0.0)), 0.0)
     up = 1 - (1 - noise_up) * (1 - outputs["p_leakage_up"])
     down = 1 - (1 - noise_down) * (1 - outputs["p_leakage_down"])
     return np.nan_to_num(found), np.stack([up, np.zeros_like(up), down])

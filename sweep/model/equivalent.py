@@ -15,6 +15,12 @@ from numba import njit
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 """Liberties that let reductions vectorise; nan and infinity keep their meaning."""
 
+AMPLITUDE_TOLERANCE = 1e-13
+"""Error of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
+
+POWER_TOLERANCE = 1e-18
+"""The same of powers: its root is what a null of |X| shows."""
+
 MOST_NODES = 64
 """Equivalent lines at the most; wider bundles are left as they are."""
 
@@ -24,15 +30,17 @@ def _bessel_bound(z: float, order: int) -> float:
     return 2 * math.exp(order * math.log(max(z, 1e-300) / 2) - math.lgamma(order + 1))
 
 
-@lru_cache(maxsize=1)
-def node_limits() -> np.ndarray:
-    """Largest pi h that J equivalent lines serve to 1e-13, (MOST_NODES + 1,); entry 0 is void."""
+@lru_cache(maxsize=2)
+def node_limits(tolerance: float) -> np.ndarray:
+    """Largest pi h that J equivalent lines serve to a tolerance, (MOST_NODES + 1,), from J = 1."""
     limits = np.zeros(MOST_NODES + 1)
     for nodes in range(1, MOST_NODES + 1):
         low, high = 0.0, 400.0
         for _ in range(80):
             middle = (low + high) / 2
-            low, high = (middle, high) if _bessel_bound(middle, nodes) < 1e-13 else (low, middle)
+            low, high = (
+                (middle, high) if _bessel_bound(middle, nodes) < tolerance else (low, middle)
+            )
         limits[nodes] = low
     return limits
 
@@ -83,7 +91,7 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
         following_node[i] = math.cos(math.pi * (i + 0.5) / nodes)
         out_re[i] = 0.0
         out_im[i] = 0.0
-        out_delta[i] = middle + half * following_node[i]
+        out_delta[i] = following_node[i]
     for j in range(nodes):
         moment_re, moment_im = 0.0, 0.0
         for b in range(n):
@@ -96,8 +104,9 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
         for i in range(nodes):
             out_re[i] += share * chebyshev[i] * moment_re
             out_im[i] += share * chebyshev[i] * moment_im
-            x_i = (out_delta[i] - middle) * inverse
-            after = 2.0 * x_i * following_node[i] - chebyshev[i]
+            after = 2.0 * out_delta[i] * following_node[i] - chebyshev[i]
             chebyshev[i] = following_node[i]
             following_node[i] = after
+    for i in range(nodes):
+        out_delta[i] = middle + half * out_delta[i]
     return nodes

@@ -13,7 +13,7 @@ import numpy as np
 
 from sweep.model import detection, footprint, link, noise, receiver, reflectance, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.equivalent import node_limits
+from sweep.model.equivalent import AMPLITUDE_TOLERANCE, POWER_TOLERANCE, node_limits
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -114,7 +114,7 @@ class Shots:
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach),
-            node_limits(),
+            node_limits(POWER_TOLERANCE if self.incoherent else AMPLITUDE_TOLERANCE),
             tangents(self.fft_size),
         )
 

@@ -51,7 +51,7 @@ def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
         (R_b - R_0)/R_0, beta_b - beta_0 and relative beat amplitude of each beamlet; the point's
         row in them.
     level : float
-        Bins whose magnitude is sure to stay below it are left out; 0 keeps all.
+        Bins in which lines stay below it, and their images too, may be left out; 0 keeps all.
     power : bool
         Whether beamlets add as powers.
     kernel : tuple

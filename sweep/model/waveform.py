@@ -76,7 +76,7 @@ def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 
 
-FOLD_PENALTY = 64.0
+FOLD_PENALTY = 4.0
 """Bins of mismatch that a reading without folds may have before one with a fold is preferred."""
 
 
@@ -102,6 +102,7 @@ def resolve(
     the carrier and to the range at mid-chirp is put right here.
     """
     penalty = FOLD_PENALTY * bin_width
+    at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
     least = np.full(np.shape(up), np.inf)
     f_d, f_r = np.zeros(np.shape(up)), np.zeros(np.shape(up))
     for folds in np.ndindex(2, 2, 2):
@@ -110,7 +111,7 @@ def resolve(
         )
         half_sum, half_difference = (u + d) / 2, np.abs(d - u) / 2
         for shift, beat in ((half_sum, half_difference), (half_difference, half_sum)):
-            cost = np.abs(shift - p) + sum(folds) * penalty
+            cost = np.abs(shift * at_start - p) + sum(folds) * penalty
             better = cost < least
             least = np.where(better, cost, least)
             f_d = np.where(better, np.where(d >= u, shift, -shift), f_d)

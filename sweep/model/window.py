@@ -178,7 +178,7 @@ def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, n
     """Largest |W| / sum at and beyond each distance, from dense samples of the closed form."""
     near = np.arange(1, min(256, length // 2) * 8) / 8
     far = np.geomspace(256, length / 2, 64) if length > 512 else np.empty(0)
-    y = np.concatenate([near, np.floor(far) + 0.5])
+    y = np.unique(np.concatenate([near, np.floor(far) + 0.5, [length / 2]]))
     y = y[y <= length / 2]
     theta = np.pi * (y + 1e-9) / length
     kernel = c[0] / np.tan(theta)
@@ -191,9 +191,12 @@ def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, n
 
 
 def _thinned(y: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The envelope at some 2 % steps of distance, each a bound for all beyond it."""
+    """The envelope at some 2 % steps of distance, each a bound for all beyond it.
+
+    The 3 % on top is for sidelobes whose peaks lie between samples.
+    """
     keep = np.unique(np.searchsorted(y, np.geomspace(y[0], y[-1], 512)).clip(0, y.size - 1))
-    return y[keep].copy(), envelope[keep].copy()
+    return y[keep].copy(), 1.03 * envelope[keep]
 
 
 def _tabulated(name: str, length: int) -> Window:

@@ -1,0 +1,269 @@
+"""Threshold, groups, leakage and probabilities of detection: closed forms, brute force, noise."""
+
+import mpmath
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from sweep.model import shot, truth
+from sweep.model.detection import RAYLEIGH_DEVIATION, assess, threshold
+from sweep.model.marcum import marcum_q1
+from sweep.model.preparation import prepare
+from sweep.model.spectra import segment_spectrum
+from sweep.model.window import samples
+
+
+def prepared(parameters):
+    ((_, shots),) = prepare(parameters)
+    return shots
+
+
+# Threshold
+
+
+def test_the_threshold_counts_standard_deviations_of_a_bins_magnitude():
+    """Not of its quadratures: the Rayleigh distribution's own deviation."""
+    deviation = stats.rayleigh(scale=1.7).std()
+    assert threshold(tnr=3.0, bin_deviation=1.7) == pytest.approx(3 * deviation, rel=1e-14)
+    assert pytest.approx(stats.rayleigh.std(), rel=1e-14) == RAYLEIGH_DEVIATION
+
+
+# Detection
+
+
+def test_the_mean_over_a_fluctuating_target_is_swerlings_closed_form(table_4_1):
+    """Exponential power of mean SNR S: exp(-Th^2 / (2 sigma^2 (1 + S))), PHYSICS section 8.
+
+    The pd of single shots, from evaluate(), averaged over the reflectance that makes the power.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    cumulative = (nodes + 1) / 2
+    scene = table_4_1(beamlets=1, fft_size=4096, tnr=6.0, range=3000.0)
+    mean = shot.evaluate(scene)["snr_down"][0]
+    drawn = shot.evaluate(scene | {"target.reflectance": -0.1 * np.log1p(-cumulative)})
+    averaged = drawn["pd_down"] @ weights / 2
+    crossing = 0.5 * 6.0**2 * RAYLEIGH_DEVIATION**2
+    assert averaged == pytest.approx(np.exp(-crossing / (1 + mean)), rel=1e-5)
+    assert 0.2 < averaged < 0.8
+
+
+@pytest.mark.parametrize("snr", [0.3, 3.0, 30.0])
+@pytest.mark.parametrize("level", [1.0, 4.0, 6.55])
+def test_marcums_q_averages_to_swerlings_closed_form(snr, level):
+    integral, _ = integrate.quad(
+        lambda s: float(marcum_q1(np.sqrt(2 * s), level).q) * np.exp(-s / snr) / snr, 0,
+        60 * snr + level**2, points=[level**2 / 2], limit=200, epsabs=1e-13, epsrel=1e-11,
+    )  # fmt: skip
+    assert integral == pytest.approx(np.exp(-0.5 * level**2 / (1 + snr)), rel=1e-9)
+
+
+@pytest.mark.parametrize("target_range", [1500.0, 3000.0, 4000.0, 6000.0])
+def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_range, table_4_1):
+    """SNR = Re P / (q B) n / (2 ENBW) less detector and amplifier noise; pd = Q_1 by ncx2."""
+    n, beat = 16384, 3000 * 600e6 / 16384
+    scene = table_4_1(
+        beamlets=1, fft_size=n, range=target_range, radial_velocity=beat * 1550e-9 / 2
+    )
+    echo = 0.1 * np.pi * 0.0125**2 / (2 * np.pi * target_range**2)
+    current = 2 * 1.1 * np.sqrt(1e-3 * echo) / (1 + (beat / 400e6) ** 2)
+    variance = 2 * 1.602176634e-19 * 1.1 * 1e-3 * 400e6 + (1.1 * 5e-12) ** 2 * 400e6 + (25e-9) ** 2
+    enbw = (0.54**2 + 0.46**2 / 2) / 0.54**2
+    snr = current**2 / 2 / variance * n / (2 * enbw)
+    crossing = 100 * (2 - np.pi / 2)  # (Th / sigma)^2 at a TNR of 10
+    results = shot.evaluate(scene)
+    assert results["snr_doppler"][0] == pytest.approx(snr, rel=1e-6)
+    # 1e-9 of signal shot noise and the rounding of ncx2 are far below this.
+    expected = stats.ncx2.sf(crossing, 2, 2 * snr)
+    assert results["pd_doppler"][0] == pytest.approx(expected, rel=1e-5)
+    assert results["miss_doppler"][0] == pytest.approx(
+        stats.ncx2.cdf(crossing, 2, 2 * snr), rel=1e-5
+    )
+
+
+def test_a_target_that_reflects_nothing_is_found_as_often_as_noise_crosses(table_4_1):
+    results = shot.evaluate(table_4_1(reflectance=0.0, tnr=3.0, fft_size=1024))
+    for segment in ("up", "down", "doppler"):
+        assert results[f"pd_{segment}"][0] == pytest.approx(results["pfa_bin"][0], rel=1e-13)
+        assert results[f"snr_{segment}"][0] == 0.0
+
+
+# Groups, exemptions and leakage
+
+
+def by_brute_force(magnitude, sigma, level, floor):
+    """Peak, exempt bins and leakage, bin by bin in Python and many digits."""
+    above = [m >= level for m in magnitude]
+    peak = max(range(len(magnitude)), key=lambda i: (magnitude[i], -i))
+    exempt = {
+        j for i in range(len(magnitude)) if above[i] or i == peak for j in (i - 1, i, i + 1)
+    } & set(range(len(magnitude)))
+    with mpmath.workdps(35):
+        beta = mpmath.mpf(level) / sigma
+        silence = mpmath.mpf(1)
+        for i, m in enumerate(magnitude):
+            if i not in exempt and m >= floor * sigma:
+                # Q_1 by its series; 35 digits are enough for their difference.
+                silence *= (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
+        return peak, exempt, float(1 - silence)
+
+
+def q1(a, b):
+    """Marcum's Q_1 from the Poisson mixture of chi-square tails."""
+    x, y = mpmath.mpf(a) ** 2 / 2, mpmath.mpf(b) ** 2 / 2
+    term, inner, total, weight = mpmath.mpf(1), mpmath.mpf(1), mpmath.mpf(0), mpmath.exp(-x)
+    for k in range(400):
+        total += weight * inner
+        weight *= x / (k + 1)
+        if k > x and weight * mpmath.exp(y) < 1e-35 * total:
+            break
+        term *= y / (k + 1)
+        inner += term
+    return mpmath.exp(-y) * total
+
+
+@pytest.mark.parametrize("level", [0.5, 2.0, 4.0, 6.55])
+def test_groups_exemptions_and_leakage_are_those_of_brute_force(level):
+    rng = np.random.default_rng((50, int(10 * level)))
+    for count in (1, 2, 3, 12, 40):
+        for scale in (0.01, 0.5, 2.0):
+            sigma = rng.uniform(0.5, 3)
+            magnitude = sigma * scale * rng.exponential(level, count)
+            for floor in (0.0, 0.1, 1.0):
+                exempt = np.empty(count, np.bool_)
+                peak, exempted, leakage = assess(
+                    magnitude, count, sigma, level * sigma, floor, exempt
+                )
+                best, excluded, chance = by_brute_force(magnitude, sigma, level * sigma, floor)
+                assert peak == best
+                assert set(np.flatnonzero(exempt)) == excluded and exempted == len(excluded)
+                assert leakage == pytest.approx(chance, rel=1e-12, abs=1e-300)
+
+
+def test_a_leaking_bin_adds_what_its_signal_adds_to_its_chance():
+    """Small signals: Q_1(a, b) - Q_1(0, b) is about exp(-b^2/2) a^2 b^2 / 4."""
+    exempt = np.empty(9, np.bool_)
+    magnitude = np.array([8.0, 0, 0, 0, 1e-6, 0, 0, 0, 0])
+    *_, leakage = assess(magnitude, 9, 1.0, 5.0, 0.0, exempt)
+    expected = np.exp(-12.5) * 1e-12 * 25 / 4 / (1 - np.exp(-12.5))
+    assert leakage == pytest.approx(expected, rel=1e-9)
+
+
+def test_two_groups_are_two_targets_and_the_gap_of_one_bin_belongs_to_both():
+    exempt = np.empty(12, np.bool_)
+    magnitude = np.array([0, 0, 0, 6, 0, 7, 6, 0, 0, 0, 0, 0.5])
+    peak, exempted, leakage = assess(magnitude, 12, 1.0, 5.0, 0.0, exempt)
+    assert (peak, exempted) == (5, 6)
+    assert np.flatnonzero(exempt).tolist() == [2, 3, 4, 5, 6, 7]
+    assert leakage > 0
+
+
+def test_the_first_of_equal_peaks_is_the_detection_and_a_threshold_met_is_crossed():
+    exempt = np.empty(6, np.bool_)
+    assert assess(np.array([5.0, 0, 0, 5.0, 0, 0]), 6, 1.0, 5.0, 0.0, exempt)[:2] == (0, 5)
+    assert assess(np.array([5.0, 0, 0, 4.999, 0, 0]), 6, 1.0, 5.0, 0.0, exempt)[:2] == (0, 2)
+
+
+@pytest.mark.parametrize("window", ["hamming", "rectangular", "flattop"])
+def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, table_4_1):
+    scenes = (
+        {"range": 30.0, "grazing_angle": 0.9}, {"range": 300.0, "grazing_angle": 0.1},
+        {"range": 2500.0, "grazing_angle": 1.5}, {"range": 700.0, "architecture": "direct"},
+    )  # fmt: skip
+    for changes in scenes:
+        scene = table_4_1(
+            fft_size=1024, tnr=4.0, beamlets=19, leakage_floor=0.0, window=window,
+            beam_divergence=1e-3, **changes,
+        )  # fmt: skip
+        shots, results = prepared(scene), shot.evaluate(scene)
+        sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
+        pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
+        for segment, name in ((0, "up"), (2, "down")):
+            exact = truth.spectrum(shots, 0, segment, range_walk=False)
+            peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0)
+            assert results[f"snr_{name}"][0] == pytest.approx(
+                exact[peak] ** 2 / (2 * sigma**2), rel=1e-8
+            )
+            assert results[f"p_leakage_{name}"][0] == pytest.approx(leakage, rel=1e-6, abs=1e-15)
+            alarms[name] = 1 - (1 - pfa) ** max(512 - len(excluded), 0)
+        assert results["pfa_segment"][0] == pytest.approx(alarms["up"], rel=1e-10)
+        assert results["pfa_shot"][0] == pytest.approx(alarms["up"] * alarms["down"], rel=1e-10)
+
+
+def test_a_leakage_floor_leaves_out_faint_bins_and_nothing_else(table_4_1):
+    """0.1 sigma, the default: a bin there crosses 1 % of a b^2/2 more often than noise alone."""
+    scene = table_4_1(fft_size=4096, range=np.geomspace(50, 5000, 40), beamlets=19, tnr=5.0)
+    exact = shot.evaluate(scene | {"accuracy.leakage_floor": 0.0})
+    floored = shot.evaluate(scene | {"accuracy.leakage_floor": 0.1})
+    for name, values in exact.items():
+        if not name.startswith("p_leakage"):
+            # The run of bins is another, so that sums are grouped otherwise.
+            assert floored[name] == pytest.approx(values, rel=1e-9, abs=1e-12), name
+    for name in ("p_leakage_up", "p_leakage_down"):
+        assert (floored[name] <= exact[name] * (1 + 1e-12)).all()
+        most = 2048 * exact["pfa_bin"] * (2 * 0.1) ** 2 / 2 * 25 * RAYLEIGH_DEVIATION**2
+        assert (exact[name] - floored[name] <= most).all()
+
+
+# White Gaussian noise on the samples of the truth
+
+DRAWS = 16_000
+"""5 sigma of a proportion near 1/2 is 0.02: an error of 2 % in pd is caught."""
+
+
+@pytest.fixture(scope="module")
+def noisy(table_4_1):
+    """Magnitudes of noisy records' bins by window: (shots, signal alone, (draws, bins))."""
+
+    def spectra(window, **changes):
+        scene = table_4_1(fft_size=256, beamlets=3, tnr=3.0, window=window, **changes)
+        shots = prepared(scene)
+        record = sum(truth.analytic_record(shots, 0, 0, b, range_walk=False).real for b in range(3))
+        rng = np.random.default_rng(51)
+        noise = rng.normal(scale=np.sqrt(shots.noise_variance[0]), size=(DRAWS, 256))
+        magnitude = np.abs(np.fft.rfft(samples(window, 256) * (record + noise), axis=1))
+        return scene, shots, segment_spectrum(shots, 0, 0)[1], magnitude
+
+    return spectra
+
+
+def within_five_sigma(rate, probability, draws):
+    return abs(rate - probability) <= 5 * np.sqrt(probability * (1 - probability) / draws)
+
+
+@pytest.mark.parametrize("window", ["rectangular", "hamming"])
+def test_noise_on_the_samples_detects_and_alarms_as_often_as_said(window, noisy):
+    scene, shots, signal, magnitude = noisy(window, range=1800.0)
+    results = shot.evaluate(scene)
+    peak, level, sigma = signal.argmax(), shots.threshold[0], shots.bin_deviation[0]
+    assert 0.2 < results["pd_up"][0] < 0.8
+    detected = (magnitude[:, peak] >= level).mean()
+    assert within_five_sigma(detected, results["pd_up"][0], DRAWS)
+    # Every bin by its own signal; DC and Nyquist, real, are no Rice variables.
+    for k in range(1, 128):
+        rate = (magnitude[:, k] >= level).mean()
+        assert within_five_sigma(rate, float(marcum_q1(signal[k] / sigma, level / sigma).q), DRAWS)
+
+
+def test_noise_alone_alarms_at_the_stated_rate_per_bin(noisy):
+    """127 bins of 16,000 draws, independent for a rectangular window: 5 sigma is 0.9 % of it."""
+    scene, shots, _, magnitude = noisy("rectangular", reflectance=0.0, range=1800.0)
+    rate = (magnitude[:, 1:128] >= shots.threshold[0]).mean()
+    pfa = shot.evaluate(scene)["pfa_bin"][0]
+    assert within_five_sigma(rate, pfa, DRAWS * 127)
+
+
+def test_false_alarms_and_leakage_together_are_the_chance_that_any_other_bin_crosses(noisy):
+    scene, shots, signal, magnitude = noisy("rectangular", range=503.0)
+    scene |= {"instrument.processing.tnr": 6.0, "accuracy.leakage_floor": 0.0}
+    level = 2 * shots.threshold[0]
+    results = shot.evaluate(scene)
+    peak = signal.argmax()
+    exempt = {j for i in np.flatnonzero(signal >= level) for j in (i - 1, i, i + 1)}
+    exempt |= {peak - 1, peak, peak + 1}
+    others = sorted(set(range(1, 128)) - exempt)
+    raised = (magnitude[:, others] >= level).any(axis=1).mean()
+    # evaluate counts 128 bins less the exempt ones; here DC and Nyquist are out: one bin fewer.
+    pfa = 1 - (1 - results["pfa_segment"][0]) / (1 - results["pfa_bin"][0])
+    expected = 1 - (1 - pfa) * (1 - results["p_leakage_up"][0])
+    assert expected > 1.2 * pfa
+    assert within_five_sigma(raised, expected, DRAWS)

@@ -1,0 +1,349 @@
+"""Link budget, receiver and noise: energy, published laws of the SNR, sums by hand."""
+
+import numpy as np
+import pytest
+from scipy import integrate
+from scipy.constants import c as speed_of_light
+
+from sweep.model import shot
+from sweep.model.footprint import beamlets
+from sweep.model.link import aperture_area, echo_power_scale
+from sweep.model.noise import SOURCES, bin_deviation, solar_power
+from sweep.model.preparation import prepare
+from sweep.model.receiver import electrical_bandwidth, transfer
+from sweep.model.reflectance import backscatter
+
+ELECTRON, BOLTZMANN = 1.602176634e-19, 1.380649e-23
+GAIN = 7e3
+"""Transimpedance of Table 4.1 [ohm]."""
+
+
+def prepared(parameters):
+    ((_, shots),) = prepare(parameters)
+    return shots
+
+
+# Light
+
+
+@pytest.mark.parametrize("law", ["thesis", "lambert"])
+def test_a_white_surface_scatters_all_its_light_into_the_hemisphere(law):
+    total, _ = integrate.quad(
+        lambda polar: 2 * np.pi * np.sin(polar) * backscatter(law, np.array(np.cos(polar))),
+        0, np.pi / 2,
+    )  # fmt: skip
+    assert total == pytest.approx(1.0, rel=1e-12)
+
+
+def test_an_unknown_reflectance_law_is_refused_with_the_choices():
+    with pytest.raises(ValueError, match="lambert"):
+        backscatter("lambertian", np.ones(1))
+
+
+def test_the_echo_is_that_of_equation_4_4():
+    """1 W, 25 mm, tau rho = 0.1, 2 km: 1 * (pi 0.0125^2) * 0.1 / (2 pi 2000^2) = 1.953125e-12 W."""
+    for efficiency, reflectance in ((0.1, 1.0), (0.5, 0.2)):
+        scale = echo_power_scale(
+            power=1.0, aperture=25e-3, optical_efficiency=efficiency, reflectance=reflectance,
+            range=2000.0,
+        )  # fmt: skip
+        echo = scale * backscatter("thesis", np.ones(1))
+        assert echo == pytest.approx(1.953125e-12, rel=1e-14)
+
+
+def test_a_whole_hemisphere_of_aperture_collects_the_whole_echo():
+    """A collecting area of 2 pi R^2 takes in all that the thesis's law scatters."""
+    diameter = 2 * np.sqrt(2) * 100.0
+    assert aperture_area(diameter) == pytest.approx(2 * np.pi * 100.0**2, rel=1e-15)
+    scale = echo_power_scale(
+        power=3.0, aperture=diameter, optical_efficiency=0.5, reflectance=0.4, range=100.0
+    )
+    assert scale * backscatter("thesis", np.ones(1)) == pytest.approx(3.0 * 0.5 * 0.4, rel=1e-14)
+
+
+@pytest.mark.parametrize("law, gain", [("thesis", 1.0), ("lambert", 2 * np.sin(np.radians(30)))])
+def test_beamlets_share_the_echo_of_the_beam(law, gain, table_4_1):
+    """A narrow beam at 30 deg: Lambert's 2 cos(incidence) times the thesis's diffuse law."""
+    scene = table_4_1(
+        reflectance_law=law, grazing_angle=np.radians(30), beam_divergence=1e-6, fft_size=1024
+    )
+    for number in (1, 19, 109):
+        shots = prepared(scene | {"footprint.beamlets": number})
+        echo = (shots.beat_scale * shots.amplitude / (2 * 1.1 * GAIN)) ** 2 / 1e-3
+        assert echo.sum() == pytest.approx(1.953125e-12 * gain, rel=1e-9)
+
+
+@pytest.mark.parametrize("law", ["thesis", "lambert"])
+def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_1):
+    """Grazing 0.03 rad, divergence 20 mrad: rays by vectors from 1 m of range on the axis."""
+    scene = table_4_1(
+        reflectance_law=law, grazing_angle=0.03, beam_divergence=20e-3, beamlets=37,
+        fft_size=1024, phases="incoherent", range=100.0,
+    )  # fmt: skip
+    (across, along), share = beamlets(37)
+    x, y = 5e-3 * across, 5e-3 * along
+    ray = np.array([np.cos(0.03) - y * np.sin(0.03), x, -np.sin(0.03) - y * np.cos(0.03)])
+    down = -ray[2] / np.sqrt((ray**2).sum(axis=0))
+    far = np.sin(0.03) / down
+    lit = down > 0
+    assert far[lit].max() / far[lit].min() > 2
+    shots = prepared(scene)
+    power = (shots.beat_scale * shots.amplitude[0] / (2 * 1.1 * GAIN)) ** 2 / 1e-3
+    scattered = down / np.pi if law == "lambert" else 1 / (2 * np.pi)
+    expected = 0.1 * np.pi * 0.0125**2 * share * scattered / (100.0 * far) ** 2
+    assert power[lit] == pytest.approx(expected[lit], rel=1e-10)
+    assert np.all(power[~lit] == 0)
+
+
+# Signal-to-noise ratio. A line in the middle of a bin has after the FFT the ratio of its mean
+# square to the noise's variance times N / (2 ENBW): its power is a sine's, shared by two bins.
+
+
+def carrier_to_noise(parameters, bins=1000):
+    """Mean square signal over noise variance in the record, from the Doppler segment's SNR."""
+    n = int(parameters["instrument.processing.fft_size"])
+    beat = bins * 600e6 / n
+    velocity = beat * 1550e-9 / 2
+    results = shot.evaluate(parameters | {"target.radial_velocity": velocity})
+    poles = 1 + (beat / parameters["instrument.receiver.detector_bandwidth"]) ** 2
+    poles *= 1 + (beat / parameters["instrument.receiver.amplifier_bandwidth"]) ** 2
+    hamming = 0.54**2 + 0.46**2 / 2
+    return results["snr_doppler"][0] * poles * hamming / 0.54**2 * 2 / n
+
+
+@pytest.fixture
+def shot_limited(table_4_1):
+    """Shot noise of the local oscillator alone, one beamlet."""
+    return table_4_1(
+        local_oscillator_power=0.5, noise_equivalent_power=0.0, amplifier_noise_current=0.0,
+        beamlets=1, fft_size=8192,
+    )  # fmt: skip
+
+
+def test_homodyne_shot_limited_snr_is_the_photons_over_the_bandwidth(shot_limited):
+    """Re P / (q B): PHYSICS section 3 with balanced detection and unit mixing efficiency."""
+    expected = 1.1 * 1.953125e-12 / (ELECTRON * 400e6)
+    assert carrier_to_noise(shot_limited) == pytest.approx(expected, rel=1e-8)
+
+
+def test_heterodyne_shot_limited_snr_is_that_of_equation_2_23(shot_limited):
+    """Re P / (2 q B), half of the homodyne receiver's; an RF noise figure divides it."""
+    scene = shot_limited | {"instrument.receiver.architecture": "heterodyne"}
+    expected = 1.1 * 1.953125e-12 / (2 * ELECTRON * 400e6)
+    assert carrier_to_noise(scene) == pytest.approx(expected, rel=1e-8)
+    for figure_db in (0.0, 3.0, 10.0):
+        figure = 10 ** (figure_db / 10)
+        noisy = scene | {"instrument.receiver.noise_figure": figure}
+        assert carrier_to_noise(noisy) == pytest.approx(expected / figure, rel=1e-8)
+
+
+def test_a_noise_figure_is_the_heterodyne_receivers_alone(shot_limited):
+    noisy = shot_limited | {"instrument.receiver.noise_figure": 2.0}
+    assert carrier_to_noise(noisy) == carrier_to_noise(shot_limited)
+
+
+def test_shot_limited_snr_is_linear_in_light_and_ignores_the_local_oscillator(shot_limited):
+    one = carrier_to_noise(shot_limited)
+    for path, factor, expected in (
+        ("instrument.laser.power", 2.0, 2.0),
+        ("instrument.telescope.aperture", 2.0, 4.0),
+        ("target.range", 2.0, 1 / 4),
+        ("instrument.receiver.mixing_efficiency", 0.5, 0.25),
+        ("instrument.receiver.excess_noise_factor", 3.0, 1 / 3),
+        ("instrument.receiver.apd_gain", 5.0, 1.0),
+        ("instrument.receiver.local_oscillator_power", 7.0, 1.0),
+        ("instrument.receiver.transimpedance", 0.3, 1.0),
+        ("instrument.processing.fft_size", 2, 1.0),
+    ):
+        scene = shot_limited | {path: shot_limited[path] * factor}
+        bins = 2000 if path.endswith("fft_size") else 1000
+        assert carrier_to_noise(scene, bins) / one == pytest.approx(expected, rel=1e-7), path
+
+
+def direct_snr(parameters):
+    """Mean square signal over noise variance in the record, from the up-chirp segment's SNR."""
+    n = 8192
+    scene = parameters | {
+        "instrument.processing.fft_size": n, "footprint.beamlets": 1, "target.range": 4 * 749.48,
+        "target.radial_velocity": 0.0, "instrument.processing.window": "rectangular",
+    }  # fmt: skip
+    beat = 2e12 * 2 * scene["target.range"] / speed_of_light
+    bins = round(beat / (600e6 / n))
+    scene["target.range"] *= bins * 600e6 / n / beat
+    snr = shot.evaluate(scene)["snr_up"][0]
+    poles = (1 + (bins * 600e6 / n / 400e6) ** 2) ** 2
+    return snr * poles * 2 / n, 1.953125e-12 * (2000.0 / scene["target.range"]) ** 2
+
+
+@pytest.fixture
+def thermally_limited(table_4_1):
+    """Direct detection of 4e6 times the light, with the thermal noise of its load alone."""
+    return table_4_1(
+        architecture="direct", noise_equivalent_power=0.0, amplifier_noise_current=0.0,
+        load_resistance=75.0, temperature=310.0,
+    )  # fmt: skip
+
+
+def test_direct_thermal_snr_is_a_quarter_of_equation_2_22(thermally_limited):
+    """2 Re^2 P^2 / (4 k T B / R_L) is for the peak current of full modulation, as link.py says."""
+    snr, echo = direct_snr(thermally_limited)
+    thesis = 2 * 1.1**2 * echo**2 / (4 * BOLTZMANN * 310.0 * 400e6 / 75.0)
+    assert snr == pytest.approx(thesis / 4, rel=1e-6)
+    half, _ = direct_snr(thermally_limited | {"instrument.receiver.modulation_index": 0.5})
+    assert half == pytest.approx(snr / 4, rel=1e-12)
+
+
+def test_direct_snr_falls_two_decibels_for_each_decibel_of_light(thermally_limited):
+    snr, _ = direct_snr(thermally_limited)
+    dimmed, _ = direct_snr(thermally_limited | {"target.reflectance": 0.1 * 10**-0.1})
+    assert 10 * np.log10(snr / dimmed) == pytest.approx(2.0, abs=1e-5)
+
+
+def test_direct_detection_ignores_the_local_oscillator_and_has_no_shot_noise_of_it(
+    thermally_limited,
+):
+    scene = thermally_limited | {"instrument.receiver.local_oscillator_power": 5.0}
+    assert direct_snr(scene) == direct_snr(thermally_limited)
+    assert np.all(prepared(scene).noise_sources["local_oscillator_shot"] == 0.0)
+
+
+# Noise
+
+
+def test_the_noise_of_table_4_1_by_hand(table_4_1):
+    """1.4099e-13 A^2 shot, 1.21e-14 detector, 6.25e-16 amplifier; times (7 kohm)^2."""
+    shots = prepared(table_4_1(fft_size=1024))
+    by_hand = {"local_oscillator_shot": 1.40992e-13, "detector": 1.21e-14, "amplifier": 6.25e-16}
+    for source, current in by_hand.items():
+        assert shots.noise_sources[source] == pytest.approx(current * 4.9e7, rel=1e-5)
+    assert shots.noise_variance == pytest.approx(7.53211e-6, rel=1e-5)
+    assert set(shots.noise_sources) == set(SOURCES)
+    assert shots.noise_sources["solar_shot"] == shots.noise_sources["thermal"] == 0.0
+    # 2 q Re P B of the echo, 1.953e-12 W.
+    assert shots.noise_sources["signal_shot"] == pytest.approx(2.7537e-22 * 4.9e7, rel=1e-3)
+
+
+def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_amplifiers(table_4_1):
+    plain = prepared(table_4_1(fft_size=1024, solar_irradiance=2.6e8)).noise_sources
+    gained = prepared(
+        table_4_1(fft_size=1024, solar_irradiance=2.6e8, apd_gain=10.0, excess_noise_factor=4.0)
+    ).noise_sources
+    factors = {
+        "local_oscillator_shot": 400.0, "signal_shot": 400.0, "solar_shot": 400.0,
+        "detector": 100.0, "amplifier": 1.0,
+    }  # fmt: skip
+    for source, factor in factors.items():
+        assert gained[source] == pytest.approx(factor * plain[source], rel=1e-13), source
+
+
+def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
+    for detector, amplifier in ((100e6, 400e6), (400e6, 100e6), (100e6, 100e6)):
+        assert (
+            electrical_bandwidth(detector_bandwidth=detector, amplifier_bandwidth=amplifier)
+            == 100e6
+        )
+        scene = table_4_1(detector_bandwidth=detector, amplifier_bandwidth=amplifier, fft_size=1024)
+        shot_noise = prepared(scene).noise_sources["local_oscillator_shot"]
+        assert shot_noise == pytest.approx(1.40992e-13 / 4 * 4.9e7, rel=1e-5)
+
+
+def test_shot_noise_of_the_signal_raises_false_alarms_below_some_five_metres(table_4_1):
+    """[T 4.2] reports the rise; the threshold is set by noise without the echo.
+
+    A variance larger by a share x raises exp(-Th^2/2 sigma^2) by exp(21.46 x): the echo of 5 m is
+    3.125e-7 W beside 1 mW, of which 92 % of the noise comes.
+    """
+    ranges = np.array([1.0, 2.0, 5.0, 20.0, 1000.0])
+    results = shot.evaluate(table_4_1(range=ranges, fft_size=1024, radial_velocity=10.0))
+    rise = results["pfa_bin"] / np.exp(-(4 - np.pi) / 4 * 100) - 1
+    share = 0.92 * 1.953125e-12 * (2000.0 / ranges) ** 2 / 1e-3
+    assert rise[2] == pytest.approx(np.exp(21.46 * share[2]) - 1, rel=0.01)
+    assert rise[0] == pytest.approx(np.exp(21.46 * share[0]) - 1, rel=0.02)
+    assert rise[0] > 0.1 and rise[2] < 0.01
+    assert np.log1p(rise[3]) / np.log1p(rise[2]) == pytest.approx(1 / 16, rel=1e-3)
+    excess = results["noise_variance"] - 7.53211e-6
+    assert excess[0] / excess[1] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_sunlight_by_hand_and_by_the_patch_that_the_receiver_sees():
+    """0.26 W/m^2/nm, 25 nm, 50 urad: 0.2 pW; the patch is pi (R div / 2)^2 at any range R."""
+    seen = solar_power(
+        solar_irradiance=2.6e8, reflectance=0.1, aperture=25e-3, beam_divergence=50e-6,
+        optical_passband=25e-9, optical_efficiency=0.8,
+    )  # fmt: skip
+    for distance in (10.0, 3000.0):
+        patch = np.pi * (distance * 25e-6) ** 2
+        scattered = 0.26 * 25.0 * patch * 0.1  # W
+        collected = scattered / np.pi * (np.pi * 0.0125**2) / distance**2
+        assert seen == pytest.approx(0.8 * collected, rel=1e-12)
+    assert seen == pytest.approx(0.8 * 1.994e-13, rel=1e-3)
+
+
+def test_sunlight_on_the_detector_is_shot_noise(table_4_1):
+    dark = prepared(table_4_1(fft_size=1024)).noise_variance
+    sunny = prepared(table_4_1(fft_size=1024, solar_irradiance=2.6e11)).noise_variance
+    current = 2 * ELECTRON * 1.1 * 1.994e-10 * 400e6
+    assert sunny - dark == pytest.approx(current * GAIN**2, rel=1e-3)
+
+
+def test_noise_of_a_bin_is_half_the_windowed_records_in_each_quadrature():
+    """White noise of variance 3 through a Hann window: its covariance, summed sample by sample."""
+    n = np.arange(128)
+    w = 0.5 - 0.5 * np.cos(2 * np.pi * n / 128)
+    sigma = bin_deviation(noise_variance=3.0, window_energy=(w**2).sum())
+    for k in (5, 31, 60):
+        turn = 2 * np.pi * k * n / 128
+        assert 3.0 * ((w * np.cos(turn)) ** 2).sum() == pytest.approx(sigma**2, rel=1e-12)
+        assert 3.0 * ((w * np.sin(turn)) ** 2).sum() == pytest.approx(sigma**2, rel=1e-12)
+        assert (w**2 * np.cos(turn) * np.sin(turn)).sum() == pytest.approx(0, abs=1e-12)
+
+
+# Receiver
+
+
+def response(frequency, detector=400e6, amplifier=200e6):
+    return transfer(
+        frequency, detector_bandwidth=detector, amplifier_bandwidth=amplifier, transimpedance=7e3
+    )
+
+
+def test_each_pole_takes_three_decibels_and_an_eighth_of_a_turn():
+    assert response(0.0) == 7e3
+    assert abs(response(200e6, detector=1e30)) == pytest.approx(7e3 / np.sqrt(2), rel=1e-12)
+    assert abs(response(400e6, amplifier=1e30)) == pytest.approx(7e3 / np.sqrt(2), rel=1e-12)
+    assert np.angle(response(200e6, detector=1e30)) == pytest.approx(-np.pi / 4, rel=1e-12)
+    assert abs(response(400e6, amplifier=400e6)) == pytest.approx(3500.0, rel=1e-12)
+    assert np.angle(response(400e6, amplifier=400e6)) == pytest.approx(-np.pi / 2, rel=1e-12)
+
+
+def test_far_above_its_poles_the_receiver_falls_forty_decibels_a_decade():
+    assert abs(response(1e12) / response(1e13)) == pytest.approx(100.0, rel=1e-5)
+
+
+def test_a_real_receiver_treats_negative_frequencies_as_the_mirror_image():
+    frequency = np.linspace(-1e9, 1e9, 41)
+    assert np.allclose(response(frequency), np.conj(response(-frequency)), rtol=1e-14)
+
+
+def test_the_receiver_answers_a_step_after_it_and_never_before():
+    """A causal decay: the impulse response is that of two cascaded RC stages."""
+    rate, size = 64e9, 2**16
+    frequency = np.fft.fftfreq(size, 1 / rate)
+    impulse = np.fft.ifft(response(frequency)).real * rate
+    t = np.arange(size) / rate
+    a, b = 2 * np.pi * 400e6, 2 * np.pi * 200e6
+    exact = 7e3 * a * b / (a - b) * (np.exp(-b * t) - np.exp(-a * t))
+    assert np.abs(impulse[: size // 2] - exact[: size // 2]).max() < 0.01 * exact.max()
+    assert np.abs(impulse[size // 2 :]).max() < 0.01 * exact.max()
+
+
+def test_the_receiver_sees_lines_where_they_are_before_they_fold(table_4_1):
+    """A 400 MHz beat folds to 200 MHz and keeps the 6 dB of 400 MHz."""
+    scene = table_4_1(beamlets=1, fft_size=4096, window="rectangular")
+    beat = 2731 * 600e6 / 4096  # the bin nearest to 400 MHz
+    results = [
+        shot.evaluate(scene | {"target.radial_velocity": f * 1550e-9 / 2})["snr_doppler"][0]
+        for f in (600e6 - beat, beat)
+    ]
+    losses = [(1 + (f / 400e6) ** 2) ** 2 for f in (600e6 - beat, beat)]
+    assert results[0] / results[1] == pytest.approx(losses[1] / losses[0], rel=1e-6)

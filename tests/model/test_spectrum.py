@@ -1,0 +1,299 @@
+"""Lines and their spectrum: exact sums over samples, phases in 60 digits, nothing left out."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.constants import c as speed_of_light
+
+from sweep.model.equivalent import (
+    AMPLITUDE_TOLERANCE,
+    MOST_NODES,
+    equivalent_lines,
+    node_limits,
+)
+from sweep.model.lines import folded_origin, segment_lines
+from sweep.model.preparation import prepare
+from sweep.model.segments import reach_of
+from sweep.model.spectra import segment_spectrum
+from sweep.model.spectrum import bin_magnitudes, tangents
+from sweep.model.window import COSINE_SUMS, samples, window
+
+TABULATED = ("kaiser(8.6)", "chebwin(100)", "dpss(3)", "tukey(0.3)", "gaussian(300)")
+
+
+def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=None):
+    """|X| of bins low .. high from lines of weights C_b at delta bins from the origin."""
+    fft_size, length = sizes
+    high = fft_size // 2 if high is None else high
+    w, n, count = window(name, length), len(delta), high - low + 1
+    re, im = np.array(weights).real.copy(), np.array(weights).imag.copy()
+    if power:
+        re, im = re**2 + im**2, np.zeros(n)
+    out, scratch, work = np.empty(count), np.empty(count), np.empty((3, count))
+    bin_magnitudes(
+        low, high, origin, np.asarray(delta, float), re, im, n, sizes,
+        (w.coefficients, w.numerator, w.poles, w.edge, w.table), power, tangents(fft_size), out,
+        scratch, work,
+    )  # fmt: skip
+    return out
+
+
+def record_of(sizes, origin, delta, weights):
+    """Records of the tones that those weights stand for, complex, (lines, L).
+
+    C = a/2 e^{i (phi + pi nu r)}: the phase is that at mid-record. Whole bins turn by whole
+    multiples of 1/N, taken exactly.
+    """
+    fft_size, length = sizes
+    n = np.arange(length)
+    whole = (n * origin) % fft_size / fft_size - (length * origin) % (2 * fft_size) / fft_size / 2
+    part = np.outer(delta, n - length / 2) / fft_size
+    return 2 * np.asarray(weights)[:, None] * np.exp(2j * np.pi * (whole + part))
+
+
+def bundle(rng, number, spread):
+    delta = rng.uniform(-spread, spread, number)
+    weights = (rng.normal(size=number) + 1j * rng.normal(size=number)) * rng.uniform(0, 1, number)
+    return delta, weights
+
+
+SIZES = [(256, 256), (255, 255), (256, 200), (255, 201), (2000, 77), (4096, 4096)]
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUMS, *TABULATED])
+@pytest.mark.parametrize("sizes", SIZES)
+def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
+    """Lines anywhere, near DC and Nyquist and beyond them, and their images."""
+    fft_size, length = sizes
+    rng = np.random.default_rng((40, fft_size, length))
+    w = samples(name, length)
+    # A table's polynomial misses e^{i pi y}, the edges of the window, by 2e-11 of their weight.
+    accuracy = 1e-12 if name in COSINE_SUMS else 1e-12 + 2e-11 * w[0]
+    for spread in (1e-9, 0.7, 12.0, fft_size):
+        for origin in (0, 1, fft_size // 5, fft_size // 2):
+            delta, weights = bundle(rng, 5, spread)
+            record = record_of(sizes, origin, delta, weights)
+            unit = np.abs(weights).sum() * w.sum()
+            exact = np.abs(np.fft.rfft(w * record.sum(axis=0).real, fft_size))
+            fast = magnitudes(name, sizes, origin, delta, weights)
+            assert np.abs(fast - exact).max() < accuracy * unit
+            halves = np.fft.fft(w * record, fft_size) / 2
+            mirrored = halves[:, -np.arange(fft_size // 2 + 1)]
+            exact = (np.abs(halves[:, : fft_size // 2 + 1]) ** 2 + np.abs(mirrored) ** 2).sum(
+                axis=0
+            )
+            fast = magnitudes(name, sizes, origin, delta, weights, power=True)
+            assert np.abs(fast - np.sqrt(exact)).max() < accuracy * unit
+
+
+@pytest.mark.parametrize("name", ["hann", "hamming"])
+def test_bins_of_a_long_record_are_within_1e_12_of_the_largest(name):
+    sizes = (2**17, 2**17)
+    delta, weights = bundle(np.random.default_rng(41), 4, 3.0)
+    w = samples(name, 2**17)
+    for origin in (3, 40_000, 2**16):
+        exact = np.abs(np.fft.rfft(w * record_of(sizes, origin, delta, weights).sum(axis=0).real))
+        fast = magnitudes(name, sizes, origin, delta, weights)
+        assert np.abs(fast - exact).max() < 1e-12 * exact.max()
+
+
+def test_any_run_of_bins_is_that_part_of_all_of_them():
+    delta, weights = bundle(np.random.default_rng(42), 7, 2.0)
+    for name in ("hann", "kaiser(8.6)"):
+        for sizes in ((512, 512), (500, 333)):
+            whole = magnitudes(name, sizes, 100, delta, weights)
+            for low, high in ((0, 0), (95, 105), (99, 99), (250, 250), (3, 200)):
+                part = magnitudes(name, sizes, 100, delta, weights, low=low, high=high)
+                assert part == pytest.approx(whole[low : high + 1], rel=1e-13)
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "blackmanharris"])
+def test_far_sidelobes_of_a_line_keep_their_digits(name):
+    """Relative to themselves, 1e-15 or less of the peak for Hann: closed form in 60 digits."""
+    length, offset = 4096, 0.375
+    fast = magnitudes(name, (length, length), 0, np.array([offset]), np.array([1.0 + 0j]))
+    with mpmath.workdps(60):
+
+        def transform(y):
+            total = mpmath.mpf(0)
+            for m, text in enumerate(COSINE_SUMS[name]):
+                for z in (y - m, y + m):
+                    turn = mpmath.expj(-2 * mpmath.pi * z / length)
+                    whole = mpmath.expj(-2 * mpmath.pi * z)
+                    total += (-1) ** m * mpmath.mpf(text) / 2 * (1 - whole) / (1 - turn)
+            return total
+
+        for k in (7, 50, 777, 2000, 2047):
+            # C = 1/2 a e^{i (phi + pi nu)}: undo the phase at mid-record for line and image.
+            half_turns = mpmath.expj(-mpmath.pi * offset)
+            line = half_turns * transform(mpmath.mpf(k) - offset)
+            image = mpmath.conj(half_turns) * transform(mpmath.mpf(k) + offset)
+            # Line and image nearly cancel for Hann and farther out: measured on one of them.
+            unit = float(abs(line))
+            assert abs(fast[k] - float(abs(line + image))) < 1e-10 * unit, k
+
+
+# Few lines for many
+
+
+@pytest.mark.parametrize("centre", [0.0, -0.31, 0.49])
+def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre):
+    """Sum of C e^{i u delta} for |u| <= pi, to the promised 1e-13 of the summed amplitudes."""
+    rng = np.random.default_rng(43)
+    limits, work = node_limits(AMPLITUDE_TOLERANCE), np.empty((5, 128))
+    u = np.linspace(-np.pi, np.pi, 41)[:, None]
+    allowed = 1e-13 + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
+    for spread in 10 ** np.linspace(-16, 2, 500):
+        delta, weights = bundle(rng, 109, spread)
+        delta += centre
+        few, re, im = np.empty(128), np.empty(128), np.empty(128)
+        n = equivalent_lines(
+            delta, weights.real.copy(), weights.imag.copy(), 109, np.pi, limits, few, re, im, work
+        )
+        assert n <= 109
+        many_sum = np.exp(1j * u * (delta - centre)) @ weights
+        few_sum = np.exp(1j * u * (few[:n] - centre)) @ (re[:n] + 1j * im[:n])
+        assert np.abs(few_sum - many_sum).max() < allowed * np.abs(weights).sum(), spread
+
+
+def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
+    limits, work = node_limits(AMPLITUDE_TOLERANCE), np.empty((5, 128))
+    few, re, im = np.empty(128), np.empty(128), np.empty(128)
+    counts = []
+    for spread in (0.0, 0.1, 1.0, 5.0, 200.0):
+        delta = np.linspace(-spread, spread, 109)
+        counts.append(
+            equivalent_lines(
+                delta, np.ones(109), np.zeros(109), 109, np.pi, limits, few, re, im, work
+            )
+        )
+    assert counts[0] == 1
+    assert counts[1] <= 10
+    assert counts == sorted(counts)
+    assert counts[-1] == 109 and np.array_equal(few[:109], delta)
+    assert limits.size == MOST_NODES + 1
+
+
+# Lines
+
+
+@given(st.floats(-1e6, 1e6), st.sampled_from([1000, 1023, 2**17]))
+def test_a_folded_line_lies_within_the_spectrum_at_an_alias_of_itself(centre, fft_size):
+    origin, turns, sign = folded_origin(centre, fft_size)
+    assert 0 <= origin <= (fft_size + 1) // 2
+    assert turns % fft_size == 0
+    assert sign in (-1.0, 1.0)
+    assert abs(sign * (centre - turns) - origin) <= 0.5
+
+
+LINE_SCENES = [
+    (segment, r, v, grazing, start)
+    for segment in range(3)
+    for r, v, grazing, start in (
+        (10e3, 150.0, 0.02, 0.0),
+        (1.0, -150.0, np.pi / 2, 70e-6),
+        (2345.678, 0.0, 0.5, 33e-6),
+        (9876.5, -320.0, 0.1, 69e-6),
+        (50e3, 900.0, 1.0, 120e-6),
+    )
+]
+
+
+@pytest.mark.parametrize("segment, r, v, grazing, start", LINE_SCENES)
+def test_lines_have_the_beat_and_the_phase_of_the_delay_in_sixty_digits(
+    segment, r, v, grazing, start, table_4_1
+):
+    """Phases of 1e10 cycles come out to 1e-9 of a turn: a plain product would lose 1e-5 of one.
+
+    Reference: the phase -f tau + s S (tau^2/2 - t tau) to first order in t from the sample at t_0,
+    and the poles' own phase.
+    """
+    scene = table_4_1(
+        range=r, radial_velocity=v, grazing_angle=grazing, acquisition_delay=start, fft_size=2**13,
+        beamlets=19, beam_divergence=1e-3,
+    )  # fmt: skip
+    ((_, shots),) = prepare(scene)
+    fft_size, length = 2**13, shots.window.length
+    p = shots.point_table()[:, 0]
+    n = shots.offset.shape[1]
+    delta, re, im = np.empty(n), np.empty(n), np.empty(n)
+    doppler = np.random.default_rng(44).uniform(-1e-9, 1e-9, n)  # +-0.15 m/s
+    sign = (1, 0, -1)[segment]
+    carrier = p[9] if sign < 0 else p[8]
+    origin = segment_lines(
+        (float(sign), carrier), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
+        (p[6], fft_size, length, p[7]), shots.offset[0], doppler, shots.amplitude[0], delta, re, im,
+    )  # fmt: skip
+    assert 0 <= origin <= fft_size // 2
+    worst_position, worst_weight = 0.0, 0.0
+    with mpmath.workdps(60):
+        f, rate = mpmath.mpf(carrier), mpmath.mpf(p[2])
+
+        def beat_of(tau, beta):
+            return f * beta - sign * rate * tau * (1 + beta)
+
+        centre_delay = 2 * mpmath.mpf(p[0]) / mpmath.mpf(speed_of_light)
+        centre = beat_of(centre_delay, mpmath.mpf(p[1])) * fft_size / mpmath.mpf(p[6])
+        turns = mpmath.nint(centre / fft_size) * fft_size
+        mirrored = centre < turns
+        for b in range(n):
+            metres = mpmath.mpf(p[0]) + mpmath.mpf(p[0] * shots.offset[0, b])
+            tau = 2 * metres / mpmath.mpf(speed_of_light)
+            beat = beat_of(tau, mpmath.mpf(p[1]) + mpmath.mpf(doppler[b]))
+            bins = beat * fft_size / mpmath.mpf(p[6]) - turns
+            phase = -f * tau + sign * rate * tau**2 / 2 + beat * mpmath.mpf(start)
+            poles = (1 + 1j * beat / mpmath.mpf(p[4])) * (1 + 1j * beat / mpmath.mpf(p[5]))
+            at_middle = phase + bins * length / fft_size / 2
+            weight = p[3] * shots.amplitude[0, b] / 2 / poles * mpmath.expjpi(2 * at_middle)
+            if mirrored:
+                bins, weight = -bins, mpmath.conj(weight)
+            error = complex(weight - mpmath.mpc(re[b], im[b]))
+            worst_position = max(worst_position, abs(float(bins - origin - delta[b])))
+            worst_weight = max(worst_weight, abs(error) / float(abs(weight)))
+    # Beats of 2e9 Hz round to 2e-7 Hz: 3e-12 bins, and 2e-10 rad over the acquisition delay.
+    assert worst_position < 1e-11
+    assert worst_weight < 1e-9
+
+
+# What is left out
+
+
+def test_the_reach_is_the_first_at_which_the_envelope_is_under_the_level():
+    envelope, reach = np.array([1.0, 0.5, 0.1, 0.01]), np.array([1.0, 2.0, 5.0, 9.0])
+    assert reach_of(0.2, 1.0, envelope, reach) == 5.0
+    assert reach_of(0.1, 1.0, envelope, reach) == 5.0
+    assert reach_of(0.2, 3.0, envelope, reach) == 9.0
+    assert reach_of(2.0, 1.0, envelope, reach) == 1.0
+    assert reach_of(0.005, 1.0, envelope, reach) == np.inf
+    assert reach_of(0.0, 1.0, envelope, reach) == np.inf
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "chebwin(60)", "kaiser(4)"])
+@pytest.mark.parametrize("fft_size", [2047, 2048, 4096])
+def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
+    name, fft_size, table_4_1
+):
+    for number, (r, grazing, phases, delay) in enumerate(
+        (
+            (500.0, 90.0, "coherent", 0.0), (5000.0, 20.0, "incoherent", 0.0),
+            (8000.0, 2.0, "coherent", 0.0), (60.0, 40.0, "incoherent", 497e-6),
+            (3000.0, 90.0, "coherent", 496e-6),
+        )
+    ):  # fmt: skip
+        scene = table_4_1(
+            range=r, grazing_angle=np.radians(grazing), phases=phases, window=name,
+            fft_size=fft_size, acquisition_delay=delay, beamlets=19 + number,
+        )  # fmt: skip
+        ((_, shots),) = prepare(scene)
+        for segment in range(3):
+            _, whole = segment_spectrum(shots, 0, segment)
+            for fraction in (0.3, 1e-2, 1e-3, 1e-5):
+                level = fraction * whole.max()
+                bins, part = segment_spectrum(shots, 0, segment, level=level)
+                assert part == pytest.approx(whole[bins], rel=1e-9, abs=1e-13 * whole.max())
+                left_out = np.delete(whole, bins)
+                # Line and image are each below the level.
+                both = np.sqrt(2) if phases == "incoherent" else 2.0
+                assert left_out.size == 0 or left_out.max() < both * level

@@ -1,0 +1,154 @@
+"""Windows: textbook figures, sums against samples, transforms against sums in many digits."""
+
+import mpmath
+import numpy as np
+import pytest
+from scipy import signal
+
+from sweep.model.window import COSINE_SUMS, canonical_name, samples, transform, window
+
+OTHERS = (
+    "kaiser(8.6)", "kaiser(0.5)", "chebwin(100)", "chebwin(45)", "dpss(3)", "gaussian(40)",
+    "tukey(0.3)", "bartlett", "parzen", "bohman", "cosine", "barthann", "lanczos",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name, scalloping, bandwidth",
+    [("rectangular", 3.92, 1.00), ("hann", 1.42, 1.50), ("hamming", 1.75, 1.36)],
+)
+@pytest.mark.parametrize("length", [4096, 131072])
+def test_scalloping_and_noise_bandwidth_are_the_textbook_figures(
+    name, scalloping, bandwidth, length
+):
+    """PHYSICS section 5, after Harris (1978), to the printed digits."""
+    shape = window(name, length)
+    assert shape.scalloping_loss == pytest.approx(scalloping, abs=0.0055)
+    assert shape.equivalent_noise_bandwidth == pytest.approx(bandwidth, abs=0.0051)
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUMS, *OTHERS])
+@pytest.mark.parametrize("length", [40, 64, 65, 777, 4096])
+def test_sum_and_energy_are_those_of_the_samples(name, length):
+    w, shape = samples(name, length), window(name, length)
+    assert w.shape == (length,)
+    assert shape.sum == pytest.approx(w.sum(), rel=1e-13)
+    assert shape.energy == pytest.approx((w**2).sum(), rel=1e-13)
+    assert shape.edge == pytest.approx(w[0], abs=1e-15)
+    assert shape.length == length
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUMS, *OTHERS])
+@pytest.mark.parametrize("length", [64, 65])
+def test_windows_are_periodic_and_peak_at_the_middle(name, length):
+    """DFT-even: symmetric about sample L/2, the first sample without a partner."""
+    w = samples(name, length)
+    assert np.allclose(w[1:], w[:0:-1], rtol=0, atol=1e-12)
+    assert w[length // 2] == pytest.approx(w.max(), abs=1e-12)
+    assert w.max() == pytest.approx(1.0, abs=1 / length)
+
+
+@pytest.mark.parametrize(
+    "name, same",
+    [("hanning", "hann"), (" Boxcar", "rectangular"), ("rect", "rectangular"),
+     ("Kaiser( 8.6 )", "kaiser(8.6)")],
+)  # fmt: skip
+def test_aliases_and_spellings_are_one_window(name, same):
+    assert canonical_name(name) == same
+    assert window(name, 128) is window(same, 128) or window(name, 128).name == same
+
+
+@pytest.mark.parametrize("name", ["hammig", "kaiser", "kaiser(one)", "hann(", "blackmann", ""])
+def test_a_window_that_scipy_does_not_know_is_refused(name):
+    with pytest.raises(ValueError):
+        samples(name, 64)
+
+
+def test_parameters_of_a_window_reach_scipy():
+    assert np.array_equal(samples("kaiser(8.6)", 99), signal.get_window(("kaiser", 8.6), 99))
+    assert np.array_equal(
+        samples("general_gaussian(1.5,7)", 99), signal.get_window(("general_gaussian", 1.5, 7), 99)
+    )
+
+
+# The transform
+
+
+def exact_transform(texts, length, y):
+    """W(y) of a cosine sum by adding its samples in 40 digits."""
+    with mpmath.workdps(40):
+        c = [mpmath.mpf(text) for text in texts]
+        step = 2 * mpmath.pi / length
+        return mpmath.fsum(
+            mpmath.fsum((-1) ** m * x * mpmath.cos(m * n * step) for m, x in enumerate(c))
+            * mpmath.expj(-step * n * mpmath.mpf(y))
+            for n in range(length)
+        )
+
+
+def fraction(shape, y):
+    """W(y) in float64 from numerator, poles and edge, as the class's docstring writes it."""
+    t = np.tan(np.pi * y / shape.length)
+    top = sum(x * t ** (2 * i) for i, x in enumerate(shape.numerator))
+    sine = np.sin(np.pi * (y - 2 * np.round(y / 2)))
+    real = sine * top / (t * np.prod([t * t - pole for pole in shape.poles]))
+    return np.exp(-1j * np.pi * (y - 2 * np.round(y / 2))) * (real + 1j * shape.edge * sine)
+
+
+@pytest.mark.parametrize("name", COSINE_SUMS)
+@pytest.mark.parametrize("length", [128, 129])
+def test_the_fraction_keeps_ten_digits_in_the_far_sidelobes(name, length):
+    """Hann's fall to 1e-7 of the peak here: term by term, seven digits would be lost."""
+    shape = window(name, length)
+    for y in (5.5, -7.25, 20.3, 40.5, 61.9, -63.4):
+        exact = complex(exact_transform(COSINE_SUMS[name], length, y))
+        assert abs(fraction(shape, y) - exact) < 1e-11 * abs(exact), y
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "blackmanharris"])
+def test_far_sidelobes_of_a_long_window_keep_their_digits_too(name):
+    """131072 samples by the closed form of a geometric series in 60 digits."""
+    length = 131072
+    shape = window(name, length)
+    with mpmath.workdps(60):
+        turn = -2 * mpmath.pi * mpmath.j
+
+        def series(z):
+            return (1 - mpmath.exp(turn * z)) / (1 - mpmath.exp(turn * z / length))
+
+        for y in (5.5, 100.25, 5000.5, 65535.375):
+            exact = mpmath.fsum(
+                (-1) ** m * mpmath.mpf(text) * (series(y - m) + series(y + m)) / 2
+                for m, text in enumerate(COSINE_SUMS[name])
+            )
+            assert abs(fraction(shape, y) - complex(exact)) < 1e-11 * abs(complex(exact)), y
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "flattop"])
+def test_the_direct_sum_is_the_sum_in_many_digits(name):
+    y = np.array([0.0, 0.5, 1.0, 2.75, -30.5, 64.0])
+    exact = [complex(exact_transform(COSINE_SUMS[name], 128, float(x))) for x in y]
+    assert np.abs(transform(window(name, 128), y) - exact).max() < 1e-13 * 128
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUMS, *OTHERS])
+def test_a_tone_leaks_no_more_than_all_its_energy(name):
+    """Parseval: the mean of |W|^2 over a period of y is the window's energy times its length."""
+    length = 96
+    y = np.arange(4 * length) / 4
+    power = np.abs(transform(window(name, length), y)) ** 2
+    assert power.sum() / 4 == pytest.approx(length * window(name, length).energy, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUMS, *OTHERS])
+@pytest.mark.parametrize("length", [100, 257, 1500])
+def test_the_envelope_bounds_every_sidelobe_beyond_its_reach(name, length):
+    shape = window(name, length)
+    rng = np.random.default_rng(length)
+    dense = np.concatenate([np.arange(0.125, 60, 1 / 64), rng.uniform(0.2, length / 2, 1500)])
+    y = np.sort(dense[(dense >= shape.reach[0]) & (dense <= length / 2)])
+    magnitude = np.abs(transform(shape, y)) / shape.sum
+    bound = shape.envelope[np.searchsorted(shape.reach, y, side="right") - 1]
+    assert (np.diff(shape.envelope) <= 0).all() and (np.diff(shape.reach) > 0).all()
+    # Rounding of the direct sum: 1e-16 a sample.
+    assert (magnitude <= bound * (1 + 1e-9) + 1e-13).all()
