@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 #: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
 #: worker's memory does not grow with the block.
-SUB_BATCH = 8192
+SUB_BATCH = 1 << 16
 
 #: Counts of draws held at once; many batches make a point larger.
 SUB_BATCH_COUNTS = 1 << 19
