@@ -33,11 +33,11 @@ def best(function, *arguments) -> float:
 
 
 def study() -> Spec:
-    """The published range-angle study at three powers: a minute on two cores."""
+    """The published range-angle study at four powers: a minute on two cores."""
     import yaml
 
     mapping = yaml.safe_load((EXPERIMENTS / "range_angle.yaml").read_text())
-    mapping["axes"]["instrument.laser.power"] = ["1 W", "3 W", "5 W"]
+    mapping["axes"]["instrument.laser.power"] = ["1 W", "2 W", "3 W", "5 W"]
     return Spec.from_mapping(mapping, base=EXPERIMENTS)
 
 

@@ -125,12 +125,12 @@ class Storage(Part):
         int,
         Numeric(
             about="Points that one block holds at most",
-            example="32768",
+            example="65536",
             at_least="1",
             at_most="1e9",
             whole=True,
         ),
-    ] = 32768
+    ] = 65536
 
 
 class Execution(Part):

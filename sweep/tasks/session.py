@@ -158,8 +158,10 @@ class Session:
         """Compute blocks until none is left; why it ended, where it was not that."""
         with Interrupts() as interrupts, ExitStack() as stack:
             try:
-                self._compile()
+                compiling = threading.Thread(target=compile_kernels, args=[self._grid], daemon=True)
+                compiling.start()  # beside the workers' start, which is mostly waiting
                 answers = stack.enter_context(self._answers(todo, lambda: interrupts.stopping))
+                self._await(compiling)
                 self._progress.begin(points=self._grid.points, done=points_before)
                 stack.callback(self._progress.end)
                 return self._take(answers, todo, interrupts)
@@ -170,16 +172,12 @@ class Session:
             except OSError as error:
                 return f"the store can't be written: {error}"
 
-    def _compile(self) -> None:
-        """Compile the kernels, and say so where that is not a matter of reading them from disk."""
-        notice = threading.Timer(
-            COMPILING, self._progress.say, ["compiling the model's kernels, once: some 20 s"]
-        )
-        notice.start()
-        try:
-            compile_kernels(self._grid)
-        finally:
-            notice.cancel()
+    def _await(self, compiling: threading.Thread) -> None:
+        """Wait for the kernels, and say so where that is not a matter of reading them from disk."""
+        compiling.join(COMPILING)
+        if compiling.is_alive():
+            self._progress.say("compiling the model's kernels, once: some 20 s")
+            compiling.join()
 
     @contextmanager
     def _answers(self, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Iterator[Answer]]:
