@@ -169,7 +169,7 @@ def _print_summary(store: Path) -> None:
             f"{row.points:,}",
             f"{100 * row.detected:.1f} %",
             f"{row.pd_shot:.4g}",
-            f"{row.pd_doppler:.4g}",
+            f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
         )
     Console().print(table)
 

@@ -100,6 +100,12 @@ def _row(part: str, shot: np.ndarray, doppler: np.ndarray) -> Row:
         part,
         int(shot.size),
         float(np.mean(shot > DETECTED)),
-        float(np.median(shot)),
-        float(np.median(doppler)),
+        _median(shot),
+        _median(doppler),
     )
+
+
+def _median(values: np.ndarray) -> float:
+    """Median of what there is; nan where there is nothing (no Doppler segment)."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if there.size else float("nan")
