@@ -1,0 +1,161 @@
+"""Tallies of navigation errors: parts add up to the whole, and to what numpy says of all draws."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sweep.model.geometry.beams import corners
+from sweep.model.navigation import velocity
+from sweep.model.navigation_tally import merge, tally
+
+FIELDS = ("attempts", "count", "mean", "deviation", "predicted")
+
+
+def _draws(n, *, bias=(3.0, -2.0, 0.5), seed=1):
+    rng = np.random.default_rng(seed)
+    mixing = np.array([[1.0, 0.0, 0.0], [0.8, 0.5, 0.0], [-0.3, 0.2, 2.0]])
+    error = rng.standard_normal((n, 3)) @ mixing.T + np.asarray(bias)
+    covariance = (mixing @ mixing.T) * rng.uniform(0.5, 1.5, (n, 1, 1))
+    return error, covariance, rng.random(n) < 0.9
+
+
+def _units(sizes):
+    """Tallies of stretches of the same draws, and the draws."""
+    error, covariance, available = _draws(sum(sizes))
+    ends = np.cumsum([0, *sizes])
+    parts = [
+        tally(error[a:b], covariance[a:b], available=available[a:b]) for a, b in pairwise(ends)
+    ]
+    return parts, (error, covariance, available)
+
+
+def _same_bits(one, other):
+    return all(getattr(one, f).tobytes() == getattr(other, f).tobytes() for f in FIELDS)
+
+
+def test_a_tally_says_what_numpy_says_of_all_draws():
+    error, covariance, available = _draws(5000)
+    result = tally(error, covariance, available=available)
+    held = error[available]
+    assert result.count == available.sum() and result.attempts == 5000
+    assert result.availability == available.mean()
+    np.testing.assert_allclose(result.bias, held.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(result.covariance, np.cov(held.T), rtol=1e-12)
+    np.testing.assert_allclose(result.rmse, np.sqrt((held**2).mean(axis=0)), rtol=1e-12)
+    np.testing.assert_allclose(
+        result.predicted_covariance, covariance[available].mean(axis=0), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("sizes", [[2000, 3000], [1, 0, 999, 17, 2500, 1483], [500] * 10])
+def test_merged_tallies_equal_one_pass(sizes):
+    parts, (error, covariance, available) = _units(sizes)
+    whole, merged = tally(error, covariance, available=available), merge(parts)
+    assert merged.attempts == whole.attempts and merged.count == whole.count
+    for name in FIELDS[2:]:
+        np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
+
+
+def test_tallies_are_merged_in_a_fixed_tree():
+    parts, _ = _units([311, 7, 1200, 44, 901, 3, 650])
+    a, b, c, d, e, f, g = parts
+    assert _same_bits(merge(parts), ((a + b) + (c + d)) + ((e + f) + g))
+    arrived = {i: parts[i] for i in (4, 0, 6, 2, 5, 1, 3)}
+    assert _same_bits(merge([arrived[i] for i in sorted(arrived)]), merge(parts))
+    # another order is the same sum up to rounding only, which is why the order is fixed
+    other = merge(parts[::-1])
+    assert other.count == merge(parts).count
+    np.testing.assert_allclose(other.deviation, merge(parts).deviation, rtol=1e-12)
+    assert not _same_bits(other, merge(parts))
+
+
+def test_a_bias_far_above_the_spread_costs_no_digits_of_the_spread():
+    """Sums of squares would lose the twelve digits that lie between (1e6)^2 and 1."""
+    error, covariance, available = _draws(8000, bias=(1e6, -1e6, 1e6))
+    available[:] = True
+    ends = np.arange(0, 8001, 1000)
+    parts = [
+        tally(error[a:b], covariance[a:b], available=available[a:b]) for a, b in pairwise(ends)
+    ]
+    mean = [math.fsum(column) / 8000 for column in error.T]
+    apart = error - mean
+    exact = [[math.fsum(p * q) / 7999 for q in apart.T] for p in apart.T]
+    # a mean rounds to 1e-10; times the 0.1 between means of parts, that is 1e-11 of the spread
+    np.testing.assert_allclose(merge(parts).covariance, exact, rtol=3e-11)
+    np.testing.assert_allclose(
+        tally(error, covariance, available=available).covariance, exact, rtol=1e-12
+    )
+
+
+def test_cells_of_altitude_and_pattern_hold_their_own_draws():
+    error, covariance, available = _draws(3000)
+    rng = np.random.default_rng(2)
+    altitude, pattern = rng.uniform(0, 700, 3000), rng.integers(0, 2, 3000)
+    edges = np.array([100.0, 200.0, 400.0, 500.0])
+    result = tally(
+        error,
+        covariance,
+        available=available,
+        cells=(np.digitize(altitude, edges) - 1, pattern),
+        shape=(3, 2),
+    )
+    assert result.attempts.shape == (3, 2) and result.covariance.shape == (3, 2, 3, 3)
+    for i, j in np.ndindex(3, 2):
+        here = (altitude >= edges[i]) & (altitude < edges[i + 1]) & (pattern == j)
+        alone = tally(error[here], covariance[here], available=available[here])
+        for name in FIELDS:
+            np.testing.assert_allclose(
+                getattr(result, name)[i, j], getattr(alone, name), rtol=1e-12, err_msg=name
+            )
+    assert result.attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
+
+
+def test_what_is_not_there_is_nan_and_never_a_warning():
+    error, covariance, _ = _draws(4)
+    error[1:] = np.nan
+    here = np.array([True, False, False, False])
+    with np.errstate(all="raise"):
+        result = tally(error, covariance, available=here, cells=([0, 0, 1, 1],), shape=(3,))
+        result = result + result
+        assert result.availability[:2].tolist() == [0.5, 0.0] and np.isnan(result.availability[2])
+        assert np.isfinite(result.bias[0]).all() and np.isnan(result.bias[1:]).all()
+        assert np.isfinite(result.rmse[0]).all() and np.isnan(result.rmse[1:]).all()
+        assert np.isnan(result.predicted_covariance[1:]).all()
+        once = tally(error, covariance, available=here)
+        assert np.isnan(once.covariance).all()  # one draw has no spread
+
+
+def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_covariance():
+    n, pd, moving = 20_000, 0.8, np.array([5.0, -3.0, -60.0])
+    beams, rng = corners(math.radians(22.5)), np.random.default_rng(3)
+    found = velocity(
+        direction=beams,
+        radial_velocity=beams @ moving + rng.normal(0, 0.01, (n, 4)),
+        standard_error=0.01,
+        valid=rng.random((n, 4)) < pd,
+    )
+    result = tally(found.velocity - moving, found.covariance, available=found.available)
+    expected = pd**4 + 4 * pd**3 * (1 - pd)
+    assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
+    stated = np.diag(result.predicted_covariance)
+    assert (np.abs(result.bias) <= 5 * np.sqrt(stated / result.count)).all()
+    # draws of three and of four beams mix, so the spread of squares is taken from themselves
+    off = found.velocity[found.available] - moving
+    spread = np.std(off**2, axis=0) / np.sqrt(result.count)
+    assert (np.abs(np.diag(result.covariance) - stated) <= 5 * spread).all()
+    assert (5 * spread < 0.07 * stated).all()  # a variance 7 % off would show
+    np.testing.assert_allclose(
+        result.rmse**2, np.diag(result.covariance) + result.bias**2, rtol=2 / result.count
+    )
+
+
+def test_tallies_that_can_not_be_are_refused():
+    error, covariance, available = _draws(5)
+    with pytest.raises(ValueError, match="tally needs"):
+        tally(error, covariance[:, :2], available=available)
+    with pytest.raises(ValueError, match="tally needs"):
+        tally(error, covariance, available=available, cells=([0] * 5,), shape=(1, 1))
+    with pytest.raises(ValueError, match="no tally"):
+        merge([])
