@@ -37,7 +37,7 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
         {"workers": 2, "processes": False},
         {"workers": 4, "processes": False},
     ],
-    ids=["1 process", "2 processes", "2 threads", "4 threads"],
+    ids=["1 process", "2 processes", "4 processes", "2 threads", "4 threads"],
 )
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
     undisturbed, tmp_path, place
