@@ -1,0 +1,216 @@
+"""Position of a tone between bins, from the magnitudes of the largest bin and its two neighbours.
+
+With the window's transform W at the spacing of the bins, a lone tone delta bins past the centre
+bin has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. How they are turned back into
+delta depends on the window:
+
+- Where the neighbours of a tone on a bin still stand high (Hann, Hamming and all wider ones), the
+  measure (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is
+  delta / 2), and one step of least squares, weighted by the noise's covariance between the three
+  bins, follows: the least error that three magnitudes allow.
+- Where the neighbours vanish (rectangular) the larger of them says the side, and the measure is
+  larger / (centre + larger), for the rectangular window delta itself.
+
+The tables are made of the window's own transform, so a noise-free lone tone is placed exactly
+(1e-6 bins). What biases the estimate: other lines within the reach of the kernel, the tone's own
+image near DC and Nyquist, a footprint that spreads over bins (the estimate is then one of its
+centre), and in the rectangular window noise that turns the wrong neighbour into the larger one.
+
+The error under noise follows to first order from the noise in phase with the signal, which the
+window correlates between bins. The Cramer-Rao bound is that of the whole record without a window;
+three magnitudes of a windowed spectrum do not reach it.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sweep.model.spectrum import bin_magnitudes, tangents
+from sweep.model.window import Window, samples
+
+_STEPS = 2048
+"""Intervals of the tables: their linear interpolation is good to some 1e-7 bins."""
+
+_VANISHING = 0.25
+"""Height of the neighbours of a tone on a bin under which the larger of them is used alone."""
+
+THREE_BINS, TWO_BINS = 0, 1
+
+
+class Interpolator(NamedTuple):
+    """Tables of one window and FFT, as the compiled code takes them; m places from 0 to 1 bin."""
+
+    measure: int
+    """THREE_BINS or TWO_BINS."""
+    low: float
+    """The measure of a tone on the centre bin."""
+    step: float
+    """Spacing of the measures in `position`."""
+    position: np.ndarray
+    """(m,): |delta| [bins] of measures low, low + step ..; 0..1."""
+    weight: np.ndarray
+    """(3, m): weights of the step of least squares by |delta|, for the bin on the tone's side
+    last; of magnitudes in units of the centre's. Zero for TWO_BINS."""
+    error: np.ndarray
+    """(m,): standard error [bins] by |delta| where the centre bin's magnitude is sigma."""
+    mixing: tuple[float, float, float, float]
+    """What makes the noise of three adjacent bins of independent numbers (:func:`noise_triple`)."""
+
+
+def noise_correlation(window: Window, fft_size: int) -> tuple[float, float]:
+    """Correlation of the noise of bins one and two apart, in phase with a tone's signal."""
+    squared = samples(window.name, window.length) ** 2
+    turns = (np.arange(window.length) - window.length / 2) / fft_size
+    near, far = (float(squared @ np.cos(2 * np.pi * d * turns)) for d in (1, 2))
+    return near / window.energy, far / window.energy
+
+
+@lru_cache(maxsize=32)
+def interpolator(window: Window, fft_size: int) -> Interpolator:
+    """Tables that place a tone between bins, made once for a window and FFT size.
+
+    A top so flat that nothing grows with delta (flat-top windows in a padded FFT) has no place
+    between bins: delta is then 0 and its error half a bin.
+    """
+    delta = np.arange(_STEPS + 1) / _STEPS
+    tone = _tone(window, fft_size, delta)
+    vanishing = tone[2, 0] < _VANISHING * tone[1, 0]
+    below, centre, above = tone
+    values = above / (centre + above) if vanishing else (above - below) / (tone.sum(0) + centre)
+    near, far = noise_correlation(window, fft_size)
+    weight, error = _least_squares(tone, delta, near, far, two_bins=bool(vanishing))
+    if not (np.diff(values[: _STEPS // 2 + 1]) > 0).all():
+        weight, error, delta = 0 * weight, np.full_like(error, 1e30), 0 * delta
+    values = np.maximum.accumulate(values)
+    grid = np.linspace(values[0], values[-1], _STEPS + 1)
+    return Interpolator(
+        measure=TWO_BINS if vanishing else THREE_BINS,
+        low=float(values[0]),
+        step=max(float(grid[1] - grid[0]), 1e-12),
+        position=np.interp(grid, values, delta),
+        weight=0 * weight if vanishing else weight,
+        error=error,
+        mixing=_mixing(near, far),
+    )
+
+
+def _tone(window: Window, fft_size: int, delta: np.ndarray) -> np.ndarray:
+    """Magnitudes of three bins around lone tones delta bins past the middle one, (3, m).
+
+    The tone lies midway between DC and Nyquist, where its image adds 1e-10 of its power or less.
+    """
+    w = window
+    shape = (w.coefficients, w.numerator, w.poles, w.edge, w.table)
+    room, one, none = np.empty((5, 3)), np.ones(1), np.zeros(1)
+    origin = fft_size // 4
+    tone = np.empty((3, delta.size))
+    for i, d in enumerate(delta):
+        bin_magnitudes(
+            origin - 1, origin + 1, origin, np.array([d]), one, none, 1, (fft_size, w.length),
+            shape, True, tangents(fft_size), room[0], room[1], room[2:],
+        )  # fmt: skip
+        tone[:, i] = room[0]
+    return tone
+
+
+def _least_squares(
+    tone: np.ndarray, delta: np.ndarray, near: float, far: float, *, two_bins: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (3, m) on the bins that give a small change of delta, and their error (m,).
+
+    Of all weights that a change of amplitude leaves at zero and a change of delta moves as much,
+    those of least variance: u = C^-1 G (G' C^-1 G)^-1 (0, 1)' with G = (tone, its slope). For a
+    centre bin of 1.
+    """
+    slope = np.gradient(tone, delta, axis=1)
+    used = slice(1 if two_bins else 0, 3)
+    covariance = np.array([[1, near, far], [near, 1, near], [far, near, 1]])[used, used]
+    inverse = np.linalg.inv(covariance + 1e-12 * np.eye(len(covariance)))
+    scale = np.maximum(tone[1], 1e-3 * tone[1, 0])
+    g = np.stack([tone[used] / scale, slope[used] / scale], axis=-1).swapaxes(0, 1)
+    solution = np.linalg.pinv(g.mT @ inverse @ g, hermitian=True)[:, :, 1]
+    weight = np.zeros_like(tone)
+    weight[used] = (inverse @ g @ solution[:, :, None])[:, :, 0].T
+    return weight, np.sqrt(np.maximum(solution[:, 1], 0.0))
+
+
+def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
+    """Factors of the covariance's root: bin 0, then +1, then -1."""
+    rest = math.sqrt(max(1 - near**2, 0.0))
+    across = (far - near**2) / rest if rest > 0 else 0.0
+    return near, rest, across, math.sqrt(max(1 - near**2 - across**2, 0.0))
+
+
+def cramer_rao_bound(window: Window, fft_size: int, ratio: np.ndarray) -> np.ndarray:
+    """Least standard deviation [bins of fs/N] of any unbiased estimate of a tone's frequency.
+
+    Parameters
+    ----------
+    window, fft_size
+        Window (length L) and FFT size N.
+    ratio : (n,) ndarray
+        Magnitude of the tone on a bin over the noise sigma per quadrature, in this window.
+
+    Notes
+    -----
+    Amplitude, phase and frequency unknown, white noise of variance s^2: the variance of the
+    frequency is at least 24 s^2 / (A^2 L (L^2 - 1)) [rad^2 a sample; Rife and Boorstyn 1974].
+    With |X| = A sum(w) / 2 and sigma^2 = sum(w^2) s^2 / 2 the ratio gives s / A.
+    """
+    length = window.length
+    noise_over_amplitude = window.sum / (math.sqrt(2 * window.energy) * np.asarray(ratio))
+    least = math.sqrt(24 / (length * (length**2 - 1.0))) * noise_over_amplitude
+    return np.asarray(least * fft_size / (2 * math.pi))
+
+
+@njit(cache=True, error_model="numpy")
+def sub_bin(below, centre, above, tables):
+    """Tone's distance [bins, -1..1] past the centre bin, from the magnitudes of three bins."""
+    measure, low, step, position, weight = tables[:5]
+    larger, lesser = max(below, above), min(below, above)
+    if not larger > 0.0:
+        return 0.0
+    if measure == THREE_BINS:
+        value = (larger - lesser) / (lesser + 2.0 * centre + larger)
+    else:
+        value = larger / (centre + larger)
+    delta = _at(position, (value - low) / step)
+    if measure == THREE_BINS and centre > 0.0:
+        place = delta * (position.size - 1)
+        change = lesser * _at(weight[0], place) + larger * _at(weight[2], place)
+        delta = min(max(delta + _at(weight[1], place) + change / centre, -1.0), 1.0)
+    return delta if above >= below else -delta
+
+
+@njit(cache=True, error_model="numpy")
+def _at(values, place):
+    """Linear interpolation in a table at a fractional index, which is clipped to the table."""
+    place = min(max(place, 0.0), values.size - 1.0)
+    i = min(int(place), values.size - 2)
+    return values[i] + (place - i) * (values[i + 1] - values[i])
+
+
+@njit(cache=True, error_model="numpy")
+def sub_bin_error(delta, ratio, tables):
+    """Standard error [bins] of :func:`sub_bin`, at most 1/2.
+
+    ``ratio`` is the centre bin's magnitude over the noise sigma per quadrature.
+    """
+    error = tables[5]
+    if not ratio > 0.0:
+        return 0.5
+    return min(_at(error, abs(delta) * (error.size - 1)) / ratio, 0.5)
+
+
+@njit(cache=True, error_model="numpy")
+def noise_triple(centre, below, above, tables):
+    """One quadrature of the noise of bins -1, 0, +1, correlated as the window correlates it.
+
+    Of three independent standard normal numbers; the middle bin's is the first of them.
+    """
+    near, rest, across, own = tables[6]
+    upper = near * centre + rest * above
+    return near * centre + across * above + own * below, centre, upper

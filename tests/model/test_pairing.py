@@ -1,0 +1,250 @@
+"""Pairing of peaks: against waveform.resolve, constructed scenes and a search of all pairings."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sweep.model import waveform
+from sweep.model.pairing import (
+    ASSUMED,
+    TOLERANCE,
+    beamlet_lines,
+    best_reading,
+    common_beamlet,
+    pair_peaks,
+    resolve_peaks,
+    resolve_reading,
+    workspace,
+)
+from sweep.model.preparation import prepare
+
+N, FS = 2**17, 600e6
+WIDTH = FS / N
+OPTICS = {"carrier": 299792458.0 / 1550e-9, "bandwidth": 1e9, "duration": 500e-6}
+AT_START = OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2)
+
+
+def _beats(target_range, radial_velocity):
+    """Folded peaks [bins] of a target in the up, Doppler and down segment."""
+    carriers = OPTICS["carrier"] + np.array([0.0, 0.0, OPTICS["bandwidth"]])
+    signed = [
+        waveform.beat_frequency(
+            sign,
+            carrier=carrier,
+            chirp_rate=OPTICS["bandwidth"] / OPTICS["duration"],
+            range=target_range,
+            radial_velocity=radial_velocity,
+        )
+        for sign, carrier in zip((1, 0, -1), carriers, strict=True)
+    ]
+    return [waveform.fold(np.array(f), np.array(FS)) / WIDTH for f in signed]
+
+
+def _pair(up, doppler, down, tolerance=TOLERANCE):
+    """(confirmed, [(up, doppler, down, code)])."""
+    lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
+    room = max(lists[0].size, lists[2].size, 1)
+    pairs = np.full((room, 4), -9)
+    confirmed, number = pair_peaks(*lists, AT_START, float(N), tolerance, pairs, workspace(room))
+    return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
+
+
+def _reported(up, down, code):
+    return resolve_reading(code, float(up) * WIDTH, float(down) * WIDTH, *OPTICS.values(), FS)
+
+
+def _scene(*targets):
+    """Peaks of targets by segment, (3, targets)."""
+    return np.round(np.transpose([_beats(*t) for t in targets]))
+
+
+def _agrees(reported, target):
+    """Half a bin in each of two peaks: 0.343 m and 3.55 mm/s at most; leading order as much."""
+    return abs(reported[0] - target[0]) < 0.7 and abs(reported[1] - target[1]) < 0.0071
+
+
+# One triple
+
+
+@pytest.mark.parametrize(("width", "readings"), [(WIDTH, 6), (1e-3 * WIDTH, 9)])
+def test_one_triple_is_resolved_as_by_the_waveform_to_the_last_bit(width, readings):
+    """Targets of all signs and folds, and peaks anywhere; narrow bins make folds cheap.
+
+    The other seven readings are mirror images of these and never better.
+    """
+    generator = np.random.default_rng(1)
+    targets = np.stack([generator.uniform(0, 12e3, 4000), generator.uniform(-240, 240, 4000)])
+    physical = np.array(_beats(*targets)) * WIDTH
+    peaks = np.concatenate([physical, generator.uniform(0, FS / 2, (3, 4000))], axis=1)
+    expected = waveform.resolve(
+        up=peaks[0], doppler=peaks[1], down=peaks[2], sample_rate=np.array(FS),
+        bin_width=np.array(width), **{k: np.array(v) for k, v in OPTICS.items()},
+    )  # fmt: skip
+    got = np.array([resolve_peaks(*p, *OPTICS.values(), FS, width) for p in peaks.T])
+    np.testing.assert_array_equal(got, np.transpose(expected))
+    codes = {best_reading(*p, AT_START, FS, 64 * width, np.inf)[0] for p in peaks.T}
+    assert len(codes) >= readings
+    assert (np.sign(got[:, 1]) == 1).any()
+    assert (np.sign(got[:, 1]) == -1).any()
+
+
+def test_a_tolerance_takes_the_cheapest_reading_among_those_within_it():
+    up, doppler, down = _beats(9000.0, 170.0)  # the down beat lies past Nyquist
+    code, cost = best_reading(up, doppler, down, AT_START, float(N), 64.0, 3.0)
+    assert code & 0b1110 == 0b0010
+    assert 64.0 <= cost < 64.5
+    assert best_reading(up, doppler + 4000.0, down, AT_START, float(N), 64.0, 3.0) == (-1, np.inf)
+    assert best_reading(up, doppler + 4000.0, down, AT_START, float(N), 64.0, np.inf)[0] >= 0
+
+
+def test_a_peak_confirms_others_by_chance_as_rarely_as_stated():
+    """1.5e-3 at most for peaks anywhere: below it by 5 sigma of 40,000 triples, and not nothing."""
+    generator = np.random.default_rng(2)
+    triples = generator.uniform(0, N / 2, (40_000, 3))
+    hits = sum(best_reading(*t, AT_START, float(N), 64.0, TOLERANCE)[0] >= 0 for t in triples)
+    stated = 16 * 2 * TOLERANCE / (N / 2)
+    assert stated == pytest.approx(1.5e-3, rel=0.03)
+    assert 0.1 * stated < hits / 40_000 <= stated + 5 * np.sqrt(stated / 40_000)
+
+
+# Scenes
+
+
+SCENES = {
+    "common velocity": [(2000.0, 12.0), (2009.0, 12.0)],
+    "different velocities": [(1500.0, 40.0), (1700.0, -25.0)],
+    "equal ranges": [(800.0, 30.0), (800.0, 31.0)],
+    "opposite velocities": [(800.0, 30.0), (800.0, -30.0)],
+    "past Nyquist": [(9000.0, 170.0), (9100.0, 170.0)],
+    "range beat above and below the Doppler shift": [(400.0, 60.0), (6000.0, 2.0)],
+    "four layers": [(250.0, 5.0), (254.0, 5.0), (259.0, 5.0), (262.0, 5.0)],
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("order", [1, -1])
+def test_every_surface_is_found_whatever_the_order_of_its_peaks(name, order):
+    targets = SCENES[name]
+    up, doppler, down = _scene(*targets)
+    doppler = np.unique(doppler)
+    confirmed, pairs = _pair(up, doppler, down[::order])
+    assert confirmed == len(pairs) == len(targets)
+    for i, (u, k, d, code) in enumerate(pairs):
+        assert u == i
+        assert k >= 0
+        assert _agrees(_reported(up[u], down[::order][d], code), targets[i])
+
+
+def test_surfaces_with_a_common_velocity_share_their_doppler_peak():
+    up, doppler, down = _scene(*SCENES["common velocity"])
+    _, pairs = _pair(up, doppler[:1], down)
+    assert [p[1] for p in pairs] == [0, 0]
+
+
+def test_false_peaks_among_true_ones_are_paired_last_and_unconfirmed():
+    up, doppler, down = _scene(*SCENES["different velocities"])
+    confirmed, pairs = _pair([*up, 20011.0], doppler, [31000.0, *down])
+    assert confirmed == 2
+    assert [(u, d) for u, _, d, _ in pairs] == [(0, 1), (1, 2), (2, 0)]
+    assert pairs[2][1] == -1
+
+
+def test_a_false_peak_alone_leaves_the_true_pair_as_it_was():
+    up, doppler, down = _scene((2000.0, 12.0))
+    confirmed, pairs = _pair([5000.0, *up], [*doppler, 61000.0], down)
+    assert confirmed == 1
+    assert [p[:3] for p in pairs] == [(1, 0, 0)]
+
+
+def test_without_a_doppler_peak_the_half_sum_counts_as_the_doppler_frequency():
+    """Right for a fast mover; range and velocity are exchanged for a slow one."""
+    for target, right in (((500.0, 60.0), True), ((500.0, 2.0), False)):
+        up, _, down = _scene(target)
+        confirmed, pairs = _pair(up, [], down)
+        assert confirmed == 0
+        assert pairs == [(0, -1, 0, ASSUMED)]
+        assert _agrees(_reported(up[0], down[0], ASSUMED), target) == right
+        f_r = 2e12 * 2 * target[0] / 299792458.0
+        f_d = 2 * target[1] / 1550e-9
+        other = _reported(up[0], down[0], ASSUMED ^ 1 if right else ASSUMED)
+        assert other[1] == pytest.approx(f_r * 1550e-9 / 2, rel=1e-3)
+        assert other[0] == pytest.approx(f_d * 299792458.0 / 4e12, rel=1e-3)
+
+
+def test_a_doppler_peak_out_of_tolerance_still_decides_the_order():
+    up, doppler, down = _scene((500.0, 2.0))
+    confirmed, pairs = _pair(up, doppler + 10.0, down)
+    assert confirmed == 0
+    assert _agrees(_reported(up[0], down[0], pairs[0][3]), (500.0, 2.0))
+    assert _pair(up, doppler + 10.0, down, tolerance=11.0)[0] == 1
+
+
+def test_missing_peaks_leave_fewer_returns():
+    up, doppler, down = _scene(*SCENES["different velocities"])
+    assert _pair([], doppler, down) == (0, [])
+    assert _pair(up, doppler, []) == (0, [])
+    confirmed, pairs = _pair(up[1:], doppler, down)
+    assert confirmed == 1
+    assert [p[:3] for p in pairs] == [(0, 1, 1)]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 4), st.integers(1, 3))
+def test_no_other_pairing_has_more_confirmed_pairs_or_less_mismatch(seed, ups, downs, dopplers):
+    """Crowded lists with a wide tolerance, against every one-to-one pairing there is."""
+    generator = np.random.default_rng(seed)
+    up, down = generator.uniform(0, 400, ups), generator.uniform(0, 400, downs)
+    doppler = generator.uniform(0, 400, dopplers)
+    tolerance = 60.0
+
+    def mismatch(u, d):
+        options = [best_reading(u, p, d, AT_START, float(N), 64.0, tolerance) for p in doppler]
+        return min(cost for _, cost in options)
+
+    cost = np.array([[mismatch(u, d) for d in down] for u in up])
+    best = (0, 0.0)
+    places = [*range(downs), *[None] * ups]
+    for choice in set(itertools.permutations(places, ups)):
+        chosen = [cost[i, j] for i, j in enumerate(choice) if j is not None]
+        if np.isfinite(chosen).all():
+            best = min(best, (-len(chosen), sum(chosen)))
+    confirmed, pairs = _pair(up, doppler, down, tolerance)
+    assert confirmed == -best[0]
+    assert sum(cost[u, d] for u, _, d, _ in pairs[:confirmed]) == pytest.approx(best[1])
+    assert len(pairs) == min(ups, downs)
+    assert len({p[0] for p in pairs}) == len({p[2] for p in pairs}) == len(pairs)
+
+
+# Truth
+
+
+def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
+    ((_, shots),) = prepare(
+        table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
+    )
+    doppler = np.linspace(-1e-9, 1e-9, 7)[None]
+    lines = np.empty((3, 7))
+    footprint = shots.offset, doppler, shots.amplitude
+    beamlet_lines(shots.point_table()[:, 0].copy(), N, footprint, 0, lines)
+    for b in range(7):
+        velocity = -170.0 + doppler[0, b] * 299792458.0 / 2
+        expected = _beats(8000.0 * (1 + shots.offset[0, b]), velocity)
+        np.testing.assert_allclose(lines[:, b], np.ravel(expected), atol=1e-6)
+    assert np.ptp(lines[0]) > 0.1
+
+
+def test_the_common_beamlet_lies_in_all_spans_and_nearest_to_the_peaks():
+    lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
+    spans = np.array([[9.0, 12.0], [4.0, 6.0], [29.0, 32.0]])
+    centres = (10.9, 5.0, 31.2)
+    everything = np.array([[-np.inf, np.inf]] * 3)
+    assert common_beamlet(spans, centres, lines, np.ones(3)) == (1, True)
+    assert common_beamlet(spans, centres, lines, np.array([1.0, 0.0, 1.0])) == (0, True)
+    apart = np.array([[9.0, 12.0], [4.0, 6.0], [69.0, 71.0]])
+    assert common_beamlet(apart, centres, lines, np.ones(3)) == (-1, True)
+    empty = np.array([[9.0, 12.0], [4.0, 6.0], [90.0, 91.0]])
+    assert common_beamlet(empty, centres, lines, np.ones(3)) == (-1, False)
+    no_doppler = np.array([spans[0], everything[1], spans[2]])
+    assert common_beamlet(no_doppler, centres, lines, np.ones(3)) == (1, True)

@@ -1,0 +1,414 @@
+"""Returns of footprints with one and several surfaces: truth, statistics, flags, invariances."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+
+from sweep.model import philox, truth
+from sweep.model.draws import draw
+from sweep.model.interpolation import interpolator
+from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
+from sweep.model.peaks import RATIO, WHOLE, _free_bin, _largest, draw_in_noise
+from sweep.model.preparation import prepare
+from sweep.model.returns import draw_returns, groups
+from sweep.model.shot import evaluate, find, report
+from sweep.model.window import window
+
+DRAWS = 20_000
+"""5 sigma of a proportion is at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows."""
+
+METHODS = ["probabilities", "noise"]
+LIGHT = 299792458.0
+RANGE_BIN, VELOCITY_BIN = LIGHT * 600e6 / (4e12 * 2**17), 1550e-9 * 600e6 / 2**18
+
+
+def _prepared(parameters):
+    ((_, shots),) = prepare(parameters)
+    return shots
+
+
+def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamlets=12, **changes):
+    """One shot over surfaces at these ranges [m] and velocities, spread [m] within each.
+
+    The first is the reference; beamlets are dealt out in turn, their power by ``shares``.
+    """
+    ranges, velocities = np.array(ranges), np.array(velocities)
+    changes = {"phases": "incoherent"} | changes
+    shots = _prepared(
+        table_4_1(range=ranges[0], radial_velocity=velocities[0], beamlets=beamlets, **changes)
+    )
+    which = np.arange(beamlets) % len(ranges)
+    member = np.arange(beamlets) // len(ranges)
+    offset = ranges[which] / ranges[0] - 1 + spread / ranges[0] * (member / beamlets)
+    share = np.ones(len(ranges)) if shares is None else np.array(shares)
+    return dataclasses.replace(
+        shots,
+        offset=offset[None],
+        doppler=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
+        amplitude=shots.amplitude[:1] * np.sqrt(share[which])[None],
+    )
+
+
+def _keys(n=1, seed=5):
+    return philox.point_keys(np.arange(float(n))[:, None], domain="returns", seed=seed)
+
+
+def _certain(found, sure=1.0):
+    return found._replace(pd=np.where(np.isnan(found.pd), np.nan, sure))
+
+
+def _drawn(shots, found=None, **keywords):
+    found = groups(shots) if found is None else found
+    return draw_returns(shots, found, keys=_keys(shots.range.size), **keywords)
+
+
+def _within_5_sigma(counts, chance, draws=DRAWS):
+    return np.abs(counts - draws * chance) <= 5 * np.sqrt(draws * chance * (1 - chance)) + 1e-9
+
+
+# Groups
+
+
+def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_4_1):
+    """Against the time-domain record, labelled by scipy; a hole of a bin parts two groups."""
+    shots = _surfaces(
+        table_4_1, [300.0, 420.0, 330.0], [20.0, 20.0, 21.0], shares=[1.0, 0.3, 0.1],
+        fft_size=4096, beamlets=6, tnr=4.0,
+    )  # fmt: skip
+    found = groups(shots, most=8)
+    for segment in range(3):
+        spectrum = truth.spectrum(shots, 0, segment, range_walk=False)
+        label, number = ndimage.label(spectrum >= shots.threshold[0])
+        assert number >= (1 if segment == 1 else 2)
+        order = np.argsort(-ndimage.maximum(spectrum, label, range(1, number + 1)), kind="stable")
+        slices = ndimage.find_objects(label)
+        listed = found.bin[0, segment] >= 0
+        assert listed.sum() == min(number, 8)
+        for g, which in enumerate(order[:8]):
+            run = slices[which][0]
+            assert found.first[0, segment, g] == run.start
+            assert found.last[0, segment, g] == run.stop - 1
+            peak = run.start + spectrum[run].argmax()
+            assert found.bin[0, segment, g] == peak
+            np.testing.assert_allclose(
+                found.neighbours[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
+            )
+
+
+def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
+    shots = _prepared(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
+    found, expected = groups(shots), np.moveaxis(find(shots), 1, 0)
+    np.testing.assert_array_equal(found.pd[:, :, 0].T, expected[0])
+    np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected[2])
+    np.testing.assert_array_equal(found.bin[:, :, 0].T, np.rint(expected[3] * 2**17 / 600e6))
+    np.testing.assert_array_equal(found.exempted.T, expected[4])
+    np.testing.assert_array_equal(found.leakage.T, expected[5])
+
+
+def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
+    shots = _surfaces(table_4_1, [300.0, 330.0, 345.0, 360.0], [20.0] * 4, shares=[0.1, 1, 0.3, 2])
+    few, many = groups(shots, most=2), groups(shots, most=12)
+    np.testing.assert_array_equal(few.bin, many.bin[..., :2])
+    strength = many.magnitude[0, 0][many.bin[0, 0] >= 0]
+    assert (np.diff(strength) <= 0).all()
+
+
+def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
+    found = groups(_prepared(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
+    assert (found.bin[0, :, 0] >= 0).all()
+    assert (found.bin[0, :, 1:] == -1).all()
+    assert (found.pd[0, :, 0] < 0.1).all()
+    np.testing.assert_array_equal(found.first[..., 0], found.last[..., 0])
+
+
+# Without chance
+
+
+def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
+    shots = _prepared(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
+    found = _certain(groups(shots))
+    got, expected = _drawn(shots, found), report(shots, find(shots))
+    np.testing.assert_array_equal(got.range[:, 0, 0], expected.range)
+    np.testing.assert_array_equal(got.radial_velocity[:, 0, 0], expected.radial_velocity)
+    assert (got.flags[:, 0, 0] == TRUE).all()
+
+
+@pytest.mark.parametrize("velocities", [(12.0, 12.0), (12.0, 7.0)])
+@pytest.mark.parametrize("method", METHODS)
+def test_two_surfaces_give_two_returns_with_their_ranges_and_velocities(
+    table_4_1, velocities, method
+):
+    """Within half a bin in each of two peaks, a fifth of a bin of footprint and noise."""
+    shots = _surfaces(table_4_1, [400.0, 412.0], velocities, shares=[1.0, 0.6])
+    found = groups(shots)
+    assert ((found.bin[0, 0] >= 0).sum(), (found.bin[0, 2] >= 0).sum()) == (2, 2)
+    got = _drawn(shots, found, method=method, draws=20)
+    assert (got.flags[0, :, :2] == TRUE).all()
+    assert (got.flags[0, :, 2:] == 0).all()
+    np.testing.assert_array_equal(got.beamlet[0, :, :2] % 2, [[0, 1]] * 20)
+    np.testing.assert_allclose(got.range[0, :, :2], [[400.0, 412.0]] * 20, atol=1.2 * RANGE_BIN)
+    np.testing.assert_allclose(
+        got.range_interpolated[0, :, :2], [[400.01, 412.01]] * 20, atol=0.2 * RANGE_BIN
+    )
+    np.testing.assert_allclose(
+        got.radial_velocity[0, :, :2], [velocities] * 20, atol=1.2 * VELOCITY_BIN
+    )
+    np.testing.assert_allclose(
+        got.radial_velocity_interpolated[0, :, :2], [velocities] * 20, atol=0.2 * VELOCITY_BIN
+    )
+    assert np.isnan(got.range[0, :, 2:]).all()
+
+
+def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
+    shots = _prepared(
+        table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
+    )
+    got = _drawn(shots)
+    assert got.flags[0, 0].tolist() == [TRUE, 0, 0, 0]
+    assert got.range_interpolated[0, 0, 0] == pytest.approx(200.0, abs=0.5 * RANGE_BIN)
+    assert got.group[0, 0, 0].tolist() == [0, -1, 0]
+
+
+# Chance
+
+
+def _weak(table_4_1, n=4, **changes):
+    """Points of the middle of pd, in whose segments false alarms are common."""
+    return table_4_1(
+        range=np.linspace(4000.0, 6500.0, n), beamlets=5, power=0.08, tnr=7.6, grazing_angle=1.2,
+        radial_velocity=31.0, phases="incoherent", **changes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1, method):
+    """The same random numbers as sweep.model.draws, and so the same counts exactly.
+
+    A true pair, both peaks found, is lost only where a false peak takes one of them: rarely.
+    """
+    parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
+    shots = _prepared(parameters)
+    counts = draw(
+        parameters, evaluate(parameters), keys=_keys(4), first_draw=3, batch_sizes=[2000],
+        method=method,
+    )  # fmt: skip
+    got = _drawn(shots, first_draw=3, draws=2000, method=method)
+    both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
+    np.testing.assert_array_equal(both.any(2).sum(1), counts["n_detected_shot"][:, 0])
+    middling = counts["n_detected_shot"]
+    assert ((middling > 200) & (middling < 1800)).sum() >= 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method):
+    """Peaks pair one to one, so there are min(up, down) returns, of 0..2 peaks in each list.
+
+    With chances p of the true and a of the false peak, both in up and down and independent:
+    returns 2 in p a p a, and so on; confirmed by the true Doppler peak where that is there.
+    """
+    parameters = _weak(table_4_1)
+    shots = _prepared(parameters)
+    out = evaluate(parameters)
+    got = _drawn(shots, draws=DRAWS, method=method)
+    alarm = [
+        1 - (1 - out["pfa_segment"]) * (1 - out["p_leakage_up"]),
+        1 - (1 - 10 ** (out["log10_pfa_shot"] - out["log10_pfa_segment"]))
+        * (1 - out["p_leakage_down"]),
+    ]  # fmt: skip
+    assert ((alarm[0] > 0.02) & (alarm[0] < 0.5)).all()
+    none, two = [], []
+    for pd, a in zip((out["pd_up"], out["pd_down"]), alarm, strict=True):
+        none.append((1 - pd) * (1 - a))
+        two.append(pd * a)
+    number = (got.flags > 0).sum(2)
+    assert _within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
+    assert _within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
+    # readings by chance (1e-3 of the false peaks) take a true peak from its partner
+    both = ((got.group[..., 0] == 0) & (got.group[..., 2] == 0)).any(2)
+    slack = 3e-3 * DRAWS * alarm[0]
+    expected = DRAWS * out["pd_up"] * out["pd_down"]
+    spread = np.sqrt(expected * (1 - expected / DRAWS))
+    assert (np.abs(both.sum(1) - expected) < 5 * spread + slack).all()
+    confirmed = (got.flags == TRUE).any(2).sum(1)
+    expected = expected * out["pd_doppler"]
+    assert (np.abs(confirmed - expected) < 5 * np.sqrt(expected) + slack).all()
+    false = (got.flags & FALSE_ALARM > 0).any(2).sum(1)
+    expected = DRAWS * ((1 - none[0]) * (1 - none[1]) - out["pd_up"] * out["pd_down"])
+    expected = expected + DRAWS * two[0] * two[1]
+    assert (np.abs(false - expected) < 5 * np.sqrt(expected) + slack).all()
+
+
+def test_false_peaks_fall_on_every_free_bin_alike():
+    """All chances of a fine comb: each free bin as often as any, the groups' bins never."""
+    half = 64
+    for spans in ([(10, 14), (16, 17), (0, 1)], [(62, 64)], [(1, 1), (3, 3), (5, 5), (63, 63)]):
+        bins = np.full((3, 4), -1)
+        for g, (first, last) in enumerate(spans):
+            bins[:, g] = first, first, last
+        taken = {k for first, last in spans for k in range(first - 1, last + 2)}
+        free = sorted(set(range(1, half + 1)) - taken)
+        chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
+        places, counts = np.unique([_free_bin(u, bins, half) for u in chances], return_counts=True)
+        assert places.tolist() == free
+        assert (counts == 20).all()
+
+
+def test_the_largest_of_many_noise_bins_has_its_order_statistic():
+    """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution."""
+    for chance in (1e-9, 0.01, 0.7):
+        for n in (1.0, 100.0, 65000.0):
+            x = _largest(chance, n)
+            assert -np.expm1(n * stats.rayleigh.logcdf(x)) == pytest.approx(chance, rel=1e-9)
+
+
+def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
+    """Kolmogorov and Smirnov against the order statistic and the uniform distribution.
+
+    A true hypothesis gives a p-value below 1e-6 once in a million seeds.
+    """
+    beta, half, n = 3.0, 2000, 1900.0
+    bins = np.full((3, 1), -1)
+    listed = bins, np.full(1, np.nan), np.full((1, 3), np.nan)
+    run = 0, np.zeros(0), np.zeros(1, bool), 0.1
+    tables = tuple(interpolator(window("hann", 4000), 4000))
+    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
+    streams = np.array([1, 4, 7, 10])
+    (key,) = _keys()
+    drawn = []
+    for d in range(4000):
+        number = draw_in_noise(
+            (key[0], key[1], d), streams, listed, (1.0, beta), n, run, tables, half, peaks, which
+        )
+        drawn += [peaks[0].copy()] if number else []
+    drawn = np.array(drawn)
+    quiet = stats.rayleigh.cdf(beta) ** n
+    assert abs(len(drawn) - 4000 * (1 - quiet)) < 5 * np.sqrt(4000 * quiet) + 1
+
+    def largest(x):
+        return (stats.rayleigh.cdf(x) ** n - quiet) / (1 - quiet)
+
+    assert stats.kstest(drawn[:, RATIO], largest).pvalue > 1e-6
+    assert stats.kstest(drawn[:, WHOLE], stats.uniform(0.5, half).cdf).pvalue > 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["hann", "hamming"])
+def test_interpolated_errors_are_those_reported(table_4_1, method, name):
+    """Normal to first order at 33 dB: 5 sigma of a deviation of 20,000 is 2.5 %; and 1/64 more.
+
+    Ranges run through the bin, so that the errors are of all places between bins.
+    """
+    shots = _prepared(
+        table_4_1(
+            range=1000 + RANGE_BIN * np.linspace(0, 1, 20, endpoint=False), window=name,
+            radial_velocity=9.0, beamlets=1, power=0.5, phases="incoherent",
+        )
+    )  # fmt: skip
+    got = _drawn(shots, draws=1000, method=method)
+    assert (got.flags[..., 0] == TRUE).all()
+    assert 2 * got.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
+    for quantity, expected in (("range", shots.range), ("radial_velocity", shots.radial_velocity)):
+        found = getattr(got, f"{quantity}_interpolated")[..., 0]
+        reported = getattr(got, f"{quantity}_interpolated_standard_error")[..., 0]
+        deviation = (found - expected[:, None]) / reported
+        assert np.sqrt(np.mean(deviation**2)) == pytest.approx(1.0, abs=0.041)
+        whole = getattr(got, quantity)[..., 0]
+        coarse = getattr(got, f"{quantity}_standard_error")[..., 0]
+        width = RANGE_BIN if quantity == "range" else VELOCITY_BIN
+        assert (coarse > reported).all()
+        assert coarse.min() >= 0.999 * width / np.sqrt(24)
+        assert (np.abs(whole - expected[:, None]) < 1.1 * width).all()
+
+
+# Flags
+
+
+def _only(found, present):
+    """Groups detected or not by hand: {(segment, group): pd}."""
+    pd = found.pd.copy()
+    for (segment, g), chance in present.items():
+        pd[:, segment, g] = chance
+    return found._replace(pd=pd)
+
+
+def test_peaks_of_two_surfaces_make_a_mispaired_return(table_4_1):
+    shots = _surfaces(table_4_1, [400.0, 412.0], [12.0, 12.0], shares=[1.0, 0.6])
+    found = _only(_certain(groups(shots)), {(0, 1): 0.0, (2, 0): 0.0})
+    got = _drawn(shots, found)
+    assert got.flags[0, 0].tolist() == [MISPAIRED | UNCONFIRMED, 0, 0, 0]
+    assert got.group[0, 0, 0].tolist() == [0, -1, 1]
+    assert got.beamlet[0, 0, 0] == -1
+
+
+def test_a_slow_target_without_its_doppler_peak_is_misread(table_4_1):
+    """Range and velocity exchanged: flagged, and true again for a fast mover."""
+    for velocity, kind in ((2.0, MISREAD), (60.0, TRUE)):
+        shots = _surfaces(table_4_1, [400.0], [velocity])
+        found = _only(_certain(groups(shots)), {(1, g): 0.0 for g in range(4)})
+        got = _drawn(shots, found)
+        assert got.flags[0, 0, 0] == kind | UNCONFIRMED
+        assert got.beamlet[0, 0, 0] >= 0
+
+
+def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
+    """A rectangular window half-way between bins: sidelobes every bin, cut by the bright target.
+
+    Nulls part the sidelobes of a tone in a padded FFT into groups of their own.
+    """
+    shots = _surfaces(
+        table_4_1, [400.0], [12.0], window="rectangular", beamlets=1, sample_rate=200e6,
+        detector_bandwidth=4e8,
+    )  # fmt: skip
+    assert shots.window.length < shots.fft_size
+    got = _drawn(shots, _certain(groups(shots)))
+    assert got.flags[0, 0, 0] == TRUE
+    assert (got.flags[0, 0, 1:] & SIDELOBE > 0).all()
+
+
+def test_noise_peaks_make_false_alarms(table_4_1):
+    """No detection at all, and a threshold so low that noise always crosses."""
+    shots = _surfaces(table_4_1, [9000.0], [12.0], tnr=3.0, power=1e-3)
+    got = _drawn(shots, _certain(groups(shots), 0.0), draws=200)
+    assert (got.flags[..., 0] | UNCONFIRMED == FALSE_ALARM | UNCONFIRMED).all()
+    assert (got.flags[..., 0] & UNCONFIRMED > 0).mean() > 0.9
+    assert np.isnan(got.pd[..., 0]).all()
+    assert (got.snr[..., 0] >= shots.threshold[0] ** 2 / shots.bin_deviation[0] ** 2 / 2).all()
+    assert (got.group == -1).all()
+
+
+def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
+    shots = _surfaces(table_4_1, [400.0, 400.3], [12.0, 12.0])
+    got = _drawn(shots)
+    assert got.flags[0, 0].tolist() == [TRUE, 0, 0, 0]
+    assert 399.8 < got.range[0, 0, 0] < 400.5
+
+
+# Invariance
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_order_and_batching_change_no_bit(table_4_1, method):
+    parameters = _weak(table_4_1, n=6)
+    keys, ranges = _keys(6), parameters["target.range"]
+    shots = _prepared(parameters)
+    whole = draw_returns(shots, groups(shots), keys=keys, draws=60, method=method)
+    order = np.array([4, 1, 5, 0, 3, 2])
+    moved = _prepared(parameters | {"target.range": ranges[order]})
+    shuffled = draw_returns(moved, groups(moved), keys=keys[order], draws=60, method=method)
+    one = _prepared(parameters | {"target.range": ranges[3:4]})
+    alone = draw_returns(
+        one, groups(one), keys=keys[3:4], first_draw=25, draws=10, method=method
+    )  # fmt: skip
+    assert len(np.unique(whole.flags)) > 3
+    for name in whole._fields:
+        a, b, c = (getattr(r, name) for r in (whole, shuffled, alone))
+        np.testing.assert_array_equal(a[order], b, err_msg=name)
+        np.testing.assert_array_equal(a[3:4, 25:35], c, err_msg=name)
+
+
+def test_an_unknown_way_to_draw_is_refused(table_4_1):
+    shots = _surfaces(table_4_1, [400.0], [12.0])
+    with pytest.raises(ValueError, match="probabilities, noise"):
+        _drawn(shots, method="dice")
