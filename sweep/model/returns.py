@@ -117,9 +117,9 @@ def draw_returns(
     shots : Shots
         n prepared points.
     found : Groups
-        :func:`groups` of them.
+        Theirs, by :func:`groups`.
     keys : (n, 2) uint64
-        Random key of each point.
+        Random key of each.
     first_draw, draws : int
         Number of the first draw, number of draws; any stretch of draws can be had alone.
     method : str
@@ -141,13 +141,12 @@ def draw_returns(
     bins = np.stack([found.bin, found.first, found.last])
     chirp = np.array(np.broadcast_arrays(shots.bandwidth, shots.duration, shots.range)[:2], float)
     counted = float(shots.counted_bins(np.zeros(()))), shots.bins_counted != "all"
-    pairs = np.empty((most + 1, 4), np.int64)
     _draw(
         keys, int(first_draw), (shots.point_table(), chirp, shots.row, shots.footprint),
         (shots.segments, shots.incoherent, method == "noise", float(tolerance)), counted,
         shots.kernel(), tuple(interpolator(shots.window, shots.fft_size)),
         (bins, found.pd, found.neighbours, found.exempted, found.leakage), STREAMS,
-        (pairs, workspace(most + 1)), (values, flags, beamlet, group),
+        (np.empty((most + 1, 4), np.int64), workspace(most + 1)), (values, flags, beamlet, group),
     )  # fmt: skip
     columns = [values[..., k] for k in range(values.shape[-1])]
     return Returns._make([*columns, flags, beamlet, group])

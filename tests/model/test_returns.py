@@ -14,7 +14,7 @@ from sweep.model.peaks import RATIO, WHOLE, _free_bin, _largest, draw_in_noise
 from sweep.model.preparation import prepare
 from sweep.model.returns import draw_returns, groups
 from sweep.model.shot import evaluate, find, report
-from sweep.model.window import window
+from sweep.model.window import samples, window
 
 DRAWS = 20_000
 """5 sigma of a proportion is at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows."""
@@ -197,6 +197,10 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
     got = _drawn(shots, first_draw=3, draws=2000, method=method)
     both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
     np.testing.assert_array_equal(both.any(2).sum(1), counts["n_detected_shot"][:, 0])
+    out = evaluate(parameters)
+    expected = np.broadcast_to((out["pd_up"] * out["pd_down"])[:, None, None], both.shape)
+    np.testing.assert_allclose(got.pd[both], expected[both])
+    assert (np.abs(out["pd_up"] - out["pd_down"]) > 1e-3).any()
     middling = counts["n_detected_shot"]
     assert ((middling > 200) & (middling < 1800)).sum() >= 2
 
@@ -291,6 +295,33 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
 
     assert stats.kstest(drawn[:, RATIO], largest).pvalue > 1e-6
     assert stats.kstest(drawn[:, WHOLE], stats.uniform(0.5, half).cdf).pvalue > 1e-6
+
+
+def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
+    """A tone 0.47 bins past its bin, in white noise of a twentieth, Hann window of 64 samples."""
+    length, delta, ratio = 64, 0.47, 20.0
+    shape = window("hann", length)
+    n = np.arange(length)
+    basis = (samples("hann", length) * np.exp(-2j * np.pi * np.outer([15, 16, 17], n) / length)).T
+    tone = np.exp(2j * np.pi * (16 + delta) * n / length)
+    sigma = shape.sum / ratio
+    noise = np.random.default_rng(4).standard_normal((DRAWS, 2 * length)).view(complex)
+    bins = np.abs((tone + sigma / np.sqrt(shape.energy) * noise) @ basis)
+    expected = np.mean(bins.argmax(axis=1) == 2)
+    tables = tuple(interpolator(shape, length))
+    listed = np.full((3, 1), 16), np.ones(1), np.abs(tone @ basis)[None]
+    run = 14, np.zeros(5), np.ones(5, bool), 0.1
+    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
+    (key,) = _keys()
+    moved = 0
+    for d in range(DRAWS):
+        draw_in_noise(
+            (key[0], key[1], d), np.array([1, 4, 7, 10]), listed, (sigma, 5.0), 0.0, run,
+            tables, 32, peaks, which,
+        )  # fmt: skip
+        moved += peaks[0, WHOLE] == 17
+    assert 0.1 < expected < 0.4
+    assert abs(moved / DRAWS - expected) < 5 * np.sqrt(2 * expected * (1 - expected) / DRAWS)
 
 
 @pytest.mark.parametrize("method", METHODS)
