@@ -106,6 +106,11 @@ def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
     beyond = reach_of(level, total * window_sum, envelope, reach) * fft_size / length + 2.0
     half = fft_size // 2
     low, high = origin + lowest - beyond, origin + highest + beyond
+    # Lines beyond DC or Nyquist are seen as their images, which fold back into the band.
+    if low < 0:
+        high = max(high, -low)
+    if high > half:
+        low = min(low, fft_size - high)
     first = 0 if low < 0 else min(math.floor(low), half)
     last = half if high > half else max(math.ceil(high), 0)
     return first, max(first, last)
