@@ -13,7 +13,8 @@ import numpy as np
 from sweep.model import reflectance
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import beamlets
-from sweep.model.geometry.jitter import transverse
+from sweep.model.geometry.beamlet_rays import beamlet_rays
+from sweep.model.geometry.jitter import PointingJitter
 from sweep.model.geometry.platform import Flight, State
 from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
@@ -36,7 +37,7 @@ class Eyepoints(NamedTuple):
     velocity: np.ndarray
     """(n, 3): of the instrument [m/s]."""
     direction: np.ndarray
-    """(n, 3): unit vector along the beam's axis."""
+    """(n, 3): unit vector along the beam's axis, as commanded."""
     range: np.ndarray
     """(n,): range R_0 of the reference beamlet [m]; inf where nothing is seen."""
     offset: np.ndarray
@@ -57,6 +58,10 @@ class Eyepoints(NamedTuple):
         """Shots of which any beamlet hits something, (n,) bool."""
         return np.isfinite(self.range)
 
+    def some(self, shots: slice | np.ndarray) -> "Eyepoints":
+        """Some of the shots, by a slice, their places or a mask."""
+        return Eyepoints._make([*(values[shots] for values in self[:-1]), self.weight])
+
 
 def observe(
     index: np.ndarray,
@@ -68,6 +73,7 @@ def observe(
     number: int,
     pattern: str = "hexagonal",
     bodies: Sequence[Flight | None] | None = None,
+    jitter: PointingJitter | None = None,
 ) -> Eyepoints:
     """Eyepoints of shots by number.
 
@@ -85,12 +91,17 @@ def observe(
         Of :func:`sweep.model.footprint.beamlets`.
     bodies : sequence of Flight or None, optional
         Motion of each of the caster's bodies, None for one at rest; all at rest by default.
+    jitter : PointingJitter, optional
+        Turns the light of each shot, of which the instrument knows nothing: position, velocity
+        and `direction` stay those commanded. None draws nothing.
     """
-    shots = scanner.shots(np.asarray(index))
+    index = np.asarray(index)
+    shots = scanner.shots(index)
     time = flight.start + shots.time
     state = flight.state(time)
     (across, along), weight = beamlets(number, pattern)
-    rays = _beamlet_directions(state, shots.direction, across, along, beam_divergence / 4)
+    attitude = state.attitude if jitter is None else jitter.turned(state.attitude, index)
+    rays = beamlet_rays(attitude, shots.direction, across, along, beam_divergence / 4)
     moving = [None if body is None else body.state(time) for body in bodies or ()]
     poses = [None if body is None else Pose(body.position, body.attitude) for body in moving]
     bundle = caster.bundle(state.position, rays, poses=poses or None)
@@ -102,18 +113,6 @@ def observe(
         rotate(state.attitude, shots.direction), bundle.range, bundle.offset, reference,
         velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
     )  # fmt: skip
-
-
-def _beamlet_directions(
-    state: State, axis: np.ndarray, across: np.ndarray, along: np.ndarray, sigma: float
-) -> np.ndarray:
-    """Unit vectors of every beamlet in the world frame, (n, b, 3)."""
-    first, second = transverse(axis)
-    body = axis[:, None] + sigma * (
-        across[:, None] * first[:, None] + along[:, None] * second[:, None]
-    )
-    rays = rotate(state.attitude[:, None], body)
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def _radial_velocity(
@@ -155,20 +154,16 @@ def prepare_eyepoints(
     Raises
     ------
     ValueError
-        Where a shot sees nothing.
+        Where a shot sees nothing, or a surface that is not given.
     """
     if not eyepoints.seen.all():
         raise ValueError("a shot that sees nothing has no radiometry: leave it out")
+    if eyepoints.surface.max(initial=-1) >= len(surfaces):
+        raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
     hit = eyepoints.surface >= 0
     relative = np.where(hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
     doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
-    sent = np.where(hit, eyepoints.weight, 0.0)
-    lit, back = np.zeros(len(hit)), np.zeros(hit.shape)
-    for surface, described in enumerate(surfaces):
-        here = np.where(eyepoints.surface == surface, sent * described.reflectance, 0.0)
-        cosine = np.where(eyepoints.surface == surface, eyepoints.cos_incidence, 0.0)
-        back += here * reflectance.backscatter(described.law, cosine)
-        lit += here.sum(axis=1)
+    lit, back = _scattered(eyepoints, surfaces)
     footprints = Footprints(np.arange(len(hit)), relative, doppler, back / (1 + relative) ** 2)
     shots = dict(parameters) | {
         "target.range": eyepoints.range,
@@ -178,3 +173,17 @@ def prepare_eyepoints(
     # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
     shots["target.solar_irradiance"] = np.asarray(parameters["target.solar_irradiance"]) * lit
     return prepare_footprints(shots, footprints)
+
+
+def _scattered(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """Power fraction x reflectance of the footprint (n,); that x backscatter by beamlet (n, b)."""
+    # the entry past the last surface is that of a miss, -1
+    bright = np.array([*(surface.reflectance for surface in surfaces), 0.0])
+    sent = eyepoints.weight * bright[eyepoints.surface]
+    cosine = np.where(eyepoints.surface >= 0, eyepoints.cos_incidence, 0.0)
+    laws = [surface.law for surface in surfaces]
+    back = np.zeros_like(sent)
+    for law in dict.fromkeys(laws):
+        follows = np.array([*(other == law for other in laws), False])[eyepoints.surface]
+        back = np.where(follows, sent * reflectance.backscatter(law, cosine), back)
+    return sent.sum(axis=1), back

@@ -50,8 +50,10 @@ def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.nd
     offsets = _PATTERNS[pattern](number)
     weights = np.exp(-0.5 * (offsets**2).sum(axis=0))
     weights /= weights.sum()
-    offsets = offsets - (offsets @ weights)[:, None]
-    values, vectors = np.linalg.eigh((offsets * weights) @ offsets.T)
+    # Sums, not products of matrices, whose order depends on the number of threads.
+    offsets = offsets - (offsets * weights).sum(axis=1)[:, None]
+    moments = (offsets[:, None] * offsets * weights).sum(axis=-1)
+    values, vectors = np.linalg.eigh(moments)
     return (vectors / np.sqrt(values)) @ vectors.T @ offsets, weights
 
 

@@ -1,10 +1,25 @@
-"""Reflectance laws: light scattered back along the beam, per steradian and unit reflectance."""
+"""Reflectance laws: light scattered back along the beam, per steradian and unit reflectance.
+
+A surface of bidirectional reflectance f [1/sr] that fills a beam of power P at incidence i sends
+the intensity f P cos(i) [W/sr] back along it: the beam spreads over 1/cos(i) of its cross-section
+and the patch, seen from the beam, shrinks to cos(i) of itself again. So Lambert's f = rho/pi gives
+rho cos(i)/pi.
+
+Lommel and Seeliger's law is that of dark, porous ground (regolith), where light that has been
+scattered once outshines all other [Hapke 1981; 2012, ch. 10]:
+
+    f = w / (4 pi) / (cos i + cos e) * p(g) (1 + B(g))
+
+with the single-scattering albedo w, the phase function p and the opposition surge B of shadows
+that hide behind their grains. A lidar looks at the phase angle g = 0 and i = e, where f cos(i) is
+w p(0) (1 + B(0)) / (8 pi) whatever the incidence: a ball of it shines as evenly as the full Moon.
+"""
 
 import math
 
 import numpy as np
 
-LAWS = ("thesis", "lambert")
+LAWS = ("thesis", "lambert", "lommel_seeliger")
 
 
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
@@ -15,11 +30,41 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     law : str
         ``thesis``: the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence.
         ``lambert``: cos(incidence)/pi.
+        ``lommel_seeliger``: 1/pi whatever the incidence; the reflectance is the normal albedo
+        (:func:`normal_albedo`), which at normal incidence is what Lambert's law means by it.
     cos_incidence : ndarray
         Cosine of the incidence angle, 0..1.
+
+    Raises
+    ------
+    ValueError
+        `law` is none of these.
     """
     if law == "thesis":
         return np.full_like(cos_incidence, 0.5 / math.pi)
     if law == "lambert":
         return cos_incidence / math.pi
+    if law == "lommel_seeliger":
+        return np.full_like(cos_incidence, 1 / math.pi)
     raise ValueError(f"no reflectance law {law!r}: choose from {', '.join(LAWS)}")
+
+
+def normal_albedo(
+    *, single_scattering_albedo: float, phase_function: float = 1.0, opposition_surge: float = 0.0
+) -> float:
+    """Brightness at zero phase angle over that of a white Lambertian surface lit along its normal.
+
+    w p(0) (1 + B(0)) / 8 of the law of Lommel and Seeliger, which light that is scattered more
+    than once exceeds on bright ground. It is what a lidar calibrated on a Lambertian target
+    measures: the surge is in it.
+
+    Parameters
+    ----------
+    single_scattering_albedo : float
+        w, 0..1.
+    phase_function : float
+        p(0), whose mean over all directions is 1; 1 for grains that scatter evenly.
+    opposition_surge : float
+        B(0), from 0 to 1 for shadow hiding.
+    """
+    return single_scattering_albedo * phase_function * (1 + opposition_surge) / 8

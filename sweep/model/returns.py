@@ -16,6 +16,9 @@ strongest group is detected, and a false alarm raised, in the very draws that ar
   other bins by its order statistic. Within the three bins noise is correlated as the window does;
   otherwise bins are independent, as in the closed forms.
 
+Standard errors are those of noise and, in quadrature, what the lines in a group make by their
+spread, of which the instrument is taken to know the size (:func:`interpolation.spread_error`).
+
 A segment and draw has one false peak at most, the largest; it is placed uniformly over bins
 1..N/2 outside the listed groups (a leaking bin in its own place). Groups beyond the ``most``
 strongest are neither detected nor false alarms.
@@ -32,7 +35,7 @@ from sweep.model.detection import assess
 from sweep.model.draws import METHODS
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.groups import FIRST, LAST, Groups, groups
-from sweep.model.interpolation import interpolator
+from sweep.model.interpolation import interpolator, spread_error
 from sweep.model.pairing import (
     FALSE_ALARM,
     MISPAIRED,
@@ -83,7 +86,7 @@ class Returns(NamedTuple):
     range_standard_error: np.ndarray
     """Standard error [m]: of the interpolated range, and of rounding to bins (1/sqrt(12))."""
     range_interpolated_standard_error: np.ndarray
-    """Standard error [m] of one line under noise."""
+    """Standard error [m] under noise, with what the spread of the groups' own lines adds."""
     radial_velocity_standard_error: np.ndarray
     """[m/s], as for the range."""
     radial_velocity_interpolated_standard_error: np.ndarray
@@ -152,6 +155,10 @@ def draw_returns(
     return Returns._make([*columns, flags, beamlet, group])
 
 
+_inlined = njit(cache=True, error_model="numpy", inline="always")
+"""Written into its caller: a call would count each of its many arrays in and out, draw by draw."""
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, streams, work, out):
     """All draws of all points: peaks of the three segments, then what they report."""
@@ -163,9 +170,10 @@ def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, stre
     exempt = np.empty(half + 1, np.bool_)
     peaks = np.zeros((3, draws, most + 1, 4))
     which, number = np.empty((3, draws, most + 1), np.int64), np.empty((3, draws), np.int64)
-    lines = np.empty((3, beamlets))
+    lines, spread = np.empty((3, beamlets)), np.empty(most)
     for i in range(points.shape[1]):
         p = points[:, i].copy()
+        beamlet_lines(p, 2 * half, footprint, row[i], lines)
         for s in range(3):
             if not segments[s]:
                 number[s], which[s, :, 0] = 1, ABSENT
@@ -179,7 +187,8 @@ def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, stre
                 (keys[i], first_draw, streams[s]), listed, (p[10], p[11] / p[10]), others,
                 found[4][i, s], noisy, run, tables, half, peaks[s], which[s], number[s],
             )  # fmt: skip
-        beamlet_lines(p, 2 * half, footprint, row[i], lines)
+            _spread_lines(listed[0], lines[s], footprint[2][row[i]], spread)
+            _widen(peaks[s], which[s], number[s], spread, power or not segments[1], tables)
         optics = p[8], chirp[0, i], chirp[1, i], p[6], p[6] / (2 * half)
         aims = p[0], p[1], footprint[0][row[i]], footprint[1][row[i]], footprint[2][row[i]], lines
         for d in range(draws):
@@ -189,7 +198,7 @@ def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, stre
             )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def _run(segment, p, footprint, row, power, kernel, room, exempt):
     """Bins that hold a segment's signal, as :func:`sweep.model.peaks.draw_in_noise` takes them."""
     sigma, level, floor = p[10], p[11], p[12]
@@ -200,7 +209,7 @@ def _run(segment, p, footprint, row, power, kernel, room, exempt):
     return low, room[0, :count] / sigma, exempt, floor
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def _draw_segment(
     source, listed, noise, others, leakage, noisy, run, tables, half, peaks, which, number
 ):
@@ -219,7 +228,35 @@ def _draw_segment(
             )
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
+def _spread_lines(bins, lines, amplitude, spread):
+    """Standard deviation [bins] of the lines in each group of a segment, weighted by power."""
+    for g in range(spread.size):
+        total = first = second = 0.0
+        for b in range(lines.size):
+            apart = lines[b] - bins[0, g]
+            if bins[FIRST, g] - 1.0 <= lines[b] <= bins[LAST, g] + 1.0:
+                weight = amplitude[b] * amplitude[b]
+                total += weight
+                first += weight * apart
+                second += weight * apart * apart
+        mean = first / total if total > 0.0 else 0.0
+        spread[g] = math.sqrt(max(second / total - mean * mean, 0.0)) if total > 0.0 else 0.0
+
+
+@_inlined
+def _widen(peaks, which, number, spread, power, tables):
+    """Adds to the errors of a segment's true peaks, in all draws, what the lines' spread does."""
+    for d in range(number.size):
+        for k in range(number[d]):
+            if which[d, k] >= 0:
+                peak = peaks[d, k]
+                delta = peak[FINE] - peak[WHOLE]
+                error = spread_error(delta, spread[which[d, k]], power, tables)
+                peak[ERROR] = math.hypot(peak[ERROR], error)
+
+
+@_inlined
 def _report(
     peaks, which, number, bins, pd, half, optics, aims, tolerance, work,
     values, flags, beamlet, group,
@@ -248,7 +285,7 @@ def _report(
             group[r, s] = max(group[r, s], -1)
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def _measure(up, down, code, optics, values):
     """Range and velocity by whole and by fine positions, their standard errors, and the SNR."""
     carrier, bandwidth, duration, sample_rate, bin_width = optics
@@ -265,7 +302,7 @@ def _measure(up, down, code, optics, values):
     values[8] = min(up[RATIO], down[RATIO]) ** 2 / 2.0
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def _judge(group, centres, bins, optics, aims, values):
     """What a return is in truth, and the beamlet that it has seen."""
     if group[0] == FALSE or group[1] == FALSE or group[2] == FALSE:

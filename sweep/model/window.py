@@ -126,7 +126,8 @@ def transform(window: Window, y: np.ndarray) -> np.ndarray:
     """W(y) by direct sum over the samples: slow and plain, (n,) complex for (n,) bins of fs/L."""
     w, n = samples(window.name, window.length), np.arange(window.length)
     turns = np.outer(np.asarray(y, float), n) / window.length
-    return np.exp(-2j * np.pi * (turns - np.rint(turns))) @ w
+    # A sum, not a product of matrices, whose order depends on the number of threads.
+    return (np.exp(-2j * np.pi * (turns - np.rint(turns))) * w).sum(axis=-1)
 
 
 def _closed_form(name: str, length: int) -> Window:

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sweep.model.eyepoints import observe, prepare_eyepoints
+from sweep.model.footprint import beamlets
 from sweep.model.geometry.attitude import Fixed, Nadir, Spin
 from sweep.model.geometry.beams import cone, corners
 from sweep.model.geometry.mesh import clean
@@ -106,6 +108,68 @@ def test_a_spinning_target_closes_on_one_side_and_recedes_on_the_other():
         assert seen.radial_velocity[0] == pytest.approx(-omega * x, rel=1e-4)
 
 
+def _beamlet_vectors(turn, beam, divergence, number):
+    """Unit vectors of a beam's beamlets in the world, of a beam in the body's x-z plane."""
+    (across, along), _ = beamlets(number)
+    # transverse: the first axis lies in the plane of the beam and x, the second across it
+    first, second = np.array([-beam[2], 0.0, beam[0]]), np.array([0.0, -1.0, 0.0])
+    body = beam + divergence / 4 * (np.outer(across, first) + np.outer(along, second))
+    return turn.apply(body / np.linalg.norm(body, axis=1)[:, None])
+
+
+@pytest.mark.parametrize("when", [0, 2])
+def test_velocity_across_the_footprint_of_a_spinning_target_is_that_of_its_points(when):
+    """Each beamlet meets the turned plate n.P = 0 at P and closes with u.(V - omega x P)."""
+    omega, place, own = np.array([0.05, 0.3, 0.1]), np.array([8.0, -3.0, 300.0]), (2.0, 1.0, -9.0)
+    path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
+    seen = _observed(
+        _flight(position=place, velocity=own), caster=Caster(_plane(size=400.0), embree=False),
+        bodies=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
+    )  # fmt: skip
+    here = place + when * np.array(own)
+    u = _beamlet_vectors(Rotation.identity(), np.array([0.0, 0.0, -1.0]), 0.02, 37)
+    normal = Rotation.from_rotvec(omega * when).apply([0.0, 0.0, 1.0])
+    ranges = -(here @ normal) / (u @ normal)
+    point = here + ranges[:, None] * u
+    closing = np.sum(u * (own - np.cross(omega, point)), axis=1)
+    np.testing.assert_allclose(seen.range[0] + seen.offset[0], ranges, rtol=1e-12)
+    got = seen.radial_velocity[0] + seen.velocity_offset[0]
+    np.testing.assert_allclose(got, closing, rtol=0, atol=1e-11)
+    assert np.ptp(closing) > 1.0
+    if when == 0:
+        # level and from straight above, angles a and b off the beam meet x + 300 a, y + 300 b
+        spread = np.sqrt(seen.weight @ (got - seen.weight @ got) ** 2)
+        by_a = own[0] - 300.0 * omega[1] + omega[2] * place[1]
+        by_b = own[1] + 300.0 * omega[0] - omega[2] * place[0]
+        across = np.hypot(by_a, by_b)
+        assert spread == pytest.approx(across * 0.02 / 4, rel=1e-3)
+
+
+@pytest.mark.parametrize("when", [0, 3])
+def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_arm(when):
+    """Ground at rest: u_b.(V + omega x a), the arm a and the beamlets u_b turned with the body."""
+    omega, arm = np.array([0.04, -0.08, 0.3]), np.array([3.0, 1.5, -0.5])
+    own, place = np.array([20.0, -5.0, -30.0]), np.array([0.0, 0.0, 900.0])
+    beam = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
+    seen = _observed(
+        _flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
+        beams=beam[None], index=[when], number=37, beam_divergence=0.02,
+    )  # fmt: skip
+    turn = Rotation.from_rotvec(omega * when)
+    u = _beamlet_vectors(turn, beam, 0.02, 37)
+    moving = own + np.cross(omega, turn.apply(arm))
+    got = seen.radial_velocity[0] + seen.velocity_offset[0]
+    np.testing.assert_allclose(got, u @ moving, rtol=0, atol=1e-11)
+    height = (place + when * own + turn.apply(arm))[2]
+    np.testing.assert_allclose(seen.range[0] + seen.offset[0], -height / u[:, 2], rtol=1e-12)
+    assert np.ptp(got) > 0.2
+    # to first order, the velocity across the beam times its angle
+    axis = turn.apply(beam)
+    spread = np.sqrt(seen.weight @ (got - seen.weight @ got) ** 2)
+    across = np.linalg.norm(np.cross(axis, moving))
+    assert spread == pytest.approx(across * 0.02 / 4, rel=1e-3)
+
+
 def test_a_tumbling_instrument_sees_the_velocity_of_its_lever_arm():
     omega, arm = np.array([0.2, -0.3, 0.1]), np.array([2.0, 1.0, -0.5])
     flight = _flight(attitude=Spin(omega), lever_arm=arm)
@@ -131,6 +195,8 @@ def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(ta
     assert not lost.seen.any()
     with pytest.raises(ValueError, match="sees nothing"):
         prepare_eyepoints(lost, table_4_1(), [GROUND])
+    with pytest.raises(ValueError, match="beyond the 0 given"):
+        prepare_eyepoints(seen, table_4_1(), [])
 
 
 def test_surfaces_scatter_by_their_own_reflectance_and_law(table_4_1):

@@ -353,6 +353,32 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
         assert (np.abs(whole - expected[:, None]) < 1.1 * width).all()
 
 
+@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
+def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
+    """A slope of 20 deg: a tenth of a bin of spread, against noise of a few thousandths.
+
+    Places between bins are moved by an amount that the place decides on: the stated error is
+    its size, so the mean square of errors over stated ones is near 1 over all places. Lines that
+    add as amplitudes may cancel, and then lie anywhere: about 1 again, with larger outliers.
+    """
+    shots = _prepared(
+        table_4_1(
+            range=1000 + RANGE_BIN * np.linspace(0, 1, 200, endpoint=False), window="hann",
+            radial_velocity=9.0, beamlets=61, power=50.0, grazing_angle=np.radians(20.0),
+            phases=phases,
+        )
+    )  # fmt: skip
+    got = _drawn(shots, draws=1)
+    good = got.flags[..., 0] == TRUE
+    error = (got.range_interpolated[..., 0] - shots.range[:, None])[good]
+    stated = got.range_interpolated_standard_error[..., 0][good]
+    assert good.mean() > 0.9
+    high = 1.5 if phases == "incoherent" else 2.5
+    assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < high
+    noise_alone = RANGE_BIN / np.sqrt(2 * np.median(got.snr[..., 0][good]))
+    assert np.median(stated) > 2 * noise_alone / np.sqrt(2)
+
+
 # Flags
 
 

@@ -1,12 +1,46 @@
-"""Pointing errors, from standard normal draws that are given."""
+"""Pointing errors, from standard normal draws that are given, or drawn by the shot's number."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply
+from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair, point_keys
+
+DOMAIN = "sweep.jitter"
+"""Domain of the random key, so that no other use of the same seed meets its numbers."""
+
+
+class PointingJitter(NamedTuple):
+    """Random turns of the beams, shot by shot: three independent normal angles about body axes.
+
+    A beam in any direction is thrown off by two angles across it, each of that standard
+    deviation; the third angle turns its footprint about it.
+    """
+
+    sigma: float
+    """Standard deviation of each angle [rad]."""
+    seed: int
+    """Seed of the study, >= 0."""
+
+    def turned(self, attitude: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Attitudes (n, 4) of shots by number (n,), turned; any stretch is the same bit for bit."""
+        ((a, b),) = point_keys(np.empty((1, 0)), domain=DOMAIN, seed=self.seed)
+        draws = np.empty((len(index), 3))
+        _draw(a, b, np.asarray(index, np.int64), STREAM_POINTING_JITTER, draws)
+        return jitter_attitude(attitude, sigma=self.sigma, draws=draws)
+
+
+@njit(cache=True, nogil=True)
+def _draw(key0, key1, index, stream, draws):
+    """Three standard normal numbers for each shot, whose number stands for that of a draw."""
+    for i in range(index.size):
+        draws[i, 0], draws[i, 1] = normal_pair(key0, key1, index[i], stream, 0)
+        draws[i, 2], _ = normal_pair(key0, key1, index[i], stream, 1)
 
 
 def jitter_attitude(

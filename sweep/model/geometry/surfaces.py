@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sweep.model.geometry.facets import Facets, join
+from sweep.model.reflectance import LAWS
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,9 @@ class Surface:
     name : str
         What it is called in a study.
     reflectance : float
-        Fraction of the light scattered back, 0..1.
+        What its law takes as such, 0..1.
     law : str
-        Reflectance law, one of the model's.
+        Reflectance law, one of :data:`sweep.model.reflectance.LAWS`.
     roughness : float
         Standard deviation of the height within a beamlet's spot [m], >= 0: against the
         wavelength it decides on speckle.
@@ -35,6 +36,9 @@ class Surface:
     def __post_init__(self) -> None:
         if not 0 <= self.reflectance <= 1:
             raise ValueError(f"{self.name}: the reflectance must lie within 0 and 1")
+        if self.law not in LAWS:
+            laws = ", ".join(LAWS)
+            raise ValueError(f"{self.name}: no reflectance law {self.law!r}: choose from {laws}")
         if not self.roughness >= 0:
             raise ValueError(f"{self.name}: the roughness must be at least 0 m")
 

@@ -1,0 +1,152 @@
+"""Point clouds: what an instrument reports of a flight's eyepoints, shot by shot and draw by draw.
+
+Eyepoints hold the geometry; here the radiometry is put to it. Every point comes with its position
+in the world, its standard errors and, beside them, the truth: surface, range and radial velocity
+of the beamlet that it has seen, and flags that say what it is.
+
+A shot that sees nothing has noise alone in its record. It has no group of bins to be detected
+and none that could not raise a false alarm, so its false alarms are the largest of all bins that
+are counted: drawn like those of any other shot, from the same addresses.
+
+Results of a shot do not depend on the shots and draws that are computed with it.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sweep.model import chances
+from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
+from sweep.model.geometry.surfaces import Surface
+from sweep.model.groups import Groups, groups
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.returns import Returns, draw_returns
+from sweep.model.scene_outputs import POINTS, STATISTICS, SceneOutput
+
+STRETCH = 1 << 20
+"""Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
+
+_NOWHERE = 1.0
+"""Range [m] of a shot that sees nothing. No light comes back from there."""
+
+
+def cloud(
+    eyepoints: Eyepoints,
+    *,
+    parameters: Parameters,
+    surfaces: Sequence[Surface],
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int = 1,
+    method: str = "probabilities",
+    returns: int = 4,
+) -> dict[str, np.ndarray]:
+    """Statistics and points of n shots.
+
+    Parameters
+    ----------
+    eyepoints : Eyepoints
+        n shots, whether they see anything or not.
+    parameters : mapping
+        Of :func:`sweep.model.eyepoints.prepare_eyepoints`, SI scalars.
+    surfaces : sequence of Surface
+        What the surface numbers mean.
+    keys : (n, 2) uint64 ndarray
+        Random key of each shot.
+    first_draw, draws : int
+        Number of the first draw, number of draws; any stretch of draws can be had alone.
+    method : str
+        ``probabilities`` or ``noise`` (:mod:`sweep.model.returns`).
+    returns : int
+        Strongest groups of bins that are looked at in a segment, and points at the most of a
+        shot and draw; at least 1.
+
+    Returns
+    -------
+    dict of ndarray
+        By the names, units and types of :data:`sweep.model.scene_outputs.STATISTICS`, (n,), and
+        :data:`sweep.model.scene_outputs.POINTS`, (n, draws, returns[, 3]). ``surfaces_seen`` is
+        `returns` at the most. ``surface``, ``true_range`` and ``true_radial_velocity`` are those
+        of the beamlet that a true or a misread point has seen; the error of a misread one shows.
+
+    Raises
+    ------
+    ValueError
+        `method` is neither of the two.
+    """
+    n = len(eyepoints.time)
+    sizes = {"shot": n, "draw": draws, "return_number": returns, "xyz": 3}
+    table = STATISTICS | POINTS
+    results = {name: _room(output, sizes) for name, output in table.items()}
+    step = max(1, STRETCH // (12 * draws * returns + 12 * eyepoints.weight.size))
+    for first in range(0, n, step):
+        part = slice(first, first + step)
+        seen = eyepoints.some(part)
+        shots, found = _groups(seen, parameters, surfaces, returns)
+        drawn = draw_returns(
+            shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
+        )
+        for name, values in (_statistics(seen, shots, found) | _points(seen, drawn)).items():
+            results[name][part] = values
+    return results
+
+
+def _room(output: SceneOutput, sizes: Mapping[str, int]) -> np.ndarray:
+    return np.empty(tuple(sizes[name] for name in output.dims), output.dtype)
+
+
+def _groups(
+    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface], most: int
+) -> tuple[Shots, Groups]:
+    """Prepared shots and the groups in their spectra; none where nothing is seen."""
+    seen = eyepoints.seen
+    somewhere = eyepoints._replace(
+        range=np.where(seen, eyepoints.range, _NOWHERE),
+        radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
+    )
+    shots = prepare_eyepoints(somewhere, parameters, surfaces)
+    found = groups(shots, most=most)
+    if not seen.all():
+        blind = ~seen
+        for bins in found[:3]:
+            bins[blind] = -1
+        found.neighbours[blind] = found.pd[blind] = np.nan
+        found.exempted[blind] = found.leakage[blind] = 0.0
+    return shots, found
+
+
+def _statistics(eyepoints: Eyepoints, shots: Shots, found: Groups) -> dict[str, np.ndarray]:
+    """Probabilities before any draw, (n,) each."""
+    up, doppler, down = found.pd[:, :, 0].T
+    one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]
+    noise = chances.at_least_one(one, shots.counted_bins(found.exempted[:, [0, 2]]))
+    leakage = found.leakage[:, [0, 2]]
+    alarm = leakage + noise * (1 - leakage)
+    above = found.magnitude[:, 0] >= shots.threshold[:, None]
+    return {
+        "pd_up": up,
+        "pd_down": down,
+        "pd_doppler": doppler,
+        "pd_shot": up * down,
+        "pfa_up": alarm[:, 0],
+        "pfa_down": alarm[:, 1],
+        "snr_up": (found.magnitude[:, 0, 0] / shots.bin_deviation) ** 2 / 2,
+        "surfaces_seen": above.sum(axis=1),
+    }
+
+
+def _points(eyepoints: Eyepoints, drawn: Returns) -> dict[str, np.ndarray]:
+    """Points and their truth, (n, draws, returns[, 3]) each."""
+    known = drawn.beamlet >= 0
+    shot = np.arange(len(known))[:, None, None]
+    at = shot, np.maximum(drawn.beamlet, 0)
+    far = eyepoints.range[:, None, None] + eyepoints.offset[at]
+    closing = eyepoints.radial_velocity[:, None, None] + eyepoints.velocity_offset[at]
+    along = drawn.range_interpolated[..., None] * eyepoints.direction[:, None, None]
+    reported = {name: getattr(drawn, name) for name in POINTS if name in Returns._fields}
+    return reported | {
+        "position": eyepoints.position[:, None, None] + along,
+        "surface": np.where(known, eyepoints.surface[at], -1),
+        "true_range": np.where(known, far, np.nan),
+        "true_radial_velocity": np.where(known, closing, np.nan),
+    }

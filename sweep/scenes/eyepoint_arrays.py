@@ -1,0 +1,73 @@
+"""Eyepoints as the arrays of a store, and back.
+
+The names are those of :mod:`sweep.model.scene_outputs`. Nothing is lost on the way: a shot read
+back gives the same radiometry, bit for bit, as the one that was cast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sweep.model.eyepoints import Eyepoints
+from sweep.model.scene_outputs import BEAMLETS, SHOTS
+
+_FIELDS = {
+    "time": "time",
+    "beam": "beam",
+    "shot_cycle": "cycle",
+    "platform_position": "position",
+    "platform_velocity": "velocity",
+    "beam_direction": "direction",
+    "beam_range": "range",
+    "beam_radial_velocity": "radial_velocity",
+    **{name: name for name in BEAMLETS},
+}
+"""Field of :class:`Eyepoints` that each array holds."""
+
+
+def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
+    """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store.
+
+    ``beam_surface`` is the surface of the reference beamlet, the first that hits; -1 where all
+    miss.
+    """
+    stored = {**SHOTS, **BEAMLETS}
+    arrays = {
+        name: np.asarray(getattr(eyepoints, field), stored[name].dtype)
+        for name, field in _FIELDS.items()
+    }
+    first = (eyepoints.surface >= 0).argmax(axis=1)
+    arrays["beam_surface"] = arrays["surface"][np.arange(len(first)), first]
+    return arrays
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
+    """Eyepoints that stored arrays stand for.
+
+    Parameters
+    ----------
+    arrays : mapping
+        Arrays of SHOTS and BEAMLETS by name, (n,), (n, 3) or (n, b); further ones are not looked
+        at.
+    weight : (b,) ndarray
+        Power fractions of the beamlets.
+
+    Raises
+    ------
+    ValueError
+        An array is missing, or its number of shots or of beamlets is not that of the others.
+    """
+    if missing := sorted(_FIELDS.keys() - arrays.keys()):
+        raise ValueError(f"eyepoints lack {', '.join(missing)}")
+    fields = {field: np.asarray(arrays[name]) for name, field in _FIELDS.items()}
+    fields["beam"] = fields["beam"].astype(np.int64)
+    fields["cycle"] = fields["cycle"].astype(np.int64)
+    weight = np.asarray(weight, float)
+    for name, field in _FIELDS.items():
+        trailing = {1: (), 2: (3,)}[len(SHOTS[name].dims)] if name in SHOTS else weight.shape
+        expected = (fields["time"].size, *trailing)
+        if fields[field].shape != expected:
+            raise ValueError(f"{name} has shape {fields[field].shape}, not {expected}")
+    return Eyepoints(**fields, weight=weight)

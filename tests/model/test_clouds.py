@@ -1,0 +1,335 @@
+"""Point clouds: their truth, the chances of points and dropouts, independence of batches."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model import clouds, philox
+from sweep.model.clouds import cloud
+from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
+from sweep.model.geometry.beams import cone
+from sweep.model.geometry.jitter import PointingJitter
+from sweep.model.geometry.scanner import BeamCycle
+from sweep.model.geometry.surfaces import Surface
+from sweep.model.groups import groups
+from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
+from sweep.model.scene_outputs import POINTS, STATISTICS
+from sweep.model.shot import evaluate
+
+DRAWS = 20_000
+"""5 sigma of a proportion is at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows."""
+
+METHODS = pytest.mark.parametrize("method", ["probabilities", "noise"])
+RANGE_BIN, VELOCITY_BIN = 299792458.0 * 600e6 / (4e12 * 2**16), 1550e-9 * 600e6 / 2**17
+GROUND, TABLE = Surface("ground", 0.1), Surface("table", 0.08)
+TABLE_HEIGHT, HEIGHT = 12.0, 412.0
+
+
+def _keys(index, seed=5):
+    return philox.point_keys(np.asarray(index, float)[:, None], domain="clouds", seed=seed)
+
+
+def _edge(places, *, lift=0.0, velocity=(0.0, 0.0, -20.0)):
+    """Nadir shots at places x [m] over ground to x = 30 m and a table, which may rise, from 0."""
+    bodies = [plate(x=(-1e3, 30.0)), plate(x=(0.0, 30.0), surface=1, height=TABLE_HEIGHT)]
+    seen = [
+        observed(
+            flight(position=(x, 0.0, HEIGHT), velocity=velocity), bodies=bodies,
+            motion=[None, flight(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, lift))],
+        )
+        for x in places
+    ]  # fmt: skip
+    fields = [np.concatenate(values) for values in zip(*(s[:-1] for s in seen), strict=True)]
+    return Eyepoints._make([*fields, seen[0].weight])
+
+
+def _cloud(seen, parameters, **keywords):
+    keys = keywords.pop("keys", _keys(np.arange(len(seen.time))))
+    return cloud(seen, parameters=parameters, surfaces=[GROUND, TABLE], keys=keys, **keywords)
+
+
+def _strong(table_4_1, **changes):
+    return instrument(table_4_1, **({"fft_size": 2**16} | changes))
+
+
+def _weak(table_4_1, tnr, power=1.6e-3):
+    """Light that leaves pd between 0 and 1, and a threshold in so many deviations of noise."""
+    return instrument(table_4_1, fft_size=2**16, power=power, tnr=tnr)
+
+
+def _within_5_sigma(counts, chance, slack=0.0):
+    spread = np.sqrt(DRAWS * chance * (1 - chance))
+    return np.abs(counts - DRAWS * chance) <= 5 * spread + slack + 1e-9
+
+
+KIND = TRUE | FALSE_ALARM | MISPAIRED | MISREAD | SIDELOBE
+ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
+
+
+# Without chance
+
+
+def test_arrays_are_those_of_the_table(table_4_1):
+    got = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns=2)
+    sizes = {"shot": 2, "draw": 3, "return_number": 2, "xyz": 3}
+    assert got.keys() == STATISTICS.keys() | POINTS.keys()
+    for name, output in (STATISTICS | POINTS).items():
+        assert got[name].dtype == output.dtype, name
+        assert got[name].shape == tuple(sizes[d] for d in output.dims), name
+
+
+@METHODS
+def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
+    """The table rises by 5 m/s: a range and a velocity of its own, half a bin off at the most."""
+    seen = _edge([ON_GROUND, BOTH, ON_TABLE], lift=5.0)
+    got = _cloud(seen, _strong(table_4_1), draws=20, method=method)
+    np.testing.assert_array_equal(got["surfaces_seen"], [1, 2, 1])
+    truth = {0: (HEIGHT, 20.0), 1: (HEIGHT - TABLE_HEIGHT, 25.0)}
+    for shot, expected in ((0, {0}), (1, {0, 1}), (2, {1})):
+        there = got["flags"][shot] > 0
+        assert (there.sum(axis=1) == len(expected)).all()
+        assert (got["flags"][shot][there] == TRUE).all()
+        surface = got["surface"][shot]
+        assert all(set(row[row >= 0]) == expected for row in surface)
+        for number in expected:
+            own, (far, closing) = surface == number, truth[number]
+            names = "true_range", "range_interpolated", "range"
+            for name, bins in zip(names, (1e-6, 0.2, 1.2), strict=True):
+                np.testing.assert_allclose(got[name][shot][own], far, atol=bins * RANGE_BIN)
+            names = "true_radial_velocity", "radial_velocity_interpolated", "radial_velocity"
+            for name, bins in zip(names, (0.1, 0.3, 1.2), strict=True):
+                np.testing.assert_allclose(got[name][shot][own], closing, atol=bins * VELOCITY_BIN)
+
+
+def test_points_lie_along_the_beam_as_commanded(table_4_1):
+    seen = observed(
+        flight(), beams=cone(4, half_angle=0.4), index=np.arange(8), jitter=PointingJitter(1e-3, 1)
+    )
+    got = _cloud(seen, _strong(table_4_1))
+    apart = got["position"][:, 0, 0] - seen.position
+    np.testing.assert_allclose(
+        apart, got["range_interpolated"][:, 0, :1] * seen.direction, rtol=1e-12
+    )
+    assert np.isnan(got["position"][:, 0, 1:]).all()
+    assert np.abs(got["position"][:, 0, 0, 2]).max() > 0.1
+
+
+def test_points_stray_from_level_ground_by_their_standard_error(table_4_1):
+    """Chi-square of 4000 heights, of one line each at about 43 dB: 5 sigma is 11 %."""
+    scanner = BeamCycle(cone(4, half_angle=0.4), [[0, 1, 2, 3]], 100.0)
+    path = flight(velocity=(10.0, 0.0, -5.0))
+    seen = observed(path, scanner=scanner, index=np.arange(4000), number=1)
+    got = _cloud(seen, _strong(table_4_1, power=5.0, window="hann"))
+    assert (got["flags"][:, 0, 0] == TRUE).all()
+    error = got["range_interpolated_standard_error"][:, 0, 0] * np.cos(0.4)
+    height = got["position"][:, 0, 0, 2]
+    assert np.mean((height / error) ** 2) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 4000))
+    assert 10 * np.log10(np.median(got["snr"][:, 0, 0])) == pytest.approx(43, abs=3)
+
+
+def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
+    """Equal parts of a tilted beam on two plates at one height: the powers' ratio is cos(i)."""
+    bodies = [plate(y=(-1e4, 0.0)), plate(y=(0.0, 1e4), surface=1)]
+    beams = cone(1, half_angle=np.radians(60.0))
+    seen = observed(flight(), bodies=bodies, beams=beams)
+    shots = prepare_eyepoints(
+        seen, _strong(table_4_1), [Surface("a", 0.1, "lommel_seeliger"), Surface("b", 0.1)]
+    )
+    power = shots.amplitude[0] ** 2 / seen.weight * (1 + shots.offset[0]) ** 2
+    first, second = (power[seen.surface[0] == s] for s in (0, 1))
+    assert min(first.size, second.size) > 5
+    np.testing.assert_allclose(first, 0.1 / np.pi, rtol=1e-12)
+    np.testing.assert_allclose(second, 0.05 / np.pi, rtol=1e-3)
+
+
+# Chance
+
+
+@METHODS
+def test_a_shot_that_sees_nothing_has_the_false_alarms_of_noise_alone(table_4_1, method):
+    """A point wants a false peak in the up and in the down-chirp, of N/2 bins each."""
+    got = _cloud(_edge([BLIND] * 4), _strong(table_4_1, tnr=7.4), draws=DRAWS, method=method)
+    one = np.exp(-(4 - np.pi) / 4 * 7.4**2)
+    chance = 1 - (1 - one) ** 2**15
+    assert 0.1 < chance < 0.5
+    for name in STATISTICS:
+        if name.startswith("pfa"):
+            np.testing.assert_allclose(got[name], chance, rtol=1e-9)
+        else:
+            assert (got[name] == 0).all() if name == "surfaces_seen" else np.isnan(got[name]).all()
+    assert (got["flags"][:, :, 1:] == 0).all()
+    there = got["flags"][:, :, 0] > 0
+    assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM).all()
+    assert _within_5_sigma(there.sum(axis=1), chance**2).all()
+    assert (got["surface"] == -1).all()
+    for name in ("true_range", "true_radial_velocity", "pd"):
+        assert np.isnan(got[name]).all(), name
+    assert np.isfinite(got["position"][:, :, 0][there]).all()
+
+
+@METHODS
+def test_dropouts_of_one_surface_have_the_probability_stated(table_4_1, method):
+    """Three powers, a threshold that noise hardly ever crosses: a point is there with pd_shot."""
+    for power in (7e-4, 9e-4, 1.1e-3):
+        parameters = _weak(table_4_1, 10.0, power=power)
+        got = _cloud(_edge([ON_GROUND, ON_TABLE]), parameters, draws=DRAWS, method=method)
+        assert ((got["pd_shot"] > 0.05) & (got["pd_shot"] < 0.98)).all()
+        assert (got["pfa_up"] < 1e-4).all()
+        there = (got["flags"] > 0).any(axis=2).sum(axis=1)
+        assert _within_5_sigma(there, got["pd_shot"], DRAWS * 1e-4).all()
+        assert (np.nan_to_num(got["pd"][:, :, 0], nan=-1.0).max(axis=1) == got["pd_shot"]).all()
+
+
+@METHODS
+def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
+    """Each has a point when its up and its down peak are found, and the shared Doppler peak.
+
+    Without that, pairs go by strength; those draws are few and stand as slack.
+    """
+    seen, parameters = _edge([BOTH, -BOTH]), _weak(table_4_1, 10.0, power=2.3e-3)
+    got = _cloud(seen, parameters, draws=DRAWS, method=method)
+    found = groups(prepare_eyepoints(seen, parameters, [GROUND, TABLE]))
+    slack = DRAWS * (1 - got["pd_doppler"] + 1e-4)
+    assert (slack < 0.002 * DRAWS).all()
+    np.testing.assert_array_equal(got["surfaces_seen"], 2)
+    both = found.pd[:, 0, :2] * found.pd[:, 2, :2]
+    assert ((both > 0.05) & (both < 0.999)).all()
+    np.testing.assert_array_equal(both[:, 0], got["pd_shot"])
+    right = (got["flags"] & (TRUE | MISREAD)) > 0
+    counts = np.array([(right & (got["surface"] == s)).any(axis=2).sum(axis=1) for s in (0, 1)])
+    # which is the stronger differs between the shots: the ground in one, the table in the other
+    stronger = counts.argmax(axis=0)
+    assert set(stronger) == {0, 1}
+    for place, surface in ((0, stronger), (1, 1 - stronger)):
+        assert _within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
+
+
+@METHODS
+@pytest.mark.parametrize("place", [ON_GROUND, BOTH])
+def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, method, place):
+    """Peaks pair one to one: k points or more where up and down have k peaks or more.
+
+    Peaks are independent chances, of groups pd and of one false peak pfa, so the numbers of both
+    lists are sums of such chances, whatever pairs with what.
+    """
+    power = {ON_GROUND: 6e-4, BOTH: 1.6e-3}[place]
+    seen, parameters = _edge([place]), _weak(table_4_1, 7.6, power=power)
+    got = _cloud(seen, parameters, draws=DRAWS, method=method)
+    found = groups(prepare_eyepoints(seen, parameters, [GROUND, TABLE]))
+    pfa = got["pfa_up"][0], got["pfa_down"][0]
+    assert all(0.03 < chance < 0.5 for chance in pfa)
+    tails = []
+    for segment, alarm in zip((0, 2), pfa, strict=True):
+        number = np.ones(1)
+        for chance in (*found.pd[0, segment][found.bin[0, segment] >= 0], alarm):
+            number = np.convolve(number, [1 - chance, chance])
+        tails.append(np.cumsum(number[::-1])[::-1])
+    points = (got["flags"][0] > 0).sum(axis=1)
+    expected = tails[0] * tails[1]
+    for k in range(1, min(4, len(expected)) + 1):
+        assert _within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
+    assert expected[2] > 0.01
+    if place == ON_GROUND:
+        # what is neither the true pair nor missing holds a false peak; a false peak takes a true
+        # one from its partner by chance, once in some 300
+        mean = expected[1:].sum()
+        false = (got["flags"][0] & FALSE_ALARM > 0).sum()
+        slack = DRAWS * pfa[0] / 300
+        assert abs(false - DRAWS * (mean - got["pd_shot"][0])) < 5 * np.sqrt(DRAWS * mean) + slack
+
+
+@METHODS
+def test_leaked_signal_raises_the_false_alarms_stated(table_4_1, method):
+    """A rectangular window; both true peaks are always there, so a second point is a false one."""
+    parameters = _strong(
+        table_4_1, window="rectangular", power=3.0, fft_size=2**12, leakage_floor=2.0
+    )
+    got = _cloud(_edge([ON_GROUND, ON_TABLE]), parameters, draws=DRAWS, method=method)
+    np.testing.assert_allclose(got["pd_shot"], 1.0, rtol=1e-12)
+    chance = got["pfa_up"] * got["pfa_down"]
+    assert ((chance > 0.01) & (chance < 0.1)).all()
+    second = (got["flags"][:, :, 1] & FALSE_ALARM) > 0
+    assert _within_5_sigma(second.sum(axis=1), chance).all()
+    target = table_4_1(range=HEIGHT, radial_velocity=20.0, reflectance_law="lambert")
+    plane = evaluate(target | parameters)
+    expected = 1 - (1 - plane["pfa_segment"]) * (1 - plane["p_leakage_up"])
+    np.testing.assert_allclose(got["pfa_up"][0], expected, rtol=1e-3)
+
+
+def test_detection_is_that_of_the_signal_to_noise_ratio_stated(table_4_1):
+    """Power of a bin over its noise's: noncentral chi-square, by scipy."""
+    got = _cloud(_edge([ON_GROUND, ON_TABLE]), _weak(table_4_1, 8.0, power=6e-4))
+    beta = 8.0 * np.sqrt(2 - np.pi / 2)
+    expected = stats.ncx2.sf(beta**2, df=2, nc=2 * got["snr_up"])
+    assert ((expected > 0.05) & (expected < 0.95)).all()
+    np.testing.assert_allclose(got["pd_up"], expected, rtol=1e-9)
+
+
+@METHODS
+def test_flags_tell_what_a_point_is(table_4_1, method):
+    seen = _edge([ON_GROUND, BOTH, -BOTH, BLIND], velocity=(0.0, 0.0, -2.0))
+    # by little light the Doppler peak is often lost, and with it the reading of a slow mover
+    parts = [
+        _cloud(seen, _weak(table_4_1, 7.6, power=power), draws=5000, method=method)
+        for power in (5e-4, 1.35e-3)
+    ]
+    got = {name: np.concatenate([part[name] for part in parts]) for name in POINTS}
+    kinds, there = got["flags"] & KIND, got["flags"] > 0
+    known = [TRUE, FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE]
+    assert np.isin(kinds[there], known).all()
+    assert all((kinds == kind).sum() > 20 for kind in (TRUE, FALSE_ALARM, MISPAIRED, MISREAD))
+    truthful = np.isin(kinds, [TRUE, MISREAD])
+    np.testing.assert_array_equal(got["surface"] >= 0, truthful)
+    for name in ("true_range", "true_radial_velocity"):
+        np.testing.assert_array_equal(np.isfinite(got[name]), truthful)
+    np.testing.assert_array_equal(np.isfinite(got["range"]), there)
+    np.testing.assert_array_equal(np.isfinite(got["pd"]), there & (kinds != FALSE_ALARM))
+    true = kinds == TRUE
+    assert np.abs(got["range"] - got["true_range"])[true].max() < 4 * RANGE_BIN
+    assert np.abs(got["radial_velocity"] - got["true_radial_velocity"])[true].max() < (
+        4 * VELOCITY_BIN
+    )
+    above = got["true_range"] < HEIGHT - TABLE_HEIGHT / 2
+    np.testing.assert_array_equal(got["surface"][truthful] == 1, above[truthful])
+    misread = kinds == MISREAD
+    assert np.abs(got["range"] - got["true_range"])[misread].min() > 4 * RANGE_BIN
+    assert (got["flags"][misread] & UNCONFIRMED > 0).mean() > 0.9
+
+
+# Invariance
+
+
+@METHODS
+def test_any_split_of_shots_and_of_draws_gives_the_same_bytes(table_4_1, method, monkeypatch):
+    seen = _edge([ON_GROUND, BOTH, BLIND, -BOTH, ON_TABLE, BLIND, 30.0 - 1e-5], lift=5.0)
+    assert 0 < (seen.surface[-1] < 0).sum() < seen.weight.size  # in part past the edge
+    parameters = _weak(table_4_1, 7.6) | {"target.solar_irradiance": 1e9}
+    keys = _keys(np.arange(7))
+    whole = _cloud(seen, parameters, keys=keys, draws=40, method=method)
+    assert len(np.unique(whole["flags"])) > 3
+    for shots in (np.arange(7)[::-1], [2], [0], [1, 6], [5, 2, 3]):
+        some = _cloud(seen.some(shots), parameters, keys=keys[shots], draws=40, method=method)
+        for name, values in some.items():
+            assert values.tobytes() == whole[name][shots].tobytes(), (name, shots)
+    for first, number in ((0, 1), (1, 25), (26, 14)):
+        some = _cloud(seen, parameters, keys=keys, first_draw=first, draws=number, method=method)
+        for name in POINTS:
+            part = whole[name][:, first : first + number]
+            assert some[name].tobytes() == part.tobytes(), (name, first)
+        for name in STATISTICS:
+            assert some[name].tobytes() == whole[name].tobytes(), name
+    monkeypatch.setattr(clouds, "STRETCH", 1)
+    for name, values in _cloud(seen, parameters, keys=keys, draws=40, method=method).items():
+        assert values.tobytes() == whole[name].tobytes(), name
+
+
+def test_no_shots_give_no_points(table_4_1):
+    seen = _edge([ON_GROUND]).some(slice(0, 0))
+    got = _cloud(seen, _strong(table_4_1), draws=2)
+    assert all(len(values) == 0 for values in got.values())
+
+
+def test_an_unknown_way_to_draw_is_refused(table_4_1):
+    with pytest.raises(ValueError, match="probabilities, noise"):
+        _cloud(_edge([ON_GROUND]), _strong(table_4_1), method="dice")

@@ -1,0 +1,323 @@
+"""Navigation from point clouds: what it takes, and its errors through the whole flow."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model import cycles, philox
+from sweep.model.clouds import cloud
+from sweep.model.cycles import solve
+from sweep.model.geometry.attitude import Fixed
+from sweep.model.geometry.beams import cone, corners, squares
+from sweep.model.geometry.jitter import PointingJitter
+from sweep.model.geometry.scanner import BeamCycle
+from sweep.model.geometry.surfaces import Surface
+from sweep.model.navigation_screening import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
+from sweep.model.scene_outputs import NAVIGATION
+
+DRAWS = 20_000
+"""A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of
+5 % in a variance (2.5 % in a standard error) shows."""
+
+MOVING = np.array([12.0, -7.0, -85.0])
+THREE, FOUR = cone(3, half_angle=np.radians(22.5), azimuth=0.2), corners(np.radians(22.5))
+SIXTEEN = squares(np.radians([15.0, 7.5]))[0].reshape(-1, 3)
+PATTERNS = pytest.mark.parametrize("beams", [THREE, FOUR, SIXTEEN], ids=len)
+
+
+def _shots(seen):
+    return {
+        "platform_position": seen.position,
+        "platform_velocity": seen.velocity,
+        "beam_direction": seen.direction,
+    }
+
+
+def _points(seen, *, draws=1, returns=3, range_error=0.02, velocity_error=3e-4):
+    """Points that state the truth exactly, one for each shot and draw, with standard errors."""
+    shape = len(seen.time), draws, returns
+    points = {"flags": np.zeros(shape, np.uint8)}
+    points["flags"][..., 0] = TRUE
+    for name, value, error in (
+        ("range", seen.range, range_error),
+        ("radial_velocity", seen.radial_velocity, velocity_error),
+    ):
+        for suffix, given in (
+            ("_interpolated", value[:, None]),
+            ("_interpolated_standard_error", error),
+            ("_standard_error", np.hypot(error, 0.1)),
+        ):
+            points[name + suffix] = np.full(shape, np.nan)
+            points[name + suffix][..., 0] = given
+    return points
+
+
+def _seen(beams, *, number=6, path=None, rate=2.0, interval=None, **keywords):
+    """Shots of some cycles over level ground."""
+    each = len(beams)
+    scanner = BeamCycle(beams, [list(range(each))], rate, interval)
+    path = flight(position=(0.0, 0.0, 900.0), velocity=MOVING) if path is None else path
+    return observed(path, scanner=scanner, index=np.arange(number * each), number=1, **keywords)
+
+
+def _solved(seen, points, beams, **keywords):
+    return solve(_shots(seen), points, shots_a_cycle=len(beams), **keywords)
+
+
+# Without chance
+
+
+@PATTERNS
+def test_true_points_give_the_mean_velocity_and_the_altitude_at_the_start(beams):
+    """Of an accelerating, turned platform whose beams fire one after another.
+
+    A relative rounding of 2e-16 in ranges and velocities, times condition numbers under 10.
+    """
+    attitude = Fixed(Rotation.from_euler("xyz", [0.1, -0.2, 0.7]).as_quat(scalar_first=True))
+    path = flight((3.0, 4.0, 900.0), MOVING, attitude, acceleration=(3.0, -6.0, 9.0))
+    seen = _seen(beams, path=path)
+    got = _solved(seen, _points(seen, draws=2), beams, test_level=0.001)
+    each = seen.velocity.reshape(6, -1, 3)
+    assert np.ptp(each, axis=1).max() > 1.0
+    expected = np.broadcast_to(each.mean(axis=1)[:, None], (6, 2, 3))
+    np.testing.assert_allclose(got["velocity"], expected, atol=1e-11)
+    height = seen.position[:: len(beams), 2]
+    np.testing.assert_allclose(got["altitude"], np.stack([height, height], 1), rtol=1e-12)
+    assert got.keys() == NAVIGATION.keys()
+    room = {"cycle": 6, "draw": 2, "xyz": 3, "xyz_again": 3}
+    for name, output in NAVIGATION.items():
+        assert got[name].dtype == output.dtype, name
+        assert got[name].shape == tuple(room[d] for d in output.dims), name
+    for name in ("velocity", "altitude"):
+        assert (got[f"{name}_status"] == SOLVED).all()
+        assert (got[f"{name}_beams"] == len(beams)).all()
+
+
+def test_the_first_confirmed_point_of_a_shot_is_taken_whatever_it_is_in_truth():
+    """Wrong values stand where the instrument must not look; a false alarm it can not know."""
+    seen = _seen(FOUR)
+    points, plain = _points(seen), _solved(seen, _points(seen), FOUR)
+    for name in points:
+        points[name][..., 1] = points[name][..., 0]  # the truth moves to the second place
+    points["flags"][..., 0] = FALSE_ALARM | UNCONFIRMED
+    points["flags"][..., 2] = TRUE
+    for name in ("range", "radial_velocity"):
+        for place in (0, 2):
+            points[f"{name}_interpolated"][..., place] = 33.0
+            points[f"{name}_interpolated_standard_error"][..., place] = 1e-9
+            points[f"{name}_standard_error"][..., place] = 1e-3
+    got = _solved(seen, points, FOUR)
+    for name in NAVIGATION:
+        np.testing.assert_array_equal(got[name], plain[name], err_msg=name)
+    points["flags"][..., 0] = FALSE_ALARM
+    fooled = _solved(seen, points, FOUR)
+    assert (np.abs(fooled["altitude"] - plain["altitude"]) > 100.0).all()
+    assert (fooled["velocity_status"] == SOLVED).all()
+
+
+def test_shots_without_a_confirmed_point_are_left_out():
+    seen = _seen(FOUR)
+    points = _points(seen)
+    points["flags"][0] = 0  # nothing
+    points["flags"][4 + 1] = TRUE | UNCONFIRMED  # nothing to trust
+    points["flags"][8:10] = 0  # two of four
+    points["flags"][12:16] = 0  # all
+    got = _solved(seen, points, FOUR)
+    assert got["velocity_beams"][:, 0].tolist() == [3, 3, 0, 0, 4, 4]
+    assert got["altitude_beams"][:, 0].tolist() == [3, 3, 2, 0, 4, 4]
+    status = [SOLVED, SOLVED, UNDETERMINED, UNDETERMINED, SOLVED, SOLVED]
+    assert got["velocity_status"][:, 0].tolist() == status
+    assert np.isnan(got["velocity"][2:4]).all() and np.isnan(got["altitude"][3]).all()
+    assert np.isnan(got["velocity_covariance"][2:4]).all()
+    solved = [0, 1, 4, 5]
+    np.testing.assert_allclose(got["velocity"][solved], np.tile(MOVING, (4, 1, 1)), atol=1e-11)
+
+
+def test_standard_errors_of_nothing_count_as_a_millionth_of_a_bin_and_others_not_at_all():
+    seen = _seen(FOUR)
+    points = _points(seen)
+    for name in ("range", "radial_velocity"):
+        points[f"{name}_interpolated_standard_error"][4:8, :, 0] = 0.0
+        points[f"{name}_standard_error"][4:8, :, 0] = 0.2
+        points[f"{name}_interpolated_standard_error"][8, :, 0] = np.nan
+        points[f"{name}_interpolated_standard_error"][12, :, 0] = np.inf
+        points[f"{name}_interpolated_standard_error"][16, :, 0] = 0.0
+        points[f"{name}_standard_error"][16, :, 0] = 0.0
+    got = _solved(seen, points, FOUR, jitter=1e-9)
+    assert got["velocity_beams"][:, 0].tolist() == [4, 4, 3, 3, 3, 4]
+    ratio = got["velocity_covariance"][1, 0] / got["velocity_covariance"][0, 0]
+    expected = ((0.2e-6) ** 2 + (1e-9 * 90) ** 2) / (3e-4) ** 2
+    assert 0.4 * expected < np.diag(ratio).min() <= np.diag(ratio).max() < 2 * expected
+
+
+def test_a_false_beam_is_found_among_sixteen_and_noticed_among_four():
+    for beams, status in ((SIXTEEN, EXCLUDED), (FOUR, WITHHELD)):
+        seen = _seen(beams)
+        points = _points(seen)
+        points["radial_velocity_interpolated"][1, :, 0] += 5.0
+        got = _solved(seen, points, beams, test_level=0.001)
+        assert got["velocity_status"][:, 0].tolist() == [status, *[SOLVED] * 5]
+        without = _solved(seen, points, beams, test_level=0.0)
+        assert (without["velocity_status"] == SOLVED).all()
+        assert np.abs(without["velocity"][0, 0] - MOVING).max() > 0.1
+
+
+def test_the_grounds_slope_and_relief_are_passed_on():
+    """Free, the plane through sloping ground fits; held level, it does not; relief adds to it."""
+    tilted = Rotation.from_euler("y", 0.2)
+    path = flight((0.0, 0.0, 900.0), (0.0, 0.0, 0.0))
+    rest = flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
+    seen = _seen(FOUR, path=path, bodies=[plate()], motion=[rest])
+    points = _points(seen)
+    free, held, rough = (
+        _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
+        for slope, relief in ((np.inf, 0.0), (0.0, 0.0), (0.0, 7.0))
+    )
+    np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
+    assert (np.abs(held["altitude"] - 900.0) > 1.0).all()
+    np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4, rtol=1e-3)
+
+
+def test_any_split_of_cycles_gives_the_same_bytes(monkeypatch):
+    seen = _seen(FOUR)
+    generator = np.random.default_rng(1)
+    points = _points(seen, draws=5)
+    points["flags"][generator.random(points["flags"].shape) < 0.2] = 0
+    for name in ("range", "radial_velocity"):
+        points[f"{name}_interpolated"] += generator.normal(0, 1e-3, points["flags"].shape)
+    options = {"test_level": 0.05, "jitter": 1e-5}
+    whole = _solved(seen, points, FOUR, **options)
+    assert len(np.unique(whole["velocity_status"])) > 1
+    for first, last in ((0, 1), (1, 4), (5, 6)):
+        some = slice(4 * first, 4 * last)
+        part = {name: values[some] for name, values in points.items()}
+        got = _solved(seen.some(some), part, FOUR, **options)
+        for name in NAVIGATION:
+            assert got[name].tobytes() == whole[name][first:last].tobytes(), name
+    monkeypatch.setattr(cycles, "STRETCH", 1)
+    for name, values in _solved(seen, points, FOUR, **options).items():
+        assert values.tobytes() == whole[name].tobytes(), name
+
+
+def test_shots_that_are_no_whole_cycles_are_refused():
+    seen = _seen(FOUR).some(slice(0, 23))
+    with pytest.raises(ValueError, match="23 shots are not whole cycles of 4"):
+        _solved(seen, _points(seen), FOUR)
+
+
+# Through the whole flow
+
+
+def _flown(table_4_1, beams, *, draws=DRAWS, method="probabilities", **changes):
+    """Eyepoints and cloud of one cycle, and the velocity of its platform."""
+    seen = _seen(beams, number=1, interval=0.0)
+    keys = philox.point_keys(np.arange(float(len(beams)))[:, None], domain="cycles", seed=8)
+    parameters = instrument(table_4_1, **({"fft_size": 2**16, "window": "hann"} | changes))
+    points = cloud(
+        seen, parameters=parameters, surfaces=[Surface("ground", 0.1)], keys=keys, draws=draws,
+        method=method, returns=2,
+    )  # fmt: skip
+    return seen, points
+
+
+def _propagated(beams, velocity_error, range_error):
+    """Covariance of the velocity and variance of the altitude over level ground.
+
+    The minimum-variance linear estimates from u.v and from R cos(angle from nadir), by normal
+    equations; the errors of beams are independent.
+    """
+    weighted = beams / velocity_error[:, None] ** 2
+    height = 1 / np.sum(1 / (range_error * beams[:, 2]) ** 2)
+    return np.linalg.inv(beams.T @ weighted), height
+
+
+@PATTERNS
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_mean_and_covariance_are_those_propagated_from_the_points(table_4_1, beams, method):
+    """All beams detected at some 50 dB; the errors that are propagated are those of the points
+    about the truth, beam by beam.
+
+    The interpolation is good to 1e-3 bins of bias there, under the 5 sigma of the mean.
+    """
+    seen, points = _flown(table_4_1, beams, method=method, power=30.0)
+    assert (points["flags"][:, :, 0] == TRUE).all()
+    got = _solved(seen, points, beams)
+    assert (got["velocity_status"] == SOLVED).all()
+    off = {
+        name: points[f"{name}_interpolated"][:, :, 0] - points[f"true_{name}"][:, :, 0]
+        for name in ("range", "radial_velocity")
+    }
+    covariance, variance = _propagated(
+        beams, off["radial_velocity"].std(axis=1), off["range"].std(axis=1)
+    )
+    error = got["velocity"][0] - MOVING
+    spread = np.sqrt(np.diag(covariance))
+    assert (np.abs(error.mean(axis=0)) <= 5 * spread / np.sqrt(DRAWS)).all()
+    # of a sample covariance of normal numbers: (C_ii C_jj + C_ij^2) / n
+    allowed = 5 * np.sqrt((np.outer(spread, spread) ** 2 + covariance**2) / DRAWS)
+    assert (np.abs(np.cov(error.T) - covariance) <= allowed).all()
+    stated = got["velocity_covariance"][0].mean(axis=0)
+    assert (np.abs(np.cov(error.T) - stated) <= allowed).all()
+    height = got["altitude"][0] - seen.position[0, 2]
+    assert abs(height.mean()) <= 5 * np.sqrt(variance / DRAWS)
+    assert height.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / DRAWS))
+    assert height.var() == pytest.approx(
+        got["altitude_variance"][0].mean(), rel=5 * np.sqrt(2 / DRAWS)
+    )
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_velocity_is_there_as_often_as_three_beams_are_confirmed(table_4_1, method):
+    """Of three beams all, up, Doppler and down: the product of their nine probabilities.
+
+    Of four beams any three. A false peak takes a true one's place by chance in at most 1e-4 of
+    the draws.
+    """
+    for beams in (THREE, FOUR):
+        seen, points = _flown(table_4_1, beams, method=method, power=0.008, tnr=9.5)
+        each = points["pd_shot"] * points["pd_doppler"]
+        assert ((each > 0.1) & (each < 0.95)).all()
+        chance = np.prod(each)
+        if len(beams) == 4:
+            chance += sum(np.prod(np.where(np.arange(4) == b, 1 - each, each)) for b in range(4))
+        got = _solved(seen, points, beams)
+        there = (got["velocity_status"] == SOLVED).sum()
+        allowed = 5 * np.sqrt(DRAWS * chance * (1 - chance)) + 1e-4 * DRAWS
+        assert abs(there - DRAWS * chance) <= allowed
+        assert np.isfinite(got["velocity"][0]).all(axis=1).sum() == there
+
+
+def test_jitter_spreads_velocity_and_altitude_as_stated():
+    """Points without any other error over many cycles, each with pointing of its own.
+
+    Standard errors of beams then are sigma |v_perp| and sigma R tan(angle).
+    """
+    sigma, number = 2e-4, 5000
+    path = flight(velocity=(60.0, -20.0, 0.0))
+    seen = _seen(
+        FOUR, number=number, path=path, rate=number / 9.9, interval=0.0,
+        jitter=PointingJitter(sigma, 4),
+    )  # fmt: skip
+    points = _points(seen, range_error=1e-9, velocity_error=1e-9)
+    got = _solved(seen, points, FOUR, jitter=sigma)
+    across = np.linalg.norm(np.cross(FOUR, [60.0, -20.0, 0.0]), axis=1)
+    tangent = np.hypot(FOUR[:, 0], FOUR[:, 1]) / -FOUR[:, 2]
+    ranges = 1000.0 / -FOUR[:, 2]
+    covariance, variance = _propagated(FOUR, sigma * across, sigma * ranges * tangent)
+    stated = got["velocity_covariance"][:, 0]
+    np.testing.assert_allclose(
+        stated, np.tile(covariance, (number, 1, 1)), atol=0.01 * covariance.max()
+    )
+    np.testing.assert_allclose(got["altitude_variance"], variance, rtol=0.01)
+    error = got["velocity"][:, 0] - [60.0, -20.0, 0.0]
+    spread = np.sqrt(np.diag(covariance))
+    assert (np.abs(error.mean(axis=0)) <= 5 * spread / np.sqrt(number)).all()
+    allowed = 5 * np.sqrt((np.outer(spread, spread) ** 2 + covariance**2) / number)
+    assert (np.abs(np.cov(error.T) - covariance) <= allowed).all()
+    height = got["altitude"][:, 0] - 1000.0
+    assert height.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / number))
+    screened = _solved(seen, points, FOUR, jitter=sigma, test_level=0.01)
+    withheld = (screened["velocity_status"] == WITHHELD).sum()
+    assert abs(withheld - 0.01 * number) <= 5 * np.sqrt(0.01 * number)
