@@ -1,7 +1,7 @@
 """The declarative experiment: YAML in, checked values out, every mistake at once."""
 
 from sweep.spec.axes import Axis, Member
-from sweep.spec.experiment import Spec, load
+from sweep.spec.experiment import Spec
 from sweep.spec.figures import (
     FalseAlarmTable,
     Figure,
@@ -12,9 +12,11 @@ from sweep.spec.figures import (
 )
 from sweep.spec.identity import difference
 from sweep.spec.instrument import Chirp, Instrument, Laser, Processing, Receiver, Telescope
+from sweep.spec.loading import from_stored, load
 from sweep.spec.mistakes import Mistake, SpecError
-from sweep.spec.scene import Accuracy, Draws, Execution, Footprint, Storage, Target
+from sweep.spec.scene_spec import SceneSpec
 from sweep.spec.schema import json_schema
+from sweep.spec.sections import Accuracy, Draws, Execution, Footprint, Storage, Target
 
 __all__ = [
     "Accuracy",
@@ -31,6 +33,7 @@ __all__ = [
     "Mistake",
     "Processing",
     "Receiver",
+    "SceneSpec",
     "Slices",
     "Spec",
     "SpecError",
@@ -41,6 +44,7 @@ __all__ = [
     "Telescope",
     "ThresholdTable",
     "difference",
+    "from_stored",
     "json_schema",
     "load",
 ]

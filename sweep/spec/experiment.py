@@ -1,89 +1,35 @@
-"""A study, declared: instrument, target, axes and how closely to look."""
+"""A study of a flat target: instrument, target, axes and how closely to look."""
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
-from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import Field
 
 from sweep.model import VERSION
-from sweep.spec.axes import Axis, Member
-from sweep.spec.axis_reading import paths_on_axes, read_axes
-from sweep.spec.fields import SECTIONS, default_of, parameter_rules, parameter_suggestion, values_of
+from sweep.spec.axes import Axis
+from sweep.spec.fields import SECTIONS, values_of
 from sweep.spec.figure_check import figure_findings
 from sweep.spec.figures import Figure
-from sweep.spec.identity import axis_identity, digest
-from sweep.spec.instrument import Instrument, Part
-from sweep.spec.limits import grid_findings
-from sweep.spec.mistakes import ABSENT, Finding, Mistake, SpecError, dotted, shown
-from sweep.spec.reading import Document, plain, read_document, resolve_instrument
-from sweep.spec.rules import Numeric, Rule, Text
-from sweep.spec.scene import Accuracy, Draws, Execution, Footprint, Storage, Target
-from sweep.spec.translation import findings_of
-from sweep.units import QuantityError
-
-LARGEST_GRID = 10**15
-
-_SEED = Numeric(
-    about="Seed of all random draws", example="1", at_least="0", at_most="2^63", whole=True
-)
+from sweep.spec.identity import axis_identity
+from sweep.spec.mistakes import Finding
+from sweep.spec.sections import Draws, Storage, Target
+from sweep.spec.study import Study
 
 
-class _ReadAxes(Rule):
-    """Axes, which `read_axes` has read before pydantic sees them."""
-
-    def read(self, written: object) -> object:
-        """The axes as they are."""
-        return written
-
-
-class Spec(Part):
-    """A study as its user declared it, every value read and checked.
+class Spec(Study):
+    """A study of a flat target over a grid of parameters, every value read and checked.
 
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
-
-    title: Annotated[str, Text(about="What the study is called")]
-    question: Annotated[str, Text(about="The question that the study answers")] = ""
-    instrument: Instrument
     target: Target
-    footprint: Footprint = Footprint()
-    accuracy: Accuracy = Accuracy()
     draws: Draws = Draws()
-    seed: Annotated[int, _SEED] = 0
     storage: Storage = Storage()
-    execution: Execution = Execution()
-    axes: Annotated[tuple[Axis, ...], _ReadAxes(about="What varies")] = ()
     figures: tuple[Figure, ...] = Field(default=(), description="Figures and tables of the results")
-
-    _written: dict[str, Any] = PrivateAttr(default_factory=dict)
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
-        """Spec from plain data, written as in a file.
-
-        Parameters
-        ----------
-        mapping : mapping
-            What a spec file holds; left as it is.
-        base : path
-            Folder that the instrument's file is relative to.
-
-        Raises
-        ------
-        SpecError
-            With every mistake in it.
-        """
-        if not isinstance(mapping, Mapping):
-            raise SpecError([Mistake("", "must be a mapping", shown(mapping))])
-        return cls._from_document(Document(plain(mapping)), Path(base))
 
     @classmethod
     def from_stored(cls, text: str) -> Self:
@@ -91,38 +37,15 @@ class Spec(Part):
         return cls.from_mapping(json.loads(text))
 
     @classmethod
-    def _from_document(cls, document: Document, base: Path) -> Self:
-        """Spec from a document, or all of its mistakes at once."""
-        has_instrument = resolve_instrument(document, base)
-        written = document.value
-        filled = [
-            path
-            for path, first in paths_on_axes(written.get("axes")).items()
-            if _fill(written, path.split("."), first)
-        ]
-        axes, findings = read_axes(written.get("axes", {}))
-        axes_are_read = not findings
-        spec: Self | None = None
-        try:
-            spec = cls.model_validate({**written, "axes": axes})
-        except ValidationError as error:
-            findings += findings_of(error, cls)
-        findings += grid_findings(_readable(written, axes), axes)
-        findings += _size_finding(axes)
-        if axes_are_read:
-            findings += figure_findings(written, axes)
-        # What is wrong with an axis or an instrument's file is told there, and there alone.
-        findings = [
-            finding
-            for finding in findings
-            if dotted(finding.location) not in filled
-            and (has_instrument or finding.location[0] != "instrument")
-        ]
-        findings = document.findings + findings
-        if findings or spec is None:
-            raise SpecError(_in_order(document, findings))
-        spec._written = spec._completed(written)
-        return spec
+    def further_findings(
+        cls,
+        written: Mapping[str, Any],
+        axes: tuple[Axis, ...],
+        base: Path | None,
+        axes_are_whole: bool,
+    ) -> list[Finding]:
+        """Figures of what the study lacks."""
+        return figure_findings(written, axes) if axes_are_whole else []
 
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
@@ -132,186 +55,17 @@ class Spec(Part):
             for path, value in values_of(getattr(self, section), section).items()
         }
 
-    def parameters_at(self, at: Mapping[str, object]) -> dict[str, float | int | str]:
-        """Parameters with some set anew, written as in a spec.
-
-        Parameters
-        ----------
-        at : mapping
-            Values by dotted path or its last part: ``{"range": "2 km"}``.
-
-        Raises
-        ------
-        SpecError
-            With every mistake in it, the combination's included.
-        """
-        parameters = self.parameters()
-        findings = []
-        for name, written in at.items():
-            path, rule = _parameter(name)
-            if rule is None:
-                findings.append(
-                    Finding((name,), "is no parameter", parameter_suggestion(name), ABSENT)
-                )
-                continue
-            try:
-                parameters[path] = rule.read(written)
-            except QuantityError as error:
-                findings.append(Finding((name,), error.rule, error.suggestion, written))
-        if not findings:
-            findings = grid_findings(parameters, ())  # type: ignore[arg-type]
-        if findings:
-            raise SpecError(Document({}).mistake(finding) for finding in findings)
-        return parameters
-
-    def member(self, name: str) -> Member:
-        """Parameter on an axis, by its coordinate's name or dotted path.
-
-        Raises
-        ------
-        KeyError
-            Where no axis has it.
-        """
-        for axis in self.axes:
-            for member in axis.members:
-                if name in (member.name, member.path):
-                    return member
-        raise KeyError(name)
-
-    def coordinate_value(self, name: str, written: object) -> float | int | str:
-        """Written value of a coordinate, in the unit that the coordinate is displayed in.
-
-        Raises
-        ------
-        KeyError
-            Where no axis has the coordinate.
-        QuantityError
-            Where the value cannot be read.
-        """
-        member = self.member(name)
-        rule = parameter_rules()[member.path]
-        if not isinstance(rule, Numeric):
-            return str(rule.read(written))
-        number, unit = rule.exact(written)
-        display = rule.exact(f"1 {member.units}" if member.units else 1)[1]
-        if unit.decibel:
-            return float(number)
-        return float((unit.factor * number + unit.offset - display.offset) / display.factor)
-
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
 
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides. The order of the axes is: it lays out the arrays.
         """
-        on_axes = {member.path for axis in self.axes for member in axis.members}
-        parameters = {path: v for path, v in self.parameters().items() if path not in on_axes}
         return {
             "model": VERSION,
-            "parameters": parameters,
+            "parameters": self.parameters_off_axes(),
             "axes": [axis_identity(axis) for axis in self.axes],
             "draws": values_of(self.draws, ""),
             "seed": self.seed,
             "storage": values_of(self.storage, ""),
         }
-
-    @cached_property
-    def id(self) -> str:
-        """Hash of the identity, 32 hexadecimal digits."""
-        return digest(self.identity())
-
-    def __hash__(self) -> int:
-        return hash(self.id)
-
-    def to_yaml_mapping(self) -> dict[str, Any]:
-        """The spec as a user would write it whole: no reference to a file, no default left out.
-
-        Execution is left out, as it is no part of what a study is.
-        """
-        return copy.deepcopy(self._written)
-
-    def _completed(self, written: dict[str, Any]) -> dict[str, Any]:
-        """The spec as written, with its defaults written out and its execution left out."""
-        mapping = {key: value for key, value in written.items() if key != "execution"}
-        for path, value in self.parameters().items():
-            _fill(mapping, path.split("."), parameter_rules()[path].written(value))
-        for section in ("draws", "storage"):
-            for path, value in values_of(getattr(self, section), section).items():
-                _fill(mapping, path.split("."), value)
-        return mapping | {"seed": self.seed}
-
-    def to_json(self) -> str:
-        """The spec as JSON text, for a store to hold."""
-        return json.dumps(self.to_yaml_mapping(), ensure_ascii=False, allow_nan=False)
-
-
-def load(path: str | Path) -> Spec:
-    """Spec in a YAML file.
-
-    Raises
-    ------
-    SpecError
-        With every mistake in it, each with its path, its line and a remedy.
-    """
-    document = read_document(Path(path))
-    return Spec._from_document(document, Path(path).parent)
-
-
-def _fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
-    """Whether the mapping lacked the path, where the value then is put."""
-    for name in path[:-1]:
-        mapping = mapping.setdefault(name, {})
-        if not isinstance(mapping, dict):
-            return False
-    lacking = path[-1] not in mapping
-    mapping.setdefault(path[-1], value)
-    return lacking
-
-
-def _readable(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> dict[str, float]:
-    """Numeric parameters off the axes, as far as they can be read."""
-    on_axes = {member.path for axis in axes for member in axis.members}
-    values: dict[str, float] = {}
-    for path, rule in parameter_rules().items():
-        found: Any = written
-        for name in path.split("."):
-            found = found.get(name, ABSENT) if isinstance(found, Mapping) else ABSENT
-        if path in on_axes or not isinstance(rule, Numeric):
-            continue
-        try:
-            value = default_of(path) if found is ABSENT else rule.read(found)
-        except QuantityError:
-            continue
-        if value is not None:
-            values[path] = value
-    return values
-
-
-def _parameter(name: str) -> tuple[str, Rule | None]:
-    """Dotted path and rule of a parameter, by its path or its last part."""
-    rules = parameter_rules()
-    paths = [path for path in rules if name in (path, path.rsplit(".", 1)[-1])]
-    return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
-
-
-def _size_finding(axes: tuple[Axis, ...]) -> list[Finding]:
-    """A grid too large to count."""
-    points = 1
-    for axis in axes:
-        points *= axis.size
-    if points <= LARGEST_GRID:
-        return []
-    return [
-        Finding(
-            ("axes",),
-            f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}",
-            "take fewer values",
-            ABSENT,
-        )
-    ]
-
-
-def _in_order(document: Document, findings: list[Finding]) -> list[Mistake]:
-    """Mistakes as they stand in the file, each once."""
-    mistakes = dict.fromkeys(document.mistake(finding) for finding in findings)
-    return sorted(mistakes, key=lambda m: (m.file != document.file, m.file, m.line or 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from functools import cache
 from types import MappingProxyType
 from typing import Any
@@ -10,8 +11,8 @@ from pydantic import BaseModel
 
 from sweep.spec.instrument import Instrument
 from sweep.spec.mistakes import near_miss
-from sweep.spec.rules import Rule
-from sweep.spec.scene import Accuracy, Footprint, Target
+from sweep.spec.rules import Rule, Text
+from sweep.spec.sections import Accuracy, Footprint, Target
 
 SECTIONS: dict[str, type[BaseModel]] = {
     "instrument": Instrument,
@@ -68,9 +69,47 @@ def values_of(part: BaseModel, prefix: str) -> dict[str, Any]:
     return values
 
 
-def parameter_suggestion(path: str) -> str:
-    """Suggestion for a path that names no parameter."""
-    rules = parameter_rules()
+def written_name(name: str, field: Any) -> str:
+    """Name of a field as users write it: `from` is a word of Python's own."""
+    return str(field.alias or name)
+
+
+UNSTORED = ("question", "execution", "axes", "figures")
+"""Sections of a study of which no default is written out."""
+
+Key = tuple[str, ...]
+
+KIND = Text(about="Which of several a part is")
+
+
+def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
+    """Every value of a part and of the parts in it that is there: its path, rule and SI value."""
+    for name, field in type(part).model_fields.items():
+        value, key = getattr(part, name), (*path, written_name(name, field))
+        rule = KIND if name == "kind" else rule_of(field)
+        if rule is not None and value is not None:
+            yield key, rule, value
+        elif isinstance(value, BaseModel):
+            yield from leaves(value, key)
+        elif isinstance(value, dict):
+            for inner, below in value.items():
+                yield from leaves(below, (*key, inner))
+
+
+def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
+    """Whether the mapping lacked the path, where the value then is put."""
+    for name in path[:-1]:
+        mapping = mapping.setdefault(name, {})
+        if not isinstance(mapping, dict):
+            return False
+    lacking = path[-1] not in mapping
+    mapping.setdefault(path[-1], value)
+    return lacking
+
+
+def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
+    """Suggestion for a path that names no parameter; of those known, all by default."""
+    rules = list(parameter_rules() if known is None else known)
     tail = path.rsplit(".", 1)[-1]
     same_tail = [known for known in rules if known.rsplit(".", 1)[-1] == tail]
     if len(same_tail) == 1:

@@ -13,7 +13,7 @@ from sweep.units import QuantityError, read_number
 Selection = str | int | float | tuple[str | int | float, ...]
 Printed = tuple[Any, ...]
 
-_STEM = Text(
+STEM = Text(
     about="Stem of the picture's file name",
     pattern=r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}",
     remedy="take letters, digits, '_', '-' and '.'",
@@ -28,7 +28,7 @@ _VARIABLE = Text(
     pattern=r"[A-Za-z_][A-Za-z0-9_]{0,99}",
     remedy="take a stored quantity, such as 'pd_shot'",
 )
-_TITLE = Text(about="Title of the figure")
+TITLE = Text(about="Title of the figure")
 
 
 class _Where(Rule):
@@ -89,15 +89,15 @@ def _number(written: object) -> float:
     return unit.to_si(value)
 
 
-_WHERE = _Where(about="Values of coordinates that the figure is confined to")
+WHERE = _Where(about="Values of coordinates that the figure is confined to")
 _PRINTED = _PrintedNumbers(about="The numbers as published, row by row, to stand beside ours")
 
 
 class _Drawing(Part):
     """What all figures have."""
 
-    name: Annotated[str, _STEM] = ""
-    title: Annotated[str, _TITLE] = ""
+    name: Annotated[str, STEM] = ""
+    title: Annotated[str, TITLE] = ""
 
     @property
     def stem(self) -> str:
@@ -121,7 +121,7 @@ class Surface(_Drawing):
     variable: Annotated[str, _VARIABLE]
     x: Annotated[str, _COORDINATE]
     y: Annotated[str, _COORDINATE]
-    where: Annotated[dict[str, Selection], _WHERE] = Field(default_factory=dict)
+    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
 
 
 class Slices(_Drawing):
@@ -131,7 +131,7 @@ class Slices(_Drawing):
     variable: Annotated[str, _VARIABLE]
     x: Annotated[str, _COORDINATE]
     by: Annotated[str, _COORDINATE] = ""
-    where: Annotated[dict[str, Selection], _WHERE] = Field(default_factory=dict)
+    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
 
 
 class Table(_Drawing):
@@ -141,7 +141,7 @@ class Table(_Drawing):
     variable: Annotated[str, _VARIABLE]
     rows: Annotated[str, _COORDINATE]
     columns: Annotated[str, _COORDINATE] = ""
-    where: Annotated[dict[str, Selection], _WHERE] = Field(default_factory=dict)
+    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
     minimum_range: Annotated[
         float,
         Numeric(about="Nearer ranges are left out", si_unit="m", example="5 m", at_least="0 m"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.fields import parameter_rules
+from sweep.spec.scene_units import scene_units
 
 LISTED_VALUES = 64
 
@@ -108,11 +109,14 @@ def _told(path: str, value: Any) -> str:
     rule = rules.get(path) or next(
         (rules[known] for known in rules if path.endswith("." + known)), None
     )
-    units = f" {rule.units}" if rule is not None and rule.units else ""
+    unit = scene_units().get(path.rsplit(".", 1)[-1], "") if rule is None else rule.units
+    units = f" {unit}" if unit else ""
     if value is None:
         return "(none)"
-    if path == "axes":
+    if path in ("axes", "objects"):
         return ", ".join(value) or "(none)"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_number, value))}]{units}"
     if isinstance(value, Mapping) and "values" in value:
         values = [_number(each) for each in value["values"]]
         if len(values) > MOST_TOLD:

@@ -50,8 +50,8 @@ class Rule:
         """
         raise QuantityError("holds nothing that can be read")
 
-    def written(self, value: Any) -> str | int | float:
-        """Text that reads back as exactly `value`."""
+    def written(self, value: Any) -> Any:
+        """What a user writes to have exactly `value`."""
         return str(value)
 
     def schema(self) -> dict[str, Any]:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
 from sweep.spec.experiment import Spec
-from sweep.spec.fields import parameter_rules
+from sweep.spec.fields import parameter_rules, rule_of, written_name
 from sweep.spec.rules import Numeric, Rule
+from sweep.spec.scene_spec import SceneSpec
+from sweep.spec.structure import all_parts
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -14,14 +20,15 @@ _INSTRUMENT_SECTIONS = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON Schema (2020-12) of a spec file.
+    """JSON Schema (2020-12) of a spec file, of a flat target or of a scene.
 
     Values of parameters are described by field. Fields that an axis or an instrument file may
     supply are not required by it; `sweep.load` does require them.
     """
-    schema = Spec.model_json_schema(mode="validation")
+    _, schema = models_json_schema([(Spec, "validation"), (SceneSpec, "validation")])
     definitions: dict[str, Any] = schema["$defs"]
-    _show_written_defaults(schema)
+    for model in all_parts(Spec, SceneSpec):
+        _show_written_defaults(definitions[model.__name__]["properties"], model)
     for name in (*_INSTRUMENT_SECTIONS, "Instrument", "Target"):
         definitions[name].pop("required", None)
     definitions["Instrument"]["description"] = (
@@ -34,47 +41,53 @@ def json_schema() -> dict[str, Any]:
         },
         **definitions["Instrument"]["properties"],
     }
-    schema["properties"]["instrument"] = {
+    rules = parameter_rules()
+    _define_values(definitions, rules)
+    scene = {path: rule for path, rule in rules.items() if SceneSpec.may_vary(path)}
+    _complete(definitions["Spec"], rules, ())
+    _complete(definitions["SceneSpec"], scene, ("scene", "platform", "scanners"))
+    return {
+        "$schema": DIALECT,
+        "title": "sweep study",
+        "if": {"required": ["scene"]},
+        "then": {"$ref": "#/$defs/SceneSpec"},
+        "else": {"$ref": "#/$defs/Spec"},
+        "$defs": definitions,
+    }
+
+
+def _complete(study: dict[str, Any], rules: Mapping[str, Rule], required: tuple[str, ...]) -> None:
+    """Describe a study's instrument and axes, and name what it can't do without."""
+    study["properties"]["instrument"] = {
         "description": "The instrument: the path of its file, a file with overrides, or all of it",
         "anyOf": [
             {"type": "string", "examples": ["instruments/table_4_1.yaml"]},
             {"$ref": "#/$defs/Instrument"},
         ],
     }
-    schema["properties"]["axes"] = _axes_schema(definitions)
-    schema["required"] = ["title", "instrument"]
-    return schema | {"$schema": DIALECT, "title": "sweep study"}
+    study["properties"]["axes"] = _axes_schema(rules)
+    study["required"] = ["title", "instrument", *required]
 
 
-def _show_written_defaults(schema: dict[str, Any]) -> None:
-    """Defaults as a user would write them, in place of SI values."""
-    rules = {tuple(path.split(".")): rule for path, rule in parameter_rules().items()}
-    for path, rule in rules.items():
-        properties = _properties(schema, path[:-1])
-        described = properties.get(path[-1], {})
-        if "default" in described:
-            described["default"] = rule.written(described["default"])
+def _show_written_defaults(properties: dict[str, Any], model: type[BaseModel]) -> None:
+    """Defaults as a user would write them, in place of SI values; of single fields only."""
+    for name, field in model.model_fields.items():
+        described, rule = properties[written_name(name, field)], rule_of(field)
+        if rule is not None and described.get("default") not in (None, ""):
+            described["default"] = rule.written(field.default)
+        else:
+            described.pop("default", None)
 
 
-def _properties(schema: dict[str, Any], path: tuple[str, ...]) -> dict[str, Any]:
-    """Properties of the section at a path."""
-    at = schema
-    for name in path:
-        described = at["properties"][name]
-        reference = described.get("$ref") or described["allOf"][0]["$ref"]
-        at = schema["$defs"][reference.rsplit("/", 1)[-1]]
-    return dict(at["properties"])
-
-
-def _axes_schema(definitions: dict[str, Any]) -> dict[str, Any]:
-    """Axes by path, each with its own field's values, and zipped axes by any other name.
-
-    What one field may hold goes into the definitions, once.
-    """
-    rules = parameter_rules()
+def _define_values(definitions: dict[str, Any], rules: Mapping[str, Rule]) -> None:
+    """Put what each parameter may hold into the definitions, once."""
     for path, rule in rules.items():
         definitions[f"{path}.value"] = rule.schema()
         definitions[f"{path}.values"] = _values_schema(path, rule)
+
+
+def _axes_schema(rules: Mapping[str, Rule]) -> dict[str, Any]:
+    """Axes by path, each with its own field's values, and zipped axes by any other name."""
     return {
         "type": "object",
         "description": "Parameters that vary: a list, a generator, or a zipped axis by any name",

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from sweep.spec.fields import parameter_rules, rule_of, rules_of
-from sweep.spec.figures import FIGURE_KINDS, Figure
-from sweep.spec.mistakes import ABSENT, Finding, Location, near_miss
+from sweep.spec.figures import FIGURE_KINDS
+from sweep.spec.mistakes import ABSENT, Finding, dotted, near_miss
 from sweep.spec.rules import BROKEN_RULE, Numeric
+from sweep.spec.scene_figures import SCENE_FIGURE_KINDS
+from sweep.spec.structure import Models, Place, field_named, fields_of, kind_of, place_of
 
-_FIGURE_MODELS = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in get_args(get_args(Figure)[0])
-}
 _PLAIN = {
     "model_type": ("must be a mapping of fields to values", ""),
     "model_attributes_type": ("must be a mapping of fields to values", ""),
@@ -22,8 +20,8 @@ _PLAIN = {
     "list_type": ("must be a list", ""),
     "tuple_type": ("must be a list", ""),
     "invalid_key": ("must be a word", ""),
-    "union_tag_not_found": ("lacks its kind", f"write kind: and one of {', '.join(FIGURE_KINDS)}"),
 }
+_DRAWN_BY = dict.fromkeys(FIGURE_KINDS, "a target") | dict.fromkeys(SCENE_FIGURE_KINDS, "a scene")
 
 
 def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:
@@ -34,62 +32,57 @@ def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:
 def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
     """One error of pydantic's."""
     kind, written = detail["type"], detail["input"]
-    location = _without_tags(detail["loc"])
+    place = place_of(detail["loc"], root)
+    location = place.location
     if kind == BROKEN_RULE:
         context = detail["ctx"]
         return Finding(location, context["rule"], context["suggestion"], written)
     if kind == "missing":
-        return Finding(location, "is missing", _remedy(location, root), ABSENT)
+        return Finding(location, "is missing", _remedy(place), ABSENT)
     if kind == "extra_forbidden":
-        return Finding(location, "is no field", _sibling(location, root), ABSENT)
+        return Finding(location, "is no field", _sibling(place, root), ABSENT)
     if kind == "union_tag_invalid":
-        tag = detail["ctx"]["tag"]
-        rule = f"must be one of {', '.join(FIGURE_KINDS)}"
-        return Finding((*location, "kind"), rule, near_miss(str(tag), FIGURE_KINDS), tag)
+        tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
+        rule = f"must be one of {', '.join(kinds)}"
+        return Finding((*location, "kind"), rule, _other_kind(str(tag), kinds), tag)
+    if kind == "union_tag_not_found":
+        return Finding(location, "lacks its kind", f"write {_with_kind(place.models)}", written)
     rule, suggestion = _PLAIN.get(kind, ("has a value that cannot stand here", ""))
     return Finding(location, rule, suggestion, written)
 
 
-def _without_tags(location: Location) -> Location:
-    """Location without the figure's kind, which pydantic puts after its index."""
-    if len(location) > 2 and location[0] == "figures":
-        return (*location[:2], *location[3:])
-    return location
+def _with_kind(models: Models) -> str:
+    """What a part of several kinds is written with."""
+    return f"kind: and one of {', '.join(kind_of(model) for model in models)}"
 
 
-def _model_at(location: Location, root: type[BaseModel]) -> type[BaseModel] | None:
-    """Model that the location's value is read as."""
-    model: Any = root
-    for name in location:
-        field = model.model_fields.get(name) if isinstance(name, str) else None
-        model = field.annotation if field is not None else None
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            return None
-    return model
+def _other_kind(tag: str, kinds: list[str]) -> str:
+    """Suggestion for a kind that is none of those here."""
+    if tag in _DRAWN_BY and kinds[0] in _DRAWN_BY:
+        return f"{tag} is for studies of {_DRAWN_BY[tag]}"
+    return near_miss(tag, kinds)
 
 
-def _remedy(location: Location, root: type[BaseModel]) -> str:
+def _remedy(place: Place) -> str:
     """What to write for a missing field or section."""
-    name = location[-1]
-    parent = _model_at(location[:-1], root)
-    field = parent.model_fields.get(str(name)) if parent else None
+    name = place.location[-1]
+    field = field_named(place.parents[0], name) if place.parents else None
     rule = rule_of(field) if field is not None else None
-    if isinstance(rule, Numeric):
-        return f"write e.g. '{name}: {rule.example}', or put it on an axis"
-    section = _model_at(location, root)
-    if section is not None:
-        return f"write '{name}:' with {', '.join(section.model_fields)}"
+    example = getattr(rule, "example", "")
+    if example:
+        varies = isinstance(rule, Numeric) and dotted(place.location) in parameter_rules()
+        return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if varies else "")
+    if len(place.models) > 1:
+        return f"write '{name}:' with {_with_kind(place.models)}"
+    if place.models:
+        return f"write '{name}:' with {', '.join(fields_of(place.models[0]))}"
     return f"write '{name}: ...'"
 
 
-def _sibling(location: Location, root: type[BaseModel]) -> str:
+def _sibling(place: Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
-    name = str(location[-1])
-    model = _model_at(location[:-1], root)
-    if location[0] == "figures" and len(location) == 3:
-        known = {key for figure in _FIGURE_MODELS.values() for key in figure.model_fields}
-        return near_miss(name, sorted(known))
-    beside = list(model.model_fields) if model else []
+    name = str(place.location[-1])
+    beside = [field for model in place.parents for field in fields_of(model)]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion

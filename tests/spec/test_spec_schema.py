@@ -9,11 +9,14 @@ from written_specs import written
 from sweep.model import window as model_window
 from sweep.spec import Spec, json_schema, load
 from sweep.spec.fields import parameter_rules
+from sweep.spec.reading import read_document
 from sweep.spec.rules import Numeric
 from sweep.spec.window_rule import _WINDOW_ALIASES, _WINDOWS
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-STUDIES = sorted(EXPERIMENTS.glob("*.yaml"))
+STUDIES = [
+    path for path in sorted(EXPERIMENTS.glob("*.yaml")) if "target" in read_document(path).value
+]
 POINTS = {
     "quickstart": 4500,
     "single_shot_2000m": 1,

@@ -2,6 +2,7 @@
 
 from typing import Annotated
 
+from sweep.model.reflectance import LAWS
 from sweep.spec.instrument import Part
 from sweep.spec.rules import Choice, Numeric, Text
 
@@ -29,8 +30,8 @@ class Target(Part):
     reflectance_law: Annotated[
         str,
         Choice(
-            about="How it scatters: Lambertian, or without a cosine as the thesis has it",
-            options=("lambert", "thesis"),
+            about="How it scatters: Lambertian, as regolith, or as the thesis has it",
+            options=LAWS,
         ),
     ] = "lambert"
     radial_velocity: Annotated[

@@ -1,0 +1,55 @@
+"""The files that a scene is made of: where they are, and that they are still the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from sweep.scenes.digests import file_digest
+from sweep.scenes.errors import SceneError
+from sweep.spec.fields import Key, leaves
+from sweep.spec.list_rules import File
+
+
+@dataclass(frozen=True)
+class Files:
+    """Files named in a spec.
+
+    Parameters
+    ----------
+    base : Path
+        Folder that their paths are relative to.
+    digests : mapping
+        Digest of each file by its path as written.
+    """
+
+    base: Path
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    def path(self, written: str) -> Path:
+        """Where a file is.
+
+        Raises
+        ------
+        SceneError
+            Where it is missing, or has another content than when the spec was loaded.
+        """
+        path = self.base / written
+        known = self.digests.get(written)
+        if known is not None and file_digest(path) != known:
+            raise SceneError(
+                path,
+                "has changed since the study was declared",
+                "bring the old file back, or make another study of the new one",
+            )
+        return path
+
+
+def named_files(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, str]]:
+    """Places in a spec that name a file, with the path written there."""
+    for key, rule, value in leaves(part, path):
+        if isinstance(rule, File):
+            yield key, value

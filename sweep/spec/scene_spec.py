@@ -1,0 +1,245 @@
+"""A study of a flight over a scene: instrument, scene, platform, scanners, axes and draws."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from pydantic import Field, PrivateAttr
+
+from sweep.model import VERSION
+from sweep.spec.axes import Axis
+from sweep.spec.content import geometry_of, leaf_values
+from sweep.spec.fields import values_of
+from sweep.spec.files import Files, named_files
+from sweep.spec.identity import axis_identity, digest
+from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
+from sweep.spec.motion import Platform
+from sweep.spec.reading import Document, plain
+from sweep.spec.scanners import AnyScanner, shots_a_cycle
+from sweep.spec.scene_axes import axis_findings, beamlet_pattern, parameter_findings, why_not
+from sweep.spec.scene_check import scene_findings
+from sweep.spec.scene_figure_check import scene_figure_findings
+from sweep.spec.scene_figures import SceneFigure
+from sweep.spec.scene_sections import Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.study import Study
+
+if TYPE_CHECKING:
+    from sweep.model.geometry.jitter import PointingJitter
+    from sweep.model.geometry.platform import Flight
+    from sweep.model.geometry.scanner import Scanner
+    from sweep.model.geometry.surfaces import Surface
+    from sweep.spec.world import World
+
+FILES = "files"
+"""Section of a stored study: the digest of each file by its path."""
+
+SECTIONS = ("instrument", "footprint", "accuracy")
+
+
+class SceneSpec(Study):
+    """A study of a flight over a scene, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    scene: Scene
+    platform: Platform
+    scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
+    draws: SceneDraws = SceneDraws()
+    navigation: Navigation = Navigation()
+    storage: SceneStorage = SceneStorage()
+    figures: tuple[SceneFigure, ...] = Field(
+        default=(), description="Figures and tables of the results"
+    )
+
+    _base: Path = PrivateAttr(default=Path())
+    _digests: dict[str, str] = PrivateAttr(default_factory=dict)
+
+    @classmethod
+    def from_document(cls, document: Document, base: Path | None) -> Self:
+        """Spec from a document, which is changed, or all of its mistakes at once."""
+        spec = super().from_document(document, base)
+        if base is not None:
+            spec._base = base
+            spec._digests = _digests(spec, base)
+        return spec
+
+    @classmethod
+    def from_stored(cls, text: str, base: Path | str | None = None) -> Self:
+        """Spec from the JSON that `to_json` gave, the same again but for its execution.
+
+        Parameters
+        ----------
+        text : str
+            The JSON.
+        base : path, optional
+            Folder that its files are relative to; they are not looked at before they are needed.
+        """
+        written = plain(json.loads(text))
+        if not isinstance(written, dict):
+            raise SpecError([Mistake("", "must be a mapping", shown(written))])
+        digests = written.pop(FILES, {})
+        spec = cls.from_document(Document(written), None)
+        spec._base, spec._digests = Path(base or "."), digests
+        return spec
+
+    @classmethod
+    def further_findings(
+        cls,
+        written: Mapping[str, Any],
+        axes: tuple[Axis, ...],
+        base: Path | None,
+        axes_are_whole: bool,
+    ) -> list[Finding]:
+        """What is wrong with scene, flight, files and figures."""
+        findings = scene_findings(written, base) + axis_findings(written, axes)
+        return findings + scene_figure_findings(written, axes if axes_are_whole else None)
+
+    @classmethod
+    def may_vary(cls, path: str) -> bool:
+        """Whether the parameter at a path is one of this kind of study that an axis may set."""
+        return not why_not(path)[0]
+
+    def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
+        """What is wrong with a parameter taking a value without the geometry changing."""
+        return parameter_findings(self.pattern, self.footprint.phases, path, [value], location)
+
+    @property
+    def base(self) -> Path:
+        """Folder that the scene's files are relative to."""
+        return self._base
+
+    @property
+    def files(self) -> Files:
+        """The scene's files."""
+        return Files(self._base, self._digests)
+
+    def parameters(self) -> dict[str, float | int | str]:
+        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        parameters = {
+            path: value
+            for section in SECTIONS
+            for path, value in values_of(getattr(self, section), section).items()
+        }
+        return parameters | {"target.solar_irradiance": self.scene.solar_irradiance}
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """What surface numbers mean; no file is looked at."""
+        from sweep.spec.world import surfaces_of
+
+        return surfaces_of(self.scene)
+
+    def world(self) -> World:
+        """The scene, built.
+
+        Raises
+        ------
+        SceneError
+            For a file that is missing, changed or unfit; or an object that can not be made.
+        """
+        from sweep.spec.world import build
+
+        flight = self.flight()
+        return build(self.scene, self.files, (flight.start, flight.stop))
+
+    def flight(self) -> Flight:
+        """Movement of the instrument in the scene's frame.
+
+        Raises
+        ------
+        SceneError
+            For a table that is missing, changed or unfit.
+        """
+        return self.platform.flight(self.files)
+
+    def scan(self, name: str) -> Scanner:
+        """The scan pattern of a scanner."""
+        return self.scanners[name].pattern()
+
+    def shots_a_cycle(self, name: str) -> int:
+        """Shots of a measurement cycle of a scanner."""
+        return shots_a_cycle(self.scan(name))
+
+    def cycles(self, name: str) -> int:
+        """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""
+        flight, scan = self.flight(), self.scan(name)
+        return scan.number(flight.stop - flight.start) // shots_a_cycle(scan)
+
+    @property
+    def pattern(self) -> str:
+        """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
+        return beamlet_pattern(self.footprint.phases, self.instrument.receiver.architecture)
+
+    def pointing_jitter(self) -> PointingJitter | None:
+        """Random turns of the beams; None where there are none."""
+        from sweep.model.geometry.jitter import PointingJitter
+
+        sigma = self.platform.jitter
+        return PointingJitter(sigma, self.seed) if sigma else None
+
+    def geometry(self, name: str) -> dict[str, Any]:
+        """Content of what is seen through one scanner: all that rays depend on, and no more.
+
+        Names are no part of it, nor are reflectances, nor where files are: they count by content.
+        """
+        seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
+        return seen | {
+            "model": VERSION,
+            "beamlets": self.footprint.beamlets,
+            "pattern": self.pattern,
+            "beam_divergence": self.instrument.laser.beam_divergence,
+            "seed": self.seed if self.platform.jitter else 0,
+        }
+
+    def geometry_id(self, name: str) -> str:
+        """Hash of the geometry, 32 hexadecimal digits."""
+        return digest(self.geometry(name))
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Title, question, figures and execution are no part of it, nor are values that an axis
+        overrides, nor where files are: they count by content. The order of axes and of objects
+        is: it lays out the arrays and numbers the surfaces.
+        """
+        digests = self._digests
+        return {
+            "model": VERSION,
+            "parameters": self.parameters_off_axes(),
+            "axes": [axis_identity(axis) for axis in self.axes],
+            "objects": list(self.scene.objects),
+            "scene": leaf_values(self.scene, digests),
+            "platform": leaf_values(self.platform, digests),
+            "scanners": {
+                f"{name}.{path}": value
+                for name, scanner in self.scanners.items()
+                for path, value in leaf_values(scanner, digests).items()
+            },
+            "draws": values_of(self.draws, ""),
+            "navigation": values_of(self.navigation, ""),
+            "seed": self.seed,
+            "storage": values_of(self.storage, ""),
+        }
+
+    def to_json(self) -> str:
+        """The spec as JSON text, for a store to hold, with the digests of its files."""
+        mapping = self.to_yaml_mapping() | ({FILES: self._digests} if self._digests else {})
+        return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SceneSpec):
+            return NotImplemented
+        return self.to_json() == other.to_json()
+
+    def __hash__(self) -> int:
+        return hash(self.id)
+
+
+def _digests(spec: SceneSpec, base: Path) -> dict[str, str]:
+    """Digest of every file that a spec names, by its path as written."""
+    from sweep.scenes.digests import file_digest
+
+    return {written: file_digest(base / written) for _, written in named_files(spec)}

@@ -1,0 +1,288 @@
+"""What makes a scene study that one, and its geometry: content, never names or places."""
+
+import json
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
+
+from sweep.scenes.errors import SceneError
+from sweep.spec import SceneSpec, difference, from_stored
+from sweep.spec.fields import leaves
+from sweep.spec.grounds import OPTICAL
+from sweep.spec.scene_units import ROOTS, scene_units, units_by_name
+from sweep.spec.structure import all_parts
+
+
+def spec_of(mapping, base="."):
+    return SceneSpec.from_mapping(mapping, base=base)
+
+
+def changed(path, value):
+    mapping = json.loads(json.dumps(RICH))
+    *parents, name = path.split(".")
+    part = mapping
+    for parent in parents:
+        part = part.setdefault(parent, {})
+    part[name] = value
+    return spec_of(mapping)
+
+
+OTHER_GEOMETRY = {
+    "scene.origin": "world",
+    "scene.objects.ground.size": "120 m",
+    "scene.objects.ground.spacing": "1 m",
+    "scene.objects.ground.hurst": 0.7,
+    "scene.objects.ground.seed": 9,
+    "scene.objects.ground.smoothing": "4 m",
+    "scene.objects.ground.factor": 1,
+    "scene.objects.ground.relief.rms_slope": 0.2,
+    "scene.objects.ground.craters.seed": 1,
+    "scene.objects.ground.craters.equilibrium_diameter": "15 m",
+    "scene.objects.forest.radius": "11 m",
+    "scene.objects.forest.tree": {"leaf_area_index": 3},
+    "scene.objects.forest.on": "other",
+    "scene.objects.rocks.law": {"kind": "power", "density": "0.1 m^-2", "exponent": 2},
+    "scene.objects.rocks.law.abundance": "6 %",
+    "scene.objects.rocks.elongation": 2,
+    "scene.objects.ball.radius": "2 m",
+    "scene.objects.ball.rotation": {"heading": "5 deg"},
+    "scene.objects.crate.motion.attitude.angular_velocity": ["1 deg/s", "0 deg/s", "1 deg/s"],
+    "scene.objects.crate.motion.path.position": ["0 m", "1 m", "9 m"],
+    "platform.path.final_speed": "21 m/s",
+    "platform.attitude": {"kind": "nadir", "heading": "1 deg"},
+    "platform.lever_arm": ["1 m", "1 m", "0 m"],
+    "platform.mounting.pitch": "2 deg",
+    "platform.jitter": "11 urad",
+    "scanners.three.rate": "3 Hz",
+    "scanners.three.interval": "1 ms",
+    "footprint.beamlets": 19,
+    "footprint.phases": "coherent",
+    "instrument.laser.beam_divergence": "60 urad",
+    "seed": 2,
+}
+SAME_GEOMETRY = {
+    "title": "Another",
+    "question": "Why?",
+    "scene.objects.ground.reflectance": 0.2,
+    "scene.objects.forest.leaf.reflectance": 0.1,
+    "scene.objects.forest.trunk.roughness": "1 mm",
+    "scene.objects.rocks.reflectance_law": "thesis",
+    "scene.solar_irradiance": "0.1 W/m^2/nm",
+    "instrument.telescope.aperture": "50 mm",
+    "instrument.chirp.duration": "400 us",
+    "accuracy.leakage_floor": 0.2,
+    "draws": {"number": 5},
+    "navigation": {"test_level": 0.01},
+    "storage": {"block_shots": 64},
+    "axes": {},
+    "execution": {"workers": 3},
+    "figures": [{"kind": "cloud"}],
+}
+SAME_STUDY = ("title", "question", "execution", "figures")
+
+
+def objects_with_another_ground():
+    mapping = json.loads(json.dumps(RICH))
+    mapping["scene"]["objects"]["other"] = RELIEF
+    return mapping
+
+
+@pytest.mark.parametrize("path", OTHER_GEOMETRY)
+def test_whatever_moves_a_ray_makes_another_geometry_and_another_study(path):
+    if path.endswith(".on"):
+        here = spec_of(objects_with_another_ground())
+        mapping = objects_with_another_ground()
+        mapping["scene"]["objects"]["forest"]["on"] = "other"
+        there = spec_of(mapping)
+    else:
+        here, there = spec_of(RICH), changed(path, OTHER_GEOMETRY[path])
+    assert here.geometry_id("three") != there.geometry_id("three")
+    assert here.id != there.id
+
+
+@pytest.mark.parametrize("path", SAME_GEOMETRY)
+def test_radiometry_leaves_the_geometry_alone(path):
+    here, there = spec_of(RICH), changed(path, SAME_GEOMETRY[path])
+    assert here.geometry_id("three") == there.geometry_id("three")
+    assert (here.id == there.id) is (path in SAME_STUDY)
+
+
+def test_every_field_of_a_scene_is_in_its_geometry_unless_it_is_optical():
+    spec = spec_of(RICH)
+    text = json.dumps(spec.geometry("three"))
+    for part in (*spec.scene.objects.values(), spec.platform, spec.scanners["three"]):
+        for path, _, _ in leaves(part):
+            told = f'"{".".join(path)}"' in text
+            assert told is (path[-1] not in OPTICAL), path
+
+
+def test_a_geometry_knows_no_names():
+    text = json.dumps(RICH)
+    for old, new in (("ground", "soil"), ("forest", "wood"), ("three", "trio")):
+        text = text.replace(f'"{old}"', f'"{new}"')
+    here, there = spec_of(RICH), spec_of(json.loads(text))
+    assert here.geometry_id("three") == there.geometry_id("trio")
+    assert here.id != there.id
+
+
+def test_the_order_of_objects_numbers_their_surfaces():
+    mapping = json.loads(json.dumps(RICH))
+    objects = mapping["scene"]["objects"]
+    mapping["scene"]["objects"] = {"ball": objects.pop("ball")} | objects
+    here, there = spec_of(RICH), spec_of(mapping)
+    assert here.geometry_id("three") != there.geometry_id("three") and here.id != there.id
+    assert there.surfaces()[0].name == "ball" and here.surfaces()[0].name == "ground"
+
+
+def test_a_geometry_is_seen_through_one_scanner():
+    mapping = json.loads(json.dumps(RICH))
+    mapping["scanners"]["again"] = mapping["scanners"]["three"]
+    mapping["scanners"]["wide"] = mapping["scanners"]["three"] | {"half_angle": "30 deg"}
+    spec = spec_of(mapping)
+    assert spec.geometry_id("again") == spec.geometry_id("three") != spec.geometry_id("wide")
+    assert spec_of(RICH).geometry_id("three") == spec.geometry_id("three")
+
+
+def test_a_seed_is_part_of_a_geometry_only_where_it_moves_the_beams():
+    steady = [changed("platform.jitter", "0 rad")]
+    mapping = json.loads(json.dumps(RICH)) | {"seed": 2}
+    mapping["platform"]["jitter"] = "0 urad"
+    steady.append(spec_of(mapping))
+    assert steady[0].geometry_id("three") == steady[1].geometry_id("three")
+    assert steady[0].id != steady[1].id
+
+
+def test_equal_quantities_make_equal_studies_however_they_are_spelt():
+    spelt = changed("scene.objects.ball.radius", "100 cm")
+    assert spelt.id == spec_of(RICH).id
+    turned = changed("platform.mounting", {"pitch": "0.017453292519943295 rad"})
+    assert turned.id == spec_of(RICH).id
+
+
+@pytest.mark.parametrize("mapping", [written(), RICH, with_object(BOULDERS)])
+def test_a_stored_study_is_the_same_again(mapping):
+    spec = spec_of(mapping)
+    again = from_stored(spec.to_json())
+    assert again == spec and again.id == spec.id
+    assert again.geometry("three") == spec.geometry("three")
+    assert again.to_json() == spec.to_json() and hash(again) == hash(spec)
+    assert pickle.loads(pickle.dumps(spec)) == spec
+
+
+def test_every_default_is_written_out_so_that_a_store_keeps_it():
+    spec = spec_of(RICH)
+    whole = spec.to_yaml_mapping()
+    for path, rule, value in leaves(spec):
+        if path[0] in ("title", "question", "execution", "axes", "figures"):
+            continue
+        at = whole
+        for name in path:
+            at = at[name]
+        assert rule.read(at) == value, path
+    assert "execution" not in whole
+
+
+@pytest.fixture
+def study_with_files(tmp_path):
+    """A folder with a study of a mesh and a path of files."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    trimesh.creation.box(extents=[2.0, 2, 2]).export(folder / "box.stl")
+    (folder / "path.csv").write_text("time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n10, 0, 0, 100\n")
+    mesh = {
+        "kind": "mesh",
+        "file": "box.stl",
+        "reflectance": 1,
+        "position": ["0 m", "0 m", "1 m"],
+    }
+    mapping = with_object(mesh)
+    mapping["platform"]["path"] = {"kind": "waypoints", "file": "path.csv"}
+    return folder, mapping
+
+
+def test_files_count_by_content_and_not_by_place(study_with_files):
+    folder, mapping = study_with_files
+    here = spec_of(mapping, folder)
+    shutil.copytree(folder, folder / "deep")
+    (folder / "deep/box.stl").rename(folder / "deep/crate.stl")
+    mapping["scene"]["objects"]["thing"]["file"] = "deep/crate.stl"
+    mapping["platform"]["path"]["file"] = str(folder / "deep/path.csv")
+    there = spec_of(mapping, folder)
+    assert (there.id, there.geometry_id("three")) == (here.id, here.geometry_id("three"))
+    (folder / "deep/path.csv").write_text("time [s], x [m], y [m], z [m]\n0,0,0,500\n10,0,0,99\n")
+    other = spec_of(mapping, folder)
+    assert other.id != here.id and other.geometry_id("three") != here.geometry_id("three")
+
+
+def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
+    folder, mapping = study_with_files
+    spec = spec_of(mapping, folder)
+    text = spec.to_json()
+    assert str(folder) not in text
+    moved = folder.rename(folder.parent / "there")
+    lost = from_stored(text)
+    assert lost.id == spec.id and lost.geometry_id("three") == spec.geometry_id("three")
+    assert [surface.name for surface in lost.surfaces()] == ["ground", "thing"]
+    for look in (lost.flight, lost.world):
+        with pytest.raises(SceneError, match="does not exist"):
+            look()
+    found = from_stored(text, base=moved)
+    assert found.cycles("three") == 21 and found.world().reports
+    assert found.base == moved and found == lost
+
+
+def test_a_file_that_has_changed_since_is_refused(study_with_files):
+    folder, mapping = study_with_files
+    spec = spec_of(mapping, folder)
+    stored = from_stored(spec.to_json(), base=folder)
+    trimesh.creation.box(extents=[2.0, 2, 3]).export(folder / "box.stl")
+    assert spec.flight().stop == 10
+    for one in (spec, stored):
+        with pytest.raises(SceneError, match=r"box\.stl: has changed since .* bring the old"):
+            one.world()
+
+
+def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
+    from sweep.scenes.digests import file_digest
+
+    for name, side in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        box = trimesh.creation.box(extents=[side, 1, 1])
+        for file, content in trimesh.Scene(box).export(file_type="gltf").items():
+            (tmp_path / name / file).write_bytes(content)
+    shutil.copy(tmp_path / "a/model.gltf", tmp_path / "b/model.gltf")
+    assert file_digest(tmp_path / "a/model.gltf") != file_digest(tmp_path / "b/model.gltf")
+    for buffer in (tmp_path / "b").glob("*.bin"):
+        buffer.unlink()
+    with pytest.raises(SceneError, match="does not exist"):
+        file_digest(tmp_path / "b/model.gltf")
+
+
+def test_differences_are_told_with_units():
+    there = changed("scene.objects.ground.size", "120 m")
+    assert difference(spec_of(RICH), there) == ["scene.objects.ground.size: 100 m -> 120 m"]
+    there = changed("platform.lever_arm", ["1 m", "0 m", "2 m"])
+    assert difference(spec_of(RICH), there) == ["platform.lever_arm: [1, 0, 0] m -> [1, 0, 2] m"]
+    lines = difference(spec_of(RICH), spec_of(written()))
+    assert "objects: ground, forest, rocks, ball, crate -> ground" in lines
+    assert "scene.objects.ball.radius: 1 m -> (none)" in lines
+    assert "axes: power -> (none)" in lines
+
+
+def test_a_name_has_one_unit_wherever_it_stands():
+    for name, units in units_by_name():
+        assert scene_units()[name] == units, name
+    assert scene_units()["half_angle"] == "rad" and len(all_parts(*ROOTS)) > 30
+
+
+def test_random_things_of_one_seed_share_no_numbers():
+    from sweep.spec.streams import generator
+
+    first = {use: generator(use, 7).random(4) for use in ("relief", "hills", "craters", "trees")}
+    values = np.array(list(first.values()))
+    assert len(np.unique(values)) == values.size
+    assert (generator("hills", 7).random(4) == first["hills"]).all()
