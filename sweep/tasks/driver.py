@@ -7,24 +7,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks import identity
+from sweep.tasks import identity, studies
+from sweep.tasks.casting import cast
 from sweep.tasks.errors import ClusterError, StoreError
-from sweep.tasks.evaluate import Evaluate
-from sweep.tasks.grid import Grid
+from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.journal import Journal, committed
 from sweep.tasks.lock import Lock
+from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.session import Outcome, Place, Session
+from sweep.tasks.recipe import write_recipe
+from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import create, remove
+from sweep.tasks.study import Evaluate
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
+
+    Declared = Spec | SceneSpec
 
 
 def run(
-    spec: Spec,
+    spec: Declared,
     *,
     store: str | Path,
     client: Client | None = None,
@@ -64,13 +72,14 @@ def run(
     StoreError, ClusterError
         Where a store is in the way or can't be written; where no scheduler or worker is to be had.
     """
-    path, grid = Path(store).absolute(), Grid(spec)
+    path, told = Path(store).absolute(), chosen(progress)
+    study = studies.study_of(spec, path)
     place = Place(
         client=client, workers=workers, scheduler=scheduler, processes=processes, evaluate=evaluate
     )
-    _make(path, spec, grid, overwrite)
+    _make(path, study, overwrite, told)
     try:
-        return _go_on(path, grid, place.for_spec(spec), chosen(progress))
+        return _go_on(path, study, place.for_spec(spec), told)
     except ClusterError:
         remove(path)  # nothing was computed, and the next try should not meet it
         raise
@@ -79,7 +88,7 @@ def run(
 def resume(
     store: str | Path,
     *,
-    spec: Spec | None = None,
+    spec: Declared | None = None,
     client: Client | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -107,40 +116,62 @@ def resume(
         Where there is no scheduler or worker to be had.
     """
     path = Path(store).absolute()
-    attributes, held = identity.read(path)
+    attributes, study = _held(path)
     if spec is not None:
-        identity.refuse_other_study(path, attributes, held, spec)
+        identity.refuse_other_study(path, attributes, study.spec, spec)
     identity.refuse_other_versions(path, attributes, where="this machine")
-    identity.refuse_altered(path, attributes, held)
+    identity.refuse_altered(path, attributes, study.spec)
+    asked = study if spec is None else studies.study_of(spec, path)  # it knows where its files are
     place = Place(
         client=client, workers=workers, scheduler=scheduler, processes=processes, evaluate=evaluate
     )
-    return _go_on(path, Grid(held), place.for_spec(spec or held), chosen(progress))
+    return _go_on(path, asked, place.for_spec(spec or study.spec), chosen(progress))
 
 
-def _make(path: Path, spec: Spec, grid: Grid, overwrite: bool) -> None:
+def _held(path: Path) -> tuple[dict[str, object], GridStudy | FlightStudy]:
+    attributes, study = studies.read(path)
+    if isinstance(study, EyepointStudy):
+        raise StoreError(
+            f"{path} holds eyepoints, which the studies that use them cast: run or resume one"
+        )
+    return attributes, study
+
+
+def _make(path: Path, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:
     if path.exists() and overwrite:
         identity.read_attributes(path)  # what is not a store of ours is not ours to remove
         lock = Lock(path)  # refuses where someone writes to it
         remove(path)
         lock.release()
     elif path.exists():
-        attributes, held = identity.read(path)
-        identity.refuse_other_study(path, attributes, held, spec)
-        done = int(np.count_nonzero(committed(path, grid)))
+        attributes, held = _held(path)
+        identity.refuse_other_study(path, attributes, held.spec, study.spec)
+        done = int(np.count_nonzero(committed(path, study)))
         raise StoreError(
-            f"{path} holds this study already, {done} of {grid.n_blocks} blocks done: "
+            f"{path} holds this study already, {done} of {study.n_blocks} blocks done: "
             f"`sweep resume {path}` goes on with it, --overwrite begins anew"
         )
-    create(path, spec, grid)
+    if isinstance(study, FlightStudy):
+        told.say("building the scene")
+    create(path, study)
 
 
-def _go_on(path: Path, grid: Grid, place: Place, progress: Progress) -> Outcome:
+def _go_on(path: Path, study: GridStudy | FlightStudy, place: Place, told: Progress) -> Outcome:
     lock = Lock(path)
     try:
         journal = Journal(path)
         try:
-            return Session(path, grid, place, progress, journal, lock).to_its_end()
+            most = study.n_blocks
+            with Interrupts() as interrupts, Pool(place, most=most, say=told.say) as pool:
+                session = Session(
+                    path, study, pool=pool, progress=told, interrupts=interrupts,
+                    journal=journal, lock=lock,
+                )  # fmt: skip
+                if isinstance(study, GridStudy):
+                    return session.to_its_end()
+                write_recipe(path, base=str(study.spec.base))
+                rays, why = cast(study, pool=pool, told=told, interrupts=interrupts)
+                return session.to_its_end(before=why, rays=rays)
         finally:
             journal.close()
     finally:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sweep.tasks.grid import Grid, Value, canonical_rows
+from sweep.tasks.study import Results
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -22,15 +22,6 @@ SUB_BATCH_COUNTS = 1 << 19
 
 #: Domain of the keys of draws, so that no other use of the same seed meets their streams.
 DOMAIN = "sweep.draws"
-
-Results = dict[str, np.ndarray]
-
-
-class Evaluate(Protocol):
-    """What computes the results of a block: `evaluate_block`, or something that wraps it."""
-
-    def __call__(self, spec: Spec, grid: Grid, block: int) -> Results:
-        """Results of one block by name."""
 
 
 def evaluate_block(spec: Spec, grid: Grid, block: int) -> Results:
@@ -106,5 +97,4 @@ def _draws(spec: Spec, parameters: Mapping[str, Value], outputs: Results, count:
 
 def compile_kernels(grid: Grid) -> None:
     """Compile what the model compiles, once, before workers get blocks and find it on disk."""
-    with suppress(Exception):  # a point that raises is a block's failure, recorded as one
-        evaluate_points(grid.spec, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1)
+    evaluate_points(grid.spec, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1)

@@ -11,24 +11,23 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.store import LAYOUT
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
 
-REQUIRED = ("spec", "study_id", "model_version", "software", "layout")
+REQUIRED = ("kind", "study_id", "model_version", "software", "layout")
 
 
-def read(path: Path) -> tuple[dict[str, Any], Spec]:
-    """Attributes of a store and the spec that it holds.
+def read_spec(path: Path, text: str, base: Path | None = None) -> Spec | SceneSpec:
+    """A spec that a store holds.
 
     Raises
     ------
     StoreError
-        Where there is no store, or not one of this program's, or one it can't read.
+        Where this program can't read it.
     """
-    from sweep.spec import Spec, SpecError
+    from sweep.spec import SpecError, from_stored
 
-    attributes = read_attributes(path)
     try:
-        return attributes, Spec.from_stored(attributes["spec"])
+        return from_stored(text, base=base)
     except (SpecError, ValueError) as error:
         raise StoreError(
             f"{path} holds a spec that this version of sweep can't read:\n{error}"
@@ -50,16 +49,20 @@ def read_attributes(path: Path) -> dict[str, Any]:
         attributes = document["attributes"]
     except (OSError, ValueError, KeyError, TypeError):
         raise StoreError(f"{path} is not a Zarr store of sweep's") from None
-    if not isinstance(attributes, dict) or any(key not in attributes for key in REQUIRED):
+    if not isinstance(attributes, dict) or "study_id" not in attributes:
         raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
-    if attributes["layout"] != LAYOUT:
+    if attributes.get("layout") != LAYOUT:
         raise StoreError(
-            f"{path} is laid out as version {attributes['layout']}; this sweep writes {LAYOUT}"
+            f"{path} is laid out as version {attributes.get('layout')}; this sweep writes {LAYOUT}"
         )
+    if any(key not in attributes for key in REQUIRED):
+        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
     return attributes
 
 
-def refuse_other_study(path: Path, attributes: dict[str, Any], held: Spec, asked: Spec) -> None:
+def refuse_other_study(
+    path: Path, attributes: dict[str, Any], held: Spec | SceneSpec, asked: Spec | SceneSpec
+) -> None:
     """Refuse a store that holds another study than the one asked for.
 
     Raises
@@ -72,7 +75,7 @@ def refuse_other_study(path: Path, attributes: dict[str, Any], held: Spec, asked
     if attributes["study_id"] == asked.id:
         return
     refuse_other_versions(path, attributes, where="this machine")  # the version is in the id too
-    lines = "\n".join(f"  {line}" for line in difference(held.identity(), asked.identity()))
+    lines = "\n".join(f"  {line}" for line in difference(held, asked))
     raise StoreError(
         f"{path} holds another study (in the store -> in the spec):\n{lines}\n"
         "Name another --store, or --overwrite this one."
@@ -101,7 +104,7 @@ def refuse_other_versions(path: str | Path, attributes: dict[str, Any], *, where
         )
 
 
-def refuse_altered(path: Path, attributes: dict[str, Any], held: Spec) -> None:
+def refuse_altered(path: Path, attributes: dict[str, Any], held: Spec | SceneSpec) -> None:
     """Refuse a store whose spec no longer is the one that its id was made from.
 
     Raises

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from sweep.tasks import store
-from sweep.tasks.grid import Grid
+from sweep.tasks.study import Study
 
 RECEIPTS = "receipts.jsonl"
 FAILURES = "failures.jsonl"
@@ -144,7 +144,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
                 yield record
 
 
-def committed(store_path: Path, grid: Grid) -> np.ndarray:
+def committed(store_path: Path, study: Study) -> np.ndarray:
     """Which blocks are done.
 
     Returns
@@ -152,12 +152,11 @@ def committed(store_path: Path, grid: Grid) -> np.ndarray:
     ndarray of bool (blocks,)
         True where there is a receipt and every object of the block is in the store.
     """
-    done = np.zeros(grid.n_blocks, dtype=bool)
-    names = store.output_names(grid.spec)
+    done = np.zeros(study.n_blocks, dtype=bool)
     for record in read_lines(receipts_path(store_path)):
         block = record.get("block", -1)
-        if isinstance(block, int) and 0 <= block < grid.n_blocks and not done[block]:
-            done[block] = store.is_whole(store_path, store.block_objects(grid, block, names))
+        if isinstance(block, int) and 0 <= block < study.n_blocks and not done[block]:
+            done[block] = store.is_whole(store_path, store.block_objects(study, block))
     return done
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import psutil
 
-from sweep.tasks import cluster, store
+from sweep.tasks import cluster
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_points, select
 from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import output_names
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -50,7 +51,7 @@ def plan(spec: Spec, *, workers: int | None = None) -> Plan:
     workers
         Workers it would run on; default those of the spec, else all cores.
     """
-    grid, names = Grid(spec), store.output_names(spec)
+    grid, names = Grid(spec), output_names(spec)
     workers = workers or spec.execution.workers or cluster.cores()
     each = measured(spec, grid)
     writing = grid.n_blocks * len(names) * WRITE_CHUNK

@@ -16,7 +16,7 @@ LINE_EVERY = 30.0
 class Progress(Protocol):
     """What a run tells of itself while it goes on."""
 
-    def begin(self, *, points: int, done: int) -> None:
+    def begin(self, *, points: int, done: int, unit: str) -> None:
         """The run begins, with so many points of the study done already."""
 
     def advance(self, *, points: int, failed: int) -> None:
@@ -39,7 +39,7 @@ def chosen(progress: bool | Progress) -> Progress:
 class Silent:
     """No progress shown."""
 
-    def begin(self, *, points: int, done: int) -> None:
+    def begin(self, *, points: int, done: int, unit: str) -> None:
         """Nothing."""
 
     def advance(self, *, points: int, failed: int) -> None:
@@ -64,11 +64,12 @@ class Lines:
     def __init__(self, every: float = LINE_EVERY) -> None:
         self._every = every
         self._points = self._done = self._before = self._failed = 0
+        self._unit = "points"
         self._begun = self._said = time.monotonic()
 
-    def begin(self, *, points: int, done: int) -> None:
+    def begin(self, *, points: int, done: int, unit: str) -> None:
         """First line."""
-        self._points, self._done, self._before = points, done, done
+        self._points, self._done, self._before, self._unit = points, done, done, unit
         self._begun = time.monotonic()
         self._line()
 
@@ -90,9 +91,9 @@ class Lines:
     def _line(self) -> None:
         self._said = time.monotonic()
         rate = (self._done - self._before) / max(self._said - self._begun, 1e-9)
-        parts = [f"{self._done:,} of {self._points:,} points"]
+        parts = [f"{self._done:,} of {self._points:,} {self._unit}"]
         if rate > 0:
-            parts.append(f"{rate:,.0f} points/s")
+            parts.append(f"{rate:,.0f} {self._unit}/s")
             if self._done < self._points:
                 parts.append(f"{duration((self._points - self._done) / rate)} left")
         if self._failed:
@@ -109,7 +110,7 @@ class Bar:
 
         self._bar = Progress(
             BarColumn(),
-            TextColumn("{task.completed:,.0f} of {task.total:,.0f} points"),
+            TextColumn("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
             TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
             TextColumn("[red]{task.fields[failures]}"),
@@ -117,12 +118,14 @@ class Bar:
         )
         self._task: TaskID | None = None
         self._points = self._failed = 0
+        self._unit = "points"
         self._begun = time.monotonic()
 
-    def begin(self, *, points: int, done: int) -> None:
+    def begin(self, *, points: int, done: int, unit: str) -> None:
         """The bar appears."""
         self._begun = time.monotonic()
-        self._task = self._bar.add_task("", total=points, completed=done, rate="", failures="")
+        self._unit, self._points = unit, 0
+        self._task = self._bar.add_task(unit, total=points, completed=done, rate="", failures="")
         self._bar.start()
 
     def advance(self, *, points: int, failed: int) -> None:
@@ -134,7 +137,7 @@ class Bar:
         rate = self._points / max(time.monotonic() - self._begun, 1e-9)
         failures = f"{self._failed} blocks failed" if self._failed else ""
         self._bar.update(
-            self._task, advance=points, rate=f"{rate:,.0f} points/s", failures=failures
+            self._task, advance=points, rate=f"{rate:,.0f} {self._unit}/s", failures=failures
         )
 
     def say(self, text: str) -> None:

@@ -6,30 +6,24 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks import cluster, store, versions
+from sweep.tasks import store, versions
 from sweep.tasks.errors import SchedulerLost
-from sweep.tasks.evaluate import Evaluate, compile_kernels
-from sweep.tasks.grid import Grid
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.journal import Failure, Journal, Receipt, committed
 from sweep.tasks.lock import Lock
+from sweep.tasks.pool import Pool
 from sweep.tasks.progress import Progress
+from sweep.tasks.study import Study
 from sweep.tasks.todo import Todo
-from sweep.tasks.window import Job, Window, plain
+from sweep.tasks.window import Job
 from sweep.tasks.worker import Answer
-
-if TYPE_CHECKING:
-    from distributed import Client
-
-    from sweep.spec import Spec
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
 HOPELESS = 20
@@ -43,45 +37,24 @@ class Outcome:
     """What a run has come to."""
 
     store: Path
+    unit: str  # what the points are called
     points: int  # of the whole study
     blocks: int
     points_done: int  # committed, in this run or before
     blocks_done: int
-    blocks_computed: int  # in this run
+    points_computed: int  # in this run
+    blocks_computed: int
     failures: tuple[Failure, ...]
     stopped: str  # why the run ended before its blocks did; empty where it didn't
     seconds: float  # wall time of this run
     work_seconds: float  # evaluating and writing, summed over workers
     write_seconds: float  # the writing in it
+    rays: Mapping[str, int] = field(default_factory=dict)  # cast in this run, by scanner
 
     @property
     def complete(self) -> bool:
         """Whether every block of the study is committed."""
         return self.blocks_done == self.blocks
-
-
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where and how blocks are computed; nothing of it shows in the results."""
-
-    client: Client | None = None
-    workers: int | None = None
-    scheduler: str | None = None
-    threads: int = 1
-    processes: bool = True
-    evaluate: Evaluate | None = None
-
-    def for_spec(self, spec: Spec) -> Place:
-        """The same place, with what it leaves open taken from the spec's `execution`."""
-        workers, scheduler = self.workers, self.scheduler
-        if scheduler is None and workers is None:
-            scheduler = spec.execution.scheduler or None
-        return replace(
-            self,
-            workers=workers or spec.execution.workers or None,
-            threads=spec.execution.threads,
-            scheduler=scheduler,
-        )
 
 
 @dataclass
@@ -107,70 +80,102 @@ class Session:
 
     Parameters
     ----------
-    path, grid
-        The store and its grid.
-    place
+    path, study
+        The store and the study that it holds.
+    pool
         Where to compute.
     progress
         Whom to tell.
+    interrupts
+        Whether to stop.
     journal, lock
         The store's, held by this process.
     """
 
     def __init__(
-        self, path: Path, grid: Grid, place: Place, progress: Progress, journal: Journal, lock: Lock
+        self,
+        path: Path,
+        study: Study,
+        *,
+        pool: Pool,
+        progress: Progress,
+        interrupts: Interrupts,
+        journal: Journal,
+        lock: Lock,
     ) -> None:
-        self._path, self._grid, self._place = path, grid, place
-        self._progress, self._journal, self._lock = progress, journal, lock
-        self._names = store.output_names(grid.spec)
+        self._path, self._study, self._pool = path, study, pool
+        self._progress, self._interrupts = progress, interrupts
+        self._journal, self._lock = journal, lock
         self._tally = Tally()
 
-    def to_its_end(self) -> Outcome:
-        """Compute all that is left, or as much as can be."""
+    def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
+        """Compute all that is left, or as much as can be.
+
+        Parameters
+        ----------
+        before
+            Why what comes before this study is not there; empty where it is.
+        rays
+            Rays that were cast for it.
+        """
         begun = time.monotonic()
-        done = committed(self._path, self._grid)
-        before = int(np.count_nonzero(done)), self._grid.points_in(done)
+        done = committed(self._path, self._study)
+        had = int(np.count_nonzero(done)), self._study.points_in(done)
         self._journal.record_session("begun", host=socket.gethostname(), pid=os.getpid())
-        stopped = self._compute(Todo(done), before[1]) if before[0] < done.size else ""
-        outcome = self._outcome(before, stopped, time.monotonic() - begun)
+        stopped = before
+        if had[0] < done.size and not before:
+            stopped = self._compute(Todo(done), had[1])
+        outcome = self._outcome(had, stopped, time.monotonic() - begun, rays or {})
         self._journal.record_session(
             "ended", blocks=outcome.blocks_computed, failed=len(outcome.failures), stopped=stopped
         )
         return outcome
 
-    def _outcome(self, before: tuple[int, int], stopped: str, seconds: float) -> Outcome:
+    def _outcome(
+        self, before: tuple[int, int], stopped: str, seconds: float, rays: Mapping[str, int]
+    ) -> Outcome:
         tally = self._tally
         return Outcome(
             store=self._path,
-            points=self._grid.points,
-            blocks=self._grid.n_blocks,
+            unit=self._study.unit,
+            points=self._study.points,
+            blocks=self._study.n_blocks,
             points_done=before[1] + tally.points,
             blocks_done=before[0] + tally.blocks,
+            points_computed=tally.points,
             blocks_computed=tally.blocks,
             failures=tuple(tally.failures),
             stopped=stopped,
             seconds=seconds,
             work_seconds=tally.seconds,
             write_seconds=tally.write_seconds,
+            rays=rays,
         )
 
     def _compute(self, todo: Todo, points_before: int) -> str:
         """Compute blocks until none is left; why it ended, where it was not that."""
-        with Interrupts() as interrupts, ExitStack() as stack:
+        with ExitStack() as stack:
             try:
-                compiling = threading.Thread(target=compile_kernels, args=[self._grid], daemon=True)
+                compiling = threading.Thread(target=self._compile, daemon=True)
                 compiling.start()  # beside the workers' start, which is mostly waiting
-                answers = stack.enter_context(self._answers(todo, lambda: interrupts.stopping))
+                job = Job(str(self._path), self._study.id, versions.model(), self._pool.evaluate)
+                answers = self._pool.answers(job, todo, lambda: self._interrupts.stopping)
                 self._await(compiling)
-                self._progress.begin(points=self._grid.points, done=points_before)
+                self._progress.begin(
+                    points=self._study.points, done=points_before, unit=self._study.unit
+                )
                 stack.callback(self._progress.end)
-                return self._take(answers, todo, interrupts)
+                return self._take(answers, todo)
             except SchedulerLost as error:
                 return f"the scheduler is gone ({error})"
             except KeyboardInterrupt:
                 return "stopped at once"
             except OSError as error:
                 return f"the store can't be written: {error}"
+
+    def _compile(self) -> None:
+        with suppress(Exception):  # what raises here is a block's failure, recorded as one
+            self._study.compile()
 
     def _await(self, compiling: threading.Thread) -> None:
         """Wait for the kernels, and say so where that is not a matter of reading them from disk."""
@@ -179,27 +184,8 @@ class Session:
             self._progress.say("compiling the model's kernels, once: some 20 s")
             compiling.join()
 
-    @contextmanager
-    def _answers(self, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Iterator[Answer]]:
-        place = self._place
-        job = Job(str(self._path), self._grid.spec.id, versions.model(), place.evaluate)
-        if place.client is not None:
-            yield Window(place.client, job, todo).answers(stopping)
-        elif place.scheduler == cluster.NONE:
-            yield plain(job, todo, stopping)
-        else:
-            workers = min(place.workers or cluster.cores(), max(1, todo.left))
-            with cluster.connected(
-                scheduler=place.scheduler,
-                workers=workers,
-                threads=place.threads,
-                processes=place.processes,
-                say=self._progress.say,
-            ) as client:
-                yield Window(client, job, todo).answers(stopping)
-
-    def _take(self, answers: Iterator[Answer], todo: Todo, interrupts: Interrupts) -> str:
-        told = False
+    def _take(self, answers: Iterator[Answer], todo: Todo) -> str:
+        told, interrupts = False, self._interrupts
         for answer in answers:
             if not self._lock.is_mine():
                 return "another process took the store's lock"
@@ -214,8 +200,7 @@ class Session:
     def _commit(self, answer: Answer, todo: Todo) -> None:
         before = self._tally.points, len(self._tally.failures)
         for receipt in answer.receipts:
-            objects = store.block_objects(self._grid, receipt.block, self._names)
-            if store.is_whole(self._path, objects):
+            if store.is_whole(self._path, store.block_objects(self._study, receipt.block)):
                 self._journal.commit(receipt)
                 self._tally.add(receipt)
             else:

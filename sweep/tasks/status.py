@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.tasks import identity, journal, lock
-from sweep.tasks.grid import Grid
+from sweep.tasks import journal, lock, studies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +18,7 @@ class Status:
     store: Path
     title: str
     study_id: str
+    unit: str  # what the points are called
     points: int
     points_done: int
     blocks: int
@@ -43,17 +43,17 @@ def status(store: str | Path) -> Status:
         Where there is no store of sweep's.
     """
     path = Path(store)
-    attributes, spec = identity.read(path)
-    grid = Grid(spec)
-    done = journal.committed(path, grid)
+    attributes, study = studies.read(path)
+    done = journal.committed(path, study)
     holder = lock.holder(path)
     return Status(
         store=path,
         title=attributes.get("title", ""),
         study_id=attributes["study_id"],
-        points=grid.points,
-        points_done=grid.points_in(done),
-        blocks=grid.n_blocks,
+        unit=study.unit,
+        points=study.points,
+        points_done=study.points_in(done),
+        blocks=study.n_blocks,
         blocks_done=int(np.count_nonzero(done)),
         failures={b: f for b, f in journal.failures(path).items() if b < done.size and not done[b]},
         holder=holder,

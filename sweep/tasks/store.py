@@ -20,41 +20,25 @@ import numpy as np
 
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.evaluate import batch_sizes
-from sweep.tasks.grid import Grid
+from sweep.tasks.study import ArrayLayout, Study
 
 if TYPE_CHECKING:
     import zarr
     from zarr.core.array_spec import ArrayConfigLike
 
-    from sweep.spec import Axis, Member, Spec
-
 #: Directory of the journal inside a store.
 JOURNAL = ".sweep"
 
 #: Version of the layout of stores.
-LAYOUT = 1
-
-#: Dimension of the batches of draws.
-BATCH = "batch"
-
-#: Fill of counts; a number of detections is never negative.
-NO_COUNT = -1
+LAYOUT = 2
 
 WRITTEN_WHOLE: ArrayConfigLike = {
     "write_empty_chunks": True
 }  # else a chunk equal to the fill looks undone
 
 
-def output_names(spec: Spec) -> list[str]:
-    """Names of the arrays that blocks write, sorted."""
-    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
-
-    return sorted([*OUTPUTS, *(DRAW_OUTPUTS if spec.draws.number else ())])
-
-
-def create(path: str | Path, spec: Spec, grid: Grid) -> Path:
-    """A new store without results: every array's metadata, coordinates and the spec.
+def create(path: str | Path, study: Study) -> Path:
+    """A new store without results: every array's metadata, what is known beforehand, and the spec.
 
     It is built beside its place and renamed into it, so that a creation cut short leaves nothing
     that looks like a store.
@@ -68,7 +52,7 @@ def create(path: str | Path, spec: Spec, grid: Grid) -> Path:
     building = path.with_name(f".{path.name}.creating-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _build(building, spec, grid)
+        _build(building, study)
         os.rename(building, path)
     except OSError as error:
         raise StoreError(f"{path} can't be made: {error.strerror or error}") from error
@@ -84,36 +68,25 @@ def remove(path: Path) -> None:
     shutil.rmtree(aside)
 
 
-def _build(path: Path, spec: Spec, grid: Grid) -> None:
+def _build(path: Path, study: Study) -> None:
     import zarr
 
-    group = zarr.create_group(path, zarr_format=3, attributes=_attributes(spec, grid))
-    for axis in spec.axes:
-        for member in axis.members:
-            _add_coordinate(group, axis, member)
-    if spec.draws.number:
-        _add_batches(group, np.array(batch_sizes(spec), dtype=np.int64))
-    for name in output_names(spec):
-        _add_output(group, name, spec, grid)
+    group = zarr.create_group(path, zarr_format=3, attributes=_attributes(study))
+    for name, attributes in study.groups().items():
+        group.create_group(name, attributes=attributes)
+    for layout in study.arrays():
+        _add(group, layout)
     (path / JOURNAL).mkdir()
     _consolidate(path)
 
 
-def _attributes(spec: Spec, grid: Grid) -> dict[str, Any]:
-    coordinates = [m.name for axis in spec.axes for m in axis.members]
-    coordinates += ["batch_draws"] if spec.draws.number else []
-    return {
-        "title": spec.title,
-        "question": spec.question,
-        "spec": spec.to_json(),
-        "study_id": spec.id,
+def _attributes(study: Study) -> dict[str, Any]:
+    return study.attributes() | {
+        "study_id": study.id,
         "model_version": versions.model(),
         "software": versions.software(),
         "processor": versions.processor(),
         "layout": LAYOUT,
-        "block_shape": list(grid.block_shape),
-        # xarray's way to tell coordinates that share a dimension from variables
-        "coordinates": " ".join(coordinates),
     }
 
 
@@ -123,55 +96,20 @@ def _codecs() -> dict[str, Any]:
     return {"compressors": [ZstdCodec(level=1), Crc32cCodec()]}
 
 
-def _add_coordinate(group: zarr.Group, axis: Axis, member: Member) -> None:
-    values = np.asarray(member.display)
-    text = values.dtype.kind in "UOT"
+def _add(group: zarr.Group, layout: ArrayLayout) -> None:
+    fill: dict[str, Any] = {} if layout.fill is None else {"fill_value": layout.fill}
     array = group.create_array(
-        member.name,
-        shape=values.shape,
-        chunks=values.shape,
-        dtype="string" if text else values.dtype,
-        dimension_names=(axis.name,),
-        attributes={
-            "units": member.units,
-            "long_name": member.name.replace("_", " "),
-            "path": member.path,
-        },
+        layout.name,
+        shape=layout.shape,
+        chunks=layout.chunks,
+        dtype=layout.dtype,
+        **fill,
+        dimension_names=layout.dims,
+        attributes=dict(layout.attributes),
         **_codecs(),
     )
-    array[...] = values.astype(object) if text else values
-
-
-def _add_batches(group: zarr.Group, sizes: np.ndarray) -> None:
-    array = group.create_array(
-        "batch_draws",
-        shape=sizes.shape,
-        chunks=sizes.shape,
-        dtype=sizes.dtype,
-        dimension_names=(BATCH,),
-        attributes={"units": "1", "long_name": "draws in the batch"},
-        **_codecs(),
-    )
-    array[...] = sizes
-
-
-def _add_output(group: zarr.Group, name: str, spec: Spec, grid: Grid) -> None:
-    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
-
-    counted = name not in OUTPUTS
-    output = DRAW_OUTPUTS[name] if counted else OUTPUTS[name]
-    attributes = {"units": output.units, "long_name": output.long_name, "comment": output.comment}
-    batches = (len(batch_sizes(spec)),) if counted else ()
-    group.create_array(
-        name,
-        shape=grid.shape + batches,
-        chunks=grid.block_shape + batches,
-        dtype="int64" if counted else "float64",
-        fill_value=NO_COUNT if counted else float("nan"),
-        dimension_names=grid.dims + ((BATCH,) if counted else ()),
-        attributes={key: text for key, text in attributes.items() if text},
-        **_codecs(),
-    )
+    if layout.values is not None:
+        array[...] = layout.values
 
 
 def _consolidate(path: Path) -> None:
@@ -181,9 +119,9 @@ def _consolidate(path: Path) -> None:
     attributes change after creation.
     """
     documents = {
-        child.name: json.loads((child / "zarr.json").read_text())
-        for child in sorted(path.iterdir())
-        if (child / "zarr.json").exists()
+        str(file.parent.relative_to(path)): json.loads(file.read_text())
+        for file in sorted(path.rglob("zarr.json"))
+        if file.parent != path
     }
     root = json.loads((path / "zarr.json").read_text())
     root["consolidated_metadata"] = {
@@ -195,26 +133,22 @@ def _consolidate(path: Path) -> None:
 
 
 class Arrays:
-    """Arrays of a store held open for writing blocks.
+    """Arrays of a store for writing blocks, each opened when it is first written and kept open.
 
     Parameters
     ----------
     path
         The store.
-    names
-        Names of the arrays that every block writes.
+    study
+        The study that it holds.
     """
 
-    def __init__(self, path: str | Path, names: list[str]) -> None:
-        import zarr
-
+    def __init__(self, path: str | Path, study: Study) -> None:
         self.path = Path(path)
-        self._arrays = {
-            name: zarr.open_array(self.path / name, mode="r+").with_config(WRITTEN_WHOLE)
-            for name in names
-        }
+        self._study = study
+        self._arrays: dict[str, zarr.Array[Any]] = {}
 
-    def write(self, grid: Grid, block: int, results: Mapping[str, np.ndarray]) -> str:
+    def write(self, block: int, results: Mapping[str, np.ndarray]) -> str:
         """Write the chunks of one block, each whole.
 
         Returns
@@ -228,31 +162,39 @@ class Arrays:
             Where the results are not exactly the block's: a missing or unknown name, or a shape
             that would fill its chunks in part.
         """
-        if results.keys() != self._arrays.keys():
-            odd = sorted(results.keys() ^ self._arrays.keys())
-            raise ValueError(f"results don't match the store's arrays: {', '.join(odd)}")
-        extent, slices = grid.extent(block), grid.block(block)
-        for name, array in self._arrays.items():
-            whole = extent + array.shape[len(extent) :]
+        chunks = self._study.chunks(block)
+        if results.keys() != chunks.keys():
+            odd = sorted(results.keys() ^ chunks.keys())
+            raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
+        for name, position in chunks.items():
+            array = self._array(name)
+            slices = tuple(
+                slice(p * chunk, min((p + 1) * chunk, size))
+                for p, chunk, size in zip(position, array.chunks, array.shape, strict=True)
+            )
+            whole = tuple(s.stop - s.start for s in slices)
             if results[name].shape != whole:
                 raise ValueError(
                     f"{name} of block {block} has shape {results[name].shape}, its chunk {whole}: "
                     "blocks write whole chunks only"
                 )
             array[slices or ...] = results[name]
-        return digest(self.path, block_objects(grid, block, list(self._arrays)))
+        return digest(self.path, block_objects(self._study, block))
+
+    def _array(self, name: str) -> zarr.Array[Any]:
+        if name not in self._arrays:
+            import zarr
+
+            opened = zarr.open_array(self.path / name, mode="r+")
+            self._arrays[name] = opened.with_config(WRITTEN_WHOLE)
+        return self._arrays[name]
 
 
-def block_objects(grid: Grid, block: int, names: list[str]) -> list[str]:
+def block_objects(study: Study, block: int) -> list[str]:
     """Paths, inside the store, of the chunks of one block."""
-    key = "/".join(["c", *map(str, grid.position(block))])
-    return [f"{name}/{key}" + ("/0" if _is_count(name) else "") for name in names]
-
-
-def _is_count(name: str) -> bool:
-    from sweep.model.outputs import DRAW_OUTPUTS
-
-    return name in DRAW_OUTPUTS
+    return [
+        "/".join([name, "c", *map(str, position)]) for name, position in study.chunks(block).items()
+    ]
 
 
 def is_whole(path: Path, objects: list[str]) -> bool:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks import identity
-from sweep.tasks.grid import Grid
+from sweep.tasks import studies
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
 
 if TYPE_CHECKING:
     from sweep.spec import Axis
@@ -52,8 +53,10 @@ def summary(store: str | Path) -> tuple[str, list[Row]]:
     import zarr
 
     path = Path(store)
-    _, spec = identity.read(path)
-    grid = Grid(spec)
+    _, study = studies.read(path)
+    if not isinstance(study, GridStudy):
+        raise StoreError(f"{path} holds no study over a grid")
+    spec, grid = study.spec, study.grid
     shot, doppler = (
         np.asarray(zarr.open_array(path / name, mode="r")[...])
         for name in ("pd_shot", "pd_doppler")

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sweep.tasks.errors import SchedulerLost, StoreError
-from sweep.tasks.evaluate import Evaluate
+from sweep.tasks.study import Evaluate
 from sweep.tasks.todo import Todo
 from sweep.tasks.worker import STORAGE_ERRORS, Answer, failure, work
 

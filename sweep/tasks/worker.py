@@ -13,9 +13,8 @@ from pathlib import Path
 
 from sweep.tasks import store, versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.evaluate import Evaluate, evaluate_block
-from sweep.tasks.grid import Grid
 from sweep.tasks.journal import Failure, Receipt
+from sweep.tasks.study import Evaluate, Study
 
 #: Errors of the place that results go to: every further block would meet them too.
 STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM}
@@ -34,18 +33,18 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Study:
+class Opened:
     """A study opened for computing its blocks."""
 
-    grid: Grid
+    study: Study
     arrays: store.Arrays
 
 
-_studies: dict[tuple[str, str], Study] = {}
+_studies: dict[tuple[str, str], Opened] = {}
 _opening = threading.Lock()
 
 
-def study(path: str, study_id: str) -> Study:
+def study(path: str, study_id: str) -> Opened:
     """The study of a store, opened once a process.
 
     Raises
@@ -61,14 +60,14 @@ def study(path: str, study_id: str) -> Study:
         return _studies[path, study_id]
 
 
-def _open(path: str, study_id: str) -> Study:
-    from sweep.tasks.identity import read, refuse_other_versions
+def _open(path: str, study_id: str) -> Opened:
+    from sweep.tasks.identity import refuse_other_versions
+    from sweep.tasks.studies import read
 
-    attributes, spec = read(Path(path))
+    attributes, held = read(Path(path))
     _refuse_another(path, study_id)
     refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
-    grid = Grid(spec)
-    return Study(grid, store.Arrays(path, store.output_names(spec)))
+    return Opened(held, store.Arrays(path, held))
 
 
 def _refuse_another(path: str, study_id: str) -> None:
@@ -90,7 +89,7 @@ def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None)
     blocks
         Numbers of the blocks.
     evaluate
-        What computes a block in place of `evaluate_block`, with the same results.
+        What computes a block in place of the study, with the same results.
 
     Raises
     ------
@@ -101,7 +100,7 @@ def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None)
     opened = study(path, study_id)
     for block in blocks:
         try:
-            answer.receipts.append(_one(opened, block, evaluate or evaluate_block))
+            answer.receipts.append(_one(opened, block, evaluate))
         except StoreError:
             raise
         except Exception as error:
@@ -111,17 +110,17 @@ def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None)
     return answer
 
 
-def _one(opened: Study, block: int, evaluate: Evaluate) -> Receipt:
-    grid = opened.grid
+def _one(opened: Opened, block: int, evaluate: Evaluate | None) -> Receipt:
+    held = opened.study
     begun = time.perf_counter()
-    results = evaluate(grid.spec, grid, block)
+    results = evaluate(held, block) if evaluate else held.evaluate(block)
     evaluated = time.perf_counter()
-    _refuse_another(str(opened.arrays.path), grid.spec.id)  # its driver may be long dead
-    digest = opened.arrays.write(grid, block, results)
+    _refuse_another(str(opened.arrays.path), held.id)  # its driver may be long dead
+    digest = opened.arrays.write(block, results)
     ended = time.perf_counter()
     return Receipt(
         block=block,
-        points=grid.block_size(block),
+        points=held.block_size(block),
         digest=digest,
         seconds=round(ended - begun, 6),
         write_seconds=round(ended - evaluated, 6),

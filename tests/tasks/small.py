@@ -65,7 +65,7 @@ def tree(store: Path) -> dict[str, str]:
     return {
         str(file.relative_to(store)): hashlib.blake2b(file.read_bytes()).hexdigest()
         for file in sorted(store.rglob("*"))
-        if file.is_file() and file.relative_to(store).parts[0] != ".sweep"
+        if file.is_file() and ".sweep" not in file.relative_to(store).parts
     }
 
 
@@ -89,13 +89,11 @@ def logged(log: Path, seconds: float = 0.0):
     A nested function, so that it travels to workers by value.
     """
 
-    def evaluate(spec, grid, block):
-        from sweep.tasks.evaluate import evaluate_block
-
+    def evaluate(study, block):
         with open(log, "a") as lines:
             lines.write(f"{block} {os.getpid()}\n")
         time.sleep(seconds)
-        return evaluate_block(spec, grid, block)
+        return study.evaluate(block)
 
     return evaluate
 
@@ -108,14 +106,12 @@ def evaluated(log: Path) -> list[int]:
 def failing(blocks: set[int], log: Path):
     """The model, with an error in some blocks."""
 
-    def evaluate(spec, grid, block):
-        from sweep.tasks.evaluate import evaluate_block
-
+    def evaluate(study, block):
         with open(log, "a") as lines:
             lines.write(f"{block} {os.getpid()}\n")
         if block in blocks:
             raise ValueError(f"nothing good comes of block {block}")
-        return evaluate_block(spec, grid, block)
+        return study.evaluate(block)
 
     return evaluate
 
@@ -123,11 +119,9 @@ def failing(blocks: set[int], log: Path):
 def deadly(blocks: set[int]):
     """The model, with blocks that kill the process that computes them."""
 
-    def evaluate(spec, grid, block):
-        from sweep.tasks.evaluate import evaluate_block
-
+    def evaluate(study, block):
         if block in blocks:
             os.kill(os.getpid(), 9)
-        return evaluate_block(spec, grid, block)
+        return study.evaluate(block)
 
     return evaluate

@@ -15,7 +15,7 @@ from small import STUDY, copied, deadly, evaluated, failing, logged, quiet, rece
 from sweep.tasks import session, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
-from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.status import status
 from sweep.tasks.store import Arrays
 from sweep.tasks.worker import work
@@ -98,7 +98,7 @@ class StopAfter:
     def __init__(self, points: int) -> None:
         self.points, self.said = points, []
 
-    def begin(self, *, points, done): ...
+    def begin(self, *, points, done, unit): ...
 
     def advance(self, *, points, failed):
         self.points -= points
@@ -200,13 +200,11 @@ def test_a_study_of_which_every_block_fails_is_given_up_early(tmp_path):
     assert "all failed" in outcome.stopped
 
 
-def full_disk(spec, grid, block):
+def full_disk(study, block):
     """The model, on a machine whose disk is full from block 3 on."""
-    from sweep.tasks.evaluate import evaluate_block
-
     if block >= 3:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    return evaluate_block(spec, grid, block)
+    return study.evaluate(block)
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
@@ -221,14 +219,12 @@ def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(undisturbed, tmp
 
 def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(tmp_path):
     path, old = tmp_path / "small.zarr", small(seed=5)
-    store.create(path, old, Grid(old))
+    store.create(path, GridStudy(old))
 
-    def replaced_meanwhile(spec, grid, block):
-        from sweep.tasks.evaluate import evaluate_block
-
+    def replaced_meanwhile(study, block):
         store.remove(path)
-        store.create(path, small(seed=6), Grid(small(seed=6)))
-        return evaluate_block(spec, grid, block)
+        store.create(path, GridStudy(small(seed=6)))
+        return study.evaluate(block)
 
     with pytest.raises(StoreError, match=f"now holds study {small(seed=6).id}, not {old.id}"):
         work(str(path), old.id, [0], replaced_meanwhile)
@@ -242,11 +238,11 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     path, lost = tmp_path / "small.zarr", []
     write = Arrays.write
 
-    def forgetful(self, grid, block, results):
+    def forgetful(self, block, results):
         if block == 3 and len(lost) < times:
             lost.append(block)
             return "0" * 32
-        return write(self, grid, block, results)
+        return write(self, block, results)
 
     monkeypatch.setattr(Arrays, "write", forgetful)
     outcome = quiet(small(), path)
@@ -263,7 +259,7 @@ def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
     most = []
 
     class Watching:
-        def begin(self, *, points, done): ...
+        def begin(self, *, points, done, unit): ...
 
         def advance(self, *, points, failed):
             most.append(len(client.futures))

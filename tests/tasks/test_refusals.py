@@ -4,7 +4,7 @@ import pytest
 import xarray as xr
 from small import STUDY, copied, everything, quiet, small, tree
 
-from sweep.tasks import driver, session, versions
+from sweep.tasks import cluster, driver, versions
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.lock import Lock
@@ -122,7 +122,7 @@ def refusing_on_workers(path, attributes, *, where):
 
 
 def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(session.cluster, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:9"):
         run(
             small(),

@@ -8,8 +8,7 @@ from small import everything, small, tree
 
 from sweep.tasks import store
 from sweep.tasks.errors import StoreError
-from sweep.tasks.evaluate import evaluate_block
-from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import GridStudy
 
 
 @pytest.fixture
@@ -18,13 +17,13 @@ def spec():
 
 
 @pytest.fixture
-def grid(spec):
-    return Grid(spec)
+def study(spec):
+    return GridStudy(spec)
 
 
 @pytest.fixture
-def path(tmp_path, spec, grid):
-    return store.create(tmp_path / "new" / "small.zarr", spec, grid)
+def path(tmp_path, study):
+    return store.create(tmp_path / "new" / "small.zarr", study)
 
 
 def test_plain_xarray_opens_a_new_store_without_a_warning(path, spec):
@@ -55,7 +54,7 @@ def test_members_of_a_zipped_axis_and_words_open_as_coordinates(tmp_path):
         "instrument.processing.window": ["hamming", "hann"],
     }
     spec = small(axes=axes)
-    path = store.create(tmp_path / "cut.zarr", spec, Grid(spec))
+    path = store.create(tmp_path / "cut.zarr", GridStudy(spec))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dataset = xr.open_zarr(path)
@@ -64,64 +63,61 @@ def test_members_of_a_zipped_axis_and_words_open_as_coordinates(tmp_path):
     assert [str(name) for name in dataset.window.values] == ["hamming", "hann"]
 
 
-def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, spec, grid):
-    names = store.output_names(spec)
-    results = evaluate_block(spec, grid, 3)
-    arrays = store.Arrays(path, names)
-    objects = store.block_objects(grid, 3, names)
+def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study):
+    results = study.evaluate(3)
+    arrays = store.Arrays(path, study)
+    objects = store.block_objects(study, 3)
     assert not store.is_whole(path, objects)
-    digest = arrays.write(grid, 3, results)
+    digest = arrays.write(3, results)
     assert store.is_whole(path, objects)
     assert digest == store.digest(path, objects)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
-        stored = dataset[name].values[grid.block(3)]
+        stored = dataset[name].values[study.grid.block(3)]
         assert stored.tobytes() == np.ascontiguousarray(values).tobytes()
-    assert int(dataset.pd_shot.notnull().sum()) == grid.block_size(3)
+    assert int(dataset.pd_shot.notnull().sum()) == study.block_size(3)
 
 
-def test_writing_again_leaves_the_same_bytes(path, spec, grid):
-    arrays = store.Arrays(path, store.output_names(spec))
-    arrays.write(grid, 0, evaluate_block(spec, grid, 0))
+def test_writing_again_leaves_the_same_bytes(path, study):
+    arrays = store.Arrays(path, study)
+    arrays.write(0, study.evaluate(0))
     before = tree(path)
-    arrays.write(grid, 0, evaluate_block(spec, grid, 0))
+    arrays.write(0, study.evaluate(0))
     assert tree(path) == before
 
 
-def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, spec, grid):
-    names = store.output_names(spec)
-    results = {name: np.full(grid.extent(1), np.nan) for name in names}
-    store.Arrays(path, names).write(grid, 1, results)
-    assert store.is_whole(path, store.block_objects(grid, 1, names))
+def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, study):
+    results = {name: np.full(study.grid.extent(1), np.nan) for name in study.chunks(1)}
+    store.Arrays(path, study).write(1, results)
+    assert store.is_whole(path, store.block_objects(study, 1))
 
 
-def test_a_flipped_bit_in_a_chunk_is_seen_on_reading_and_changes_the_digest(path, spec, grid):
-    names = store.output_names(spec)
-    digest = store.Arrays(path, names).write(grid, 0, evaluate_block(spec, grid, 0))
+def test_a_flipped_bit_in_a_chunk_is_seen_on_reading_and_changes_the_digest(path, study):
+    digest = store.Arrays(path, study).write(0, study.evaluate(0))
     chunk = path / "pd_shot" / "c" / "0" / "0" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    assert store.digest(path, store.block_objects(grid, 0, names)) != digest
+    assert store.digest(path, store.block_objects(study, 0)) != digest
     with pytest.raises(Exception, match=r"(?i)checksum|crc32c"):
-        xr.open_zarr(path).pd_shot.values[grid.block(0)].sum()
+        xr.open_zarr(path).pd_shot.values[study.grid.block(0)].sum()
 
 
-def test_part_of_a_chunk_and_wrong_names_are_refused(path, spec, grid):
-    arrays = store.Arrays(path, store.output_names(spec))
-    results = evaluate_block(spec, grid, 0)
+def test_part_of_a_chunk_and_wrong_names_are_refused(path, study):
+    arrays = store.Arrays(path, study)
+    results = study.evaluate(0)
     with pytest.raises(ValueError, match="whole chunks only"):
-        arrays.write(grid, 0, {**results, "pd_shot": results["pd_shot"][:1]})
+        arrays.write(0, {**results, "pd_shot": results["pd_shot"][:1]})
     with pytest.raises(ValueError, match="surprise"):
-        arrays.write(grid, 0, {**results, "surprise": results["pd_shot"]})
+        arrays.write(0, {**results, "surprise": results["pd_shot"]})
 
 
 def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
     spec = small(axes={}, draws={"number": 250, "batch": 100})
-    grid, names = Grid(spec), store.output_names(spec)
-    path = store.create(tmp_path / "draws.zarr", spec, grid)
-    store.Arrays(path, names).write(grid, 0, evaluate_block(spec, grid, 0))
-    assert store.is_whole(path, store.block_objects(grid, 0, names))
+    study = GridStudy(spec)
+    path = store.create(tmp_path / "draws.zarr", study)
+    store.Arrays(path, study).write(0, study.evaluate(0))
+    assert store.is_whole(path, store.block_objects(study, 0))
     dataset = xr.open_zarr(path)
     assert dataset.pd_shot.dims == ()
     assert dataset.n_detected_up.dims == ("batch",)
@@ -131,18 +127,18 @@ def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
     assert np.all((counted >= 0) & (counted <= drawn))
 
 
-def test_a_store_is_never_made_in_the_place_of_something_else(path, spec, grid):
+def test_a_store_is_never_made_in_the_place_of_something_else(path, study):
     before = everything(path)
     with pytest.raises(StoreError, match="can't be made"):
-        store.create(path, spec, grid)
+        store.create(path, study)
     assert everything(path) == before
     assert [child.name for child in path.parent.iterdir()] == [path.name]
 
 
-def test_a_creation_cut_short_leaves_no_store(tmp_path, spec, grid, monkeypatch):
+def test_a_creation_cut_short_leaves_no_store(tmp_path, study, monkeypatch):
     monkeypatch.setattr(
         store, "_consolidate", lambda path: (_ for _ in ()).throw(KeyboardInterrupt)
     )
     with pytest.raises(KeyboardInterrupt):
-        store.create(tmp_path / "small.zarr", spec, grid)
+        store.create(tmp_path / "small.zarr", study)
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,93 @@
+"""The rays of a scene study, cast once: its eyepoint stores found, or made and filled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sweep.tasks import identity
+from sweep.tasks.errors import StoreError
+from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.interrupt import Interrupts
+from sweep.tasks.journal import Journal, committed
+from sweep.tasks.lock import Lock
+from sweep.tasks.pool import Pool
+from sweep.tasks.progress import Progress
+from sweep.tasks.recipe import write_recipe
+from sweep.tasks.session import Outcome, Session
+from sweep.tasks.store import create
+
+
+def cast(
+    study: FlightStudy, *, pool: Pool, told: Progress, interrupts: Interrupts
+) -> tuple[dict[str, int], str]:
+    """Cast what is missing of a study's eyepoints.
+
+    Returns
+    -------
+    rays : dict of int
+        Rays cast by scanner; 0 where its eyepoints were there.
+    why : str
+        Why eyepoints are still missing; empty where none is.
+
+    Raises
+    ------
+    StoreError
+        Where an eyepoint store is not what its name says, or is being written by someone else.
+    """
+    rays: dict[str, int] = {}
+    for eyepoints in study.eyepoint_studies():
+        path = eyepoints_path(study.path, eyepoints.id)
+        if _is_whole(path, eyepoints):
+            rays[eyepoints.scanner] = 0
+            continue
+        told.say(f"casting {eyepoints.rays:,} rays through the scanner '{eyepoints.scanner}'")
+        outcome = _fill(path, eyepoints, pool, told, interrupts)
+        rays[eyepoints.scanner] = eyepoints.rays_in(outcome.points_computed)
+        if not outcome.complete:
+            return rays, f"eyepoints of '{eyepoints.scanner}': {_why(outcome)}"
+    return rays, ""
+
+
+def _is_whole(path: Path, eyepoints: EyepointStudy) -> bool:
+    """Whether an eyepoint store is there with all of its blocks."""
+    if not path.exists():
+        return False
+    attributes = identity.read_attributes(path)
+    if attributes["study_id"] != eyepoints.id:
+        raise StoreError(f"{path} holds other eyepoints than its name says: remove it")
+    identity.refuse_other_versions(path, attributes, where="this machine")
+    return bool(committed(path, eyepoints).all())
+
+
+def _fill(
+    path: Path, eyepoints: EyepointStudy, pool: Pool, told: Progress, interrupts: Interrupts
+) -> Outcome:
+    if not path.exists():
+        create(path, eyepoints)
+    lock = Lock(path)
+    try:
+        write_recipe(
+            path,
+            spec=eyepoints.spec.to_json(),
+            base=str(eyepoints.spec.base),
+            scanner=eyepoints.scanner,
+        )
+        journal = Journal(path)
+        try:
+            session = Session(
+                path, eyepoints, pool=pool, progress=told, interrupts=interrupts,
+                journal=journal, lock=lock,
+            )  # fmt: skip
+            return session.to_its_end()
+        finally:
+            journal.close()
+    finally:
+        lock.release()
+
+
+def _why(outcome: Outcome) -> str:
+    """Why a session ended before its blocks did."""
+    if outcome.stopped or not outcome.failures:
+        return outcome.stopped
+    return f"{len(outcome.failures)} blocks failed, the first with {outcome.failures[0].error}"

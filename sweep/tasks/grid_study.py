@@ -1,0 +1,161 @@
+"""A study over a grid of parameters: what its store holds and which block writes what."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
+from sweep.tasks.grid import Grid
+from sweep.tasks.study import ArrayLayout, Results
+
+if TYPE_CHECKING:
+    from sweep.spec import Axis, Member, Spec
+
+#: Dimension of the batches of draws.
+BATCH = "batch"
+
+#: Fill of counts; a number of detections is never negative.
+NO_COUNT = -1
+
+
+def output_names(spec: Spec) -> list[str]:
+    """Names of the arrays that blocks write, sorted."""
+    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
+
+    return sorted([*OUTPUTS, *(DRAW_OUTPUTS if spec.draws.number else ())])
+
+
+class GridStudy:
+    """A study over a grid of parameters.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    """
+
+    unit = "points"
+
+    def __init__(self, spec: Spec) -> None:
+        self.spec = spec
+        self.grid = Grid(spec)
+        self._names = output_names(spec)
+
+    @property
+    def id(self) -> str:
+        """Hash of the spec's identity."""
+        return self.spec.id
+
+    @property
+    def points(self) -> int:
+        """Number of points of the whole grid."""
+        return self.grid.points
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return self.grid.n_blocks
+
+    def block_size(self, block: int) -> int:
+        """Points of a block."""
+        return self.grid.block_size(block)
+
+    def points_in(self, blocks: np.ndarray) -> int:
+        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
+        return self.grid.points_in(blocks)
+
+    def attributes(self) -> dict[str, Any]:
+        """Title, question, spec and the blocks' shape."""
+        coordinates = [member.name for axis in self.spec.axes for member in axis.members]
+        coordinates += ["batch_draws"] if self.spec.draws.number else []
+        return {
+            "kind": "grid",
+            "title": self.spec.title,
+            "question": self.spec.question,
+            "spec": self.spec.to_json(),
+            "block_shape": list(self.grid.block_shape),
+            # xarray's way to tell coordinates that share a dimension from variables
+            "coordinates": " ".join(coordinates),
+        }
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Coordinates, the sizes of batches, and an array for each output."""
+        arrays = coordinates(self.spec.axes)
+        if self.spec.draws.number:
+            arrays.append(_batches(np.array(batch_sizes(self.spec), dtype=np.int64)))
+        return arrays + [self._output(name) for name in self._names]
+
+    def _output(self, name: str) -> ArrayLayout:
+        from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
+
+        counted = name not in OUTPUTS
+        output = DRAW_OUTPUTS[name] if counted else OUTPUTS[name]
+        batches = (len(batch_sizes(self.spec)),) if counted else ()
+        return ArrayLayout(
+            name=name,
+            shape=self.grid.shape + batches,
+            chunks=self.grid.block_shape + batches,
+            dims=self.grid.dims + ((BATCH,) if counted else ()),
+            dtype="int64" if counted else "float64",
+            fill=NO_COUNT if counted else float("nan"),
+            attributes=described(output.units, output.long_name, output.comment),
+        )
+
+    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
+        """The block's chunk of every output."""
+        from sweep.model.outputs import OUTPUTS
+
+        position = self.grid.position(block)
+        return {name: position + (() if name in OUTPUTS else (0,)) for name in self._names}
+
+    def evaluate(self, block: int) -> Results:
+        """Outputs of a block."""
+        return evaluate_block(self.spec, self.grid, block)
+
+    def compile(self) -> None:
+        """Compile the model's kernels."""
+        compile_kernels(self.grid)
+
+
+def coordinates(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
+    """Arrays of the values along axes, in the units that they were written in."""
+    return [_coordinate(axis, member) for axis in axes for member in axis.members]
+
+
+def _coordinate(axis: Axis, member: Member) -> ArrayLayout:
+    values = np.asarray(member.display)
+    text = values.dtype.kind in "UOT"
+    long_name = member.name.replace("_", " ")
+    return ArrayLayout(
+        name=member.name,
+        shape=values.shape,
+        chunks=values.shape,
+        dims=(axis.name,),
+        dtype="string" if text else str(values.dtype),
+        attributes={**described(member.units, long_name, ""), "path": member.path},
+        values=values.astype(object) if text else values,
+    )
+
+
+def described(units: str, long_name: str, comment: str) -> dict[str, str]:
+    """Attributes that say what an array holds."""
+    attributes = {"units": units, "long_name": long_name}
+    return attributes | ({"comment": comment} if comment else {})
+
+
+def _batches(sizes: np.ndarray) -> ArrayLayout:
+    return ArrayLayout(
+        name="batch_draws",
+        shape=sizes.shape,
+        chunks=sizes.shape,
+        dims=(BATCH,),
+        dtype="int64",
+        attributes=described("1", "draws in the batch", ""),
+        values=sizes,
+    )

@@ -1,0 +1,105 @@
+"""Where blocks are computed: a plain loop, a given cluster, or workers started when needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from sweep.tasks import cluster
+from sweep.tasks.study import Evaluate
+from sweep.tasks.todo import Todo
+from sweep.tasks.window import Job, Window, plain
+from sweep.tasks.worker import Answer
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from sweep.spec import SceneSpec, Spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where and how blocks are computed; nothing of it shows in the results."""
+
+    client: Client | None = None
+    workers: int | None = None
+    scheduler: str | None = None
+    threads: int = 1
+    processes: bool = True
+    evaluate: Evaluate | None = None
+
+    def for_spec(self, spec: Spec | SceneSpec) -> Place:
+        """The same place, with what it leaves open taken from the spec's `execution`."""
+        workers, scheduler = self.workers, self.scheduler
+        if scheduler is None and workers is None:
+            scheduler = spec.execution.scheduler or None
+        return replace(
+            self,
+            workers=workers or spec.execution.workers or None,
+            threads=spec.execution.threads,
+            scheduler=scheduler,
+        )
+
+
+class Pool:
+    """A place in use: its workers serve one study after another, and end with it.
+
+    Parameters
+    ----------
+    place
+        Where to compute.
+    most
+        Blocks of the largest study: more workers than that are not started.
+    say
+        Takes the dashboard's address.
+    """
+
+    def __init__(self, place: Place, *, most: int, say: Callable[[str], None]) -> None:
+        self._place, self._most, self._say = place, most, say
+        self._stack = ExitStack()
+        self._client = place.client
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    @property
+    def evaluate(self) -> Evaluate | None:
+        """What computes blocks in place of their study."""
+        return self._place.evaluate
+
+    def answers(self, job: Job, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Answer]:
+        """Answers of a study's blocks as they arrive.
+
+        Raises
+        ------
+        ClusterError
+            Where there is no scheduler or worker to be had.
+        """
+        if self._client is None and self._place.scheduler == cluster.NONE:
+            return plain(job, todo, stopping)
+        return Window(self._connected(), job, todo).answers(stopping)
+
+    def _connected(self) -> Client:
+        place = self._place
+        if self._client is None:
+            self._client = self._stack.enter_context(
+                cluster.connected(
+                    scheduler=place.scheduler,
+                    workers=min(place.workers or cluster.cores(), max(1, self._most)),
+                    threads=place.threads,
+                    processes=place.processes,
+                    say=self._say,
+                )
+            )
+        return self._client

@@ -1,0 +1,46 @@
+"""The study in a store, of whatever kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sweep.tasks.errors import StoreError
+from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.identity import read_attributes, read_spec
+from sweep.tasks.recipe import read_recipe
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
+
+AnyStudy = GridStudy | EyepointStudy | FlightStudy
+
+
+def study_of(spec: Spec | SceneSpec, path: Path) -> GridStudy | FlightStudy:
+    """The study that a spec declares, to be stored at a path."""
+    from sweep.spec import SceneSpec
+
+    return FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
+
+
+def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
+    """Attributes of a store and the study that it holds.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or not one of this program's, or one it can't read.
+    """
+    attributes, recipe = read_attributes(path), read_recipe(path)
+    base = Path(recipe["base"]) if "base" in recipe else None
+    if attributes["kind"] == "eyepoints":
+        return attributes, _eyepoints(path, recipe, base)
+    return attributes, study_of(read_spec(path, attributes["spec"], base), path)
+
+
+def _eyepoints(path: Path, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:
+    if "spec" not in recipe:
+        raise StoreError(f"{path} does not say how its eyepoints were made: run their study again")
+    return EyepointStudy(read_spec(path, recipe["spec"], base), recipe["scanner"])  # type: ignore[arg-type]

@@ -1,0 +1,97 @@
+"""What every kind of study is to those that run it: blocks, and arrays that take them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+Results = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayLayout:
+    """An array of a store.
+
+    Parameters
+    ----------
+    name
+        Its path inside the store, ``range`` or ``group/range``.
+    shape, chunks, dims, dtype
+        As Zarr has them; text has the type ``string``.
+    fill
+        What stands where nothing is written.
+    attributes
+        Units, name in words and so on.
+    values
+        What it holds, where that is known as the store is made; else blocks write it.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dims: tuple[str, ...]
+    dtype: str
+    fill: float | int | str | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    values: np.ndarray | None = None
+
+    def within(self, group: str) -> ArrayLayout:
+        """The same array in a group."""
+        return replace(self, name=f"{group}/{self.name}")
+
+
+class Study(Protocol):
+    """A study as the driver and its workers see it.
+
+    No two blocks share a chunk of any array, and every chunk belongs to a block.
+    """
+
+    @property
+    def id(self) -> str:
+        """Hash of all that its results depend on."""
+
+    @property
+    def unit(self) -> str:
+        """What its points are called, in the plural."""
+
+    @property
+    def points(self) -> int:
+        """Number of points of all blocks."""
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+
+    def block_size(self, block: int) -> int:
+        """Points of a block."""
+
+    def points_in(self, blocks: np.ndarray) -> int:
+        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
+
+    def attributes(self) -> dict[str, Any]:
+        """What its store says of it, but for versions; the same wherever it is made."""
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """Groups of its store and their attributes."""
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Every array of its store."""
+
+    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
+        """Chunks that a block writes, whole: the position of one in each of some arrays."""
+
+    def evaluate(self, block: int) -> Results:
+        """Results of a block by the names of its arrays, each with its chunk's shape."""
+
+    def compile(self) -> None:
+        """Compile what evaluation compiles, so that workers find it on disk."""
+
+
+class Evaluate(Protocol):
+    """What computes a block in place of the study itself, with the same results."""
+
+    def __call__(self, study: Any, block: int) -> Results:
+        """Results of one block by name."""

@@ -1,0 +1,53 @@
+"""A client killed in the midst of a scene's study, while it casts and while it looks."""
+
+import os
+import signal
+import sys
+
+import pytest
+from small import receipts, tree
+from small_scenes import small_scene
+from test_kills import process, wait_for
+
+from sweep.tasks.driver import resume, run
+from sweep.tasks.eyepoint_study import eyepoints_path
+
+CLIENT = """
+import sys, time
+from small_scenes import small_scene
+from sweep.tasks import eyepoint_study
+from sweep.tasks.driver import run
+
+eyepoint_study.BLOCK_SHOTS = 24
+
+def slowly(study, block):
+    time.sleep(0.1)
+    return study.evaluate(block)
+
+run(small_scene(), store=sys.argv[1], scheduler="none", evaluate=slowly, progress=False)
+"""
+
+
+@pytest.mark.parametrize("stage", ["casting", "looking"])
+def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, stage):
+    store = tmp_path / "killed" / "scene.zarr"
+    store.parent.mkdir()
+    eyepoints = eyepoints_path(store, small_scene().geometry_id("three"))
+    watched = eyepoints if stage == "casting" else store
+    script = tmp_path / "client.py"
+    script.write_text(CLIENT)
+    with process(sys.executable, str(script), str(store)) as client:
+        wait_for(lambda: len(receipts(watched)) >= 3)
+        os.kill(client.pid, signal.SIGKILL)
+        client.wait()
+    before = {path: receipts(path) for path in (eyepoints, store)}
+    assert before[store] == [] if stage == "casting" else len(before[store]) >= 3
+    monkeypatch.setattr("sweep.tasks.eyepoint_study.BLOCK_SHOTS", 24)
+    outcome = resume(store, progress=False, scheduler="none")
+    assert outcome.complete and (outcome.rays["three"] == 0) == (stage == "looking")
+    for path, committed in before.items():
+        after = receipts(path)
+        assert after[: len(committed)] == committed and len(set(after)) == len(after)
+    plain = tmp_path / "plain" / "scene.zarr"
+    run(small_scene(), store=plain, scheduler="none", progress=False)
+    assert tree(store.parent) == tree(plain.parent)

@@ -1,0 +1,49 @@
+"""A small study of a scene: a descent over a plain with a ball on it, seen by two scanners."""
+
+from pathlib import Path
+
+from small import STUDY
+
+from sweep.spec import SceneSpec
+
+SCENE = {
+    "title": "Small scene",
+    "question": "Does it fly?",
+    "instrument": STUDY["instrument"] | {"telescope": {"aperture": "50 mm"}},
+    "scene": {
+        "origin": "ground",
+        "objects": {
+            "ground": {"kind": "plane", "size": "3 km", "reflectance": 0.1},
+            "stone": {
+                "kind": "sphere",
+                "radius": "20 m",
+                "position": ["150 m", "0 m", "5 m"],
+                "reflectance": 0.3,
+            },
+        },
+    },
+    "platform": {
+        "path": {
+            "kind": "straight",
+            "from": ["0 m", "0 m", "1500 m"],
+            "to": ["0 m", "0 m", "300 m"],
+            "initial_speed": "100 m/s",
+            "final_speed": "30 m/s",
+        },
+        "attitude": {"kind": "nadir"},
+    },
+    "scanners": {
+        "three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": "4 Hz"},
+        "line": {"kind": "line", "half_angle": "10 deg", "line_rate": "1 Hz", "rate": "8 Hz"},
+    },
+    "footprint": {"beamlets": 7},
+    "draws": {"number": 5, "returns": 3},
+    "seed": 3,
+    "storage": {"block_shots": 60, "block_draws": 2},
+    "axes": {"instrument.laser.power": ["0.01 W", "1 W"]},
+}
+
+
+def small_scene(**changes) -> SceneSpec:
+    """The small study of a scene with some of its sections replaced."""
+    return SceneSpec.from_mapping({**SCENE, **changes}, base=Path("."))
