@@ -1,6 +1,7 @@
 """Monte Carlo sweeps of FMCW Doppler lidar performance.
 
-`load` a spec, `run` it into a store, `open` the store as an xarray Dataset.
+`load` a spec, `run` it into a store, `open` the store as an xarray Dataset; the store of a scene
+as a DataTree with `open_scene`, and `export` its point clouds.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ _HOMES = {
     "run": "sweep.tasks.driver",
     "resume": "sweep.tasks.driver",
     "open": "sweep.analysis.opening",
+    "open_scene": "sweep.analysis.scenes.opening",
+    "export": "sweep.analysis.export",
 }
 
 __all__ = ["__version__", *_HOMES]

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from sweep.cli import main
 from sweep.spec import Spec
-from sweep.tasks import driver, progress, session
+from sweep.tasks import driver, pool, progress
 from sweep.tasks.lock import Lock
 
 STUDY = """\
@@ -134,12 +134,10 @@ def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
 
 
 def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch):
-    def poisoned(spec, grid, block):
-        from sweep.tasks.evaluate import evaluate_block
-
+    def poisoned(study, block):
         if block == 4:
             raise ValueError("no good")
-        return evaluate_block(spec, grid, block)
+        return study.evaluate(block)
 
     whole = driver.run
 
@@ -285,7 +283,7 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
 
 def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys):
     lines = progress.Lines(every=0.0)
-    lines.begin(points=100, done=20)
+    lines.begin(points=100, done=20, unit="points")
     lines.advance(points=30, failed=0)
     lines.advance(points=0, failed=2)
     lines.end()
@@ -294,7 +292,7 @@ def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys)
     assert shown[1].startswith("50 of 100 points, ")
     assert shown[-1].endswith("2 blocks failed")
     patient = progress.Lines()
-    patient.begin(points=100, done=0)
+    patient.begin(points=100, done=0, unit="points")
     for _ in range(50):
         patient.advance(points=1, failed=0)
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -312,9 +310,9 @@ def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(h
     spec = Spec.from_mapping(
         {**_mapping(), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
-    assert session.Place().for_spec(spec).scheduler == "none"
-    assert session.Place(workers=2).for_spec(spec) == session.Place(workers=2)
-    assert session.Place().for_spec(spec).workers == 3
+    assert pool.Place().for_spec(spec).scheduler == "none"
+    assert pool.Place(workers=2).for_spec(spec) == pool.Place(workers=2)
+    assert pool.Place().for_spec(spec).workers == 3
 
 
 def _mapping() -> dict:

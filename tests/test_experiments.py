@@ -8,9 +8,12 @@ import pytest
 import sweep
 from sweep.analysis.figures import draw
 from sweep.model.outputs import OUTPUTS
-from sweep.spec import Spec
+from sweep.spec import SceneSpec, Spec
+from sweep.spec.reading import read_document
 
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
+SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
+GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
 KEPT = 3
 """Values kept of a plain axis; zipped axes keep the first of every run of equal grazing angle."""
 
@@ -37,7 +40,7 @@ def _thinned(spec):
     return Spec.from_mapping(mapping | {"axes": axes})
 
 
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
 def test_experiment_runs_to_store_and_figures(path, tmp_path):
     spec = sweep.load(path)
     assert spec.question
@@ -56,8 +59,44 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     assert len(files) >= len(spec.figures) and all(file.stat().st_size > 0 for file in files)
 
 
+def _lightened(path):
+    """The same study of a scene with fewer beamlets and draws; skipped without its files."""
+    document = read_document(path).value
+    files = [thing.get("file") for thing in document["scene"]["objects"].values()]
+    for file in filter(None, files):
+        if not (path.parent / file).exists():
+            pytest.skip(f"{file} is not here")
+    mapping = sweep.load(path).to_yaml_mapping()
+    few = {"footprint": mapping["footprint"] | {"beamlets": 7}}
+    few["draws"] = mapping["draws"] | {"number": min(2, mapping["draws"]["number"])}
+    return SceneSpec.from_mapping(mapping | few, base=path.parent)
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
+    spec = _lightened(path)
+    assert spec.question and spec.figures
+    store = tmp_path / "light.zarr"
+    assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
+    tree = sweep.open_scene(store)
+    for scanner in spec.scanners:
+        cloud = tree[scanner].ds
+        seen = np.isfinite(cloud.beam_range.values)
+        assert seen.mean() > 0.99
+        assert (np.isfinite(cloud.pd_shot.values) == seen).all()
+        points = cloud.flags.values > 0
+        assert (np.isfinite(cloud.range.values) == points).all()
+        assert points.any()
+    files = draw(store, tmp_path / "figures")
+    assert len(files) >= len(spec.figures) and all(file.stat().st_size > 0 for file in files)
+
+
 def test_the_published_study_is_there():
-    assert {path.stem for path in EXPERIMENTS} >= {
+    assert {path.stem for path in GRIDS} >= {
         "aperture", "beam_divergence", "fft_size", "quickstart", "range_angle",
         "single_shot_2000m", "single_shot_45deg", "threshold", "transmit_power",
+    }  # fmt: skip
+    assert {path.stem for path in SCENES} >= {
+        "forest_scan", "morpheus_three_beam", "square_high_descent", "square_low_descent",
+        "oblique_descent", "expanded_pattern", "gale_crater_descent", "scan_pattern_comparison",
     }  # fmt: skip

@@ -10,6 +10,7 @@ import xarray as xr
 
 from sweep.analysis import canvas, false_alarms, labels, mean_table, slices, surface_figure, tables
 from sweep.analysis.defaults import default_figures
+from sweep.analysis.opening import SCENE, kind_of, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points, confined, points
 from sweep.analysis.tabular import Page
@@ -68,11 +69,15 @@ def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Pa
     Raises
     ------
     NotAStoreError
-        Where there is no store of a study.
+        Where there is no store of a grid of points or of a scene.
     """
     store_path = Path(store_path)
     beside = store_path.with_name(f"{store_path.name.removesuffix('.zarr')}-figures")
     directory = beside if directory is None else Path(directory)
+    if kind_of(read_attributes(store_path)) == SCENE:
+        from sweep.analysis.scenes import figures as of_scenes
+
+        return of_scenes.draw(store_path, directory)
     study = Study.of(store_path)
     figures = study.spec.figures or default_figures(study.spec)
     if not figures:

@@ -56,6 +56,11 @@ def number(value: float) -> str:
     return f"{value:.6g}"
 
 
+def counted(number: int, thing: str) -> str:
+    """A number of things: ``1 shot``, ``1,200 shots``."""
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
+
+
 def coordinate(name: str) -> str:
     """A coordinate's name in words."""
     return {"tnr": "TNR", "fft_size": "FFT size"}.get(name, name.replace("_", " "))

@@ -16,6 +16,14 @@ BATCH_DRAWS = "batch_draws"
 NOT_COUNTED = -1
 """What a count holds where its block is not computed."""
 
+GRID, SCENE = "grid", "scene"
+_HOLDS = {
+    GRID: "a grid of points: sweep.open() opens it",
+    SCENE: "a scene's point clouds: sweep.open_scene() opens it",
+    "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
+}
+"""What the kinds of stores hold, and what to do with them."""
+
 
 class NotAStoreError(ValueError):
     """A path at which there is no store of a study."""
@@ -46,21 +54,30 @@ def open(path: str | Path) -> xr.Dataset:
         Where there is no store of a study.
     """
     path = Path(path)
-    attributes = read_attributes(path)
+    attributes = read_attributes(path, GRID)
     dataset = xr.open_zarr(path, consolidated="consolidated_metadata" in _document(path))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
-    return dataset.assign_attrs(progress(path, attributes, _points(dataset, attributes)))
+    shape = _points(dataset, attributes)
+    blocks = (math.ceil(n / cut) for n, cut in zip(shape, attributes["block_shape"], strict=True))
+    return dataset.assign_attrs(progress(path, math.prod(shape), math.prod(blocks)))
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
+def read_attributes(path: Path, kind: str = "") -> dict[str, Any]:
     """Attributes of a store, from its group's metadata.
+
+    Parameters
+    ----------
+    path
+        The store.
+    kind
+        What it must hold, ``grid`` or ``scene``; any by default.
 
     Raises
     ------
     NotAStoreError
-        Where there is none, with the stores that are near.
+        Where there is none, with the stores that are near, or one of another kind.
     """
     if not path.exists():
         raise NotAStoreError(f"there is no store at {path}{_near(path)}")
@@ -68,11 +85,17 @@ def read_attributes(path: Path) -> dict[str, Any]:
         attributes = _document(path)["attributes"]
     except (OSError, ValueError, KeyError, TypeError):
         raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}") from None
-    if not isinstance(attributes, dict) or not {"spec", "study_id", "block_shape"} <= set(
-        attributes
-    ):
+    if not isinstance(attributes, dict) or not {"study_id", "model_version"} <= set(attributes):
         raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    found = kind_of(attributes)
+    if kind and found != kind:
+        raise NotAStoreError(f"{path} holds {_HOLDS.get(found, found)}")
     return attributes
+
+
+def kind_of(attributes: dict[str, Any]) -> str:
+    """Kind of study in a store: ``grid``, ``scene`` or ``eyepoints``."""
+    return str(attributes.get("kind", GRID))
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -104,28 +127,25 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.drop_dims(BATCH).assign(sums).assign(n_draws=number)
 
 
-def progress(path: Path, attributes: dict[str, Any], points: tuple[int, ...]) -> dict[str, Any]:
+def progress(path: Path, points: int, blocks: int) -> dict[str, Any]:
     """Times and amount of what is committed, as attributes.
 
     Parameters
     ----------
-    path, attributes
-        The store and its attributes.
-    points
-        Shape of the grid.
+    path
+        The store.
+    points, blocks
+        How many there are in all: points of a grid, or shots times draws of a flight.
     """
     receipts = {r["block"]: r for r in _records(path / ".sweep" / "receipts.jsonl") if "block" in r}
     sessions = list(_records(path / ".sweep" / "sessions.jsonl"))
-    blocks = math.prod(
-        math.ceil(n / block) for n, block in zip(points, attributes["block_shape"], strict=True)
-    )
     times = [r["time"] for r in receipts.values() if "time" in r]
     started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s] or times
     complete = len(receipts) >= blocks
     return {
         "started": _utc(min(started)) if started else "",
         "finished": _utc(max(times)) if complete and times else "",
-        "points": math.prod(points),
+        "points": points,
         "points_committed": sum(r.get("points", 0) for r in receipts.values()),
         "blocks": blocks,
         "blocks_committed": len(receipts),

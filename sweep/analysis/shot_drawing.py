@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,18 +19,35 @@ NARROWEST = 12
 """Least half-width of the view around the peak, in bins."""
 
 
-def draw(shots: Sequence[Shot], *, title: str, note: str) -> Sheet:
-    """Spectra of shots side by side: a row a segment, the whole band and around the peak."""
+def draw(
+    shots: Sequence[Shot],
+    *,
+    title: str,
+    note: str,
+    near: Callable[[Segment], slice] | None = None,
+) -> Sheet:
+    """Spectra of shots side by side: a row a segment, the whole band and around the peak.
+
+    Parameters
+    ----------
+    shots
+        What to draw.
+    title, note
+        What stands over the sheet and at its foot.
+    near
+        Bins that the view around the peak shows; those around the strongest peak by default.
+    """
+    near = near or (lambda segment: around_peak(segment.signal))
     rows, columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
     sheet, axes = canvas.panels(width * columns, 3.1 * rows + 1.2, rows, columns)
     limits = _limits(shots)
     for j, shot in enumerate(shots):
         for i, segment in enumerate(shot.segments):
-            whole, near = axes[i * columns + 2 * j], axes[i * columns + 2 * j + 1]
+            whole, close = axes[i * columns + 2 * j], axes[i * columns + 2 * j + 1]
             _whole(whole, shot, segment)
-            _around_peak(near, shot, segment)
-            for panel in (whole, near):
+            _around_peak(close, shot, segment, near(segment))
+            for panel in (whole, close):
                 panel.set_ylim(*limits)
                 panel.grid(True, color="0.92", linewidth=0.6)
             whole.set_title(", ".join(filter(None, [segment.name, shot.label])), size=10)
@@ -88,9 +105,9 @@ def _whole(axes: Axes, shot: Shot, segment: Segment) -> None:
         )
 
 
-def _around_peak(axes: Axes, shot: Shot, segment: Segment) -> None:
+def _around_peak(axes: Axes, shot: Shot, segment: Segment, bins: slice) -> None:
     """Bins around the peak, with what their frequency means on top."""
-    _lines(axes, shot, segment, around_peak(segment.signal), 1.0)
+    _lines(axes, shot, segment, bins, 1.0)
     told = [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
     axes.text(
         0.98, 0.95, "\n".join([*told, f"pd {segment.pd:.4g}"]), transform=axes.transAxes,

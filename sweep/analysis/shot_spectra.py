@@ -114,6 +114,21 @@ def simulated(parameters: Parameters, *, label: str = "", seed: int | None = Non
         Seed of its noise; without one, spectra are the signal's alone.
     """
     ((_, prepared),) = model.prepare(parameters)
+    return simulated_shot(prepared, parameters, label=label, seed=seed)
+
+
+def simulated_shot(
+    prepared: model.Shots, parameters: Parameters, *, label: str = "", seed: int | None = None
+) -> Shot:
+    """One shot that is prepared already, whatever it looks at.
+
+    Parameters
+    ----------
+    prepared
+        The shot, alone.
+    parameters, label, seed
+        As for :func:`simulated`.
+    """
     found = model.find(prepared)
     segments = tuple(
         _segment(prepared, found[k, :, 0], k, seed) for k in range(3) if prepared.segments[k]

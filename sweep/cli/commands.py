@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-if TYPE_CHECKING:
-    from sweep.tasks.session import Outcome
+from sweep.cli.telling import conclude, grid_plan, scene_plan
 
-FAILED, MISTAKE, INCOMPLETE = 1, 2, 3
+MISTAKE = 2
 
 SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 STORE = click.argument("store", type=click.Path(path_type=Path))
@@ -33,10 +31,12 @@ class Commands(click.Group):
         except (click.exceptions.Exit, click.ClickException, click.Abort):
             raise
         except Exception as error:
+            from sweep.analysis.opening import NotAStoreError
+            from sweep.scenes.errors import SceneError
             from sweep.spec import SpecError
             from sweep.tasks.errors import TaskError
 
-            if not isinstance(error, (SpecError, TaskError)):
+            if not isinstance(error, (NotAStoreError, SceneError, SpecError, TaskError)):
                 raise
             click.echo(str(error), err=True)
             ctx.exit(MISTAKE)
@@ -55,6 +55,9 @@ def main() -> None:
       sweep status results/quickstart.zarr        how far is it? (any time)
       sweep resume results/quickstart.zarr        go on after an interruption
       sweep figures results/quickstart.zarr       draw it
+
+    A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
+    them as PLY, LAS or CSV.
 
     Ctrl-C once finishes what runs and stops; nothing that is written is lost.
 
@@ -86,12 +89,16 @@ def run(
 
     outcome = driver.run(
         load(spec),
-        store=store or Path("results") / f"{spec.stem}.zarr",
+        store=store or _default_store(spec),
         workers=workers,
         scheduler=scheduler,
         overwrite=overwrite,
     )
-    _conclude(outcome, _shown(outcome.store))
+    conclude(outcome, _shown(outcome.store))
+
+
+def _default_store(spec: Path) -> Path:
+    return Path("results") / f"{spec.stem}.zarr"
 
 
 @main.command()
@@ -116,62 +123,12 @@ def resume(store: Path, spec: Path | None, workers: int | None, scheduler: str |
     outcome = driver.resume(
         store, spec=load(spec) if spec else None, workers=workers, scheduler=scheduler
     )
-    _conclude(outcome, store)
+    conclude(outcome, store)
 
 
 def _shown(path: Path) -> Path:
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
-
-
-def _conclude(outcome: Outcome, store: Path) -> None:
-    """Say what a run has come to, and leave with its exit code."""
-    from sweep.tasks.progress import duration
-
-    if outcome.blocks_done:
-        _print_summary(store)
-    click.echo(
-        f"{store}: {outcome.points_done:,} of {outcome.points:,} points, "
-        f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
-        f"in {duration(outcome.seconds)}"
-    )
-    if outcome.complete:
-        click.echo(f"sweep figures {store}  draws it.")
-        return
-    for failure in outcome.failures[:5]:
-        click.echo(f"block {failure.block} failed: {failure.error}", err=True)
-    left = outcome.blocks - outcome.blocks_done
-    why = outcome.stopped or f"{len(outcome.failures)} blocks failed"
-    click.echo(
-        f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.\n"
-        f"sweep resume {store}  goes on.",
-        err=True,
-    )
-    sys.exit(INCOMPLETE)
-
-
-def _print_summary(store: Path) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from sweep.tasks.summary import DETECTED, summary
-
-    part, rows = summary(store)
-    table = Table(title="Probability of detection", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column(escape(part), justify="right")
-    for heading in ("points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(
-            row.part,
-            f"{row.points:,}",
-            f"{100 * row.detected:.1f} %",
-            f"{row.pd_shot:.4g}",
-            f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
-        )
-    Console().print(table)
 
 
 @main.command()
@@ -182,32 +139,15 @@ def plan(spec: Path, workers: int | None) -> None:
 
     The time comes from about a second of computing points of the study itself.
     """
-    from sweep.spec import load
-    from sweep.tasks.plan import plan as planned
-    from sweep.tasks.progress import duration
+    from sweep.spec import SceneSpec, load
 
     study = load(spec)
-    p = planned(study, workers=workers)
-    shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items()) or "the point"
-    for name, text in (
-        ("points", f"{p.points:,}"),
-        ("blocks", f"{p.blocks:,} of at most {shape}"),
-        ("chunks", f"{p.chunks:,} files"),
-        ("bytes", f"{_bytes(p.bytes)} before compression"),
-        ("time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"),
-        ("time", f"about {duration(p.seconds)} on {p.workers} workers"),
-        ("memory", f"about {_bytes(p.worker_memory)} a worker"),
-    ):
+    if isinstance(study, SceneSpec):
+        lines = scene_plan(study, _default_store(spec), workers)
+    else:
+        lines = grid_plan(study, workers)
+    for name, text in lines:
         click.echo(f"{name:>12}  {text}")
-
-
-def _bytes(count: int) -> str:
-    size, unit = float(count), "B"
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            break
-        size /= 1000
-    return f"{size:.3g} {unit}"
 
 
 @main.command()
@@ -221,7 +161,7 @@ def status(store: Path) -> None:
     left = duration((s.points - s.points_done) / s.rate) if s.rate else "unknown"
     click.echo(f"{s.title or store}\nstudy {s.study_id}")
     click.echo(
-        f"{s.points_done:,} of {s.points:,} points, {s.blocks_done:,} of {s.blocks:,} blocks"
+        f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
     )
     if s.holder_lives and s.holder:
         click.echo(f"running: process {s.holder.pid} on {s.holder.host}, {left} left")
@@ -259,9 +199,13 @@ def shot(
       sweep shot experiments/range_angle.yaml --at range=2km --at grazing_angle=45deg
     """  # noqa: D301
     from sweep.analysis.shot_figure import report
-    from sweep.spec import load
+    from sweep.spec import SceneSpec, load
 
     study = load(spec)
+    if isinstance(study, SceneSpec):
+        raise click.UsageError(
+            f"{spec} is a study of a scene: run it, and ask for a figure of the kind shot_spectra"
+        )
     text, files = report(
         study,
         at=_assignments(at),
@@ -299,12 +243,45 @@ def _list(files: list[Path]) -> None:
 )
 def figures(store: Path, output: Path | None) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
-    from sweep.tasks.identity import read
+    from sweep.tasks.studies import read
 
     read(store)
     from sweep.analysis.figures import draw
 
     _list(draw(store, output))
+
+
+@main.command()
+@STORE
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--scanner", help="Which scanner's points, where the study has several.")
+@click.option("--draw", type=click.IntRange(min=0), default=0, help="Number of the draw [0].")
+@click.option(
+    "--ranges",
+    default="interpolated",
+    help="Ranges and velocities: interpolated between bins [default], or quantised to them.",
+)
+@click.option(
+    "--at",
+    "at",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Value of a coordinate, where the study has axes; as often as needed.",
+)
+def export(
+    store: Path, file: Path, scanner: str | None, draw: int, ranges: str, at: tuple[str, ...]
+) -> None:
+    """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
+
+    \b
+      sweep export results/forest_scan.zarr forest.las
+      sweep export results/scan_pattern_comparison.zarr four.ply \\
+          --scanner four --at optical_efficiency=1
+    """  # noqa: D301
+    from sweep.analysis.export import export as write
+
+    points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=_assignments(at))
+    click.echo(f"{_shown(file.absolute())}: {points:,} points")
 
 
 @main.command()

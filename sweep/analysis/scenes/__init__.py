@@ -1,0 +1,1 @@
+"""Scenes as computed: point clouds and navigation, read from stores and drawn."""

@@ -1,0 +1,156 @@
+"""What the commands print: plans before a run, tables and counts after it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.session import Outcome
+
+INCOMPLETE = 3
+
+
+def conclude(outcome: Outcome, store: Path) -> None:
+    """Say what a run has come to, and leave with its exit code."""
+    from sweep.tasks.progress import duration
+
+    if outcome.blocks_done:
+        _print_summary(store)
+    for scanner, rays in outcome.rays.items():
+        told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
+        click.echo(f"{scanner}: {told}")
+    click.echo(
+        f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
+        f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
+        f"in {duration(outcome.seconds)}"
+    )
+    if outcome.complete:
+        click.echo(f"sweep figures {store}  draws it.")
+        return
+    for failure in outcome.failures[:5]:
+        click.echo(f"block {failure.block} failed: {failure.error}", err=True)
+    left = outcome.blocks - outcome.blocks_done
+    why = outcome.stopped or f"{len(outcome.failures)} blocks failed"
+    click.echo(
+        f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.\n"
+        f"sweep resume {store}  goes on.",
+        err=True,
+    )
+    sys.exit(INCOMPLETE)
+
+
+def _print_summary(store: Path) -> None:
+    from sweep.tasks.identity import read_attributes
+
+    _print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
+
+
+def _grid_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
+    """Title, headings and rows of a grid's summary."""
+    from sweep.tasks.summary import DETECTED, summary
+
+    part, rows = summary(store)
+    headings = [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"]
+    return (
+        "Probability of detection",
+        headings,
+        [
+            [
+                row.part,
+                f"{row.points:,}",
+                f"{100 * row.detected:.1f} %",
+                f"{row.pd_shot:.4g}",
+                f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
+            ]
+            for row in rows
+        ],
+    )
+
+
+def _scene_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
+    """Title, headings and rows of a scene's summary."""
+    from sweep.tasks.scene_summary import scene_summary
+
+    headings = ["scanner", "shots", "mean pd", "true", "false points", "velocity"]
+    return (
+        "What came back",
+        headings,
+        [
+            [
+                row.part,
+                f"{row.shots:,}",
+                f"{row.pd:.4g}",
+                f"{100 * row.true / max(row.shots, 1):.1f} %",
+                f"{row.false:,}",
+                f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
+            ]
+            for row in scene_summary(store)
+        ],
+    )
+
+
+def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    for heading in headings:
+        table.add_column(escape(heading), justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    Console().print(table)
+
+
+def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
+    """Lines, with their headings, of what a grid will take."""
+    from sweep.tasks.plan import plan as planned
+    from sweep.tasks.progress import duration
+
+    p = planned(study, workers=workers)
+    shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items()) or "the point"
+    yield "points", f"{p.points:,}"
+    yield "blocks", f"{p.blocks:,} of at most {shape}"
+    yield "chunks", f"{p.chunks:,} files"
+    yield "bytes", f"{_bytes(p.bytes)} before compression"
+    yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
+    yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
+    yield "memory", f"about {_bytes(p.worker_memory)} a worker"
+
+
+def scene_plan(study: SceneSpec, store: Path, workers: int | None) -> Iterator[tuple[str, str]]:
+    """Lines, with their headings, of what a scene will take."""
+    from sweep.tasks.progress import duration
+    from sweep.tasks.scene_plan import scene_plan as planned
+
+    p = planned(study, store=store, workers=workers)
+    for report in p.reports:
+        yield "scene", report
+    for s in p.scanners:
+        yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
+            "eyepoints are there already" if s.is_cast
+            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
+        )  # fmt: skip
+        yield "", f"{1e6 * s.seconds_a_draw:.3g} us a shot and draw on one core"
+    yield "draws", f"{p.draws:,}, at {p.places:,} place(s) along the axes"
+    yield "blocks", f"{p.blocks:,}"
+    yield "chunks", f"{p.chunks:,} files"
+    yield "bytes", f"{_bytes(p.bytes)} before compression"
+    yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
+    yield "memory", f"about {_bytes(p.worker_memory)} a worker"
+
+
+def _bytes(count: int) -> str:
+    size, unit = float(count), "B"
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            break
+        size /= 1000
+    return f"{size:.3g} {unit}"

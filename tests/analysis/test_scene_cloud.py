@@ -1,0 +1,266 @@
+"""Clouds as gathered and drawn, held against the arrays of the store."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from drawn_scenes import SLOPE, cut_short, scene
+from mpl_toolkits.mplot3d import proj3d
+
+from sweep.analysis.scenes import cloud, cloud_figure, colours
+from sweep.analysis.scenes.cloud import AXES, gathered
+from sweep.analysis.scenes.opening import opened
+from sweep.analysis.scenes.places import place
+from sweep.analysis.scenes.recording import Interval
+from sweep.analysis.scenes.terrain import Ground
+from sweep.model.pairing import FLAGS, TRUE
+
+
+@pytest.fixture(scope="module")
+def tree(scene_store):
+    return opened(scene_store)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return scene(tmp_path_factory.mktemp("spec"))
+
+
+@pytest.fixture(scope="module")
+def weak(tree, spec):
+    return place(spec, {"power": "0.3 mW"}).recording(tree, "pair")
+
+
+@pytest.fixture(scope="module")
+def arrays(scene_store):
+    return xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=1).load()
+
+
+def drawn(found, tree, **options):
+    wanted = {
+        "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "ground": None,
+        "title": "A cloud", "remarks": [],
+    }  # fmt: skip
+    sheet = cloud_figure.draw(found, **(wanted | options))
+    sheet.canvas.draw()
+    return sheet
+
+
+def small_cloud(points, **changes):
+    """A cloud of points given as columns x, y, z, all true."""
+    table = dict(zip(AXES, np.asarray(points, float), strict=True))
+    number = table["x"].size
+    table |= {"colour": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
+    box = {axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in AXES}
+    parts = {
+        "points": table, "dropouts": {}, "path": {}, "total": number, "total_dropouts": 0,
+        "outside": 0, "every": 1, "every_dropout": 1, "box": box,
+    }  # fmt: skip
+    return cloud.Cloud(**(parts | changes))
+
+
+def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, arrays):
+    found = gathered(weak, colour="range", ranges="quantised", draw=1, dropouts=True)
+    none = (arrays.flags.values == 0).all(axis=-1)
+    assert 20 < none.sum() < none.size - 20
+    assert found.total_dropouts == none.sum()
+    assert found.total == (arrays.flags.values > 0).sum()
+    aimed = (
+        arrays.platform_position.values
+        + arrays.beam_range.values[:, None] * arrays.beam_direction.values
+    )[none]
+    for k, axis in enumerate(AXES):
+        assert np.array_equal(found.dropouts[axis], aimed[:, k])
+
+
+@pytest.mark.parametrize("geometry", [True, False])
+def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path, arrays, geometry):
+    short = opened(cut_short(scene_store, tmp_path, geometry=geometry))
+    weak = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
+    found = gathered(weak, colour="range", ranges="quantised", draw=1, dropouts=True)
+    none = (arrays.flags.values == 0).all(axis=-1)
+    assert found.total_dropouts == none[:256].sum() > 0
+
+
+@pytest.mark.parametrize(("power", "has_false"), [("0.3 mW", False), ("1 W", True)])
+def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_beyond(
+    scene_store, tree, spec, power, has_false
+):
+    at = place(spec, {"power": power})
+    found = gathered(
+        at.recording(tree, "pair"), colour="snr", ranges="interpolated", draw=1, dropouts=True,
+        path=True,
+    )  # fmt: skip
+    arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.index, draw=1)
+    true = (arrays.flags.values & TRUE) > 0
+    position = arrays.position.values
+    for k, axis in enumerate(AXES):
+        low, high = found.box[axis]
+        for inside in (position[true][:, k], found.dropouts[axis], found.path[axis]):
+            assert ((low < inside) & (inside < high)).all()
+    box = np.array([found.box[axis] for axis in AXES])
+    others = position[(arrays.flags.values > 0) & ~true]
+    beyond = ((others < box[:, 0]) | (others > box[:, 1])).any(axis=1).sum()
+    assert found.outside == beyond and (beyond > 0) == has_false
+    assert found.points["x"].size == found.total - beyond
+    assert np.array_equal(found.path["z"], arrays.platform_position.values[:, 2])
+
+
+def test_crops_cut_points_and_dropouts_and_the_picture(weak):
+    crops = {"x": Interval(-30.0, 25.0), "time": Interval(1.0, 5.0)}
+    found = gathered(weak, colour="range", ranges="quantised", crops=crops, dropouts=True)
+    every = gathered(weak, colour="range", ranges="quantised", dropouts=True)
+    assert 0 < found.total < every.total and 0 < found.total_dropouts < every.total_dropouts
+    for table in (found.points, found.dropouts):
+        assert table["x"].min() >= -30 and table["x"].max() <= 25
+    room = max(high - low for low, high in found.box.values()) * cloud.MARGIN
+    assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
+    assert gathered(weak, colour="range", ranges="quantised", crops={"x": Interval(1e5)}) is None
+
+
+def test_many_points_are_thinned_and_the_foot_says_so(weak, tree, monkeypatch):
+    whole = gathered(weak, colour="shot", ranges="quantised")
+    monkeypatch.setattr(cloud, "MOST_POINTS", 50)
+    found = gathered(weak, colour="shot", ranges="quantised")
+    assert found.every == 2 ** int(np.ceil(np.log2(whole.total / 50)))
+    said = drawn(found, tree).get_supxlabel()
+    assert f"{whole.total:,} points, one in {found.every} of them shown" in said
+
+
+@pytest.mark.parametrize(
+    ("view", "axes"), [("above", ("x", "y")), ("side", ("x", "z")), ("front", ("y", "z"))]
+)
+def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
+    found = gathered(weak, colour="range", ranges="quantised", dropouts=True, path=True)
+    sheet = drawn(found, tree, view=view, ground=Ground.of(tree))
+    picture = sheet.axes[0]
+    true = (found.points["flags"] & TRUE) > 0
+    shown = picture.collections[-3].get_offsets()
+    expected = np.column_stack([found.points[axis][true] for axis in axes])
+    assert np.array_equal(np.sort(shown, axis=0), np.sort(expected, axis=0))
+    pixels = picture.transData.transform([[0, 0], [1, 0], [0, 1]])
+    assert pixels[1, 0] - pixels[0, 0] == pytest.approx(pixels[2, 1] - pixels[0, 1], rel=1e-6)
+    assert picture.get_xlabel() == f"{axes[0]} (m)" and picture.get_ylabel() == f"{axes[1]} (m)"
+
+
+def test_the_nearest_points_lie_on_top():
+    found = small_cloud([[0, 0, 0], [0, 0, 0], [5.0, 9.0, 1.0]])
+    scale = colours.chosen("range", found.points["colour"], trusted=np.ones(3, bool), surfaces=[])
+    colour = drawn(found, None).axes[0].collections[0].get_facecolors()
+    assert np.allclose(colour, scale.of(np.array([2.0, 0.0, 1.0])))
+
+
+@pytest.mark.parametrize("view", ["oblique", (20.0, 60.0), (-130.0, 5.0)])
+def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
+    found = small_cloud([[0, 300.0, 150.0], [0, 40.0, 90.0], [0, 10.0, 25.0]])
+    sheet = drawn(found, None, view=view)
+    axes = sheet.axes[0]
+    places = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    x, y, _ = proj3d.proj_transform(*places, axes.get_proj())
+    units = axes.transData.transform(np.column_stack([x, y])) - axes.transData.transform(
+        (x[0], y[0])
+    )
+    # an orthographic image of a right-angled frame of equal units: the squares sum to 2
+    frame = units[1:]
+    scale = np.sqrt((frame**2).sum() / 2)
+    assert frame.T @ frame == pytest.approx(scale**2 * np.eye(2), abs=1e-6 * scale**2)
+    corners = np.array(np.meshgrid(*(found.box[axis] for axis in AXES))).reshape(3, -1)
+    x, y, _ = proj3d.proj_transform(*corners, axes.get_proj())
+    pixels = axes.transData.transform(np.column_stack([x, y]))
+    size = sheet.get_size_inches() * sheet.dpi
+    assert (pixels > 0).all() and (pixels < size).all()
+    reach = np.ptp(pixels, axis=0) / sheet.dpi
+    assert reach[0] == pytest.approx(7.6, rel=0.02) or reach[1] == pytest.approx(6.4, rel=0.02)
+
+
+def test_velocities_of_both_signs_have_a_scale_centred_on_zero_and_of_one_sign_do_not():
+    true = np.ones(3, bool)
+    both = colours.chosen("radial_velocity", np.array([-1, 0, 4.0]), trusted=true, surfaces=[])
+    one = colours.chosen("radial_velocity", np.array([1, 2, 4.0]), trusted=true, surfaces=[])
+    assert (both.norm.vmin, both.norm.vmax) == (-4, 4)
+    assert both.cmap is colours.BOTH_SIGNS
+    assert (one.norm.vmin, one.norm.vmax) == (1, 4)
+    assert both.label == "radial velocity (m/s)"
+    middle = both.of(np.array([0.0]))[0, :3]
+    assert all(middle.sum() < both.of(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
+
+
+def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_told():
+    values = np.concatenate([np.linspace(100, 200, 1000), [5000.0, -7.0]])
+    trusted = np.arange(values.size) < 1000
+    scale = colours.chosen("range", values, trusted=trusted, surfaces=[])
+    assert (scale.norm.vmin, scale.norm.vmax, scale.extend) == (100, 200, "both")
+    lonely = colours.chosen("range", values, trusted=np.ones(1002, bool), surfaces=[])
+    assert lonely.norm.vmin > 99 and lonely.norm.vmax < 201
+    assert colours.chosen("range", values[:1000], trusted=trusted[:1000], surfaces=[]).extend == (
+        "neither"
+    )
+
+
+def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
+    values = np.array([0, 1, -1, 1.0])
+    names = colours.chosen(
+        "surface", values, trusted=np.ones(4, bool), surfaces=["ground", "block"]
+    )
+    assert names.names == {-1: "none", 0: "ground", 1: "block"}
+    paint = names.of(values)
+    assert len(np.unique(paint, axis=0)) == 3 and np.array_equal(paint[1], paint[3])
+    assert len(set(colours.canvas.LINES)) == len(colours.canvas.LINES)
+    kinds = colours.chosen("flags", np.array([0, 4.0]), trusted=np.ones(2, bool), surfaces=[])
+    assert list(kinds.names.values()) == ["true", "sidelobe"]
+
+
+def test_a_legend_tells_false_points_dropouts_and_path():
+    found = small_cloud([[0, 9.0], [0, 9.0], [0, 1.0]])
+    found.points["flags"][1] = found.points["colour"][1] = FLAGS["sidelobe"]
+    found.points["colour"][0] = TRUE
+    places = {axis: np.array([4.0]) for axis in AXES}
+    for options, more in (
+        ({}, set()),
+        ({"dropouts": places, "path": places}, {"shot without a point", "flight path, dot: start"}),
+    ):
+        sheet = drawn(replace(found, **options), None, quantity="flags", view="oblique")
+        words = {t.get_text().replace("\n", " ") for own in sheet.legends for t in own.get_texts()}
+        assert words == {"true", "sidelobe", "false point"} | more
+
+
+def test_far_off_coordinates_are_read_against_a_round_number():
+    points = np.array([[4_000_000.0, 4_000_300.0], [10.0, 90.0], [0, 10.0]])
+    sheet = drawn(small_cloud(points), None)
+    picture = sheet.axes[0]
+    assert picture.get_xlabel() == "x - 4000000 (m)" and picture.get_ylabel() == "y (m)"
+    words = [tick.get_text() for tick in picture.get_xticklabels()]
+    assert "200" in words and not any("e" in word for word in words)
+
+
+def test_the_ground_of_the_store_is_the_slope_with_the_block(tree):
+    ground = Ground.of(tree)
+    heights = ground.at(np.array([-60.0, -20.0, 20.0, 30.0]), np.array([20.0, -20.0, 0.0, 10.0]))
+    assert heights == pytest.approx([-60 * SLOPE, -20 * SLOPE, 20.0, 20.0], abs=1e-6)
+    assert np.isnan(ground.at(np.array([1e4]), np.array([0.0]))).all()
+
+
+def test_cropped_ground_of_even_slope_is_that_slope_at_every_node():
+    x, y = np.linspace(0, 100, 11), np.linspace(-50, 50, 6)
+    ground = Ground(x, y, 3 + 0.2 * x - 0.1 * y[:, None])
+    part = ground.cropped((13.0, 57.0), (-500.0, 11.0), most=23)
+    assert (part.x[0], part.x[-1], part.y[0], part.y[-1]) == (13, 57, -50, 11)
+    assert part.x.size <= 23 and part.y.size == 23
+    np.testing.assert_allclose(part.height, 3 + 0.2 * part.x - 0.1 * part.y[:, None], rtol=1e-12)
+    assert ground.cropped((200.0, 300.0), (0.0, 10.0)) is None
+
+
+def test_slopes_towards_the_light_are_brighter_and_walls_are_left_open():
+    x = y = np.linspace(0, 10, 21)
+    towards = Ground(x, y, 0.3 * (x - y[:, None])).shade()  # rises to the south-east, faces the sun
+    away = Ground(x, y, 0.3 * (y[:, None] - x)).shade()
+    level = Ground(x, y, np.zeros((21, 21))).shade()
+    assert (towards > level).all() and (level > away).all()
+    step = np.where(x > 5, 10.0, 0.0) + 0 * y[:, None]
+    kept = np.isfinite(Ground(x, y, step).without_walls().height)
+    assert not kept[:, 10].any() and kept[:, :9].all() and kept[:, 13:].all()
+
+
+def test_flags_have_the_bits_that_the_figures_take_for_true():
+    assert FLAGS["true"] == TRUE

@@ -1,0 +1,185 @@
+"""Exported points, read back by other programs' libraries, against the arrays of the store."""
+
+import csv
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+import xarray as xr
+from drawn_scenes import FAR, cut_short, flown
+
+from sweep.analysis.export import export
+from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.scenes.opening import opened
+from sweep.analysis.scenes.point_files import write_las
+from sweep.analysis.scenes.point_table import FIELDS, PointTable
+from sweep.analysis.scenes.recording import Recording
+from sweep.model.pairing import TRUE
+from sweep.spec import SpecError
+
+
+def expected(store, *, scanner="pair", power=1, draw=1, ranges="interpolated"):
+    """Columns that a file must hold, straight from the arrays."""
+    arrays = xr.open_zarr(store, group=scanner, chunks=None).isel(power=power, draw=draw).load()
+    there = arrays.flags.values > 0
+    shot, place = np.nonzero(there)
+    suffix = "_interpolated" if ranges == "interpolated" else ""
+    reach = arrays[f"range{suffix}"].values[there]
+    position = arrays.platform_position.values[shot] + np.array(FAR)
+    position = position + reach[:, None] * arrays.beam_direction.values[shot]
+    columns = dict(zip("xyz", position.T, strict=True))
+    columns |= {"range": reach, "shot": shot, "return_number": place + 1}
+    columns["number_of_returns"] = there.sum(axis=1)[shot]
+    for name in ("radial_velocity", "range_standard_error", "radial_velocity_standard_error"):
+        stored = name
+        if suffix:
+            stored = (
+                name.replace("_standard", "_interpolated_standard") if "_error" in name
+                else name + suffix
+            )  # fmt: skip
+        columns[name] = arrays[stored].values[there]
+    for name in ("snr", "pd", "surface", "flags", "true_range", "true_radial_velocity"):
+        columns[name] = arrays[name].values[there]
+    for name in ("time", "beam"):
+        columns[name] = arrays[name].values[shot]
+    return columns
+
+
+def test_the_columns_of_files_are_those_expected(scene_store):
+    assert set(expected(scene_store)) == {field.name for field in FIELDS}
+
+
+@pytest.mark.parametrize("ranges", ["interpolated", "quantised"])
+def test_a_ply_file_holds_every_point_with_all_fields_as_stored(scene_store, tmp_path, ranges):
+    file = tmp_path / "deep" / "cloud.ply"
+    number = export(
+        scene_store, file, scanner="pair", draw=1, ranges=ranges, where={"power": "1 W"}
+    )
+    wanted = expected(scene_store, ranges=ranges)
+    cloud = trimesh.load(file)
+    vertices = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert number == len(vertices) == len(wanted["x"]) > 50
+    np.testing.assert_allclose(cloud.vertices, np.column_stack([wanted[a] for a in "xyz"]),
+                               rtol=0, atol=1e-8)  # fmt: skip
+    for name in wanted.keys() - set("xyz"):
+        assert np.array_equal(vertices[name], wanted[name], equal_nan=True), name
+    header = file.read_bytes().split(b"end_header")[0].decode()
+    for text in ("comment surface 1: block", "comment flag 2: false alarm", "power 1000 mW",
+                 "radial_velocity_standard_error true_radial_velocity in m s-1"):  # fmt: skip
+        assert text in header
+    assert list(tmp_path.iterdir()) == [file.parent] and list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".LAS"])
+def test_a_las_file_keeps_a_tenth_of_a_millimetre_and_all_other_fields(
+    scene_store, tmp_path, suffix
+):
+    file = tmp_path / f"cloud{suffix}"
+    export(scene_store, file, scanner="pair", draw=1, where={"power": "1 W"})
+    wanted, las = expected(scene_store), laspy.read(file)
+    assert (str(las.header.version), las.header.point_format.id) == ("1.4", 6)
+    assert las.header.global_encoding.wkt
+    for axis in "xyz":
+        assert np.abs(np.asarray(las[axis]) - wanted[axis]).max() <= 0.5e-4 + 1e-9
+    assert np.array_equal(las.gps_time, wanted["time"])
+    for name in wanted.keys() - {*"xyz", "time"}:
+        assert np.array_equal(np.asarray(las[name]), wanted[name], equal_nan=True), name
+    true = (wanted["flags"] & TRUE) > 0
+    assert np.array_equal(np.asarray(las.classification) == 7, ~true) and not true.all()
+    decibels = 10 * np.log10(wanted["snr"])
+    assert np.asarray(las.intensity) == pytest.approx(100 * decibels, abs=0.51)
+    units = {extra.name: extra.description for extra in las.point_format.extra_dimensions}
+    assert units["radial_velocity"] == "m s-1" and units["snr"] == ""
+    assert (file.read_bytes()[104] >= 128) == (suffix == ".laz")  # the format's compression bit
+
+
+def test_a_csv_file_has_units_in_its_header_and_digits_that_give_the_same_numbers(
+    scene_store, tmp_path
+):
+    file = tmp_path / "cloud.csv"
+    number = export(scene_store, file, scanner="pair", draw=1, where={"power": "1 W"})
+    wanted = expected(scene_store)
+    with file.open(newline="") as text:
+        header, *rows = csv.reader(text)
+    assert header[:6] == ["x [m]", "y [m]", "z [m]", "time [s]", "range [m]",
+                          "radial_velocity [m s-1]"]  # fmt: skip
+    assert len(rows) == number == len(wanted["x"])
+    columns = np.array(rows, float).T
+    for title, column in zip(header, columns, strict=True):
+        name = title.split(" ")[0]
+        if name in "xyz":
+            assert column == pytest.approx(wanted[name], abs=1e-8)
+        else:
+            assert np.array_equal(column, wanted[name], equal_nan=True), name
+
+
+def test_what_is_not_computed_yet_is_left_out(scene_store, tmp_path):
+    short = cut_short(scene_store, tmp_path)
+    file = tmp_path / "short.ply"
+    number = export(short, file, scanner="pair", draw=1, where={"power": "1 W"})
+    assert number == (expected(scene_store)["shot"] < 256).sum()
+    assert len(trimesh.load(file).vertices) == number
+
+
+def test_a_single_scanner_and_place_need_not_be_named(tmp_path, scene_store):
+    from drawn_scenes import MAPPING
+
+    path = MAPPING["platform"]["path"] | {"from": ["30 m", "5 m", "170 m"]}
+    store = flown(
+        tmp_path,
+        scanners={"one": MAPPING["scanners"]["square"]},
+        axes={},
+        draws={"number": 1},
+        platform={"path": path, "attitude": {"kind": "nadir"}},
+    )
+    assert export(store, tmp_path / "one.ply") > 10
+
+
+def test_all_mistakes_are_told_at_once_with_what_to_take_instead(scene_store, tmp_path):
+    with pytest.raises(SpecError) as caught:
+        export(
+            scene_store, tmp_path / "cloud.xyz", scanner="sqare", draw=3, ranges="quantized"
+        )  # fmt: skip
+    text = str(caught.value)
+    for part in (
+        "file: must have a suffix that says its format", "take one of .ply, .las, .laz, .csv",
+        "scanner: is no scanner of this study (you wrote sqare); did you mean 'square'?",
+        "draw: is no draw of this study (you wrote 3); they are numbered 0 to 2",
+        "did you mean 'quantised'?",
+        "where.power: has 2 values, and a file holds the points of one; choose power from 0.3 mW",
+    ):  # fmt: skip
+        assert part in text
+    with pytest.raises(SpecError, match="scanner: must be named where there are several"):
+        export(scene_store, tmp_path / "cloud.ply", where={"power": "1 W"})
+    with pytest.raises(NotAStoreError):
+        export(tmp_path / "none.zarr", tmp_path / "cloud.ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_can_not_be_finished_leaves_the_old_one(scene_store, tmp_path, monkeypatch):
+    file = tmp_path / "cloud.ply"
+    file.write_text("old")
+    monkeypatch.setattr(PointTable, "parts", lambda self: iter([1 / 0]))
+    with pytest.raises(ZeroDivisionError):
+        export(scene_store, file, scanner="pair", where={"power": "1 W"})
+    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(("half", "step"), [(100.0, 1e-4), (214_000.0, 1e-4), (215_000.0, 1e-3)])
+def test_las_steps_grow_only_where_points_lie_farther_apart_than_its_integers_reach(
+    scene_store, tmp_path, half, step
+):
+    """2^31 steps of 0.1 mm to either side of the offset are 214.7 km."""
+    group = opened(scene_store).children["square"].to_dataset(inherit=False).isel(power=1).load()
+    there = group.flags.values[:, 0] > 0
+    position = np.full(group.position.shape, np.nan)
+    position[:, 0][there] = np.linspace(-half, half, there.sum())[:, None] * [1.0, 0.1, 0.0]
+    wide = group.assign(position=(group.position.dims, position))
+    table = PointTable(Recording("square", wide), 0, "interpolated", np.array([4e6, 0.0, 0.0]))
+    file = tmp_path / "wide.las"
+    write_las(table, file, [])
+    las = laspy.read(file)
+    assert las.header.scales.tolist() == [step] * 3
+    x = position[:, 0][there][:, 0] + 4e6
+    assert np.abs(np.asarray(las.x) - x).max() <= 0.5 * step + 1e-8

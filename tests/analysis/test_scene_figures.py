@@ -1,0 +1,142 @@
+"""Figures of scenes as specs ask for them, made from stores."""
+
+import csv
+
+import numpy as np
+import pytest
+import xarray as xr
+from drawn_scenes import cut_short, flown, scene
+from PIL import Image
+
+from sweep.analysis.figures import draw
+from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.scenes import figures, scatter_figure
+from sweep.analysis.scenes.defaults import default_figures
+from sweep.analysis.scenes.figures import SceneStudy
+from sweep.analysis.scenes.opening import opened
+from sweep.analysis.scenes.places import place
+from sweep.analysis.scenes.recording import Interval
+from sweep.model.pairing import TRUE
+
+ASKED = [
+    {"kind": "cloud", "path": True, "where": {"power": "1 W"}},
+    {"kind": "cloud", "colour": "surface", "view": "above", "scanner": "pair", "name": "plan"},
+    {"kind": "cloud", "x": ["-30 m", "30 m"], "time": ["3 s", "7.5 s"], "dropouts": True,
+     "view": {"azimuth": "-30 deg", "elevation": "20 deg"}, "ranges": "interpolated",
+     "name": "close"},
+    {"kind": "cloud", "z": ["5 km", "6 km"], "name": "nothing"},
+    {"kind": "scatter", "scanner": "pair", "y": "radial_velocity", "where": {"power": "1 W"}},
+    {"kind": "scatter", "x": "altitude", "y": "pd_shot", "colour": "snr_up", "title": "By shots"},
+    {"kind": "shot_spectra", "scanner": "pair", "where": {"power": "1 W"}},
+    {"kind": "shot_spectra", "shot": 7, "name": "seventh"},
+    {"kind": "shot_spectra", "shot": 5000, "name": "beyond"},
+    {"kind": "navigation", "where": {"power": "1 W"}, "bins": 4},
+    {"kind": "navigation_table", "quantity": "altitude", "show": "rmse", "bins": 3},
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Files of a study that asks for every kind of figure."""
+    store = flown(tmp_path_factory.mktemp("asked"), figures=ASKED)
+    return draw(store)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return scene(tmp_path_factory.mktemp("spec"))
+
+
+def test_every_figure_that_is_asked_for_is_made_beside_the_store(drawn):
+    stems = ["range_cloud", "plan", "close", "nothing", "pair_radial_velocity_over_time_scatter",
+             "pd_shot_over_altitude_scatter", "pair_several_surfaces_shot_spectra", "seventh",
+             "beyond", "velocity_all_navigation"]  # fmt: skip
+    names = [f"{stem}.png" for stem in stems]
+    names += [f"altitude_rmse_navigation_table.{suffix}" for suffix in ("txt", "csv")]
+    assert [file.name for file in drawn] == names
+    assert {file.parent.name for file in drawn} == {"scene-figures"}
+
+
+def test_pictures_have_something_on_them_and_those_without_say_why_in_little_room(drawn):
+    for file in drawn:
+        if file.suffix == ".png":
+            picture = np.asarray(Image.open(file).convert("L"))
+            assert picture.std() > 3
+            says_why = file.stem in ("nothing", "beyond")
+            assert (picture.shape[0] == 300) == says_why
+
+
+def test_the_table_has_a_row_for_each_bin(drawn):
+    rows = list(csv.DictReader(drawn[-1].open()))
+    assert [row["scanner"] for row in rows] == ["square"] * 3
+    assert "rmse" in rows[0] and "bias" not in rows[0]
+
+
+def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
+    usual = default_figures(opened(scene_store))
+    assert [figure.stem for figure in usual] == [
+        "square_range_cloud", "square_radial_velocity_cloud", "pair_range_cloud",
+        "pair_radial_velocity_cloud", "velocity_all_navigation", "altitude_all_navigation",
+    ]  # fmt: skip
+
+
+def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
+    scene_store, tmp_path, monkeypatch
+):
+    short = cut_short(scene_store, tmp_path)
+    log = short / ".sweep" / "receipts.jsonl"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-8]))
+    assert SceneStudy.of(short).note.endswith("32 of 40 blocks computed")
+    usual = figures.default_figures
+    monkeypatch.setattr(figures, "default_figures", lambda tree: usual(tree)[4:5])
+    assert [file.name for file in draw(short)] == ["velocity_all_navigation.png"]
+
+
+def test_spectra_need_the_eyepoints_beside_the_store(tmp_path):
+    directory = tmp_path / "own"
+    directory.mkdir()
+    store = flown(directory, figures=[{"kind": "shot_spectra", "shot": 0}], draws={"number": 1})
+    alone = store.rename(tmp_path / "moved.zarr")
+    with pytest.raises(NotAStoreError, match="eyepoints of the study are not at"):
+        draw(alone)
+
+
+def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every_point(
+    scene_store, spec, tmp_path
+):
+    weak = place(spec, {"power": "0.3 mW"}).recording(opened(scene_store), "pair")
+    arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
+    options = {"draw": 0, "ranges": "quantised", "time": None}
+    shots = scatter_figure.gathered(weak, ["time", "pd_shot", "beam"], **options)
+    assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values)
+    points = scatter_figure.gathered(weak, ["time", "radial_velocity", "beam"], **options)
+    there = arrays.flags.values > 0
+    assert np.array_equal(points.rows()["radial_velocity"], arrays.radial_velocity.values[there])
+    short = opened(cut_short(scene_store, tmp_path, geometry=False))
+    less = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
+    shots = scatter_figure.gathered(less, ["time", "pd_shot", "beam"], **options)
+    assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values[:256])
+    some = scatter_figure.gathered(
+        weak, ["time", "pd_shot", "beam"], **(options | {"time": Interval(2.0, 3.0)})
+    )
+    inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
+    assert np.array_equal(some.rows()["pd_shot"], arrays.pd_shot.values[inside])
+
+
+def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
+    strong = place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
+    found = scatter_figure.gathered(
+        strong, ["time", "range", "snr"], draw=0, ranges="interpolated", time=None
+    )
+    sheet = scatter_figure.draw(
+        found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
+    )
+    table, axes = found.rows(), sheet.axes[0]
+    true = (table["flags"] & TRUE) > 0
+    expected = np.column_stack([table["time"], table["range"]])
+    assert np.array_equal(axes.collections[0].get_offsets(), expected[true])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "range (m)")
+    low, high = axes.get_ylim()
+    beyond = int((~true & ((expected[:, 1] < low) | (expected[:, 1] > high))).sum())
+    assert beyond > 0 and f"{beyond} false points outside" in sheet.get_supxlabel()
+    assert sheet.axes[1].get_ylabel() == "signal-to-noise ratio (dB)"

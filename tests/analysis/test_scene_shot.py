@@ -1,0 +1,110 @@
+"""Spectra of single shots of a scene against the store's statistics and the beamlets' beats."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from drawn_scenes import scene
+
+from sweep.analysis.scenes import shot_figure
+from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
+from sweep.analysis.scenes.opening import opened
+from sweep.analysis.scenes.places import place
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.pairing import TRUE
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return scene(tmp_path_factory.mktemp("spec"))
+
+
+@pytest.fixture(scope="module")
+def recording(scene_store, spec):
+    return place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
+
+
+@pytest.fixture(scope="module")
+def arrays(scene_store):
+    return xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=1).load()
+
+
+def one(scene_store, spec, recording, number, seed=None):
+    eyepoints = read_eyepoints(eyepoints_of(scene_store, recording.dataset), np.array([number]))
+    parameters = place(spec, {"power": "1 W"}).parameters(spec)
+    return eyepoints, shot_figure.simulated(eyepoints, parameters, spec.surfaces(), seed=seed)
+
+
+def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recording, arrays):
+    for draw in range(2):
+        first = next(
+            shot
+            for shot in range(arrays.sizes["shot"])
+            if len(
+                {
+                    int(surface)
+                    for surface, flags in zip(
+                        arrays.surface.values[shot, draw], arrays.flags.values[shot, draw],
+                        strict=True,
+                    )
+                    if flags & TRUE
+                }
+            ) == 2
+        )  # fmt: skip
+        assert shot_figure.several_surfaces(recording, draw) == first
+
+
+def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store, spec):
+    square = place(spec, {"power": "1 W"}).recording(opened(scene_store), "square")
+    values = square.dataset.load()
+    alike = square.dataset.assign(surface=xr.zeros_like(values.surface))
+    seen = type(square)("square", alike)
+    expected = int(np.flatnonzero(values.surfaces_seen.values >= 2)[0])
+    assert shot_figure.several_surfaces(seen) == expected
+    none = alike.assign(surfaces_seen=xr.zeros_like(values.surfaces_seen))
+    assert shot_figure.several_surfaces(type(square)("square", none)) is None
+
+
+@pytest.mark.parametrize("number", [5, 120, 250])
+def test_a_shot_drawn_again_has_the_statistics_that_the_store_holds(
+    scene_store, spec, recording, arrays, number
+):
+    _, shot = one(scene_store, spec, recording, number)
+    for name in ("pd_up", "pd_down", "pd_doppler", "snr_up"):
+        assert shot.outputs[name] == pytest.approx(float(arrays[name][number]), rel=1e-12)
+
+
+def test_two_surfaces_have_a_peak_each_where_their_own_range_beats(scene_store, spec, recording):
+    number = shot_figure.several_surfaces(recording)
+    eyepoints, shot = one(scene_store, spec, recording, number)
+    sheet = shot_figure.draw(shot, eyepoints, ["ground", "block"], title="T", remarks=["told"])
+    up, close = shot.segments[0], sheet.axes[1]
+    marks = {line.get_label(): line for line in close.lines if line.get_marker() == "|"}
+    assert set(marks) == {"ground", "block"}
+    bin_ = 600e6 / 2**15
+    peaks = [up.frequency[group.peak] for group in up.groups]
+    hit = eyepoints.surface[0] >= 0
+    for surface, name in enumerate(("ground", "block")):
+        own = hit & (eyepoints.surface[0] == surface)
+        # the up-chirp's beat: 2 v / lambda less 2 R S / c, to the millionth of the range's part
+        beat = (
+            2 * (eyepoints.radial_velocity[0] + eyepoints.velocity_offset[0]) / 1550e-9
+            - 2 * (eyepoints.range[0] + eyepoints.offset[0]) * (1e9 / 500e-6) / SPEED_OF_LIGHT
+        )[own]
+        drawn = 1e6 * np.sort(marks[name].get_xdata())
+        assert drawn == pytest.approx(np.sort(np.abs(beat)), abs=0.01 * bin_)
+        assert min(abs(peak - f) for peak in peaks for f in drawn) < 1.5 * bin_
+    low, high = close.get_xlim()
+    assert all(low < 1e-6 * peak < high for peak in peaks)
+    assert "told" in sheet.get_supxlabel().lower()
+
+
+def test_views_reach_over_all_detections_but_not_to_those_far_away():
+    from sweep.analysis.scenes.shot_figure import around_detections
+    from sweep.analysis.shot_spectra import Group, Segment
+
+    signal = np.full(4000, 1e-9)
+    signal[1000] = 1.0
+    groups = tuple(Group(k, k, k) for k in (950, 1000, 1140, 3900))
+    segment = Segment("up-chirp", 1, np.arange(4000.0), signal, signal, 0.0, 0.0, groups, 1.0, 1.0)
+    view = around_detections(segment)
+    assert 900 < view.start < 950 and 1140 < view.stop < 1200
