@@ -226,12 +226,14 @@ def test_figures_go_beside_the_store_or_where_asked(here):
 
 def test_schema_prints_a_json_schema_that_names_the_sections():
     schema = json.loads(sweep("schema").stdout)
-    assert {"instrument", "target", "axes"} <= schema["properties"].keys()
+    grid, scene = (schema["$defs"][name]["properties"] for name in ("Spec", "SceneSpec"))
+    assert {"instrument", "target", "axes"} <= grid.keys()
+    assert {"instrument", "scene", "platform", "scanners"} <= scene.keys()
 
 
 def test_help_teaches_with_examples():
     text = sweep("--help").stdout
-    for command in ("run", "plan", "status", "resume", "shot", "figures", "schema"):
+    for command in ("run", "plan", "status", "resume", "shot", "figures", "export", "schema"):
         assert command in text
     assert "3 incomplete" in text
     assert "sweep run experiments/quickstart.yaml\n" in sweep("run", "--help").stdout

@@ -34,6 +34,8 @@ def cast(
     ------
     StoreError
         Where an eyepoint store is not what its name says, or is being written by someone else.
+    SceneError
+        Where a file of the scene is missing, changed or unfit.
     """
     rays: dict[str, int] = {}
     for eyepoints in study.eyepoint_studies():
@@ -41,6 +43,7 @@ def cast(
         if _is_whole(path, eyepoints):
             rays[eyepoints.scanner] = 0
             continue
+        _ = eyepoints.world  # what is wrong with the scene is the user's to mend, not a block's
         told.say(f"casting {eyepoints.rays:,} rays through the scanner '{eyepoints.scanner}'")
         outcome = _fill(path, eyepoints, pool, told, interrupts)
         rays[eyepoints.scanner] = eyepoints.rays_in(outcome.points_computed)
@@ -70,7 +73,7 @@ def _fill(
         write_recipe(
             path,
             spec=eyepoints.spec.to_json(),
-            base=str(eyepoints.spec.base),
+            base=str(eyepoints.spec.base.absolute()),
             scanner=eyepoints.scanner,
         )
         journal = Journal(path)

@@ -169,7 +169,9 @@ def _go_on(path: Path, study: GridStudy | FlightStudy, place: Place, told: Progr
                 )  # fmt: skip
                 if isinstance(study, GridStudy):
                     return session.to_its_end()
-                write_recipe(path, base=str(study.spec.base))
+                write_recipe(path, base=str(study.spec.base.absolute()))
+                if committed(path, study).all():
+                    return session.to_its_end()
                 rays, why = cast(study, pool=pool, told=told, interrupts=interrupts)
                 return session.to_its_end(before=why, rays=rays)
         finally:

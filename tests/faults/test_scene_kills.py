@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from small import receipts, tree
-from small_scenes import small_scene
+from small_flights import small_scene
 from test_kills import process, wait_for
 
 from sweep.tasks.driver import resume, run
@@ -14,7 +14,7 @@ from sweep.tasks.eyepoint_study import eyepoints_path
 
 CLIENT = """
 import sys, time
-from small_scenes import small_scene
+from small_flights import small_scene
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import run
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from small import evaluated, logged, receipts, tree
-from small_scenes import SCENE, small_scene
+from small_flights import SCENE, small_scene
 from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
@@ -95,7 +95,7 @@ def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monk
 
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
-        "from small_scenes import small_scene; from sweep.tasks.driver import run;"
+        "from small_flights import small_scene; from sweep.tasks.driver import run;"
         f"run(small_scene(), store={str(tmp_path / 'one.zarr')!r}, scheduler='none',"
         " progress=False)"
     )

@@ -1,0 +1,102 @@
+"""The command line over scenes: plan, run, run again, export, and what is refused."""
+
+import csv
+
+import pytest
+import xarray as xr
+from test_cli import STUDY, refused, sweep
+
+from sweep.tasks.eyepoint_study import world_of
+
+SCENE = (
+    STUDY.split("target:")[0]
+    + """\
+scene:
+  origin: ground
+  objects:
+    ground: {kind: plane, size: 3 km, reflectance: 0.1}
+platform:
+  path: {kind: straight, from: [0 m, 0 m, 500 m], to: [0 m, 0 m, 100 m],
+         initial_speed: 100 m/s, final_speed: 30 m/s}
+scanners:
+  three: {kind: cone, beams: 3, half_angle: 22.5 deg, rate: 4 Hz}
+footprint: {beamlets: 7}
+draws: {number: 2}
+"""
+)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A directory of one's own with a spec, descent.yaml, in it."""
+    (tmp_path / "descent.yaml").write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_scene_is_planned_run_and_exported(here):
+    planned = sweep("plan", "descent.yaml")
+    assert planned.exit_code == 0 and "550 rays" in planned.stdout
+    assert "ground: 2 faces" in planned.stdout and "2, at 1 place" in planned.stdout
+    ran = sweep("run", "descent.yaml", "--scheduler", "none")
+    assert ran.exit_code == 0
+    assert "three: 550 rays cast" in ran.stdout
+    assert "150 of 150 shots, computed 1 of 1 blocks" in ran.stdout
+    assert "150 of 150 shots" in sweep("status", "results/descent.zarr").stdout
+    written = sweep("export", "results/descent.zarr", "cloud.csv")
+    assert written.exit_code == 0
+    flags = xr.open_datatree("results/descent.zarr", engine="zarr")["three"].flags.values[:, 0]
+    assert written.stdout == f"cloud.csv: {(flags > 0).sum()} points\n"
+    with open("cloud.csv") as file:
+        assert sum(1 for _ in csv.DictReader(file)) == (flags > 0).sum()
+
+
+def test_a_second_study_of_the_same_geometry_says_that_no_ray_was_cast(here):
+    sweep("run", "descent.yaml", "--scheduler", "none")
+    (here / "weak.yaml").write_text(SCENE.replace("power: 1 W", "power: 10 mW"))
+    assert "eyepoints are there already" in sweep("plan", "weak.yaml").stdout
+    again = sweep("run", "weak.yaml", "--scheduler", "none")
+    assert again.exit_code == 0 and "three: eyepoints were there, no ray cast" in again.stdout
+
+
+def test_mistakes_over_a_scene_end_in_plain_words_and_exit_code_2(here):
+    refused(sweep("shot", "descent.yaml"), "shot_spectra")
+    missing = SCENE.replace("kind: plane, size: 3 km", "kind: raster, file: none.tif")
+    (here / "missing.yaml").write_text(missing)
+    refused(sweep("run", "missing.yaml"), "scene.objects.ground.file", "none.tif")
+    (here / "low.yaml").write_text(SCENE.replace("kind: cone", "kind: kone"))
+    refused(sweep("run", "low.yaml"), "kone", "did you mean 'cone'?")
+    refused(sweep("export", "results/none.zarr", "a.las"), "there is no store")
+    sweep("run", "descent.yaml", "--scheduler", "none")
+    refused(sweep("export", "results/descent.zarr", "a.xyz"), "suffix", ".ply")
+    refused(sweep("export", "results/descent.zarr", "a.ply", "--draw", "7"), "numbered 0 to 1")
+    (eyepoints,) = (here / "results" / "eyepoints").iterdir()
+    refused(sweep("resume", eyepoints), "holds eyepoints")
+    refused(sweep("figures", eyepoints), "eyepoints")
+    (here / "turned.yaml").write_text(SCENE.replace("22.5 deg", "20 deg"))
+    told = sweep("run", "turned.yaml", "--store", "results/descent.zarr")
+    refused(told, "scanners.three.half_angle", "0.39269", "rad")
+
+
+def test_a_file_that_changes_under_a_study_is_noticed(here):
+    import numpy as np
+
+    np.save("ground.npy", np.zeros((20, 20)))
+    (here / "array.yaml").write_text(
+        SCENE.replace(
+            "kind: plane, size: 3 km", "kind: array, file: ground.npy, spacing: [100 m, 100 m]"
+        )
+    )
+    assert sweep("run", "array.yaml", "--scheduler", "none").exit_code == 0
+    store = here / "results" / "array.zarr"
+    chunk = store / "three" / "range" / "c" / "0" / "0" / "0"
+    chunk.unlink()
+    np.save("ground.npy", np.ones((20, 20)))
+    assert sweep("resume", store, "--scheduler", "none").exit_code == 0  # rays are cast already
+    refused(sweep("run", "array.yaml", "--store", store), "another study", "ground")
+    (eyepoints,) = (here / "results" / "eyepoints").iterdir()
+    (eyepoints / "offset" / "c" / "0" / "0").unlink()
+    world_of.cache_clear()  # as in another process
+    assert sweep("resume", store, "--scheduler", "none").exit_code == 0  # the cloud is whole
+    chunk.unlink()
+    refused(sweep("resume", store, "--scheduler", "none"), "ground.npy", "changed")
