@@ -153,6 +153,8 @@ def _make(path: Path, study: GridStudy | FlightStudy, overwrite: bool, told: Pro
         )
     if isinstance(study, FlightStudy):
         told.say("building the scene")
+        for line in study.reports:
+            told.say(line)
     create(path, study)
 
 

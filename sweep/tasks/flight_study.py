@@ -12,7 +12,13 @@ import numpy as np
 
 from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS, SceneOutput
 from sweep.tasks.eyepoint_reader import EyepointReader
-from sweep.tasks.eyepoint_study import SIZES, EyepointStudy, eyepoints_path, scene_array
+from sweep.tasks.eyepoint_study import (
+    SIZES,
+    EyepointStudy,
+    eyepoints_path,
+    scene_array,
+    world_of,
+)
 from sweep.tasks.grid_study import coordinates
 from sweep.tasks.stretches import Part, Stretches
 from sweep.tasks.study import ArrayLayout, Results
@@ -243,6 +249,11 @@ class FlightStudy:
         """The studies that this one looks with."""
         for stretches in self._stretches:
             yield EyepointStudy(self.spec, stretches.scanner)
+
+    @property
+    def reports(self) -> tuple[str, ...]:
+        """What loading the scene found and mended, a line an object."""
+        return tuple(world_of(self.spec).reports)
 
     @cached_property
     def _map(self) -> Any:
