@@ -1,4 +1,4 @@
 """The physics of FMCW Doppler lidar: arrays in, arrays out; SI and radians throughout."""
 
-VERSION = "1"
+VERSION = "2"
 """Version of the physics: part of a study's identity, raised when any result can change."""
