@@ -8,14 +8,20 @@ import time
 from pathlib import Path
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from rich.console import Console
 from rich.table import Table
 
 import sweep
 from sweep.model import shot, truth
+from sweep.model.eyepoints import observe, prepare_eyepoints
+from sweep.model.footprint import beamlets
+from sweep.model.geometry.beamlet_rays import beamlet_rays
 from sweep.model.preparation import prepare
 from sweep.model.spectra import segment_spectrum
-from sweep.spec import Spec
+from sweep.spec import SceneSpec, Spec
+from sweep.spec.reading import read_document
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 REPEATS = 3
@@ -34,9 +40,7 @@ def best(function, *arguments) -> float:
 
 def study() -> Spec:
     """The published range-angle study at four powers: a minute on two cores."""
-    import yaml
-
-    mapping = yaml.safe_load((EXPERIMENTS / "range_angle.yaml").read_text())
+    mapping = read_document(EXPERIMENTS / "range_angle.yaml").value
     mapping["axes"]["instrument.laser.power"] = ["1 W", "2 W", "3 W", "5 W"]
     return Spec.from_mapping(mapping, base=EXPERIMENTS)
 
@@ -77,6 +81,71 @@ def rate(table: Table, parameters: dict) -> None:
     )
 
 
+def descent() -> SceneSpec:
+    """Four beams from 2000 m down to 10 m over 100,352 triangles; 10,000 shots."""
+    mapping = read_document(EXPERIMENTS / "square_high_descent.yaml").value
+    path = {"from": ["0 m", "0 m", "2000 m"], "to": ["0 m", "0 m", "10 m"]}
+    speeds = {"initial_speed": "38 m/s", "final_speed": "1.8 m/s"}
+    ground = {
+        "kind": "relief", "size": "3 km", "spacing": "13.393 m", "hurst": 0.8,
+        "rms_slope": 0.1, "baseline": "13 m", "seed": 5, "reflectance": 0.1,
+    }  # fmt: skip
+    mapping |= {
+        "scene": {"origin": "ground", "objects": {"ground": ground}},
+        "platform": {"path": {"kind": "straight"} | path | speeds},
+        "scanners": {"four": {"kind": "corners", "angle": "22.5 deg", "rate": "25 Hz"}},
+        "footprint": {"beamlets": 19},
+        "axes": {},
+        "figures": [],
+    }
+    return SceneSpec.from_mapping(mapping, base=EXPERIMENTS)
+
+
+def scenes(table: Table) -> None:
+    """Beams a second of one core, beside the bare Embree cast of the same rays."""
+    spec = descent()
+    world, flight, scan = spec.world(), spec.flight(), spec.scan("four")
+    (mesh,), parameters = world.caster.meshes, spec.parameters()
+    index = np.arange(spec.cycles("four") * spec.shots_a_cycle("four"))
+    divergence = float(parameters["instrument.laser.beam_divergence"])
+    number = int(parameters["footprint.beamlets"])
+
+    def look():
+        return observe(
+            index, flight=flight, scanner=scan, caster=world.caster, bodies=world.bodies,
+            beam_divergence=divergence, number=number, pattern=spec.pattern,
+        )  # fmt: skip
+
+    seen = look()
+    assert seen.seen.all()
+
+    def detect():
+        return shot.statistics(prepare_eyepoints(seen, parameters, world.surfaces))
+
+    pattern = beamlets(number, spec.pattern)[0]
+    shots = scan.shots(index)
+    attitude = flight.state(flight.start + shots.time).attitude
+    rays = beamlet_rays(attitude, shots.direction, *pattern, divergence / 4)
+    origins = (np.repeat(seen.position, number, axis=0) - mesh.origin).astype(np.float32)
+    directions = rays.reshape(-1, 3).astype(np.float32)
+    embree = EmbreeScene(robust=True)
+    TriangleMesh(embree, mesh.vertices.astype(np.float32), mesh.faces)
+    bare, casting, detecting = (
+        best(embree.run, origins, directions), best(look), best(detect),
+    )  # fmt: skip
+    whole, size = casting + detecting, index.size
+    table.add_row(
+        f"eyepoints, {len(mesh.faces):,} triangles, {number} beamlets: time over bare Embree's",
+        f"{casting / bare:.2f} x",
+        f"{casting / size * 1e6:.2f} us a beam, the bare rays {bare / size * 1e6:.2f} us",
+    )
+    table.add_row(
+        "eyepoints to pd, three segments: time over bare Embree's",
+        f"{whole / bare:.2f} x",
+        f"{size / whole:,.0f} beams a second, one core",
+    )
+
+
 def engine(table: Table, console: Console) -> None:
     """Share of the wall time that is not kernel, for a study of a minute on all cores."""
     spec = study()
@@ -114,6 +183,7 @@ def main() -> None:
     parameters = sweep.load(EXPERIMENTS / "range_angle.yaml").parameters()
     against_truth(table, parameters)
     rate(table, parameters)
+    scenes(table)
     engine(table, console)
     console.print(table)
 

@@ -5,7 +5,14 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.marcum import excess_crossing
+from sweep.model.crossings import (
+    MOST_TERMS,
+    STRETCH,
+    added_crossings,
+    any_crossing,
+    crossing_series,
+)
+from sweep.model.equivalent import FAST
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 """Standard deviation of |X| in a noise-only bin, in units of sigma (per quadrature)."""
@@ -21,24 +28,81 @@ def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def assess(magnitude, count, sigma, level, floor, exempt):
-    """Detection and leakage in a run of bins around a segment's lines.
+def mark(magnitude, count, level, exempt):
+    """Detection in a run of bins, and the bins that it keeps from raising a false alarm.
 
     Adjacent bins at or above the threshold form a group; its largest bin is the detection. The
     bins of a group and the two beside it can't raise a false alarm, nor can the strongest bin
-    and its neighbours, group or not. Every other bin crosses with Q_1 of its own magnitude
-    [T 3.3.2]; what that adds to the crossings of noise alone is the leakage.
+    and its neighbours, group or not.
 
     Parameters
     ----------
     magnitude : (>= count,) float64
         |X| of the bins, without noise.
-    sigma, level : float
-        Noise per quadrature; threshold.
-    floor : float
-        Bins of less than this many sigma count as noise alone.
+    level : float
+        Threshold.
     exempt : (>= count,) bool
         Result: bins that can't raise a false alarm.
+
+    Returns
+    -------
+    peak, exempted : int
+        Index of the largest bin; number of exempt bins.
+    """
+    largest, above = _survey(magnitude[:count], level)
+    peak = 0
+    while peak < count - 1 and magnitude[peak] < largest:
+        peak += 1
+    exempt[:count] = False
+    first, last = peak, peak
+    while first > 0 and magnitude[first - 1] >= level:
+        first -= 1
+    while last < count - 1 and magnitude[last + 1] >= level:
+        last += 1
+    exempted = _exempt(first, last, count, exempt)
+    if above > last - first + 1:
+        exempted = 0
+        for i in range(count):
+            if magnitude[i] >= level:
+                _exempt(i, i, count, exempt)
+        for i in range(count):
+            exempted += exempt[i]
+    return peak, exempted
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST | {"nnan"})
+def _survey(magnitude, level):
+    """Largest magnitude, and how many reach a level."""
+    largest, above = magnitude[0], 0
+    for i in range(magnitude.size):
+        largest = magnitude[i] if magnitude[i] > largest else largest
+        above += magnitude[i] >= level
+    return largest, above
+
+
+@njit(cache=True, error_model="numpy")
+def _exempt(first, last, count, exempt):
+    """Marks the bins of a group and the two beside it; how many they are."""
+    first, last = max(first - 1, 0), min(last + 1, count - 1)
+    exempt[first : last + 1] = True
+    return last - first + 1
+
+
+@njit(cache=True, error_model="numpy")
+def assess(magnitude, count, sigma, level, floor, exempt):
+    """Detection and leakage in a run of bins around a segment's lines, bin by bin.
+
+    What is no detection (:func:`mark`) crosses with Q_1 of its own magnitude [T 3.3.2]; what that
+    adds to the crossings of noise alone is the leakage.
+
+    Parameters
+    ----------
+    magnitude, count, level, exempt
+        As of :func:`mark`.
+    sigma : float
+        Noise per quadrature.
+    floor : float
+        Bins of less than this many sigma count as noise alone.
 
     Returns
     -------
@@ -47,22 +111,17 @@ def assess(magnitude, count, sigma, level, floor, exempt):
     leakage : float
         Probability that leaked signal raises at least one extra group, over noise alone.
     """
-    peak = 0
-    for i in range(count):
-        exempt[i] = False
-        if magnitude[i] > magnitude[peak]:
-            peak = i
-    for i in range(count):
-        if magnitude[i] >= level or i == peak:
-            for j in range(max(i - 1, 0), min(i + 2, count)):
-                exempt[j] = True
+    peak, exempted = mark(magnitude, count, level, exempt)
     beta = level / sigma
-    noise_only = -math.expm1(-0.5 * beta * beta)
-    exempted = 0
-    silence = 0.0
-    for i in range(count):
-        if exempt[i]:
-            exempted += 1
-        elif magnitude[i] >= floor * sigma:
-            silence += math.log1p(-excess_crossing(magnitude[i] / sigma, beta) / noise_only)
-    return peak, exempted, 0.0 - math.expm1(silence)
+    series, x, chance = np.empty(MOST_TERMS), np.empty(STRETCH), np.empty(STRETCH)
+    crossing_series(beta, series)
+    some = 0.0
+    for first in range(0, count, STRETCH):
+        number = min(STRETCH, count - first)
+        for i in range(number):
+            ratio = magnitude[first + i] / sigma
+            quiet = exempt[first + i] or ratio < floor
+            x[i] = 0.0 if quiet else 0.5 * ratio * ratio
+        added_crossings(x, number, beta, series, chance)
+        some += (1.0 - some) * any_crossing(chance, 0, number)
+    return peak, exempted, some

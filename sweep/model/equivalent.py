@@ -25,6 +25,11 @@ MOST_NODES = 64
 """Equivalent lines at the most; wider bundles are left as they are."""
 
 
+_NODES = np.zeros((MOST_NODES + 1, MOST_NODES))
+for _n in range(1, MOST_NODES + 1):
+    _NODES[_n, :_n] = np.cos(np.pi * (np.arange(_n) + 0.5) / _n)
+
+
 def _bessel_bound(z: float, order: int) -> float:
     """Bound 2 (z/2)^J / J! on what a Chebyshev series of e^{i z x} leaves out after J terms."""
     return 2 * math.exp(order * math.log(max(z, 1e-300) / 2) - math.lgamma(order + 1))
@@ -45,7 +50,7 @@ def node_limits(tolerance: float) -> np.ndarray:
     return limits
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, work):
     """Few lines with the same spectrum as n lines: Chebyshev moments put onto Chebyshev nodes.
 
@@ -75,7 +80,18 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
     nodes = 1
     while nodes < limits.size and limits[nodes] < band * half:
         nodes += 1
-    if nodes >= n or nodes >= limits.size:
+    return put_on_nodes(
+        delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
+    """Moves n weights within ``middle`` +- ``half`` onto Chebyshev nodes there, if they are fewer.
+
+    Other parameters and the result as of :func:`equivalent_lines`.
+    """
+    if nodes >= n or nodes > MOST_NODES:
         for b in range(n):
             out_delta[b], out_re[b], out_im[b] = delta[b], re[b], im[b]
         return n
@@ -88,7 +104,7 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
     chebyshev, following_node = work[3], work[4]
     for i in range(nodes):
         chebyshev[i] = 1.0
-        following_node[i] = math.cos(math.pi * (i + 0.5) / nodes)
+        following_node[i] = _NODES[nodes, i]
         out_re[i] = 0.0
         out_im[i] = 0.0
         out_delta[i] = following_node[i]

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sweep.model.detection import assess
-from sweep.model.equivalent import MOST_NODES
+from sweep.model.crossings import crossing_series
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.preparation import Shots
-from sweep.model.segments import ROOM, segment_spectrum
+from sweep.model.segments import inspect_segment, lent, workspace
 
 BIN, FIRST, LAST = range(3)
 
@@ -55,32 +54,31 @@ def groups(shots: Shots, *, most: int = 4) -> Groups:
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     _find_groups(
         shots.point_table(), shots.row, shots.footprint, shots.segments, shots.incoherent,
-        shots.kernel(), bins, neighbours, pd, exempted, leakage,
+        shots.kernel(), workspace(shots.offset.shape[1], shots.fft_size), bins, neighbours, pd,
+        exempted, leakage,
     )  # fmt: skip
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_groups(
-    points, row, footprint, segments, power, kernel, bins, neighbours, pd, exempted, leakage
+    points, row, footprint, segments, power, kernel, work, bins, neighbours, pd, exempted, leakage
 ):
     """Groups of every point and segment, into arrays of the shapes of :class:`Groups`."""
     half = kernel[0][0] // 2
-    room = np.empty((ROOM, max(footprint[0].shape[1], MOST_NODES, half + 1)))
-    exempt = np.empty(half + 1, np.bool_)
+    footprint, kernel, (room, exempt, series) = lent(footprint, kernel, work)
+    p = np.empty(points.shape[0])
     for i in range(points.shape[1]):
-        p = points[:, i].copy()
-        sigma, level, floor = p[10], p[11], p[12]
+        p[:] = points[:, i]
+        sigma, level = p[10], p[11]
+        crossing_series(level / sigma, series)
         for s in range(3):
             if not segments[s]:
                 continue
-            low, count = segment_spectrum(
-                s, p, footprint, row[i], floor * sigma, power, kernel, room
+            low, count, peak, exempted[i, s], leakage[i, s] = inspect_segment(
+                s, p, footprint, row[i], power, False, kernel, room, exempt, series
             )
             magnitude = room[0, :count]
-            peak, exempted[i, s], leakage[i, s] = assess(
-                magnitude, count, sigma, level, floor, exempt
-            )
             found = _list_groups(magnitude, peak, level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]

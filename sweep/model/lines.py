@@ -32,7 +32,9 @@ def folded_origin(centre, fft_size):
 
 
 @njit(cache=True, error_model="numpy")
-def segment_lines(segment, chirp, optics, record, offset, doppler, amplitude, delta, re, im):
+def segment_lines(
+    segment, chirp, optics, record, offset, doppler, amplitude, delta, re, im, power=False
+):  # fmt: skip
     """Lines of a segment: positions and complex weights C_b of :mod:`sweep.model.spectrum`.
 
     Parameters
@@ -50,6 +52,8 @@ def segment_lines(segment, chirp, optics, record, offset, doppler, amplitude, de
         (R_b - R_0)/R_0, beta_b - beta_0 and relative amplitude of each beamlet.
     delta, re, im : (>= n,) float64
         Result: bins from the returned origin, and C_b.
+    power : bool
+        |C_b|^2 and 0 instead, which takes no phases.
 
     Returns
     -------
@@ -65,26 +69,53 @@ def segment_lines(segment, chirp, optics, record, offset, doppler, amplitude, de
     centre = centre_frequency * bins
     origin, turns, fold = folded_origin(centre, fft_size)
     delta_0 = fold * (centre - turns) - origin
+    poles = 1.0 / (optics[0] * optics[1]), 1.0 / optics[0] + 1.0 / optics[1]
+    centre_line = centre_frequency, delta_0, fold, bins
+    motion = carrier, per_metre, range_0, beta
+    if power:
+        _powers(motion, centre_line, poles, scale, offset, doppler, amplitude, delta, re, im)
+        return origin
     high, low = quotient(2.0 * carrier, SPEED_OF_LIGHT)
     phase_0 = -product_fraction(high, low, range_0) + fraction_of_cycle(centre_frequency * start)
     half_ratio = 0.5 * (length / fft_size)
     turn_0 = (length * origin % (2 * fft_size)) / (2.0 * fft_size)
     square = 0.5 * sign * rate
-    cross = 1.0 / optics[0] + 1.0 / optics[1]
-    product = 1.0 / (optics[0] * optics[1])
     for b in range(offset.size):
+        beat = _beat(motion, offset[b], doppler[b])
         further = range_0 * offset[b]
-        shift = (1.0 + beta) * further + (range_0 + further) * doppler[b]
-        beat = carrier * doppler[b] - per_metre * shift
         delay = (range_0 + further) * (2.0 / SPEED_OF_LIGHT)
         phase = phase_0 - product_fraction(high, low, further)
         phase += fraction_of_cycle(square * delay * delay) + beat * start
         delta[b] = delta_0 + fold * beat * bins
         sine, cosine = sincos_cycles(fold * phase + turn_0 + half_ratio * delta[b])
         frequency = centre_frequency + beat
-        p = 1.0 - frequency * frequency * product
-        q = fold * frequency * cross
+        p = 1.0 - frequency * frequency * poles[0]
+        q = fold * frequency * poles[1]
         weight = 0.5 * scale * amplitude[b] / (p * p + q * q)
         re[b] = weight * (cosine * p + sine * q)
         im[b] = weight * (sine * p - cosine * q)
     return origin
+
+
+@njit(inline="always")
+def _beat(motion, offset, doppler):
+    """Beat of a beamlet less that of the beam's centre [Hz]."""
+    carrier, per_metre, range_0, beta = motion
+    further = range_0 * offset
+    shift = (1.0 + beta) * further + (range_0 + further) * doppler
+    return carrier * doppler - per_metre * shift
+
+
+@njit(cache=True, error_model="numpy")
+def _powers(motion, centre_line, poles, scale, offset, doppler, amplitude, delta, re, im):
+    """Positions of the lines and |C_b|^2."""
+    centre_frequency, delta_0, fold, bins = centre_line
+    for b in range(offset.size):
+        beat = _beat(motion, offset[b], doppler[b])
+        delta[b] = delta_0 + fold * beat * bins
+        frequency = centre_frequency + beat
+        p = 1.0 - frequency * frequency * poles[0]
+        q = frequency * poles[1]
+        weight = 0.5 * scale * amplitude[b]
+        re[b] = weight * weight / (p * p + q * q)
+        im[b] = 0.0

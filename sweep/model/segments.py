@@ -5,36 +5,23 @@ import math
 import numpy as np
 from numba import njit
 
+from sweep.model.crossings import MOST_TERMS, crossing_series
 from sweep.model.detection import assess
+from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.far_field import MOST_POINTS
+from sweep.model.leakage import inspect, reach_of, smooth
 from sweep.model.lines import segment_lines
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.spectrum import bin_magnitudes
 
 SIGNS = (1.0, 0.0, -1.0)
 
-ROOM = 15
-"""Rows of scratch that :func:`segment_spectrum` needs."""
+ROOM = 22
+"""Rows of scratch that :func:`segment_spectrum` and :func:`inspect_segment` need."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Rows of the result: what is found in each segment's spectrum."""
-
-
-@njit(cache=True, error_model="numpy")
-def reach_of(level, weights, envelope, reach):
-    """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
-    if not weights > 0.0:
-        return 1.0
-    low, high = 0, envelope.size - 1
-    if envelope[high] * weights > level:
-        return np.inf
-    while low < high:
-        middle = (low + high) // 2
-        if envelope[middle] * weights > level:
-            low = middle + 1
-        else:
-            high = middle
-    return reach[low]
 
 
 @njit(cache=True, error_model="numpy")
@@ -66,17 +53,9 @@ def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
     """
     sizes, shape, sidelobes, limits, tangent = kernel
     fft_size, length = sizes
-    offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
-    n = offset.size
-    delta, re, im = room[12], room[13], room[14]
-    origin = segment_lines(
-        (SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-        (p[6], fft_size, length, p[7]), offset, doppler, amplitude, delta, re, im,
-    )  # fmt: skip
-    if power:
-        for b in range(n):
-            re[b] = re[b] * re[b] + im[b] * im[b]
-            im[b] = 0.0
+    origin = _lines_of(segment, p, footprint, row, power, sizes, room[19:])
+    n = footprint[0].shape[1]
+    delta, re, im = room[19], room[20], room[21]
     few_delta, few_re, few_im = room[4], room[5], room[6]
     band = math.pi * length / fft_size * (2.0 if power else 1.0)
     few = equivalent_lines(
@@ -90,6 +69,85 @@ def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
         room[0], room[1], room[7:10],
     )  # fmt: skip
     return low, high - low + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _lines_of(segment, p, footprint, row, power, sizes, lines):
+    """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into (3, n); their origin."""
+    offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
+    origin = segment_lines(
+        (SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
+        (p[6], sizes[0], sizes[1], p[7]), offset, doppler, amplitude, lines[0], lines[1],
+        lines[2], power,
+    )  # fmt: skip
+    return origin
+
+
+@njit(cache=True, error_model="numpy")
+def inspect_segment(
+    segment, p, footprint, row, power, every_bin, kernel, room, exempt, series
+):  # fmt: skip
+    """What a segment's spectrum shows, without noise.
+
+    Parameters
+    ----------
+    segment, p, footprint, row, power, kernel, room
+        As of :func:`segment_spectrum`.
+    every_bin : bool
+        Look at each bin by itself where leakage could be summed as an integral.
+    exempt : (room's width,) bool
+        Result: bins of the run that can't raise a false alarm.
+    series : (MOST_TERMS,) float64
+        :func:`sweep.model.crossings.crossing_series` of the threshold.
+
+    Returns
+    -------
+    low, count : int
+        Run of bins that holds every bin above the threshold and its neighbours; |X| in row 0.
+    peak, exempted : int
+        Index of the largest bin; number of exempt bins.
+    leakage : float
+        Of all bins; where the window has no closed form or the record is padded, or for
+        ``every_bin``, of those above the leakage floor.
+    """
+    sigma, level, floor = p[10], p[11], p[12]
+    if every_bin or not smooth(kernel):
+        low, count = segment_spectrum(
+            segment, p, footprint, row, floor * sigma, power, kernel, room
+        )
+        peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
+        return low, count, peak, exempted, leakage
+    origin = _lines_of(segment, p, footprint, row, power, kernel[0], room[19:])
+    return inspect(
+        origin, footprint[0].shape[1], (sigma, level), power, kernel, room, exempt, series
+    )
+
+
+def workspace(beamlets: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scratch of :func:`inspect_segment`: room (ROOM, width), exempt (width,), series."""
+    width = max(beamlets, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS) + 16
+    return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
+
+
+@njit(cache=True, error_model="numpy")
+def lent(footprint, kernel, work):
+    """Footprint, kernel and workspace for the length of a call, their use uncounted."""
+    offset, doppler, amplitude = footprint
+    sizes, shape, sidelobes, limits, tangent = kernel
+    coefficients, numerator, poles, edge, table = shape
+    window_sum, envelope, reach = sidelobes
+    room, exempt, series = work
+    return (
+        (borrowed(offset), borrowed(doppler), borrowed(amplitude)),
+        (
+            sizes,
+            (coefficients, numerator, poles, edge, borrowed(table)),
+            (window_sum, borrowed(envelope), borrowed(reach)),
+            borrowed(limits),
+            borrowed(tangent),
+        ),
+        (borrowed(room), borrowed(exempt), borrowed(series)),
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -117,7 +175,7 @@ def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate_segments(points, row, footprint, segments, power, kernel, out):
+def evaluate_segments(points, row, footprint, segments, power, every_bin, kernel, work, out):
     """Every point's segments: detection probability, peak, exempt bins, leakage.
 
     Parameters
@@ -130,24 +188,26 @@ def evaluate_segments(points, row, footprint, segments, power, kernel, out):
         As in :func:`segment_spectrum`.
     segments : (3,) bool
         Segments to evaluate.
-    power, kernel
-        As in :func:`segment_spectrum`.
+    power, every_bin, kernel
+        As in :func:`inspect_segment`.
+    work : tuple
+        :func:`workspace`.
     out : (3, 6, n) float64
         Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
     """
     fft_size = kernel[0][0]
-    room = np.empty((ROOM, max(footprint[0].shape[1], MOST_NODES, fft_size // 2 + 1)))
-    exempt = np.empty(fft_size // 2 + 1, np.bool_)
+    footprint, kernel, (room, exempt, series) = lent(footprint, kernel, work)
+    p = np.empty(points.shape[0])
     for i in range(points.shape[1]):
-        p = points[:, i].copy()
-        sigma, level, floor = p[10], p[11], p[12]
+        p[:] = points[:, i]
+        sigma, level = p[10], p[11]
+        crossing_series(level / sigma, series)
         for s in range(3):
             if not segments[s]:
                 continue
-            low, count = segment_spectrum(
-                s, p, footprint, row[i], floor * sigma, power, kernel, room
+            low, _, peak, exempted, leakage = inspect_segment(
+                s, p, footprint, row[i], power, every_bin, kernel, room, exempt, series
             )
-            peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
             found, missed = marcum_q1_pair(room[0, peak] / sigma, level / sigma)
             out[s, 0, i] = found
             out[s, 1, i] = missed

@@ -7,7 +7,7 @@ import numpy as np
 
 from sweep.model import chances, waveform
 from sweep.model.preparation import Parameters, Shots, prepare
-from sweep.model.segments import evaluate_segments
+from sweep.model.segments import evaluate_segments, workspace
 
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
 
@@ -66,12 +66,16 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
     return results
 
 
-def find(shots: Shots) -> np.ndarray:
-    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS."""
+def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
+    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
+
+    ``every_bin`` as of :func:`sweep.model.segments.inspect_segment`.
+    """
     out = np.full((3, 6, shots.range.size), np.nan)
     evaluate_segments(
         shots.point_table(), shots.row, shots.footprint, shots.segments,
-        shots.incoherent, shots.kernel(), out,
+        shots.incoherent, every_bin, shots.kernel(),
+        workspace(shots.offset.shape[1], shots.fft_size), out,
     )  # fmt: skip
     return out
 

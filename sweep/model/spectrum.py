@@ -123,7 +123,7 @@ def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, powe
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _fraction(tangent, offset, numerator, poles):
+def fraction(tangent, offset, numerator, poles):
     """K at tan(a + b), given the two tangents, as one fraction (one division)."""
     n = tangent + offset
     d = 1.0 - tangent * offset
@@ -159,28 +159,42 @@ def _add_far(
         if power:
             for i in range(count):
                 side = sine_q[i] * cosine + cosine_q[i] * sine
-                kernel = _fraction(t[i], tangent, numerator, poles)
+                kernel = fraction(t[i], tangent, numerator, poles)
                 value = a * side * side * (kernel * kernel + edge * edge)
                 out_re[i] += 0.0 if low <= i < high else value
         else:
             a_edge, b_edge = a * edge, b * edge
             for i in range(count):
                 side = sine_q[i] * cosine + cosine_q[i] * sine
-                kernel = side * _fraction(t[i], tangent, numerator, poles)
+                kernel = side * fraction(t[i], tangent, numerator, poles)
                 near = low <= i < high
                 out_re[i] += 0.0 if near else a * kernel - b_edge * side
                 out_im[i] += 0.0 if near else b * kernel + a_edge * side
 
 
 @njit(cache=True, error_model="numpy")
-def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
-    """tan(pi q / N), sin(pi q r), cos(pi q r) for q = first .. first + count - 1."""
-    fft_size, length = sizes
+def set_tangents(first, count, fft_size, tangent, t):
+    """tan(pi q / N) for q = first .. first + count - 1, from the table of :func:`tangents`."""
+    if first >= -(fft_size // 2) and first + count <= tangent.size:
+        below = min(max(-first, 0), count)
+        for i in range(below):
+            t[i] = -tangent[-first - i]
+        for i in range(below, count):
+            t[i] = tangent[first + i]
+        return
     q = first % fft_size
-    sign = -1.0 if first & 1 else 1.0
     for i in range(count):
         t[i] = tangent[q] if 2 * q <= fft_size else -tangent[fft_size - q]
         q = q + 1 if q + 1 < fft_size else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
+    """tan(pi q / N), sin(pi q r), cos(pi q r) for q = first .. first + count - 1."""
+    fft_size, length = sizes
+    set_tangents(first, count, fft_size, tangent, t)
+    sign = -1.0 if first & 1 else 1.0
+    for i in range(count):
         sine_q[i] = 0.0
         cosine_q[i] = sign
         sign = -sign

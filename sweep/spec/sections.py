@@ -79,7 +79,8 @@ class Accuracy(Part):
     leakage_floor: Annotated[
         float,
         Numeric(
-            about="Bins whose leaked signal is under this many noise sigmas count as noise alone",
+            about="Bins with less leaked signal than so many noise sigmas count as noise alone, "
+            "where leakage is summed bin by bin: in draws, padded FFTs, windows without closed form",
             example="0.1",
             above="0",
             at_most="1000",

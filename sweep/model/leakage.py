@@ -1,0 +1,312 @@
+"""A segment's detection and leakage, every bin accounted for without looking at each.
+
+Bins within a run around the lines are evaluated one by one: all that may cross the threshold, and
+as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
+chances that leaked signal adds are summed as an integral (:mod:`sweep.model.far_field`), to better
+than 1e-6 of the leakage.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sweep.model import far_field
+from sweep.model.crossings import (
+    added_crossings,
+    any_crossing,
+    largest,
+    silence,
+    weighted_silence,
+)
+from sweep.model.detection import mark
+from sweep.model.equivalent import FAST
+from sweep.model.far_field import CLEARANCE, add_far_field, add_near_field
+from sweep.model.spectrum import set_tangents
+
+APRON = 3
+"""Bins on either side of an integral's near end that its corrections look at."""
+
+SMOOTHNESS = 1e-7
+"""Largest last correction at the near end of an integral, relative to all that leaks."""
+
+DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
+"""Rows of scratch that hold the lines."""
+
+SOURCES, IMAGES = 13, 16
+"""First of three rows each that hold the sources of lines and of images."""
+
+
+@njit(cache=True, error_model="numpy")
+def smooth(kernel):
+    """Whether spectra are smooth between lines: closed form of the window, no padding."""
+    return kernel[1][4].size == 0 and kernel[0][0] == kernel[0][1]
+
+
+@njit(cache=True, error_model="numpy")
+def reach_of(level, weights, envelope, reach):
+    """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
+    if not weights > 0.0:
+        return 1.0
+    low, high = 0, envelope.size - 1
+    if envelope[high] * weights > level:
+        return np.inf
+    while low < high:
+        middle = (low + high) // 2
+        if envelope[middle] * weights > level:
+            low = middle + 1
+        else:
+            high = middle
+    return reach[low]
+
+
+@njit(cache=True, error_model="numpy")
+def inspect(origin, n, noise, power, kernel, room, exempt, series):
+    """Run of bins, detection and leakage of a segment's lines.
+
+    Parameters
+    ----------
+    origin, n : int
+        Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
+        ``power`` |C_b|^2 and nothing; they become strengths.
+    noise : (float, float)
+        sigma per quadrature; threshold.
+    power, kernel
+        As of :func:`sweep.model.segments.segment_spectrum`.
+    room : (ROOM, width) float64
+        Scratch; |X| of the run in row 0.
+    exempt : (width,) bool
+        Result: bins of the run that can't raise a false alarm.
+    series : (MOST_TERMS,) float64
+        :func:`sweep.model.crossings.crossing_series` of the threshold.
+
+    Returns
+    -------
+    low, count, peak, exempted : int
+        First bin of the run, number of bins, index of the largest, number of exempt ones.
+    leakage : float
+    """
+    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
+    near, mirrored = _near_bins(origin, lowest, highest, kernel)
+    middle = math.floor(0.5 * (lowest + highest) + 0.5)
+    centre = min(max(origin + middle, 0), half_size)
+    number = far_field.far_sources(
+        delta, re, im, n, (lowest, highest), centre, centre - origin, fft_size,
+        len(kernel[1][2]), power, kernel[4], room[SOURCES:], room[5:11],
+    )  # fmt: skip
+    edge = far_field.edge_field(re if power else im, n, kernel[1][3], power)
+    spread = highest - lowest
+    total = math.sqrt(total) if power else _sum_afar(re, im, n, total, spread, len(kernel[1][2]))
+    reach = _least_reach(total, spread, noise, centre, kernel)
+    while True:
+        low, high = near[0] - reach, near[1] + reach
+        low = 0 if low <= reach + APRON else low
+        high = half_size if half_size - high <= reach + APRON else high
+        count = high - low + 1
+        _magnitudes(
+            low, count, origin, n, near, mirrored, centre, number, edge, power, kernel, room
+        )
+        peak, exempted = mark(room[0], count, noise[1], exempt)
+        leakage, settled = _leakage(
+            low, count, centre, number, edge, noise, power, kernel, room, exempt, series
+        )
+        if settled:
+            return low, count, peak, exempted, leakage
+        reach *= 2
+
+
+@njit(cache=True, error_model="numpy")
+def _near_bins(origin, lowest, highest, kernel):
+    """First and last bin near a line; whether images are near too."""
+    fft_size = kernel[0][0]
+    half_size = fft_size // 2
+    clearance = CLEARANCE + len(kernel[1][2])
+    low = origin + math.floor(lowest) - clearance
+    high = origin + math.ceil(highest) + clearance
+    # Lines beyond DC or Nyquist are seen as their images, which fold back into the band.
+    if low < 0:
+        high = max(high, -low)
+    if high > half_size:
+        low = min(low, fft_size - high)
+    low, high = max(low, 0), min(high, half_size)
+    below, above = low + origin + lowest, fft_size - high - origin - highest
+    return (low, high), min(below, above) < clearance
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _sum_afar(re, im, n, total, spread, poles):
+    """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
+
+    By how much kernels may differ over the bundle, from the clearance on: the spread times their
+    derivative, (2 poles + 1) over the distance.
+    """
+    sum_re, sum_im = 0.0, 0.0
+    for b in range(n):
+        sum_re += re[b]
+        sum_im += im[b]
+    differ = (2 * poles + 1) * 0.5 * spread / CLEARANCE
+    return min(total, math.hypot(sum_re, sum_im) + differ * total)
+
+
+@njit(cache=True, error_model="numpy")
+def _least_reach(total, spread, noise, centre, kernel):
+    """Bins beyond the near ones that the run has to take in: see the module."""
+    sigma, level = noise
+    window_sum, envelope, reach = kernel[2]
+    half_size = kernel[0][0] // 2
+    clearance = CLEARANCE + len(kernel[1][2])
+    weight = total * window_sum
+    crossing = reach_of(0.9 * level, weight, envelope, reach)
+    far = min(centre, half_size - centre) - 0.5 * spread - 1.0
+    if far < 32.0 * crossing:  # else images add less than a tenth
+        crossing = reach_of(0.5 * level, weight, envelope, reach)
+    at = np.searchsorted(reach, float(clearance))
+    beside = envelope[min(at, envelope.size - 1)] * weight / sigma
+    gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
+    least = max(crossing + 1.5, max(gentle, 0.75 * spread)) - clearance
+    return int(min((max(math.ceil(least), 0.0) + 2 * APRON + 7) // 8 * 8, half_size))
+
+
+@njit(cache=True, error_model="numpy")
+def _magnitudes(
+    low, count, origin, n, near, mirrored, centre, number, edge, power, kernel, room
+):  # fmt: skip
+    """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
+    coefficients, numerator, poles, _, _ = kernel[1]
+    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    re, im, t = room[0, :count], room[1, :count], room[2, :count]
+    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
+    re[:] = edge
+    im[:] = 0.0
+    set_tangents(low - centre, count, fft_size, kernel[4], t)
+    first, last = near[0] - low, near[1] - low + 1
+    for start, end in ((0, first), (last, count)):
+        if start < end:
+            part_re, part_im = re[start:end], im[start:end]
+            add_far_field(t[start:end], lines, number[0], numerator, poles, power, part_re, part_im)
+            if mirrored:
+                add_far_field(
+                    t[start:end], images, number[1], numerator, poles, power, part_re, part_im
+                )
+    if not mirrored:
+        add_far_field(t, images, number[1], numerator, poles, power, re, im)
+    delta, strength_re, strength_im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    first_bin, near_re, near_im = near[0] - origin, re[first:last], im[first:last]
+    add_near_field(
+        first_bin, delta, strength_re, strength_im, n, False, fft_size, coefficients, power,
+        room[5:7], near_re, near_im,
+    )  # fmt: skip
+    if mirrored:
+        for b in range(n):
+            room[7, b] = -delta[b]
+        first_bin = near[0] + origin - (fft_size if 2 * near[0] > half_size else 0)
+        add_near_field(
+            first_bin, room[7], strength_re, strength_im, n, True, fft_size, coefficients, power,
+            room[5:7], near_re, near_im,
+        )  # fmt: skip
+    for i in range(count):
+        re[i] = math.sqrt(re[i] if power else re[i] * re[i] + im[i] * im[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _leakage(low, count, centre, number, edge, noise, power, kernel, room, exempt, series):
+    """Leakage of the run and of all beyond it; False where the run is too short to tell."""
+    sigma, level = noise
+    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    beta, scale = level / sigma, 0.5 / (sigma * sigma)
+    magnitude, x, chance = room[0], room[3], room[4]
+    _half_squares(magnitude[:count], exempt, scale, x)
+    added_crossings(x, count, beta, series, chance)
+    below, above = low > 0, low + count - 1 < half_size
+    some = any_crossing(chance, APRON if below else 0, count - APRON if above else count)
+    if not below and not above:
+        return some, True
+    tail, rest, points = 0.0, 0.0, 0
+    for side in (-1, 1):
+        if not (below if side < 0 else above):
+            continue
+        correction, last, steepness, found = _near_end(side, count, chance, exempt)
+        if not found:
+            return 0.0, False
+        tail += correction
+        rest += abs(last)
+        points = _points_beyond(side, low, count, centre, steepness, kernel, room, points)
+    while points % 8:  # whole vectors: what is left over costs as much as all of them
+        room[9, points], room[10, points] = 1.0, 0.0
+        points += 1
+    far_field.points_to_bins(room[9, :points], room[10, :points], fft_size)
+    below_level = _far_chances(points, number, edge, scale, beta, power, kernel, room, series)
+    tail += weighted_silence(chance[:points], room[10, :points])
+    if not (below_level and rest <= SMOOTHNESS * (some + tail)):
+        return 0.0, False
+    return some - (1.0 - some) * math.expm1(-tail), True
+
+
+@njit(cache=True, error_model="numpy")
+def _half_squares(magnitude, exempt, scale, x):
+    """a^2/2 of bins; 0 of those that can't raise a false alarm."""
+    for i in range(magnitude.size):
+        x[i] = magnitude[i] * magnitude[i] * scale
+    for i in range(magnitude.size):
+        if exempt[i]:
+            x[i] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _near_end(side, count, chance, exempt):
+    """An integral's correction at its near end, its last term, -d ln f / dq; whether they exist."""
+    step = 1 if side > 0 else -1
+    i = count - APRON - 1 if side > 0 else APRON  # the last bin before the integral
+    for k in range(-2, 4):
+        if exempt[i + k * step]:
+            return 0.0, 0.0, 0.0, False
+    before, after = silence(chance[i]), silence(chance[i + step])
+    first = after - before
+    middle = silence(chance[i + 2 * step]) - silence(chance[i - step])
+    third = middle - 3.0 * first
+    fifth = silence(chance[i + 3 * step]) - silence(chance[i - 2 * step])
+    fifth += 10.0 * first - 5.0 * middle
+    last = 367.0 / 967680.0 * fifth
+    steepness = abs(first) / max(after, 1e-300)
+    return first / 24.0 - 17.0 / 5760.0 * third + last, last, steepness, True
+
+
+@njit(cache=True, error_model="numpy")
+def _points_beyond(side, low, count, centre, steepness, kernel, room, points):
+    """Adds the points and weights of one side's integral to rows 9 and 10."""
+    fft_size, half_size, tangent = kernel[0][0], kernel[0][0] // 2, kernel[4]
+    odd = 2 * half_size != fft_size
+    if side < 0:
+        last, far_bin, half = centre - low - APRON, 0, False
+    else:
+        last, far_bin, half = low + count - 1 - APRON - centre, half_size, odd
+    v, weight = room[9], room[10]
+    far = max(far_field.half_bin_cotangent(abs(far_bin - centre), half, fft_size, tangent), 1e-9)
+    points = far_field.far_points(
+        float(side), far_field.half_bin_cotangent(last, True, fft_size, tangent), far,
+        steepness * (last + 0.5), v, weight, points,
+    )  # fmt: skip
+    if not half:  # the far end is a bin: half of it lies beyond the integral
+        v[points] = side * far
+        weight[points] = 0.5 * math.pi / fft_size * (1.0 + far * far)
+        points += 1
+    return points
+
+
+@njit(cache=True, error_model="numpy")
+def _far_chances(points, number, edge, scale, beta, power, kernel, room, series):
+    """Added chances at the points of the integrals, into row 4; whether all lie below level."""
+    _, numerator, poles, _, _ = kernel[1]
+    t, re, im, x = room[9, :points], room[11, :points], room[12, :points], room[3]
+    re[:] = edge
+    im[:] = 0.0
+    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
+    add_far_field(t, lines, number[0], numerator, poles, power, re, im)
+    add_far_field(t, images, number[1], numerator, poles, power, re, im)
+    for i in range(points):
+        x[i] = scale * (re[i] if power else re[i] * re[i] + im[i] * im[i])
+    below_level = largest(x[:points]) < 0.45 * beta * beta
+    added_crossings(x, points, beta, series, room[4])
+    return below_level

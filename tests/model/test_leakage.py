@@ -1,0 +1,156 @@
+"""Leakage summed as an integral against every bin looked at by itself, hard cases first."""
+
+import mpmath
+import numpy as np
+import pytest
+
+from sweep.model.crossings import (
+    MOST_TERMS,
+    added_crossings,
+    any_crossing,
+    crossing_series,
+    silence,
+)
+from sweep.model.preparation import Footprints, prepare, prepare_footprints
+from sweep.model.shot import find
+
+PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
+
+ACCURACY = 1e-6
+"""What the module states, relative to the leakage."""
+
+CLOSED_FORMS = ("hamming", "hann", "rectangular", "blackman", "blackmanharris", "flattop")
+
+
+def compare(shots):
+    """Largest relative differences of what is found, fast against bin by bin."""
+    fast, slow = find(shots), find(shots, every_bin=True)
+    exists = np.isfinite(slow)
+    np.testing.assert_array_equal(np.isfinite(fast), exists)
+    scale = np.abs(slow)
+    # A tone on a bin leaks nothing but rounding, which bin by bin is left out under 1e-12 sigma.
+    scale[:, LEAKAGE] = np.maximum(scale[:, LEAKAGE], 1e-20)
+    scale = np.maximum(scale, 1e-290)
+    return np.nanmax(np.abs(fast - slow) / scale, axis=(0, 2)), slow
+
+
+def held(shots):
+    """The module's accuracy, and that of everything else that both report."""
+    error, slow = compare(shots)
+    assert error[LEAKAGE] < ACCURACY
+    assert error[MAGNITUDE] < 1e-9 and error[PD] < 1e-7
+    assert error[FREQUENCY] == 0 and error[EXEMPTED] == 0
+    return slow[:, LEAKAGE]
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("window", CLOSED_FORMS)
+def test_leakage_over_ranges_and_angles_for_every_window(table_4_1, window, phases):
+    generator = np.random.default_rng(3)
+    parameters = table_4_1(
+        window=window,
+        phases=phases,
+        fft_size=2**14,
+        beamlets=19,
+        leakage_floor=1e-12,
+        tnr=5.0,
+    ) | {
+        "target.range": np.exp(generator.uniform(np.log(1.0), np.log(1.2e4), 150)),
+        "target.grazing_angle": np.radians(generator.uniform(1.0, 90.0, 150)),
+        "target.radial_velocity": generator.uniform(-400.0, 400.0, 150),
+    }
+    ((_, shots),) = prepare(parameters)
+    leakage = held(shots)
+    assert np.nanmax(leakage) > 1e-2 and np.nanmin(leakage) < 1e-3  # of many sizes
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_leakage_of_near_targets_at_normal_incidence(table_4_1, phases):
+    """The strongest signals there are, with all sidelobes far above the noise, and a wide FFT."""
+    parameters = table_4_1(phases=phases, leakage_floor=1e-12, beamlets=109) | {
+        "target.range": np.array([0.01, 0.3, 2.0, 10.0, 35.0, 80.0])
+    }
+    ((_, shots),) = prepare(parameters)
+    held(shots)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("velocity", [0.0, 0.005, -0.02, 232.5, 232.497, -465.0])
+def test_leakage_of_beats_at_dc_at_nyquist_and_where_they_cancel(table_4_1, phases, velocity):
+    """232.5 m/s is Nyquist's Doppler shift; the ranges include those where beats meet DC."""
+    parameters = table_4_1(phases=phases, leakage_floor=1e-12, beamlets=19, fft_size=2**13)
+    meets = abs(velocity) * 2 / 1550e-9 / (2 / 299792458 * 2e12)
+    parameters |= {
+        "target.radial_velocity": velocity,
+        "target.range": np.array([0.02, 1.0, meets + 0.1, meets + 3.0, 22473.0, 22484.4]),
+    }
+    ((_, shots),) = prepare(parameters)
+    held(shots)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_leakage_of_two_surfaces_apart_in_range_and_velocity(table_4_1, phases):
+    generator = np.random.default_rng(8)
+    rows, beamlets = 60, 12
+    apart = np.where(np.arange(beamlets) % 2, generator.uniform(-0.05, 0.05, (rows, 1)), 0.0)
+    speeds = np.where(np.arange(beamlets) % 2, generator.uniform(-2e-8, 2e-8, (rows, 1)), 0.0)
+    offset = apart + generator.normal(0, 1e-5, (rows, beamlets))
+    echo = np.full((rows, beamlets), 1 / beamlets / np.pi)
+    echo[:, 1::2] *= 10 ** generator.uniform(-6, 0, (rows, 1))
+    footprints = Footprints(np.arange(rows), offset, speeds, echo)
+    parameters = table_4_1(phases=phases, leakage_floor=1e-12, fft_size=2**14, tnr=5.0) | {
+        "target.range": generator.uniform(50.0, 3000.0, rows)
+    }
+    held(prepare_footprints(parameters, footprints))
+
+
+def test_a_shot_leaks_the_same_whatever_its_company(table_4_1):
+    parameters = table_4_1(phases="incoherent", beamlets=19) | {
+        "target.range": np.linspace(5.0, 9000.0, 40),
+        "target.grazing_angle": np.radians(np.linspace(3.0, 90.0, 40)),
+    }
+    ((_, together),) = prepare(parameters)
+    whole = find(together)
+    for i in (0, 17, 39):
+        alone = {k: v[i : i + 1] if np.ndim(v) else v for k, v in parameters.items()}
+        ((_, single),) = prepare(alone)
+        assert find(single)[..., 0].tobytes() == np.ascontiguousarray(whole[..., i]).tobytes()
+
+
+@pytest.mark.parametrize("beta", [0.3, 2.0, 4.5, 6.55, 10.0, 25.0, 29.9])
+def test_added_crossings_have_their_digits(beta):
+    """(Q_1(a, b) - Q_1(0, b)) / (1 - Q_1(0, b)) against 40 digits, up to the threshold."""
+    y = beta**2 / 2
+    x = y * np.array([1e-30, 1e-12, 1e-6, 1e-3, 0.03, 0.1, 0.2, 0.35, 0.45])
+    series, out = np.zeros(MOST_TERMS), np.empty(32)
+    crossing_series(beta, series)
+    room = np.zeros(32)
+    room[: x.size] = x
+    added_crossings(room, x.size, beta, series, out)
+    with mpmath.workdps(40):
+        for value, got in zip(x, out, strict=False):
+            xm, ym = mpmath.mpf(value), mpmath.mpf(y)
+            term, below, total, n = mpmath.e ** (-xm), mpmath.e ** (-ym), mpmath.mpf(0), 0
+            power = below
+            poisson = below  # sum_{j<=n} e^-y y^j / j!
+            while n < 4000:
+                n += 1
+                term *= xm / n
+                power *= ym / n
+                poisson += power
+                total += term * (poisson - below)
+                if n > 20 and term < total * mpmath.mpf(10) ** -38:
+                    break
+            exact = total / (1 - below)
+            assert abs(got / float(exact) - 1) < 2e-14 + 3e-16 * y  # e^-y itself is good to y eps
+
+
+def test_many_small_chances_keep_their_digits():
+    chances = np.array([1e-300, 1e-20, 3e-17, 1e-9, 0.2, 0.0, 1e-16, 1e-12, 0.5])
+    with mpmath.workdps(60):
+        exact = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances)
+        assert any_crossing(chances, 0, chances.size) == pytest.approx(float(exact), rel=1e-15)
+        few = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances[:4])
+        assert any_crossing(chances, 0, 4) == pytest.approx(float(few), rel=1e-15)
+        for c in [*chances, 9.9e-5, 1.01e-4]:
+            assert silence(c) == pytest.approx(float(-mpmath.log(1 - mpmath.mpf(c))), rel=1e-15)
