@@ -80,7 +80,7 @@ class Accuracy(Part):
         float,
         Numeric(
             about="Bins with less leaked signal than so many noise sigmas count as noise alone, "
-            "where leakage is summed bin by bin: in draws, padded FFTs, windows without closed form",
+            "where bins are taken one by one: in draws, padded FFTs, tabulated windows",
             example="0.1",
             above="0",
             at_most="1000",
