@@ -14,7 +14,6 @@ import math
 
 from numba import njit
 
-from sweep.model.equivalent import FAST
 from sweep.model.marcum import excess_crossing
 
 STRETCH = 24
@@ -88,7 +87,7 @@ def added_crossings(x, count, beta, series, out):
         _polynomial(x[first:last], 1.0 / y, series, terms, scale, halvings, out[first:last])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST | {"nnan"})
+@njit(cache=True, error_model="numpy", fastmath={"nnan"})
 def largest(x):
     """Largest of some numbers, at least 0."""
     most = 0.0
@@ -97,7 +96,7 @@ def largest(x):
     return most
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _polynomial(x, inverse, series, terms, scale, halvings, out):
     """e^-x sum d_n (x inverse)^n, n = 1 .. terms; e^-x as a power of e^(-x scale)."""
     for i in range(x.size):
@@ -148,7 +147,7 @@ def silence(chance):
     return -math.log1p(-chance)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def weighted_silence(chances, weights):
     """Sum of the weighted -ln(1 - chance)."""
     total = 0.0

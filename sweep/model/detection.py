@@ -12,7 +12,6 @@ from sweep.model.crossings import (
     any_crossing,
     crossing_series,
 )
-from sweep.model.equivalent import FAST
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 """Standard deviation of |X| in a noise-only bin, in units of sigma (per quadrature)."""
@@ -70,7 +69,7 @@ def mark(magnitude, count, level, exempt):
     return peak, exempted
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST | {"nnan"})
+@njit(cache=True, error_model="numpy", fastmath={"nnan"})
 def _survey(magnitude, level):
     """Largest magnitude, and how many reach a level."""
     largest, above = magnitude[0], 0

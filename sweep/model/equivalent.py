@@ -12,9 +12,6 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Liberties that let reductions vectorise; nan and infinity keep their meaning."""
-
 AMPLITUDE_TOLERANCE = 1e-13
 """Error of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
 
@@ -85,7 +82,7 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
     """Moves n weights within ``middle`` +- ``half`` onto Chebyshev nodes there, if they are fewer.
 

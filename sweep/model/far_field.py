@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.elementary import sincos_cycles
-from sweep.model.equivalent import FAST, put_on_nodes
+from sweep.model.equivalent import put_on_nodes
 from sweep.model.spectrum import fraction
 
 CLEARANCE = 9
@@ -56,7 +56,7 @@ for _n in range(1, _LARGEST_ORDER + 1):
     _GAUSS[:, _n, :_n] = np.polynomial.legendre.leggauss(_n)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST | {"nnan"})
+@njit(cache=True, error_model="numpy", fastmath={"nnan"})
 def strengths(delta, re, im, n, power, sines):
     """Turns C_b of n lines into C_b sin(pi delta_b), |C_b|^2 into |C_b|^2 sin^2(pi delta_b).
 
@@ -91,14 +91,14 @@ def strengths(delta, re, im, n, power, sines):
     return total, lowest, highest
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _tangent(z, square):
     """tan(pi z / N) N / pi for small angles, ``square`` (pi / N)^2."""
     w = square * z * z
     return z * (1.0 + w * (1.0 / 3.0 + w * (2.0 / 15.0 + w * (17.0 / 315.0))))
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _kernel(q, delta, coefficients, square):
     """K pi / N at q - delta bins: c_0 cot + sum (-1)^m c_m / 2 (cot + cot, m bins off each side).
 
@@ -117,7 +117,7 @@ def _kernel(q, delta, coefficients, square):
     return above / below
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _add_tile(first, delta, re, im, n, image, fft_size, coefficients, power, out_re, out_im):
     """Adds the kernels of n lines, or images, to the bins of one tile."""
     square = (math.pi / fft_size) ** 2
@@ -263,7 +263,7 @@ def _two_sources(delta, re, im, n, middle, half, out):
     return 2
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def add_far_field(t, sources, number, numerator, poles, power, out_re, out_im):
     """Adds the kernels of sources, or of images, at points; t is tan(pi q / N) there."""
     for j in range(number):
@@ -279,7 +279,7 @@ def add_far_field(t, sources, number, numerator, poles, power, out_re, out_im):
                 out_im[i] += b * k
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def edge_field(strength, n, edge, power):
     """What the window's first sample adds to every bin, of lines and images: real.
 
@@ -339,7 +339,7 @@ def far_points(side, near, far, steepness, v, weight, first):
     return first
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def points_to_bins(v, weight, fft_size):
     """Turns cotangents and weights into tangents and weights [bins]."""
     scale = fft_size / math.pi

@@ -20,7 +20,6 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
-from sweep.model.equivalent import FAST
 from sweep.model.far_field import CLEARANCE, add_far_field, add_near_field
 from sweep.model.spectrum import set_tangents
 
@@ -135,7 +134,7 @@ def _near_bins(origin, lowest, highest, kernel):
     return (low, high), min(below, above) < clearance
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _sum_afar(re, im, n, total, spread, poles):
     """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
 

@@ -23,7 +23,6 @@ import numpy as np
 from numba import njit
 
 from sweep.model.elementary import sincos_cycles
-from sweep.model.equivalent import FAST
 from sweep.model.window import OVERSAMPLING
 
 _TABLE_PAD = 8
@@ -71,7 +70,7 @@ def _table_kernel(y, table):
         return table[start + 4]
     top, bottom, weight = 0.0, 0.0, 1.0
     for j in range(10):
-        term = weight / (t + 4.0 - j)
+        term = weight / (t + (4.0 - j))  # t alone where j is 4, however small
         top += term * table[start + j]
         bottom += term
         weight *= (j - 9.0) / (j + 1.0)
@@ -122,7 +121,7 @@ def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, powe
                 out_im[i] += parity * (b * real + a * imaginary)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def fraction(tangent, offset, numerator, poles):
     """K at tan(a + b), given the two tangents, as one fraction (one division)."""
     n = tangent + offset
@@ -138,7 +137,7 @@ def fraction(tangent, offset, numerator, poles):
     return d * top / bottom
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _add_far(
     first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge, power,
     t, sine_q, cosine_q, out_re, out_im,

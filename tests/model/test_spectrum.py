@@ -297,3 +297,15 @@ def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
                 # Line and image are each below the level.
                 both = np.sqrt(2) if phases == "incoherent" else 2.0
                 assert left_out.size == 0 or left_out.max() < both * level
+
+
+@pytest.mark.parametrize("delta", [0.0, 1e-300, 1e-18, 4e-16, -1e-17, 1e-12])
+def test_a_tabulated_window_has_its_height_beside_the_line(table_4_1, delta):
+    """A Doppler line within rounding of DC, in windows without a closed form."""
+    parameters = table_4_1(window="kaiser(8.6)", fft_size=2**10, beamlets=1)
+    parameters["target.radial_velocity"] = delta * 600e6 / 2**10 * 1550e-9 / 2
+    ((_, shots),) = prepare(parameters)
+    _, magnitude = segment_spectrum(shots, 0, 1)
+    rest = prepare(parameters | {"target.radial_velocity": 1e-9})
+    ((_, near),) = rest
+    np.testing.assert_allclose(magnitude, segment_spectrum(near, 0, 1)[1], rtol=1e-4, atol=1e-18)
