@@ -1,0 +1,288 @@
+"""How far the lines of a footprint lie apart, and what their spread can do to the largest bin.
+
+Beamlet b of power share p_b has its line X_b bins off the beam's axis; as powers they make
+
+    P_k = sum_b p_b F(k - x_0 - X_b)
+
+in bin k. With the mean m and the rms s of X, added to lines of rms S, Taylor's series says
+
+    |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s,
+
+F1, F2 bounds on |F'| and |F''| (:mod:`sweep.model.effects.lobes`), c what the receiver's poles
+make of a bin's difference in frequency. Wide spreads have another bound: by Chebyshev's
+inequality a share 1 - 1/t^2 of the power lies within t s, hence its energy in the 2 t s + 2 m + 1
+bins around, of which the largest holds the mean at least; and no footprint's largest bin holds
+less than its strongest beamlet's line. No bin holds more than all power on the lobe's peak.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.change import Change
+from sweep.model.effects.lobes import Lobe, lobe
+from sweep.model.footprint import beamlets
+from sweep.model.preparation import Shots
+
+SIGNS = (1.0, 0.0, -1.0)
+_CHEBYSHEV = (1.4, 1.8, 2.5, 4.0, 8.0)
+_NEAR_EDGE = 8.0
+"""Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
+
+
+class Line(NamedTuple):
+    """The line on the beam's axis in one segment, (n,) each."""
+
+    bin_offset: np.ndarray
+    """Distance from the nearest bin [bins], 0..1/2."""
+    edge: np.ndarray
+    """Distance of the folded line from the nearer of DC and Nyquist [bins], >= 0."""
+    transfer: np.ndarray
+    """|H| at the line over that at DC, 0..1."""
+    tilt: np.ndarray
+    """Bound c on the relative change of |H|^2 a bin, near the line [1/bin]."""
+    lobe: Lobe
+
+
+class Moments(NamedTuple):
+    """Bounds on the lines' offsets from the axis [bins], weighted by echo power, (n,) each."""
+
+    mean: np.ndarray | float
+    rms: np.ndarray | float
+    extreme: np.ndarray | float
+
+    def scaled(self, factor: ArrayLike) -> "Moments":
+        """Offsets in another unit."""
+        return Moments(*(np.multiply(value, factor) for value in self))
+
+
+NO_SPREAD = Moments(0.0, 0.0, 0.0)
+
+
+def axis_line(
+    segment: int,
+    *,
+    name: str,
+    length: int,
+    fft_size: int,
+    range: ArrayLike,
+    beta: ArrayLike,
+    chirp_rate: ArrayLike,
+    carrier: ArrayLike,
+    sample_rate: ArrayLike,
+    detector_bandwidth: ArrayLike,
+    amplifier_bandwidth: ArrayLike,
+) -> Line:
+    """The axis's line in a segment (0 up, 1 Doppler, 2 down), as in :mod:`sweep.model.lines`."""
+    rate = SIGNS[segment] * np.asarray(chirp_rate, float) * (2 / SPEED_OF_LIGHT)
+    beta, width = np.asarray(beta, float), np.asarray(sample_rate, float) / fft_size
+    frequency = np.asarray(carrier) * beta - rate * (1 + beta) * np.asarray(range, float)
+    one, two = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
+    transfer = 1 / (np.hypot(1, frequency / one) * np.hypot(1, frequency / two))
+    position = frequency / width
+    folded = abs(position - fft_size * np.rint(position / fft_size))
+    return Line(
+        bin_offset=np.asarray(abs(folded - np.rint(folded))),
+        edge=np.asarray(np.minimum(folded, fft_size / 2 - folded)),
+        transfer=np.asarray(transfer),
+        tilt=np.asarray((1 / one + 1 / two) * width),
+        lobe=lobe(name, length, fft_size),
+    )
+
+
+def line_of(shots: Shots, segment: int) -> Line:
+    """The axis's line of prepared points; what they do not share in it is scalars a point."""
+    return axis_line(
+        segment,
+        name=shots.window.name,
+        length=shots.window.length,
+        fft_size=shots.fft_size,
+        range=shots.range,
+        beta=shots.beta,
+        chirp_rate=shots.chirp_rate,
+        carrier=shots.carriers[segment],
+        sample_rate=shots.sample_rate,
+        detector_bandwidth=shots.detector_bandwidth,
+        amplifier_bandwidth=shots.amplifier_bandwidth,
+    )
+
+
+def axis_amplitude(shots: Shots, segment: int) -> np.ndarray:
+    """Magnitude of the largest bin, over sigma, had the axis's line all power and no image, (n,).
+
+    What the bounds of all effects on the lines start from.
+    """
+    line, echo = line_of(shots, segment), shots.amplitude
+    together = echo.sum(axis=1) if shots.architecture == "direct" else np.sqrt((echo**2).sum(1))
+    peak = 0.5 * shots.beat_scale * together[shots.row] * shots.window.sum
+    return np.asarray(peak * line.transfer * line.lobe.least(line.bin_offset) / shots.bin_deviation)
+
+
+def plane_range_moments(
+    *, grazing_angle: ArrayLike, beam_divergence: ArrayLike, number: int, pattern: str
+) -> Moments:
+    """Bounds on (R_b - R_0)/R_0 of a beam on a plane, weighted by echo power.
+
+    With u the angle along the slope times cot(grazing), (1 + d)/(1 + u) is R_b/R_0, and the
+    echo's weight (1 + u)^m, m <= 3 (Lambert). The pattern has exactly the beam's covariance, so
+    that u has the rms q = (divergence/4) cot(grazing); the rest bounds Taylor's remainders.
+    Infinite where a beamlet may pass over the horizon.
+    """
+    if number == 1:
+        return NO_SPREAD
+    radius = _radius(number, pattern)
+    sigma = np.asarray(beam_divergence, float) / 4
+    rms = sigma / np.tan(np.asarray(grazing_angle, float))
+    widest, bulge = radius * rms, (radius * sigma) ** 2 / 2
+    inside = np.where(widest < 1, 1 - widest, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        heavier = (1 + widest) ** 3 * np.exp(6 * bulge)
+        lean = 3 * rms**2 * (1 + widest) ** 2 * np.exp(6 * bulge) + 6 * rms * bulge
+        mean = lean + (rms**2 + sigma**2) * heavier / inside
+        far = (rms + sigma * np.sqrt(bulge)) * np.sqrt(heavier) / inside
+        extreme = (widest + bulge) / inside
+    bounds = (np.where(inside > 0, value, np.inf) for value in (mean, far, extreme))
+    return Moments(*(np.asarray(value) for value in bounds))
+
+
+def plane_velocity_moments(
+    *,
+    across: ArrayLike,
+    along: ArrayLike,
+    grazing_angle: ArrayLike,
+    beam_divergence: ArrayLike,
+    number: int,
+    pattern: str,
+) -> Moments:
+    """Bounds on the beamlets' radial velocities less the axis's [m/s], at a velocity off the beam.
+
+    A beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1), |d|^2 = 1 + x^2; its
+    weight is that of :func:`plane_range_moments`.
+    """
+    if number == 1:
+        return NO_SPREAD
+    radius = _radius(number, pattern)
+    sigma = np.asarray(beam_divergence, float) / 4
+    slope = sigma / np.tan(np.asarray(grazing_angle, float))
+    widest = np.minimum(radius * slope, 1.0)
+    bulge = (radius * sigma) ** 2 / 2
+    across, along = np.abs(across), np.abs(along)
+    heavier = (1 + widest) ** 3 * np.exp(6 * bulge)
+    lean = sigma * (3 * slope * heavier + 8 * radius * bulge)
+    return Moments(
+        np.asarray(across * lean + along * sigma**2 * heavier),
+        np.asarray((across * sigma + along * sigma * np.sqrt(bulge)) * np.sqrt(heavier)),
+        np.asarray(across * radius * sigma + along * bulge),
+    )
+
+
+def _radius(number: int, pattern: str) -> float:
+    """Largest angle of a beamlet off the axis, in standard deviations."""
+    points, _ = beamlets(number, pattern)
+    return float(np.sqrt((points**2).sum(axis=0)).max())
+
+
+def range_to_bins(
+    *, range: ArrayLike, beta: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
+) -> np.ndarray:
+    """Bins of a chirped segment for a relative difference of range of 1; 0 in the Doppler's."""
+    slope = 2 / SPEED_OF_LIGHT * np.asarray(chirp_rate, float) * (1 + np.abs(beta))
+    return np.asarray(slope * np.asarray(range, float) / np.asarray(bin_width))
+
+
+def velocity_to_bins(
+    *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
+) -> np.ndarray:
+    """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta stretches."""
+    beat = np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)
+    return np.asarray((2 / SPEED_OF_LIGHT) * (np.asarray(carrier) + beat) / np.asarray(bin_width))
+
+
+def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest power of the largest bin, over that of all lines on a bin.
+
+    ``spread`` is that of the lines in it; images are in it.
+    """
+    mean, rms, extreme = (np.asarray(value, float) for value in spread)
+    f = line.lobe
+    double = image_factor(line, extreme)
+    on_axis = f.least(line.bin_offset) ** 2
+    with np.errstate(invalid="ignore"):
+        second = 0.5 * f.curvature * rms**2
+        slant = np.minimum(f.slope, f.curvature * line.bin_offset)
+        least = on_axis - slant * mean - second - line.tilt * rms
+        uphill = np.exp(np.minimum(line.tilt * extreme, 50.0))
+        most = np.where(rms > 0, f.most(line.bin_offset) ** 2, on_axis)
+        most = most + f.slope * mean + second
+        most = (
+            double
+            * np.fmin(most, f.most(np.asarray(0.0)) ** 2)
+            * (1 + uphill * np.fmin(line.tilt * rms, 50.0))
+        )
+    least = np.fmax(least, np.exp(-line.tilt * extreme) * f.least(np.asarray(0.5)) ** 2 / beamlets)
+    for t in _CHEBYSHEV:
+        wide = t * rms
+        mean_bin = (1 - 1 / t**2) * f.energy / (2 * wide + 2 * f.margin + 1)
+        least = np.fmax(least, mean_bin * np.exp(-line.tilt * wide))
+    return np.asarray(np.minimum(least, most)), np.asarray(most)
+
+
+def image_factor(line: Line, extreme: ArrayLike) -> np.ndarray:
+    """How much larger images can make powers: 2 near DC and Nyquist."""
+    apart = (line.edge - np.asarray(extreme)) / line.lobe.margin
+    return np.where(2 * apart > _NEAR_EDGE, 1.01, 2.0)
+
+
+def spread_change(line: Line, added: Moments, present: Moments, beamlets: int) -> Change:
+    """What spreading lines further can change in the largest bin's magnitude, as powers.
+
+    Parameters
+    ----------
+    line : Line
+        The axis's.
+    added, present : Moments
+        Of the offsets that the effect adds, and of those that there are without it.
+    beamlets : int
+        Lines at the most.
+    """
+    return moved_change(line, line, 0.0, added, present, beamlets)
+
+
+def moved_change(
+    moved: Line,
+    still: Line,
+    shift: ArrayLike,
+    added: Moments,
+    present: Moments,
+    beamlets: int,
+) -> Change:
+    """What moving the axis's line by a known shift, and spreading lines further, can change.
+
+    Parameters
+    ----------
+    moved, still : Line
+        The axis's, with the effect and without.
+    shift : array_like
+        Bins from one to the other, unfolded, >= 0.
+    added, present, beamlets
+        As for :func:`spread_change`.
+    """
+    shift = np.asarray(shift, float)
+    mean, rms, extreme = (np.asarray(value, float) for value in added)
+    f, wide = still.lobe, np.asarray(present.extreme) + extreme
+    together = Moments(present.mean + mean, present.rms + rms, wide)
+    with_least, with_most = power_range(moved, together, beamlets)
+    least, most = power_range(still, present, beamlets)
+    double = np.maximum(image_factor(still, wide + shift), 1.05)
+    with np.errstate(invalid="ignore", over="ignore"):
+        uphill = np.exp(np.minimum(still.tilt * (wide + shift), 50.0))
+        change = f.slope * (mean + shift) + f.curvature * (present.rms * rms + rms**2 / 2)
+        change = double * uphill * (change + still.tilt * (rms + shift)) / least
+    change = np.where(np.isnan(change), np.inf, change)
+    gain = np.asarray(moved.transfer / still.transfer) ** 2
+    low = np.maximum(1 - change, gain * with_least / most)
+    high = np.minimum(1 + change, gain * with_most / least)
+    same = (extreme == 0) & (shift == 0)
+    return Change(signal=(np.sqrt(np.where(same, 1.0, low)), np.sqrt(np.where(same, 1.0, high))))

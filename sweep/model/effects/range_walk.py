@@ -1,0 +1,91 @@
+"""Range walk: the target moves while the chirp runs, and the beat drifts.
+
+With tau(t) = tau_0 - beta t, beta = 2 v_r / c, the beat's phase (PHYSICS section 2) has, besides
+the terms up to t that make the line, exactly
+
+    psi(t) = s S beta (1 + beta / 2) t^2    [cycles]
+
+a frequency drift of 2 s S (2 v_r / c) over time, of opposite sign in up and down chirp, none in
+the Doppler segment. Time runs from the segment's start: the line moves by the drift up to the
+middle of the record and spreads over what drifts within it.
+"""
+
+import numpy as np
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.change import Change
+from sweep.model.effects.phase_bounds import phase_change
+from sweep.model.window import Window
+
+
+def phase(
+    x: np.ndarray,
+    *,
+    sign: int,
+    chirp_rate: np.ndarray,
+    radial_velocity: np.ndarray,
+    start: np.ndarray,
+    duration: np.ndarray,
+) -> np.ndarray:
+    """Phase [cycles] that the terms in t^2 add to the line's, (n, m).
+
+    Parameters
+    ----------
+    x : (m,) ndarray
+        Places in the record, -1 at its first sample, 1 one sample past its last.
+    sign : int
+        Sign of the chirp: +1 up, 0 Doppler, -1 down.
+    chirp_rate, radial_velocity : (n,) ndarray
+        Chirp rate B/T [Hz/s]; radial velocity at the segment's start [m/s], positive closing.
+    start, duration : (n,) ndarray
+        Acquisition delay t_0 and length L/fs of the record [s].
+    """
+    beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
+    drift = sign * chirp_rate * beta * (1 + beta / 2)
+    return np.atleast_1d(drift)[:, None] * record_times(x, start=start, duration=duration) ** 2
+
+
+def record_times(x: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
+    """Time since the segment's start [s] at places x of the record, (n, m)."""
+    start, duration = np.atleast_1d(start), np.atleast_1d(duration)
+    return start[:, None] + duration[:, None] * (np.asarray(x) + 1) / 2
+
+
+def drift_bins(
+    *,
+    sign: int,
+    chirp_rate: np.ndarray,
+    radial_velocity: np.ndarray,
+    duration: np.ndarray,
+) -> np.ndarray:
+    """Bins of fs/L over which the beat drifts within the record, (n,), signed."""
+    beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
+    return 2 * sign * chirp_rate * beta * (1 + beta / 2) * np.asarray(duration) ** 2
+
+
+def bound(
+    *,
+    sign: int,
+    chirp_rate: np.ndarray,
+    radial_velocity: np.ndarray,
+    start: np.ndarray,
+    duration: np.ndarray,
+    window: Window,
+    concentration: np.ndarray | None = None,
+) -> Change:
+    """What leaving range walk out can change of a segment's detecting bin.
+
+    Parameters as of :func:`phase` and :func:`sweep.model.effects.phase_bounds.phase_change`.
+    """
+    return phase_change(
+        lambda x: phase(
+            x,
+            sign=sign,
+            chirp_rate=chirp_rate,
+            radial_velocity=radial_velocity,
+            start=start,
+            duration=duration,
+        ),
+        window=window,
+        concentration=concentration,
+    )

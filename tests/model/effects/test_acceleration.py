@@ -1,0 +1,89 @@
+"""Radial acceleration: its phase against the exact delay, its drift, its bound."""
+
+import mpmath
+import numpy as np
+import pytest
+from phase_error_checks import check_bound, peak_ratio
+
+from sweep.model.effects import acceleration
+from sweep.model.effects.line_splitting import split_lines
+from sweep.model.window import window
+
+LIGHT = mpmath.mpf(299792458)
+
+
+def exact_phase(t, *, sign, carrier, chirp_rate, range, radial_velocity, acceleration):
+    """Beat phase [cycles] of the delayed wave less the local oscillator's, in 40 digits."""
+    with mpmath.workdps(40):
+        t = mpmath.mpf(t)
+        distance = range - radial_velocity * t - mpmath.mpf(acceleration) * t * t / 2
+        delay = 2 * distance / LIGHT
+        emitted = lambda at: carrier * at + sign * mpmath.mpf(chirp_rate) * at * at / 2  # noqa: E731
+        return emitted(t - delay) - emitted(t)
+
+
+@pytest.mark.parametrize("sign", [-1, 0, 1])
+@pytest.mark.parametrize("a", [-9.81, 300.0, 1e5])
+def test_the_phase_is_what_acceleration_adds_to_the_delays_own(sign, a):
+    scene = {
+        "sign": sign, "carrier": 1.934e14, "chirp_rate": 2e12, "range": 3500.0,
+        "radial_velocity": -120.0,
+    }  # fmt: skip
+    x = np.linspace(-1, 1, 9)
+    start, duration = 4e-5, 4e-4
+    found = acceleration.phase(
+        x, **{k: np.array([v]) if k != "sign" else v for k, v in scene.items()},
+        acceleration=np.array([a]), start=np.array([start]), duration=np.array([duration]),
+    )[0]  # fmt: skip
+    times = [start + duration * (v + 1) / 2 for v in x]
+    expected = [
+        float(exact_phase(t, **scene, acceleration=a) - exact_phase(t, **scene, acceleration=0))
+        for t in times
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_the_doppler_segment_drifts_by_two_a_over_lambda():
+    wavelength, duration, a = 1550e-9, 2e-3, 250.0
+    carrier = 299792458 / wavelength
+    expected = 2 * a / wavelength * duration**2
+    found = acceleration.drift_bins(carrier=carrier, acceleration=a, duration=duration)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    phase = acceleration.phase(
+        np.array([-1.0, 0.0, 1.0]), sign=0, carrier=carrier, chirp_rate=1e12, range=1e3,
+        radial_velocity=50.0, acceleration=a, start=0.0, duration=duration,
+    )[0]  # fmt: skip
+    np.testing.assert_allclose(4 * np.diff(phase, 2), expected, rtol=1e-9)
+
+
+def scenes(n, rng, sign):
+    return {
+        "sign": sign,
+        "carrier": 1.934e14,
+        "chirp_rate": 2e12,
+        "range": 10 ** rng.uniform(0, 4, n),
+        "radial_velocity": rng.uniform(-200, 200, n),
+        "acceleration": 10 ** rng.uniform(-2, 3, n) * rng.choice([-1, 1], n),
+        "start": rng.uniform(0, 1e-4, n),
+        "duration": 10 ** rng.uniform(-4, -3.3, n),
+    }
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "flattop", "kaiser(8.6)"])
+def test_the_bound_holds_and_is_not_idle(name):
+    rng = np.random.default_rng(21)
+    idle = []
+    for sign in (-1, 0, 1):
+        scene, bins = scenes(120, rng, sign), 200 + rng.uniform(-0.5, 0.5, 120)
+        ratio = peak_ratio(lambda x, s=scene: acceleration.phase(x, **s), name, 512, bins)
+        idle.append(check_bound(acceleration.bound(window=window(name, 512), **scene), ratio))
+    assert np.median(np.concatenate(idle)) < 30
+
+
+def test_its_lines_are_its_phase():
+    scene = scenes(40, np.random.default_rng(22), 1)
+    scene["acceleration"] = scene["acceleration"] / 10
+    split = split_lines(lambda x: acceleration.phase(x, **scene))
+    x = np.linspace(-1, 1, 301)
+    found = (split.weight[:, :, None] * np.exp(1j * np.pi * split.offset[:, :, None] * x)).sum(1)
+    assert np.abs(found - np.exp(2j * np.pi * acceleration.phase(x, **scene))).max() < 2e-9

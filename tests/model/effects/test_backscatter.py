@@ -1,0 +1,124 @@
+"""Light from the air along the beam: closed forms, another quadrature, the bound's bracket."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import exp1
+
+from sweep.model.effects.backscatter import bound, power, power_bounds
+from sweep.model.effects.extinction import PROFILES, Profile, exponential, layer, optical_depth
+
+BEAM = {
+    "laser_power": 1.0, "aperture": 25e-3, "optical_efficiency": 0.8, "beam_divergence": 50e-6,
+    "lidar_ratio": 50.0,
+}  # fmt: skip
+AREA = np.pi * 0.0125**2
+NEAR = 500.0
+"""Aperture over divergence [m]."""
+
+
+def even(extinction):
+    return layer(optical_depth=extinction * 1e5, depth=1e5)
+
+
+@pytest.mark.parametrize(
+    "extinction, length",
+    [(1e-6, 1.0), (1e-6, 1e5), (4e-5, 300.0), (4e-5, 1e4), (1e-3, 300.0), (1e-3, 1e4), (2e-2, 1e3)],
+)
+def test_even_air_has_the_closed_form_of_exponential_integrals(extinction, length):
+    """Im[e^(-2i a z) (E1(-2i a z) - E1(2 a (R - i z)))] / z, by 1/(r^2 + z^2) = Im[1/(r - iz)] / z.
+
+    Optical depths to 20, one way.
+    """
+    a, z = extinction, NEAR
+    integral = np.exp(-2j * a * z) * (exp1(-2j * a * z) - exp1(2 * a * (length - 1j * z)))
+    expected = 0.8 * AREA * a / 50 * integral.imag / z
+    found = power(even(a), start_height=7.0, end_height=7.0, range=length, **BEAM)
+    assert found == pytest.approx(expected, rel=1e-8)
+
+
+def test_clear_air_by_hand():
+    """atan(R/r_0)/r_0 of a medium that dims nothing: from r_0 = 500 m, half of it from beyond.
+
+    1e-6/m, 50 sr: 0.8 * 4.9087e-4 m^2 * 2e-8 /m/sr * (pi/4) / 500 m = 1.2337e-14 W up to 500 m.
+    """
+    near = power(even(1e-6), start_height=7.0, end_height=7.0, range=500.0, **BEAM)
+    assert near == pytest.approx(1.2337e-14, rel=1e-3)
+    far = power(even(1e-6), start_height=7.0, end_height=7.0, range=np.array([1e4, 1e5]), **BEAM)
+    np.testing.assert_allclose(far / near, [1.937, 1.992], rtol=0.05)
+
+
+def test_diffraction_limited_overlap_is_that_of_the_coherent_lidar():
+    """r_0 = pi D^2 / (4 lambda): the nearest air gives 1/r_0^2, whatever its distance."""
+    divergence = 4 * 1.55e-6 / (np.pi * 25e-3)
+    beam = BEAM | {"beam_divergence": divergence}
+    found = power(even(1e-6), start_height=7.0, end_height=7.0, range=1.0, **beam)
+    limit = np.pi * 25e-3**2 / (4 * 1.55e-6)
+    assert limit == pytest.approx(316.7, rel=1e-3)
+    assert found == pytest.approx(0.8 * AREA * 2e-8 / limit**2, rel=1e-4)
+
+
+def scenes(number=150):
+    rng = np.random.default_rng(6)
+    drawn = [
+        *PROFILES.values(),
+        layer(optical_depth=2.0, depth=40.0),
+        exponential(surface_extinction=1e-3, scale_height=50.0),
+        Profile((0.0, 200.0, 200.0, 350.0), (1e-5, 1e-5, 2e-3, 1e-3)),
+    ]
+    for _ in range(number):
+        profile = drawn[rng.integers(len(drawn))]
+        start, end = 10 ** rng.uniform(0, 4, 2) * (rng.random(2) > 0.3)
+        length = abs(end - start) * rng.uniform(1, 5) + rng.uniform(1, 2000)
+        yield profile, start, end, length
+
+
+def test_slant_paths_agree_with_adaptive_quadrature_over_range():
+    for profile, start, end, length in scenes(40):
+
+        def local(r, profile=profile, start=start, end=end, length=length):
+            h = start + (end - start) * r / length
+            depth = optical_depth(profile, start_height=start, end_height=h, range=r)
+            slope = optical_depth(profile, start_height=h, end_height=h, range=1.0)
+            return float(slope * np.exp(-2 * depth) / (r * r + NEAR**2))
+
+        rise = end - start
+        at = [(h - start) / rise * length for h in profile.height] if rise else []
+        breaks = sorted(r for r in (*at, *np.geomspace(1, 1e4, 13)) if 0 < r < length)
+        total, error = quad(
+            local, 0, length, points=breaks or None, limit=400, epsabs=0, epsrel=1e-9
+        )
+        found = power(profile, start_height=start, end_height=end, range=length, **BEAM)
+        expected = 0.8 * AREA / 50 * total
+        assert found == pytest.approx(expected, rel=1e-8, abs=2 * 0.8 * AREA / 50 * error)
+
+
+def test_the_bracket_holds_and_is_narrow():
+    spans = []
+    for profile, start, end, length in scenes():
+        path = {"start_height": start, "end_height": end, "range": length}
+        true = power(profile, **path, **BEAM)
+        least, largest = power_bounds(profile, **path, **BEAM)
+        assert least <= true * (1 + 1e-9) + 1e-30
+        assert true <= largest * (1 + 1e-9) + 1e-30
+        if true > 1e-25:
+            spans.append(largest / true)
+    assert np.median(spans) < 1.5 and np.max(spans) < 20
+
+
+def test_the_change_is_shot_noise_of_that_light():
+    """4e-12 W beside 1 mW whose shot noise is 0.917 of the whole."""
+    profile = PROFILES["earth_haze"]
+    path = {"start_height": 0.0, "end_height": np.array([0.0, 300.0]), "range": 2000.0}
+    true = power(profile, **path, **BEAM)
+    change = bound(
+        backscattered_power=power_bounds(profile, **path, **BEAM), apd_gain=2.0,
+        excess_noise_factor=3.0, responsivity=1.1, electrical_bandwidth=400e6,
+        noise_variance=12 * 1.53715e-13,
+    )  # fmt: skip
+    share = 0.91723 * true / 1e-3
+    assert np.all(true > 1e-12) and np.all(true < 1e-11)
+    for factor, side in zip(change.noise, (-1, 1), strict=True):
+        assert np.all(side * (factor - 1 - share) >= 0)
+        np.testing.assert_allclose(factor - 1, share, rtol=0.5)
+    assert change.threshold_follows and change.signal == (1.0, 1.0)

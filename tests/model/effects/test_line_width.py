@@ -1,0 +1,221 @@
+"""Line width: mean bin powers against simulated records, lags and limits; bounds."""
+
+import numpy as np
+import pytest
+
+from sweep.model.effects import line_width
+from sweep.model.window import samples, transform, window
+
+WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
+LENGTH = 256
+BINS = np.arange(60, 91)
+PLACE = 75.3
+RATE = 1e6
+DURATION = LENGTH / RATE
+
+
+def by_lags(name, y, correlation):
+    """Mean |W|^2-like power at y bins from the line, from the beat's autocorrelation at lags."""
+    w = samples(name, LENGTH)
+    r = np.correlate(w, w, "full")[LENGTH - 1 :]
+    j = np.arange(1, LENGTH)
+    turns = np.cos(2 * np.pi * np.outer(y, j) / LENGTH)
+    return r[0] * correlation[0] + 2 * turns @ (r[1:] * correlation[1:])
+
+
+def assert_mean_power(records, name, bins, expected):
+    """Mean |X|^2 of complex records (m, LENGTH) at bins is the expected one, to 5 sigma."""
+    w = samples(name, LENGTH)
+    power = np.abs(np.fft.fft(records * w, axis=1)[:, bins]) ** 2
+    error = power.std(axis=0, ddof=1) / np.sqrt(len(power))
+    assert (np.abs(power.mean(axis=0) - expected) < 5 * error + 1e-12 * w.sum() ** 2).all()
+    return error / expected
+
+
+def gaussian_power(name, y, fwhm):
+    """The module's mean power of a single line, from its shifts."""
+    shifts = line_width.gaussian_shifts(fwhm=np.array([fwhm]), duration=np.array([DURATION]))
+    form = window(name, LENGTH)
+    each = np.abs(transform(form, (y[:, None] - shifts.offset[0]).ravel())) ** 2
+    return each.reshape(y.size, -1) @ shifts.weight[0]
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hamming"])
+@pytest.mark.parametrize("bins_fwhm", [0.3, 1.5, 6.0])
+def test_records_of_normal_frequencies_have_the_gaussian_lines_mean_power(name, bins_fwhm):
+    rng = np.random.default_rng(41)
+    # FWHM is where the density has fallen to a half.
+    deviation = bins_fwhm / 2 / np.sqrt(2 * np.log(2))
+    shift = PLACE + deviation * rng.standard_normal((20000, 1))
+    records = np.exp(2j * np.pi * shift * np.arange(LENGTH) / LENGTH)
+    # Further out the mean is made by lines so rare that their spread can not be estimated.
+    bins = BINS[np.abs(BINS - PLACE) < 2.5 * deviation + 2]
+    expected = gaussian_power(name, bins - PLACE, bins_fwhm / DURATION)
+    relative = assert_mean_power(records, name, bins, expected)
+    assert relative[np.argmax(expected)] < 0.03  # sharp enough to tell an FWHM from a deviation
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.parametrize("bins_fwhm", [0.0, 1e-4, 0.1, 1.0, 7.0, 40.0])
+def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm):
+    """By lags the convolution is a product: exp(-2 pi^2 s^2 T^2)."""
+    y = np.linspace(-60, 60, 61) + 0.2
+    deviation = bins_fwhm / np.sqrt(8 * np.log(2))
+    lag = np.arange(LENGTH) / LENGTH
+    expected = by_lags(name, y, np.exp(-2 * (np.pi * deviation * lag) ** 2))
+    found = gaussian_power(name, y, bins_fwhm / DURATION)
+    top = samples(name, LENGTH).sum() ** 2
+    assert np.abs(found - expected).max() < 10 * line_width.TOLERANCE * top
+
+
+def test_shifts_of_many_points_are_those_of_each():
+    fwhm = np.array([0.0, 3.0, 20.0]) / DURATION
+    together = line_width.gaussian_shifts(fwhm=fwhm, duration=DURATION)
+    assert (together.weight >= 0).all()
+    np.testing.assert_allclose(together.weight.sum(axis=1), 1)
+    variance = (together.weight * together.offset**2).sum(axis=1)
+    np.testing.assert_allclose(variance, np.array([0.0, 9.0, 400.0]) / (8 * np.log(2)), rtol=1e-9)
+
+
+def wiener_records(rng, number, laser_width, delay):
+    """Beats of a laser whose phase walks randomly, with itself ``delay`` samples before."""
+    steps = rng.standard_normal((number, LENGTH + delay)) * np.sqrt(2 * np.pi * laser_width / RATE)
+    walk = np.cumsum(steps, axis=1)
+    beat = walk[:, :LENGTH] - walk[:, delay:]
+    return np.exp(1j * (beat + 2 * np.pi * PLACE * np.arange(LENGTH) / LENGTH))
+
+
+def lorentzian_power(name, y, laser_width, delay):
+    """The module's mean power of a single line: pure line and pedestal."""
+    laser = {"line_width": np.array([laser_width]), "delay": np.array([delay]),
+             "duration": np.array([DURATION])}  # fmt: skip
+    form = window(name, LENGTH)
+    pedestal = line_width.pedestal_power(y[None], window=form, **laser)[0]
+    pure = line_width.coherent_share(**laser)[0] * np.abs(transform(form, y)) ** 2
+    return pure + pedestal, pedestal
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hamming"])
+@pytest.mark.parametrize(
+    ("laser_width", "delay"), [(2e3, 40), (2e3, 400), (200.0, 150), (2e4, 100)]
+)
+def test_a_randomly_walking_phase_has_the_lorentzian_lines_mean_power(name, laser_width, delay):
+    records = wiener_records(np.random.default_rng(42), 6000, laser_width, delay)
+    expected, _ = lorentzian_power(name, BINS - PLACE, laser_width, delay / RATE)
+    relative = assert_mean_power(records, name, BINS, expected)
+    assert np.median(relative) < 0.03
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.parametrize("laser_width", [1.0, 3e4])
+@pytest.mark.parametrize("delay", [0.6, 20, 100.3, 1000])
+def test_pure_line_and_pedestal_are_the_autocorrelation_at_every_lag(name, laser_width, delay):
+    y = np.concatenate([np.linspace(-8, 8, 33), [20.4, 50.0, -100.0]])
+    gamma = 2 * np.pi * laser_width / RATE
+    lags = np.arange(LENGTH)
+    expected = by_lags(name, y, np.exp(-gamma * np.minimum(lags, delay)))
+    found, pedestal = lorentzian_power(name, y, laser_width, delay / RATE)
+    assert (pedestal > -1e-12 * pedestal.max()).all()
+    # What the integral leaves out: kinks of the third derivative at no lag and at the delay.
+    share = 2e-5 + (gamma + 1 / LENGTH) / (10 * delay**2)
+    assert np.abs(found - expected).max() < share * pedestal.max() + 1e-13 * found.max()
+
+
+@pytest.mark.parametrize("g", [1e-6, 0.019, 0.021, 1.0, 30.0])
+def test_the_pedestals_density_holds_the_power_that_the_line_has_lost(g):
+    delay = 5e-6
+    laser_width = g / (2 * np.pi * delay)
+    # The transform of the lags beyond the pure line: at no lag the power, at the delay nothing.
+    step = 1 / (64 * delay * max(1, g))
+    f = (np.arange(-(2**19), 2**19) + 0.5) * step
+    density = line_width.pedestal_density(f, line_width=laser_width, delay=delay)
+    assert (density >= 0).all()
+    tail = 2 * 2 * laser_width / (2 * np.pi * f[-1])  # of 2 Gamma / w^2, on both sides
+    assert density.sum() * step + tail == pytest.approx(-np.expm1(-g), rel=2e-3)
+
+
+def test_the_density_is_the_transform_of_the_lags():
+    x, weight = np.polynomial.legendre.leggauss(200)
+    for laser_width, delay, frequency in ((1e4, 1e-5, 7e4), (1e6, 3e-6, 0.0), (10.0, 1e-5, 3e5)):
+        gamma, lag = 2 * np.pi * laser_width, delay * (x + 1) / 2
+        value = np.exp(-gamma * lag) * -np.expm1(-gamma * (delay - lag))
+        expected = delay * (weight * value * np.cos(2 * np.pi * frequency * lag)).sum()
+        found = line_width.pedestal_density(frequency, line_width=laser_width, delay=delay)
+        assert found == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_energy():
+    length = 4096
+    laser = {"line_width": np.array([1e3]), "delay": np.array([40 / RATE])}
+    form, duration = window("hann", length), np.array([length / RATE])
+    y = np.array([[0.0, 10.0, 25.0]])
+    found = line_width.pedestal_power(y, duration=duration, window=form, **laser)
+    density = line_width.pedestal_density(y[0] / duration, line_width=1e3, delay=40 / RATE)
+    # Lags up to a hundredth of the record: the window's autocorrelation has hardly fallen there.
+    np.testing.assert_allclose(found[0], form.energy * RATE * density, rtol=2e-3)
+
+
+def test_no_width_is_no_change():
+    laser = {"line_width": np.array([0.0]), "delay": np.array([1e-5]), "duration": DURATION}
+    assert line_width.coherent_share(**laser)[0] == 1
+    form = window("hann", LENGTH)
+    assert not line_width.pedestal_power(np.array([[0.0, 3.0]]), window=form, **laser).any()
+    change = line_width.lorentzian_bound(**laser, window=form, sample_rate=RATE, cnr=10.0)
+    assert change.signal[0] == 1 and change.noise[1] == 1
+    change = line_width.gaussian_bound(fwhm=np.array([0.0]), duration=DURATION, window=form)
+    assert change.signal == (1, 1)
+
+
+def true_changes(name, correlations, places):
+    """Root of the mean power of the largest bin over that of a pure line."""
+    bins = np.arange(-30, 31)
+    pure = np.ones(LENGTH)
+    return np.sqrt(
+        [
+            by_lags(name, bins + p, r).max() / by_lags(name, bins + p, pure).max()
+            for r, p in zip(correlations, places, strict=True)
+        ]
+    )
+
+
+def check(change, true):
+    low, high = change.signal
+    assert (low <= true * (1 + 1e-12)).all()
+    assert (true <= high * (1 + 1e-12)).all()
+    return np.median(np.log(high / low) / np.abs(np.log(true)))
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+def test_the_gaussian_bound_holds_and_is_not_idle(name):
+    rng = np.random.default_rng(43)
+    bins_fwhm, places = 10 ** rng.uniform(-2, 1, 60), rng.uniform(-0.5, 0.5, 60)
+    deviation = bins_fwhm / np.sqrt(8 * np.log(2))
+    lag = np.arange(LENGTH) / LENGTH
+    true = true_changes(name, np.exp(-2 * (np.pi * np.outer(deviation, lag)) ** 2), places)
+    change = line_width.gaussian_bound(
+        fwhm=bins_fwhm / DURATION, duration=DURATION, window=window(name, LENGTH)
+    )
+    assert check(change, true) < 30
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+def test_the_lorentzian_bound_holds_and_is_not_idle(name):
+    rng = np.random.default_rng(44)
+    laser_width, delay = 10 ** rng.uniform(0, 4.3, 60), 10 ** rng.uniform(-5, -3, 60)
+    lags = np.minimum(np.arange(LENGTH) / RATE, delay[:, None])
+    correlation = np.exp(-2 * np.pi * laser_width[:, None] * lags)
+    true = true_changes(name, correlation, rng.uniform(-0.5, 0.5, 60))
+    form = window(name, LENGTH)
+    change = line_width.lorentzian_bound(
+        line_width=laser_width, delay=delay, duration=DURATION, window=form, sample_rate=RATE,
+        cnr=0.3,
+    )  # fmt: skip
+    assert check(change, true) < 30
+    # No bin of the pedestal, with |C|^2 = a^2 / 4, is above what the bound says of noise.
+    y = np.broadcast_to(np.arange(-10.0, 11), (60, 21))
+    pedestal = line_width.pedestal_power(
+        y, line_width=laser_width, delay=delay, duration=np.full(60, DURATION), window=form
+    )
+    raised = 1 + 0.3 / 2 * pedestal.max(axis=1) / form.energy
+    assert (raised <= change.noise[1]).all()
+    assert np.median((change.noise[1] - 1) / (raised - 1)) < 4

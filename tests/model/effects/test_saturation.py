@@ -1,0 +1,138 @@
+"""Clipping: closed forms of a clipped sine, clipped records, and the bound for any envelope."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from sweep.model import window
+from sweep.model.effects.quantisation import truth_quantise
+from sweep.model.effects.saturation import bound, clipping, harmonic_amplitude
+
+
+@pytest.mark.parametrize("ratio", [0.999, 0.9, 0.5, 0.1, 0.01])
+def test_a_clipped_sine_has_the_gain_and_power_of_the_textbook(ratio):
+    """Hard limiter on a sine, its describing function; the rest of its mean square is harmonics."""
+    found = clipping(amplitude=2.0, deviation=2e-6 * ratio, full_scale=2.0 * ratio)
+    angle = np.arcsin(ratio)
+    gain = 2 / np.pi * (angle + ratio * np.sqrt(1 - ratio**2))
+    assert found.signal_gain == pytest.approx(gain, rel=1e-6)
+    assert found.noise_gain == pytest.approx(2 / np.pi * angle, rel=1e-4, abs=1e-6)
+    square, _ = quad(
+        lambda t: np.minimum(2 * np.sin(t), 2 * ratio) ** 2, 0, np.pi / 2, points=[angle]
+    )
+    distortion = square * 2 / np.pi - (2 * gain) ** 2 / 2
+    assert found.distortion == pytest.approx(distortion, rel=1e-5, abs=1e-10)
+
+
+def test_a_sine_clipped_to_a_square_wave_has_its_harmonics():
+    """4 V / pi (sin t + sin 3t / 3 + ...): distortion V^2 (1 - 8/pi^2)."""
+    level = 1e-4
+    arguments = {"amplitude": 1.0, "deviation": 1e-9, "full_scale": level}
+    found = clipping(**arguments)
+    assert found.signal_gain == pytest.approx(4 * level / np.pi, rel=1e-6)
+    assert found.distortion == pytest.approx(level**2 * (1 - 8 / np.pi**2), rel=1e-3)
+    for order in (1, 3, 5, 31):
+        amplitude = harmonic_amplitude(order, **arguments)
+        assert amplitude == pytest.approx(4 * level / np.pi / order, rel=1e-4)
+
+
+def test_harmonics_hold_the_distortion():
+    arguments = {"amplitude": 1.3, "deviation": 0.1, "full_scale": 1.0}
+    total = sum(harmonic_amplitude(k, **arguments) ** 2 / 2 for k in range(3, 32, 2))
+    assert clipping(**arguments).distortion == pytest.approx(total, rel=1e-9)
+
+
+@pytest.mark.parametrize("bits", [4, 6, 8, 12, 14])
+@pytest.mark.parametrize("amplitude", [0.5, 0.9, 1.0, 1.3, 4.0])
+def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude):
+    """Two records that differ in noise: their sum has the line, their difference the noise.
+
+    The highest level, which is held, is half a step below full scale. 2^16 samples, 5 sigma: an
+    amplitude strays by 5 s / sqrt(N), a mean over bins by 5 / sqrt(bins) of itself. Rounding
+    bends the mean of a sample by lsb^2/24 of its second derivative, at most 0.4/s, and adds up to
+    lsb^2/12 of variance.
+    """
+    number, lsb = 2**16, 2 * 0.5**bits
+    s, full_scale = max(0.09, lsb), 1 - lsb / 2
+    rng = np.random.default_rng(bits)
+    turn = 2 * np.pi * 10007 * np.arange(number) / number
+    records = [
+        truth_quantise(
+            amplitude * np.cos(turn) + s * rng.standard_normal(number), full_scale=1.0, bits=bits
+        )
+        for _ in range(2)
+    ]
+    found = clipping(amplitude=amplitude, deviation=s, full_scale=full_scale)
+    line = ((records[0] + records[1]) * np.cos(turn)).mean()
+    bend = lsb**2 / 24 * 0.4 / s * 4 / np.pi
+    assert line == pytest.approx(found.signal_gain * amplitude, abs=5 * s / np.sqrt(number) + bend)
+    bins = abs(np.fft.rfft((records[0] - records[1]) / np.sqrt(2))[1:-1]) ** 2 / number
+    expected = found.noise_gain * s**2
+    assert bins.mean() == pytest.approx(
+        expected + lsb**2 / 24, abs=5 / np.sqrt(bins.size) * expected + lsb**2 / 24
+    )
+    power = (found.signal_gain * amplitude) ** 2 / 2 + found.distortion + expected
+    error = 5 * np.std(records[0] ** 2) / np.sqrt(number) + 2 * amplitude * bend + lsb**2 / 24
+    assert np.mean(records[0] ** 2) == pytest.approx(power + lsb**2 / 24, abs=error)
+
+
+def clipped_moments(x, s, v):
+    """Mean and variance of clipped x + noise by a sum over the noise, |error| < 1e-6 s."""
+    z = np.linspace(-9, 9, 3601)
+    weight = np.exp(-z * z / 2)
+    weight /= weight.sum()
+    out = np.clip(x[:, None] + s * z, -v, v)
+    mean = (out * weight).sum(axis=1)
+    return mean, ((out - mean[:, None]) ** 2 * weight).sum(axis=1)
+
+
+def scene(s, amplitude, second, cycles, phase, name):
+    """True factors on the larger tone's bin and on its noise, and the bound; full scale 1."""
+    n = np.arange(160)
+    w = window.samples(name, n.size)
+    x = amplitude * np.cos(2 * np.pi * cycles * n / n.size + phase)
+    x += second * amplitude * np.cos(2 * np.pi * (cycles + 1.4) * n / n.size)
+    mean, spread = clipped_moments(x, s, 1.0)
+    turn = w * np.exp(-2j * np.pi * round(cycles) * n / n.size)
+    plain = abs((turn * x).sum())
+    true = abs((turn * mean).sum()) / plain, (w**2 * spread).sum() / ((w**2).sum() * s**2)
+    change = bound(
+        peak=amplitude * (1 + second), deviation=s, full_scale=1.0, magnitude=plain,
+        window_sum=w.sum(),
+    )  # fmt: skip
+    return true, change
+
+
+@given(
+    st.floats(0.01, 0.5), st.floats(0.1, 5), st.floats(0, 1), st.floats(3, 75), st.floats(0, 6.3),
+    st.sampled_from(["rectangular", "hann", "hamming"]),
+)  # fmt: skip
+def test_no_clipped_record_strays_beyond_the_bound(s, amplitude, second, cycles, phase, name):
+    true, change = scene(s, amplitude, second, cycles, phase, name)
+    for factor, (low, high) in zip(true, (change.signal, change.noise), strict=True):
+        assert low * (1 - 1e-5) <= factor <= high * (1 + 1e-5)
+
+
+def test_the_bound_is_near_the_change():
+    """One tone of 0.8 to 1.5 full scales with noise of 1 to 10 %."""
+    rng = np.random.default_rng(5)
+    ratios = []
+    for _ in range(100):
+        true, change = scene(
+            10 ** rng.uniform(-2, -1), rng.uniform(0.8, 1.5), 0.0, rng.integers(5, 70),
+            rng.uniform(0, 6), "hamming",
+        )  # fmt: skip
+        lost = 1 - true[0]
+        if lost > 1e-9:
+            ratios.append((1 - change.signal[0]) / lost)
+    assert len(ratios) > 50
+    assert 1 <= np.median(ratios) < 10
+
+
+def test_a_record_well_within_full_scale_is_left_alone():
+    change = bound(peak=0.5, deviation=0.01, full_scale=1.0, magnitude=100.0, window_sum=500.0)
+    np.testing.assert_array_equal([*change.signal, *change.noise], 1)
+    found = clipping(amplitude=0.5, deviation=0.01, full_scale=1.0)
+    assert found == pytest.approx((1.0, 1.0, 0.0), abs=1e-12)
