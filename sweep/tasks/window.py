@@ -179,6 +179,8 @@ class Window:
                 pass  # lost, as below, and not computed again in that time
             except (CancelledError, OSError) as error:
                 raise SchedulerLost(str(error)) from error
+            except Exception as error:  # gone with its worker, computed again, and that failed
+                return _failed(error, blocks)
         if future.status == "error":
             return _failed(future.exception(), blocks)
         if future.status == "cancelled":

@@ -3,7 +3,7 @@ import tracemalloc
 import numpy as np
 
 from sweep.tasks.todo import Todo
-from sweep.tasks.window import Job, Pace, task_key
+from sweep.tasks.window import Job, Pace, Window, task_key
 from sweep.tasks.worker import Answer
 
 
@@ -69,3 +69,20 @@ def test_the_same_work_has_the_same_key_and_other_work_another():
         task_key(Job("/store", "id", "2"), [1, 2], 0),
     ]
     assert len({task_key(job, [1, 2], 0), *others}) == 6
+
+
+def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_its_blocks():
+    """A future may be finished when it is looked at, and failed when its result is asked for."""
+
+    class Lost:
+        key, status = "lost", "finished"
+
+        def result(self, timeout):
+            raise RuntimeError("killed")
+
+    window = Window(None, Job("x.zarr", "0", "0"), Todo(np.zeros(8, dtype=bool)))
+    window._flying["lost"] = (Lost(), [3, 4])
+    window._arrived.put(Lost())
+    answer = window._next()
+    assert [failure.block for failure in answer.failures] == [3, 4] and not answer.receipts
+    assert all(failure.error.startswith("RuntimeError") for failure in answer.failures)
