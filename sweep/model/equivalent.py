@@ -12,6 +12,8 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
+from sweep.model.elementary import fma
+
 AMPLITUDE_TOLERANCE = 1e-13
 """Error of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
 
@@ -83,6 +85,23 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
 
 
 @njit(cache=True, error_model="numpy")
+def dot(a, b, n):
+    """Sum of n products, in an order of its own: four at a time, as each waits for the last."""
+    w, x, y, z = 0.0, 0.0, 0.0, 0.0
+    i = 0
+    while i + 3 < n:
+        w = fma(a[i], b[i], w)
+        x = fma(a[i + 1], b[i + 1], x)
+        y = fma(a[i + 2], b[i + 2], y)
+        z = fma(a[i + 3], b[i + 3], z)
+        i += 4
+    while i < n:
+        w = fma(a[i], b[i], w)
+        i += 1
+    return (w + x) + (y + z)
+
+
+@njit(cache=True, error_model="numpy")
 def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
     """Moves n weights within ``middle`` +- ``half`` onto Chebyshev nodes there, if they are fewer.
 
@@ -106,10 +125,8 @@ def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_i
         out_im[i] = 0.0
         out_delta[i] = following_node[i]
     for j in range(nodes):
-        moment_re, moment_im = 0.0, 0.0
+        moment_re, moment_im = dot(re, previous, n), dot(im, previous, n)
         for b in range(n):
-            moment_re += re[b] * previous[b]
-            moment_im += im[b] * previous[b]
             following = 2.0 * x[b] * current[b] - previous[b]
             previous[b] = current[b]
             current[b] = following

@@ -24,7 +24,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.elementary import sincos_cycles
+from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.equivalent import put_on_nodes
 from sweep.model.spectrum import fraction
 
@@ -41,8 +41,8 @@ REMOTE = 2e9
 """Cube of the distance [bins] over the square of a bundle's half width from which on two sources
 stand for its images, to 1e-11 of the line's peak."""
 
-LARGEST_ANGLE = 0.02
-"""pi q / N up to which the tangent's series serves next to a line, to 1e-15."""
+LARGEST_ANGLE = 0.06
+"""pi q / N up to which the tangent's series serves next to a line, to 1e-14."""
 
 MOST_POINTS = 200
 """Gauss points on one side of the lines, at the most."""
@@ -95,7 +95,8 @@ def strengths(delta, re, im, n, power, sines):
 def _tangent(z, square):
     """tan(pi z / N) N / pi for small angles, ``square`` (pi / N)^2."""
     w = square * z * z
-    return z * (1.0 + w * (1.0 / 3.0 + w * (2.0 / 15.0 + w * (17.0 / 315.0))))
+    series = fma(w, fma(w, fma(w, 62.0 / 2835.0, 17.0 / 315.0), 2.0 / 15.0), 1.0 / 3.0)
+    return fma(z * w, series, z)
 
 
 @njit(cache=True, error_model="numpy")
@@ -111,7 +112,7 @@ def _kernel(q, delta, coefficients, square):
         one = _tangent(float(q - m) - delta, square)
         other = _tangent(float(q + m) - delta, square)
         both = one * other
-        above = above * both + half * coefficients[m] * below * (one + other)
+        above = fma(above, both, half * coefficients[m] * below * (one + other))
         below *= both
         half = -half
     return above / below
@@ -128,13 +129,13 @@ def _add_tile(first, delta, re, im, n, image, fft_size, coefficients, power, out
             a = re[j] * scale * scale
             for i in range(_TILE):
                 k = _kernel(first + i, d, coefficients, square)
-                out_re[i] += a * k * k
+                out_re[i] = fma(a * k, k, out_re[i])
         else:
             a = re[j] * scale if image else -re[j] * scale
             for i in range(_TILE):
                 k = _kernel(first + i, d, coefficients, square)
-                out_re[i] += a * k
-                out_im[i] += b * k
+                out_re[i] = fma(a, k, out_re[i])
+                out_im[i] = fma(b, k, out_im[i])
 
 
 @njit(cache=True, error_model="numpy")
@@ -202,19 +203,10 @@ def far_sources(
         Number of sources.
     """
     middle, half = 0.5 * (spread[0] + spread[1]), 0.5 * (spread[1] - spread[0])
+    needed = _sources_needed(half, n, poles)
     lines = put_on_nodes(
-        delta,
-        re,
-        im,
-        n,
-        middle,
-        half,
-        _sources_needed(half, n, poles),
-        work[5],
-        out[1],
-        out[2],
-        work,
-    )
+        delta, re, im, n, middle, half, needed, work[5], out[1], out[2], work
+    )  # fmt: skip
     images = lines
     if lines > 2 and min(centre, fft_size // 2 - centre) ** 3 > REMOTE * half * half:
         images = _two_sources(work[5], out[1], out[2], lines, middle, half, out[3:6])
@@ -271,12 +263,12 @@ def add_far_field(t, sources, number, numerator, poles, power, out_re, out_im):
         if power:
             for i in range(t.size):
                 k = fraction(t[i], offset, numerator, poles)
-                out_re[i] += a * k * k
+                out_re[i] = fma(a * k, k, out_re[i])
         else:
             for i in range(t.size):
                 k = fraction(t[i], offset, numerator, poles)
-                out_re[i] += a * k
-                out_im[i] += b * k
+                out_re[i] = fma(a, k, out_re[i])
+                out_im[i] = fma(b, k, out_im[i])
 
 
 @njit(cache=True, error_model="numpy")
@@ -353,9 +345,9 @@ def _order(steepness, share):
     """Gauss points of a stretch that begins at a share of the near end's v."""
     order = 4 + int(0.6 * steepness * share)
     if share > 0.9:
-        order += 4
+        order += 5
     elif share > 0.06:
-        order += 3
+        order += 4
     elif share > 0.008:
         order += 2
     return min(order, _LARGEST_ORDER)

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.crossings import crossing_series
+from sweep.model.elementary import borrowed
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.preparation import Shots
 from sweep.model.segments import inspect_segment, lent, workspace
@@ -46,27 +47,31 @@ class Groups(NamedTuple):
         return self.neighbours[..., 1]
 
 
-def groups(shots: Shots, *, most: int = 4) -> Groups:
-    """Groups of each segment's spectrum without noise, the ``most`` strongest of them."""
+def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
+    """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
+
+    ``every_bin`` as of :func:`sweep.model.segments.inspect_segment`.
+    """
     n = shots.range.size
     bins = np.full((3, n, 3, most), -1, np.int64)
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     _find_groups(
-        shots.point_table(), shots.row, shots.footprint, shots.segments, shots.incoherent,
-        shots.kernel(), workspace(shots.offset.shape[1], shots.fft_size), bins, neighbours, pd,
-        exempted, leakage,
+        shots.point_table(), shots.row, shots.footprint, shots.segments,
+        (shots.incoherent, every_bin), shots.kernel(),
+        workspace(shots.offset.shape[1], shots.fft_size), bins, neighbours, pd, exempted, leakage,
     )  # fmt: skip
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_groups(
-    points, row, footprint, segments, power, kernel, work, bins, neighbours, pd, exempted, leakage
+    points, row, footprint, segments, choices, kernel, work, bins, neighbours, pd, exempted, leakage
 ):
     """Groups of every point and segment, into arrays of the shapes of :class:`Groups`."""
     half = kernel[0][0] // 2
     footprint, kernel, (room, exempt, series) = lent(footprint, kernel, work)
+    bins = borrowed(bins)
     p = np.empty(points.shape[0])
     for i in range(points.shape[1]):
         p[:] = points[:, i]
@@ -76,7 +81,7 @@ def _find_groups(
             if not segments[s]:
                 continue
             low, count, peak, exempted[i, s], leakage[i, s] = inspect_segment(
-                s, p, footprint, row[i], power, False, kernel, room, exempt, series
+                s, p, footprint, row[i], choices[0], choices[1], kernel, room, exempt, series
             )
             magnitude = room[0, :count]
             found = _list_groups(magnitude, peak, level, bins[:, i, s])

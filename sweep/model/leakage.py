@@ -20,7 +20,7 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
-from sweep.model.far_field import CLEARANCE, add_far_field, add_near_field
+from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
 from sweep.model.spectrum import set_tangents
 
 APRON = 3
@@ -82,34 +82,27 @@ def inspect(origin, n, noise, power, kernel, room, exempt, series):
     Returns
     -------
     low, count, peak, exempted : int
-        First bin of the run, number of bins, index of the largest, number of exempt ones.
+        First bin of the run, number of bins, index of the largest, number of exempt ones; count
+        is 0 where the lines lie too far apart for what this rests on.
     leakage : float
     """
-    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    half_size = kernel[0][0] // 2
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
-    near, mirrored = _near_bins(origin, lowest, highest, kernel)
-    middle = math.floor(0.5 * (lowest + highest) + 0.5)
-    centre = min(max(origin + middle, 0), half_size)
-    number = far_field.far_sources(
-        delta, re, im, n, (lowest, highest), centre, centre - origin, fft_size,
-        len(kernel[1][2]), power, kernel[4], room[SOURCES:], room[5:11],
-    )  # fmt: skip
-    edge = far_field.edge_field(re if power else im, n, kernel[1][3], power)
-    spread = highest - lowest
-    total = math.sqrt(total) if power else _sum_afar(re, im, n, total, spread, len(kernel[1][2]))
-    reach = _least_reach(total, spread, noise, centre, kernel)
+    near, mirrored, fits = _near_bins(origin, lowest, highest, kernel)
+    if not fits:
+        return 0, 0, 0, 0, 0.0
+    field, total = _prepare(origin, n, total, (lowest, highest), power, kernel, room)
+    reach = _least_reach(total, highest - lowest, noise, field[0], kernel)
     while True:
         low, high = near[0] - reach, near[1] + reach
         low = 0 if low <= reach + APRON else low
         high = half_size if half_size - high <= reach + APRON else high
         count = high - low + 1
-        _magnitudes(
-            low, count, origin, n, near, mirrored, centre, number, edge, power, kernel, room
-        )
+        _magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
         peak, exempted = mark(room[0], count, noise[1], exempt)
         leakage, settled = _leakage(
-            low, count, centre, number, edge, noise, power, kernel, room, exempt, series
+            low, count, peak, field, noise, power, kernel, room, exempt, series
         )
         if settled:
             return low, count, peak, exempted, leakage
@@ -118,7 +111,7 @@ def inspect(origin, n, noise, power, kernel, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _near_bins(origin, lowest, highest, kernel):
-    """First and last bin near a line; whether images are near too."""
+    """First and last bin near a line; whether images are near too; whether angles are small."""
     fft_size = kernel[0][0]
     half_size = fft_size // 2
     clearance = CLEARANCE + len(kernel[1][2])
@@ -131,7 +124,33 @@ def _near_bins(origin, lowest, highest, kernel):
         low = min(low, fft_size - high)
     low, high = max(low, 0), min(high, half_size)
     below, above = low + origin + lowest, fft_size - high - origin - highest
-    return (low, high), min(below, above) < clearance
+    mirrored = min(below, above) < clearance
+    farthest = max(high - origin - lowest, origin + highest - low)
+    if mirrored:
+        sum_, other = high + origin + highest, fft_size - low - origin - lowest
+        farthest = max(farthest, sum_ if below < above else other)
+    fits = (farthest + clearance) * math.pi < LARGEST_ANGLE * fft_size
+    return (low, high), mirrored, fits
+
+
+@njit(cache=True, error_model="numpy")
+def _prepare(origin, n, total, spread, power, kernel, room):
+    """What the far field needs, and the summed strengths as they are seen from afar.
+
+    The field is: bin that distances count from, number of sources of the lines and of their
+    images, what the window's first sample adds to every bin.
+    """
+    fft_size, poles = kernel[0][0], len(kernel[1][2])
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    centre = abs(origin + math.floor(0.5 * (spread[0] + spread[1]) + 0.5))
+    centre = fft_size - centre if centre > fft_size // 2 else centre  # where it is seen
+    lines, images = far_field.far_sources(
+        delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
+        room[SOURCES:], room[5:11],
+    )  # fmt: skip
+    edge = far_field.edge_field(re if power else im, n, kernel[1][3], power)
+    afar = math.sqrt(total) if power else _sum_afar(re, im, n, total, spread, poles)
+    return (centre, lines, images, edge), afar
 
 
 @njit(cache=True, error_model="numpy")
@@ -145,7 +164,7 @@ def _sum_afar(re, im, n, total, spread, poles):
     for b in range(n):
         sum_re += re[b]
         sum_im += im[b]
-    differ = (2 * poles + 1) * 0.5 * spread / CLEARANCE
+    differ = (2 * poles + 1) * 0.5 * (spread[1] - spread[0]) / CLEARANCE
     return min(total, math.hypot(sum_re, sum_im) + differ * total)
 
 
@@ -169,12 +188,11 @@ def _least_reach(total, spread, noise, centre, kernel):
 
 
 @njit(cache=True, error_model="numpy")
-def _magnitudes(
-    low, count, origin, n, near, mirrored, centre, number, edge, power, kernel, room
-):  # fmt: skip
+def _magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room):
     """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
     coefficients, numerator, poles, _, _ = kernel[1]
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    centre, lines_used, images_used, edge = field
     re, im, t = room[0, :count], room[1, :count], room[2, :count]
     lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
     re[:] = edge
@@ -183,14 +201,12 @@ def _magnitudes(
     first, last = near[0] - low, near[1] - low + 1
     for start, end in ((0, first), (last, count)):
         if start < end:
-            part_re, part_im = re[start:end], im[start:end]
-            add_far_field(t[start:end], lines, number[0], numerator, poles, power, part_re, part_im)
+            at, part_re, part_im = t[start:end], re[start:end], im[start:end]
+            add_far_field(at, lines, lines_used, numerator, poles, power, part_re, part_im)
             if mirrored:
-                add_far_field(
-                    t[start:end], images, number[1], numerator, poles, power, part_re, part_im
-                )
+                add_far_field(at, images, images_used, numerator, poles, power, part_re, part_im)
     if not mirrored:
-        add_far_field(t, images, number[1], numerator, poles, power, re, im)
+        add_far_field(t, images, images_used, numerator, poles, power, re, im)
     delta, strength_re, strength_im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     first_bin, near_re, near_im = near[0] - origin, re[first:last], im[first:last]
     add_near_field(
@@ -206,11 +222,12 @@ def _magnitudes(
             room[5:7], near_re, near_im,
         )  # fmt: skip
     for i in range(count):
-        re[i] = math.sqrt(re[i] if power else re[i] * re[i] + im[i] * im[i])
+        square = re[i] if power else re[i] * re[i] + im[i] * im[i]
+        re[i] = math.sqrt(square if square > 0.0 else 0.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _leakage(low, count, centre, number, edge, noise, power, kernel, room, exempt, series):
+def _leakage(low, count, peak, field, noise, power, kernel, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
     sigma, level = noise
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
@@ -230,15 +247,16 @@ def _leakage(low, count, centre, number, edge, noise, power, kernel, room, exemp
         if not found:
             return 0.0, False
         tail += correction
-        rest += abs(last)
-        points = _points_beyond(side, low, count, centre, steepness, kernel, room, points)
+        rest += last
+        points = _points_beyond(side, low, count, field[0], steepness, kernel, room, points)
     while points % 8:  # whole vectors: what is left over costs as much as all of them
-        room[9, points], room[10, points] = 1.0, 0.0
+        room[9, points], room[10, points] = room[9, points - 1], 0.0
         points += 1
     far_field.points_to_bins(room[9, :points], room[10, :points], fft_size)
-    below_level = _far_chances(points, number, edge, scale, beta, power, kernel, room, series)
+    largest_beyond = _far_chances(points, field, scale, beta, power, kernel, room, series)
     tail += weighted_silence(chance[:points], room[10, :points])
-    if not (below_level and rest <= SMOOTHNESS * (some + tail)):
+    most = min(0.45 * beta * beta, magnitude[peak] * magnitude[peak] * scale)
+    if not (largest_beyond <= most and rest <= SMOOTHNESS * (some + tail)):
         return 0.0, False
     return some - (1.0 - some) * math.expm1(-tail), True
 
@@ -255,7 +273,7 @@ def _half_squares(magnitude, exempt, scale, x):
 
 @njit(cache=True, error_model="numpy")
 def _near_end(side, count, chance, exempt):
-    """An integral's correction at its near end, its last term, -d ln f / dq; whether they exist."""
+    """Correction of an integral at its near end, its last term's size, -d ln f / dq; if there."""
     step = 1 if side > 0 else -1
     i = count - APRON - 1 if side > 0 else APRON  # the last bin before the integral
     for k in range(-2, 4):
@@ -267,9 +285,10 @@ def _near_end(side, count, chance, exempt):
     third = middle - 3.0 * first
     fifth = silence(chance[i + 3 * step]) - silence(chance[i - 2 * step])
     fifth += 10.0 * first - 5.0 * middle
-    last = 367.0 / 967680.0 * fifth
+    terms = first / 24.0, -17.0 / 5760.0 * third, 367.0 / 967680.0 * fifth
+    last = max(abs(terms[2]), abs(terms[1]) / 30.0)  # the fifth may cross zero
     steepness = abs(first) / max(after, 1e-300)
-    return first / 24.0 - 17.0 / 5760.0 * third + last, last, steepness, True
+    return terms[0] + terms[1] + terms[2], last, steepness, True
 
 
 @njit(cache=True, error_model="numpy")
@@ -295,17 +314,19 @@ def _points_beyond(side, low, count, centre, steepness, kernel, room, points):
 
 
 @njit(cache=True, error_model="numpy")
-def _far_chances(points, number, edge, scale, beta, power, kernel, room, series):
-    """Added chances at the points of the integrals, into row 4; whether all lie below level."""
+def _far_chances(points, field, scale, beta, power, kernel, room, series):
+    """Added chances at the points of the integrals, into row 4; the largest a^2/2 there."""
     _, numerator, poles, _, _ = kernel[1]
+    _, lines_used, images_used, edge = field
     t, re, im, x = room[9, :points], room[11, :points], room[12, :points], room[3]
     re[:] = edge
     im[:] = 0.0
     lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
-    add_far_field(t, lines, number[0], numerator, poles, power, re, im)
-    add_far_field(t, images, number[1], numerator, poles, power, re, im)
+    add_far_field(t, lines, lines_used, numerator, poles, power, re, im)
+    add_far_field(t, images, images_used, numerator, poles, power, re, im)
     for i in range(points):
-        x[i] = scale * (re[i] if power else re[i] * re[i] + im[i] * im[i])
-    below_level = largest(x[:points]) < 0.45 * beta * beta
+        square = re[i] if power else re[i] * re[i] + im[i] * im[i]
+        x[i] = scale * (square if square > 0.0 else 0.0)
+    largest_beyond = largest(x[:points])
     added_crossings(x, points, beta, series, room[4])
-    return below_level
+    return largest_beyond

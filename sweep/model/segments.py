@@ -10,7 +10,7 @@ from sweep.model.detection import assess
 from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.far_field import MOST_POINTS
-from sweep.model.leakage import inspect, reach_of, smooth
+from sweep.model.leakage import DELTA, STRENGTH_IM, STRENGTH_RE, inspect, reach_of, smooth
 from sweep.model.lines import segment_lines
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.spectrum import bin_magnitudes
@@ -53,9 +53,9 @@ def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
     """
     sizes, shape, sidelobes, limits, tangent = kernel
     fft_size, length = sizes
-    origin = _lines_of(segment, p, footprint, row, power, sizes, room[19:])
+    origin = _lines_of(segment, p, footprint, row, power, sizes, room[DELTA:])
     n = footprint[0].shape[1]
-    delta, re, im = room[19], room[20], room[21]
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     few_delta, few_re, few_im = room[4], room[5], room[6]
     band = math.pi * length / fft_size * (2.0 if power else 1.0)
     few = equivalent_lines(
@@ -111,16 +111,16 @@ def inspect_segment(
         ``every_bin``, of those above the leakage floor.
     """
     sigma, level, floor = p[10], p[11], p[12]
-    if every_bin or not smooth(kernel):
-        low, count = segment_spectrum(
-            segment, p, footprint, row, floor * sigma, power, kernel, room
+    if smooth(kernel) and not every_bin:
+        origin = _lines_of(segment, p, footprint, row, power, kernel[0], room[DELTA:])
+        low, count, peak, exempted, leakage = inspect(
+            origin, footprint[0].shape[1], (sigma, level), power, kernel, room, exempt, series
         )
-        peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
-        return low, count, peak, exempted, leakage
-    origin = _lines_of(segment, p, footprint, row, power, kernel[0], room[19:])
-    return inspect(
-        origin, footprint[0].shape[1], (sigma, level), power, kernel, room, exempt, series
-    )
+        if count:
+            return low, count, peak, exempted, leakage
+    low, count = segment_spectrum(segment, p, footprint, row, floor * sigma, power, kernel, room)
+    peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
+    return low, count, peak, exempted, leakage
 
 
 def workspace(beamlets: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-from sweep.model.elementary import sincos_cycles
+from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.window import OVERSAMPLING
 
 _TABLE_PAD = 8
@@ -125,15 +125,15 @@ def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, powe
 def fraction(tangent, offset, numerator, poles):
     """K at tan(a + b), given the two tangents, as one fraction (one division)."""
     n = tangent + offset
-    d = 1.0 - tangent * offset
+    d = fma(-tangent, offset, 1.0)
     n2, d2 = n * n, d * d
     scale = 1.0
     top = numerator[len(poles)]
     bottom = n
     for m in range(len(poles)):
         scale *= d2
-        top = top * n2 + numerator[len(poles) - 1 - m] * scale
-        bottom *= n2 - poles[m] * d2
+        top = fma(top, n2, numerator[len(poles) - 1 - m] * scale)
+        bottom *= fma(-poles[m], d2, n2)
     return d * top / bottom
 
 

@@ -4,6 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from sweep.model import truth
 from sweep.model.crossings import (
     MOST_TERMS,
     added_crossings,
@@ -11,7 +12,9 @@ from sweep.model.crossings import (
     crossing_series,
     silence,
 )
+from sweep.model.groups import groups
 from sweep.model.preparation import Footprints, prepare, prepare_footprints
+from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 
 PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
@@ -102,6 +105,106 @@ def test_leakage_of_two_surfaces_apart_in_range_and_velocity(table_4_1, phases):
         "target.range": generator.uniform(50.0, 3000.0, rows)
     }
     held(prepare_footprints(parameters, footprints))
+
+
+RANGE_BIN, DOPPLER_BIN = 149_896_229 * 600e6 / 2e12, 1550e-9 * 600e6 / 299_792_458
+"""Offset [m] and change of 2 v_r / c that move a line by one bin, times the FFT's size."""
+
+
+def drawn_bundles(table_4_1, seed, fft_size, apart):
+    """Forty shots of two to three clusters of lines, ``apart`` bins from the beam's centre."""
+    rng = np.random.default_rng((61, seed))
+    shots, beamlets = 40, int(rng.choice([1, 2, 5, 19]))
+    parameters = table_4_1(
+        window=CLOSED_FORMS[seed % len(CLOSED_FORMS)],
+        phases=str(rng.choice(["coherent", "incoherent"])),
+        architecture=str(rng.choice(["homodyne", "heterodyne", "direct"])),
+        fft_size=fft_size,
+        tnr=float(rng.choice([2.0, 4.0, 10.0])),
+        leakage_floor=1e-12,
+    )
+    ranges = 10 ** rng.uniform(0.0, 3.8, shots)
+    clusters = rng.uniform(-apart, apart, (2, shots, 3))
+    which = rng.integers(3, size=(shots, beamlets))
+    bins, doppler = (np.take_along_axis(c, which, axis=1) for c in clusters)
+    bins += rng.normal(size=bins.shape) * rng.choice([1e-6, 0.1, 2.0])
+    parameters |= {
+        "target.range": ranges,
+        "target.radial_velocity": rng.uniform(-160.0, 160.0, shots),
+        "target.reflectance": 1.0,
+    }
+    echo = rng.exponential(size=bins.shape) / beamlets / 6
+    offset = bins * RANGE_BIN / fft_size / ranges[:, None]
+    shift = doppler * DOPPLER_BIN / fft_size
+    return prepare_footprints(parameters, Footprints(np.arange(shots), offset, shift, echo))
+
+
+@pytest.mark.parametrize("fft_size", [64, 100, 255, 512, 1023, 2048, 4099, 8192])
+def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_size):
+    """Among them bundles as wide as the band, and all of whose lines lie past DC or Nyquist."""
+    for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
+        held(drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart))
+
+
+@pytest.mark.parametrize("place", [0.0, 300e6])
+@pytest.mark.parametrize("past", [-500.0, -148.3, -12.0, -3.0, 0.0, 3.0, 12.0, 148.3, 500.0])
+def test_leakage_where_all_lines_lie_past_dc_or_nyquist(table_4_1, place, past):
+    """A beam's centre near DC or Nyquist, its lines so many bins away from it."""
+    for window in CLOSED_FORMS:
+        beamlets, fft_size = 7, 16384
+        parameters = table_4_1(window=window, fft_size=fft_size, leakage_floor=1e-12, tnr=5.0)
+        velocity = (place + np.array([-1e5, 0.0, 1e4])) * 1550e-9 / 2
+        bins = past + 0.1 * np.arange(beamlets) - 0.3
+        shots = prepare_footprints(
+            parameters | {"target.radial_velocity": velocity, "target.range": 300.0},
+            Footprints(
+                np.zeros(3, int), np.zeros((1, beamlets)), bins[None] * DOPPLER_BIN / fft_size,
+                np.full((1, beamlets), 0.01),
+            ),
+        )  # fmt: skip
+        held(shots)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("window", CLOSED_FORMS)
+def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
+    """Within 1e-10 of the peak of the time-domain truth, near the lines and beside them."""
+    scene = table_4_1(window=window, phases=phases, fft_size=8192, beamlets=19, power=20.0)
+    for r, grazing, v in ((30.0, 1.5, 150.0), (700.0, 0.7, 0.3), (4000.0, 0.1, -90.0)):
+        ((_, shots),) = prepare(
+            scene
+            | {
+                "target.range": r,
+                "target.grazing_angle": grazing,
+                "target.radial_velocity": v,
+            }
+        )
+        room, exempt, series = workspace(19, 8192)
+        point = shots.point_table()[:, 0].copy()
+        crossing_series(point[11] / point[10], series)
+        for segment in range(3):
+            low, count, *_ = inspect_segment(
+                segment, point, shots.footprint, 0, shots.incoherent, False, shots.kernel(), room,
+                exempt, series,
+            )  # fmt: skip
+            exact = truth.spectrum(shots, 0, segment, range_walk=False)
+            assert 20 < count < 4097
+            error = np.abs(room[0, :count] - exact[low : low + count]).max()
+            assert error < 1e-10 * exact.max()
+
+
+@pytest.mark.parametrize("apart", [0.5, 50.0])
+def test_groups_are_those_of_every_bin(table_4_1, apart):
+    """Of the wide run that looks at each bin, the fast one leaves out no group and no neighbour."""
+    found = 0
+    for seed in range(12):
+        shots = drawn_bundles(table_4_1, 900 + seed, 16384, apart)
+        fast, slow = groups(shots, most=6), groups(shots, most=6, every_bin=True)
+        for name in ("bin", "first", "last", "exempted"):
+            np.testing.assert_array_equal(getattr(fast, name), getattr(slow, name))
+        np.testing.assert_allclose(fast.neighbours, slow.neighbours, rtol=1e-7)
+        found += (slow.bin >= 0).sum(axis=-1).max()
+    assert found >= 12 * (2 if apart > 1 else 1)
 
 
 def test_a_shot_leaks_the_same_whatever_its_company(table_4_1):
