@@ -21,10 +21,10 @@ test: $(READY) forget-kernels
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist worksteal
 
 test-all: $(READY) forget-kernels
-	$(BIN)/pytest -m ''
+	$(BIN)/pytest -n auto --dist worksteal -m ''
 
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py
