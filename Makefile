@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all bench lock forget-kernels clean
+.PHONY: demo test test-all bench effects lock forget-kernels clean
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
@@ -28,6 +28,9 @@ test-all: $(READY) forget-kernels
 
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py
+
+effects: $(READY)
+	$(BIN)/python benchmarks/effects.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete

@@ -15,10 +15,10 @@ from rich.table import Table
 
 import sweep
 from sweep.model import shot, truth
+from sweep.model.chain import prepare
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.beamlet_rays import beamlet_rays
-from sweep.model.preparation import prepare
 from sweep.model.spectra import segment_spectrum
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.reading import read_document

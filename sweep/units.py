@@ -18,18 +18,24 @@ from typing import Any
 
 LONGEST_TEXT = 100
 DECIBEL = "dB"
+PER_HERTZ = "1/Hz"
+DECIBEL_PER_HERTZ = "dB/Hz"
+"""A power ratio in each hertz: -155 dB/Hz is 10^-15.5 /Hz."""
 
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 _POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>\d{1,3})"
-_VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>[^\d\s.+\-].*)?", re.ASCII)
-_FACTOR = re.compile(r"(?P<name>[A-Za-z]+|%)(?:(?:\^|\*\*)?(?P<exponent>[+-]?\d(?:\.5)?))?")
+_UNIT = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
+_VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>{_UNIT})?", re.ASCII)
+_EXPONENT = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
+_FACTOR = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT})?")
+_OPERATOR = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
 _NOT_FINITE = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 _ROOT_OF = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
 _SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
 
 # Units that a near miss is looked for in, by the SI unit they measure.
 _PREFIXED = {
-    "m": "nm um mm cm m km",
+    "m": "nm um mm cm m km au",
     "s": "ns us ms s",
     "Hz": "Hz kHz MHz GHz THz",
     "W": "pW nW uW mW W kW",
@@ -41,6 +47,9 @@ _PREFIXED = {
     "A/W": "mA/W A/W",
     "W/Hz^0.5": "fW/rtHz pW/rtHz nW/rtHz W/rtHz",
     "W/m^3": "W/m^2/nm mW/m^2/nm W/m^2/um",
+    "V": "uV mV V",
+    "1/m": "1/cm 1/m 1/km",
+    PER_HERTZ: "1/Hz dB/Hz",
     DECIBEL: "dB",
     "": "%",
 }
@@ -67,7 +76,7 @@ class QuantityError(ValueError):
 class Unit:
     """A unit as the user wrote it and its way to SI: ``si = factor * value + offset``.
 
-    Decibels are power ratios: ``si = 10 ** (value / 10)``.
+    Decibels are power ratios, or such ratios in each hertz: ``si = 10 ** (value / 10)``.
     """
 
     text: str
@@ -77,7 +86,7 @@ class Unit:
     @property
     def decibel(self) -> bool:
         """Whether values of this unit are logarithms of power ratios."""
-        return self.text == DECIBEL
+        return self.text in (DECIBEL, DECIBEL_PER_HERTZ)
 
     def to_si(self, value: Fraction) -> float:
         """SI value of `value` in this unit, correctly rounded.
@@ -146,6 +155,8 @@ def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
         if si_unit == text:
             return Unit(DECIBEL)
         raise QuantityError(*_unfit(text, si_unit, example))
+    if si_unit == PER_HERTZ and "".join(text.split()) == DECIBEL_PER_HERTZ:
+        return Unit(DECIBEL_PER_HERTZ)
     factors = _factors(text)
     if factors is None:
         raise QuantityError(
@@ -201,7 +212,8 @@ def _factors(text: str) -> list[tuple[str, Fraction]] | None:
     """Names and exponents of a unit's factors; None where the text is no unit."""
     factors = []
     sign = 1
-    for piece in re.split(r"(\*(?!\*)|/|(?<=[A-Za-z0-9]) +(?=[A-Za-z]))", text.replace("**", "^")):
+    text = re.sub(r"^1\s*/", "/", text.replace("**", "^"))
+    for piece in _OPERATOR.split(text):
         operator = piece.strip()
         if operator in ("", "*", "/"):
             sign = -1 if operator == "/" else 1
@@ -209,17 +221,20 @@ def _factors(text: str) -> list[tuple[str, Fraction]] | None:
         match = _FACTOR.fullmatch(operator)
         if match is None:
             return None
-        factors.append((match["name"], sign * Fraction(match["exponent"] or 1)))
+        factors.append((match["name"], sign * Fraction(match["exponent"] or match["ratio"] or 1)))
     return factors
 
 
 def _plain(factors: list[tuple[str, Fraction]]) -> str:
-    """One spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``."""
+    """One spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``, ``1/km``, ``m^(-2/3)``."""
+    if [exponent for _, exponent in factors] == [-1]:
+        return f"1/{factors[0][0]}"
     text = ""
     for name, exponent in factors:
         operator = "/" if exponent < 0 and text else "*" if text else ""
         size = abs(exponent) if operator == "/" else exponent
-        text += operator + name + ("" if size == 1 else f"^{float(size):g}")
+        power = f"{float(size):g}" if 2 % size.denominator == 0 else f"({size})"
+        text += operator + name + ("" if size == 1 else f"^{power}")
     return text
 
 
@@ -267,13 +282,17 @@ def _combined(
 
 
 def _power(factor: Fraction, exponent: Fraction) -> Fraction:
-    """Power of a positive fraction, to 50 digits where the exponent is a half."""
+    """Power of a positive fraction, to 50 digits where the exponent is no whole number."""
     if exponent.denominator == 1:
         return factor ** int(exponent)
     with localcontext() as context:
-        context.prec = 50
-        root = (Decimal(factor.numerator) / Decimal(factor.denominator)).sqrt()
-    return Fraction(root) ** int(2 * exponent)
+        context.prec = 60
+        root = (Decimal(factor.numerator) / factor.denominator) ** (
+            Decimal(1) / exponent.denominator
+        )
+        context.prec = 50  # rounded once more, so that the root of a cube is exact
+        root = +root
+    return Fraction(root) ** exponent.numerator
 
 
 def _near_miss(name: str, si_unit: str, example: str) -> str:

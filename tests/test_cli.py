@@ -178,16 +178,20 @@ def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):
 
 
 def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
+    from sweep.model.effects.catalogue import NAMES
     from sweep.model.outputs import OUTPUTS
 
     result = sweep("plan", "small.yaml", "--workers", "2")
     assert result.exit_code == 0
-    lines = dict(line.strip().split("  ", 1) for line in result.stdout.splitlines())
+    told, _, table = result.stdout.partition("Effects")
+    lines = dict(line.strip().split("  ", 1) for line in told.splitlines())
+    arrays = len(OUTPUTS) + 2  # what was simulated, and what that leaves out
     assert lines["points"] == "80"
     assert lines["blocks"] == "10 of at most 4 range x 2 power"
-    assert lines["chunks"] == f"{10 * len(OUTPUTS)} files"
-    assert lines["bytes"] == f"{80 * 8 * len(OUTPUTS) / 1000:.3g} kB before compression"
+    assert lines["chunks"] == f"{10 * arrays} files"
+    assert lines["bytes"] == f"{80 * 8 * arrays / 1000:.3g} kB before compression"
     assert lines["time"].endswith("on 2 workers")
+    assert all(name.replace("_", " ") in " ".join(table.split()) for name in NAMES)
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
 
 

@@ -48,7 +48,7 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)
-    assert set(dataset.data_vars) == set(OUTPUTS)
+    assert set(dataset.data_vars) == {*OUTPUTS, "effects", "effects_error"}
     for name, variable in dataset.data_vars.items():
         assert np.isfinite(variable).all(), name
     for name in OUTPUTS:

@@ -61,6 +61,29 @@ def si(written: object, si_unit: str) -> float:
         ("20 °C", "K", 293.15),
         ("0 dB", "dB", 1.0),
         ("10 dB", "dB", 10.0),
+        ("-150 dB/Hz", "1/Hz", 1e-15),
+        ("-150 dB / Hz", "1/Hz", 1e-15),
+        ("1e-15 1/Hz", "1/Hz", 1e-15),
+        ("1e-15 /Hz", "1/Hz", 1e-15),
+        ("1e-15 Hz^-1", "1/Hz", 1e-15),
+        ("1e-12 1/kHz", "1/Hz", 1e-15),
+        ("1 au", "m", 149_597_870_700.0),
+        ("1.52 au", "m", 227_388_763_464.0),
+        ("50 sr", "sr", 50.0),
+        ("1e-4 1/m", "1/m", 1e-4),
+        ("0.1 1/km", "1/m", 1e-4),
+        ("0.1/km", "1/m", 1e-4),
+        ("11/km", "1/m", 0.011),
+        ("1 1/km", "1/m", 1e-3),
+        ("2^3 1/km", "1/m", 8e-3),
+        ("1e-14 m^(-2/3)", "m^(-2/3)", 1e-14),
+        ("1e-14 m**(-2/3)", "m^(-2/3)", 1e-14),
+        ("1e-14 1/m^(2/3)", "m^(-2/3)", 1e-14),
+        ("1 mm^(-2/3)", "m^(-2/3)", 100.0),
+        ("5 pW/Hz^(1/2)", "W/Hz^0.5", 5e-12),
+        ("10 m/s^2", "m/s^2", 10.0),
+        ("10 m/s²", "m/s^2", 10.0),
+        ("1 V", "V", 1.0),
     ],
 )
 def test_a_written_quantity_gives_exactly_its_si_value(written, si_unit, value):
@@ -69,6 +92,35 @@ def test_a_written_quantity_gives_exactly_its_si_value(written, si_unit, value):
 
 def test_three_decibels_are_a_power_ratio_and_no_amplitude_ratio():
     assert si("3 dB", "dB") == pytest.approx(1.99526231496888, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("written", "si_unit", "text"),
+    [
+        ("1 W*m^-2/nm", "W/m^3", "W/m^2/nm"),
+        ("1 pW/rtHz", "W/Hz^0.5", "pW/Hz^0.5"),
+        ("1 /km", "1/m", "1/km"),
+        ("1 km^-1", "1/m", "1/km"),
+        ("1 m^-2", "m^-2", "m^-2"),
+        ("1 cm**(-2/3)", "m^(-2/3)", "cm^(-2/3)"),
+        ("1 dB/Hz", "1/Hz", "dB/Hz"),
+    ],
+)
+def test_a_unit_has_one_spelling_which_reads_back_the_same(written, si_unit, text):
+    _, unit = read_quantity(written, si_unit=si_unit, example="7 of them")
+    assert unit.text == text
+    assert read_quantity(f"1 {text}", si_unit=si_unit, example="7 of them") == (1, unit)
+
+
+def test_the_cube_root_of_a_factor_agrees_with_a_longer_one():
+    with mpmath.workdps(60):
+        assert si("7 cm^(-2/3)", "m^(-2/3)") == float(7 * mpmath.mpf(100) ** (mpmath.mpf(2) / 3))
+
+
+def test_decibels_per_hertz_are_a_power_ratio_in_each_hertz():
+    with mpmath.workdps(40):
+        expected = float(mpmath.mpf(10) ** mpmath.mpf("-15.5"))
+    assert si("-155 dB/Hz", "1/Hz") == pytest.approx(expected, rel=2e-15)
 
 
 @given(st.integers(-(10**9), 10**9))
@@ -108,6 +160,14 @@ def test_degrees_agree_with_radians_to_one_ulp(degrees):
         ("10 rpm", "Hz", "needs a unit like Hz"),
         ("3 dB", "m", "needs a unit like m"),
         ("3 W", "dB", "needs a unit like dB"),
+        ("3 dB", "1/Hz", "needs a unit like 1/Hz"),
+        ("3 dB/Hz", "dB", "needs a unit like dB"),
+        ("3 dB/Hz", "1/m", "unknown unit 'dB'"),
+        ("3 dB/km", "1/m", "unknown unit 'dB'"),
+        ("1e-14 m^-2/3", "m^(-2/3)", "cannot be read"),
+        ("1 1/2 m", "m", "cannot be read"),
+        ("5 1", "m", "must be a number, with its unit"),
+        ("1 m^(1/0)", "m", "cannot be read"),
         ("nan m", "m", "must be a finite number"),
         ("inf m", "m", "must be a finite number"),
         (".inf", "m", "must be a finite number"),
@@ -150,7 +210,7 @@ def test_a_pure_number_takes_no_unit():
 
 @given(st.text(max_size=120))
 def test_any_text_is_a_quantity_or_a_quantity_error(text):
-    for si_unit in ("m", "W/Hz^0.5", "dB", "K"):
+    for si_unit in ("m", "W/Hz^0.5", "dB", "K", "1/Hz", "m^(-2/3)"):
         try:
             value = si(text, si_unit)
         except QuantityError:

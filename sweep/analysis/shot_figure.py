@@ -11,6 +11,7 @@ from sweep.analysis import canvas, labels, shot_drawing, shot_text
 from sweep.analysis.cuts import GRAZING_ANGLE
 from sweep.analysis.shot_spectra import Parameters, Shot, simulated
 from sweep.analysis.tabular import Block, Page
+from sweep.model.effects.catalogue import EFFECTS
 from sweep.spec import Spec
 from sweep.spec.fields import parameter_rules
 
@@ -59,8 +60,10 @@ def report(
     SpecError
         For names and values in `at` that cannot be read.
     """
+    modes = spec.modes()
+    effects = [e.name for e in EFFECTS if not e.is_random and modes[e.name] != "off"]
     shots = [
-        simulated(parameters, label=label, seed=seed if noise else None)
+        simulated(parameters, effects, label=label, seed=seed if noise else None)
         for label, parameters in chosen(spec, at)
     ]
     directory, stem = Path(directory), _stem(at)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from sweep.model import shot as model
 from sweep.model import waveform, window
+from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import CORE
 from sweep.model.spectra import segment_spectrum
 
 Parameters = Mapping[str, float | int | str]
@@ -101,19 +103,27 @@ class Shot:
         return all(segment.groups for segment in self.segments if segment.sign)
 
 
-def simulated(parameters: Parameters, *, label: str = "", seed: int | None = None) -> Shot:
+def simulated(
+    parameters: Parameters,
+    effects: Collection[str] = CORE,
+    *,
+    label: str = "",
+    seed: int | None = None,
+) -> Shot:
     """One shot on a flat plane.
 
     Parameters
     ----------
     parameters
         SI values of every parameter by dotted path.
+    effects
+        Names of the effects that are simulated.
     label
         What to call it.
     seed
         Seed of its noise; without one, spectra are the signal's alone.
     """
-    ((_, prepared),) = model.prepare(parameters)
+    ((_, prepared),) = prepare(parameters, effects)
     return simulated_shot(prepared, parameters, label=label, seed=seed)
 
 
@@ -158,7 +168,7 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
         carrier=carrier,
         chirp_rate=np.asarray(prepared.chirp_rate),
         range=prepared.range[0],
-        radial_velocity=prepared.radial_velocity[0],
+        radial_velocity=np.asarray(prepared.beta).flat[0] * SPEED_OF_LIGHT / 2,
     )
     return Segment(
         name=NAMES[k],
@@ -208,6 +218,6 @@ def quantity_at(shot: Shot, segment: Segment, frequency: np.ndarray) -> np.ndarr
     signed = fold + np.where(segment.beat < fold, -1.0, 1.0) * np.asarray(frequency)
     if segment.sign == 0:
         return signed * SPEED_OF_LIGHT / (2 * segment.carrier)
-    beta = float(p.beta[0])
+    beta = float(np.asarray(p.beta).flat[0])
     delay_beat = segment.sign * (segment.carrier * beta - signed)
     return delay_beat * SPEED_OF_LIGHT / (2 * np.asarray(p.chirp_rate).item() * (1 + beta))

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from sweep.cli.telling import conclude, grid_plan, scene_plan
+from sweep.cli.telling import conclude, grid_plan, scene_plan, tell_effects, warn_before
 
 MISTAKE = 2
 
@@ -87,8 +87,10 @@ def run(
     from sweep.spec import load
     from sweep.tasks import driver
 
+    study = load(spec)
+    warn_before(study)
     outcome = driver.run(
-        load(spec),
+        study,
         store=store or _default_store(spec),
         workers=workers,
         scheduler=scheduler,
@@ -135,9 +137,11 @@ def _shown(path: Path) -> Path:
 @SPEC
 @WORKERS
 def plan(spec: Path, workers: int | None) -> None:
-    """Say what SPEC would take: points, blocks, bytes, time and memory. Nothing is written.
+    """Say what SPEC would take, and which effects it calls for. Nothing is written.
 
-    The time comes from about a second of computing points of the study itself.
+    The time comes from about a second of computing points of the study itself. Of each effect the
+    table says at how many points and where it is simulated, how much it may change a probability
+    (a bound), and the time that it takes a point there.
     """
     from sweep.spec import SceneSpec, load
 
@@ -148,6 +152,7 @@ def plan(spec: Path, workers: int | None) -> None:
         lines = grid_plan(study, workers)
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
+    tell_effects(study, _default_store(spec))
 
 
 @main.command()

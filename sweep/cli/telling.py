@@ -11,9 +11,13 @@ import click
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.session import Outcome
 
 INCOMPLETE = 3
+
+LOOKED_AT = 1024
+"""Shots of each scanner whose effects are planned before a run."""
 
 
 def conclude(outcome: Outcome, store: Path) -> None:
@@ -95,7 +99,8 @@ def _scene_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
     )
 
 
-def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None:
+def _print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
+    """Print a table; `words` names a column that may be broken into lines."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -103,7 +108,10 @@ def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None
 
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     for heading in headings:
-        table.add_column(escape(heading), justify="right", no_wrap=True)
+        if heading == words:
+            table.add_column(escape(heading), justify="left", overflow="fold")
+        else:
+            table.add_column(escape(heading), justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*map(escape, row))
     Console().print(table)
@@ -145,6 +153,60 @@ def scene_plan(study: SceneSpec, store: Path, workers: int | None) -> Iterator[t
     yield "bytes", f"{_bytes(p.bytes)} before compression"
     yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {_bytes(p.worker_memory)} a worker"
+
+
+def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
+    """Print which effects a study calls for, where, and what they cost; warn of what is off."""
+    from sweep.spec import SceneSpec
+
+    if isinstance(study, SceneSpec):
+        from sweep.tasks.effects_table import flight_effects_table
+        from sweep.tasks.flight_study import FlightStudy
+
+        table = flight_effects_table(FlightStudy(study, store.absolute()), LOOKED_AT)
+    else:
+        from sweep.tasks.effects_table import effects_table
+
+        table = effects_table(study)
+    there = [row for row in table.rows if row.bound > 0 or row.share > 0]
+    headings = ["effect", "points", "costs", "may change", "called for"]
+    _print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
+    absent = [row.name for row in table.rows if row not in there]
+    if absent:
+        click.echo(f"Nothing of these in the scene: {', '.join(absent).replace('_', ' ')}.")
+    click.echo(
+        f"What is left out may change a probability of detection by {table.error:.2g} at the most; "
+        f"the tolerance is {table.tolerance:g}."
+    )
+    warn(table)
+
+
+def warn_before(study: Spec | SceneSpec) -> None:
+    """Before a run over a grid: which effects are forced off though they matter."""
+    from sweep.spec import SceneSpec
+
+    if isinstance(study, SceneSpec) or "off" not in study.modes().values():
+        return
+    from sweep.tasks.effects_table import effects_table
+
+    warn(effects_table(study, costs=False))
+
+
+def warn(table: EffectsTable) -> None:
+    """Say which effects are forced off though they matter."""
+    for warning in table.warnings():
+        click.echo(f"warning: {warning}", err=True)
+
+
+def _effect_cells(row: EffectRow) -> list[str]:
+    cost, forced = row.seconds_a_point, "" if row.mode == "auto" else f" ({row.mode})"
+    return [
+        row.name.replace("_", " ") + forced,
+        f"{100 * row.share:.3g} %",
+        f"{1e6 * cost:.2g} us" if cost == cost else "-",
+        f"{row.bound:.2g}",
+        row.where or f"nowhere; most at {row.at}",
+    ]
 
 
 def _bytes(count: int) -> str:

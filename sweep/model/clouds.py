@@ -11,11 +11,12 @@ are counted: drawn like those of any other shot, from the same addresses.
 Results of a shot do not depend on the shots and draws that are computed with it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from sweep.model import chances
+from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.surfaces import Surface
 from sweep.model.groups import Groups, groups
@@ -40,6 +41,7 @@ def cloud(
     draws: int = 1,
     method: str = "probabilities",
     returns: int = 4,
+    effects: Collection[str] = CORE,
 ) -> dict[str, np.ndarray]:
     """Statistics and points of n shots.
 
@@ -60,6 +62,8 @@ def cloud(
     returns : int
         Strongest groups of bins that are looked at in a segment, and points at the most of a
         shot and draw; at least 1.
+    effects : collection of str
+        Names of the effects that are simulated.
 
     Returns
     -------
@@ -82,11 +86,13 @@ def cloud(
     for first in range(0, n, step):
         part = slice(first, first + step)
         seen = eyepoints.some(part)
-        shots, found = _groups(seen, parameters, surfaces, returns)
+        shots, found = _groups(seen, parameters, surfaces, returns, effects)
         drawn = draw_returns(
             shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
         )
-        for name, values in (_statistics(seen, shots, found) | _points(seen, drawn)).items():
+        for name, values in (
+            _statistics(seen, shots, found) | _points(seen, drawn, shots.offset.shape[1])
+        ).items():
             results[name][part] = values
     return results
 
@@ -96,7 +102,11 @@ def _room(output: SceneOutput, sizes: Mapping[str, int]) -> np.ndarray:
 
 
 def _groups(
-    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface], most: int
+    eyepoints: Eyepoints,
+    parameters: Parameters,
+    surfaces: Sequence[Surface],
+    most: int,
+    effects: Collection[str],
 ) -> tuple[Shots, Groups]:
     """Prepared shots and the groups in their spectra; none where nothing is seen."""
     seen = eyepoints.seen
@@ -104,7 +114,7 @@ def _groups(
         range=np.where(seen, eyepoints.range, _NOWHERE),
         radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
     )
-    shots = prepare_eyepoints(somewhere, parameters, surfaces)
+    shots = prepare_eyepoints(somewhere, parameters, surfaces, effects)
     found = groups(shots, most=most)
     if not seen.all():
         blind = ~seen
@@ -135,11 +145,13 @@ def _statistics(eyepoints: Eyepoints, shots: Shots, found: Groups) -> dict[str, 
     }
 
 
-def _points(eyepoints: Eyepoints, drawn: Returns) -> dict[str, np.ndarray]:
+def _points(eyepoints: Eyepoints, drawn: Returns, beamlets: int) -> dict[str, np.ndarray]:
     """Points and their truth, (n, draws, returns[, 3]) each."""
     known = drawn.beamlet >= 0
     shot = np.arange(len(known))[:, None, None]
     at = shot, np.maximum(drawn.beamlet, 0)
+    if beamlets < eyepoints.weight.size:  # the footprint is left out: its one line is the axis's
+        at = shot, np.broadcast_to(eyepoints.reference[:, None, None], known.shape)
     far = eyepoints.range[:, None, None] + eyepoints.offset[at]
     closing = eyepoints.radial_velocity[:, None, None] + eyepoints.velocity_offset[at]
     along = drawn.range_interpolated[..., None] * eyepoints.direction[:, None, None]

@@ -2,6 +2,7 @@
 
 from scipy.constants import c as SPEED_OF_LIGHT
 from scipy.constants import e as ELEMENTARY_CHARGE
+from scipy.constants import h as PLANCK
 from scipy.constants import k as BOLTZMANN
 
-__all__ = ["BOLTZMANN", "ELEMENTARY_CHARGE", "SPEED_OF_LIGHT"]
+__all__ = ["BOLTZMANN", "ELEMENTARY_CHARGE", "PLANCK", "SPEED_OF_LIGHT"]

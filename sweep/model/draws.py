@@ -4,23 +4,28 @@ Two ways that agree in the mean. ``probabilities`` is [T 3.3.2]'s: uniform numbe
 the probability of a false alarm (noise and leakage together). ``noise`` adds complex Gaussian
 noise to the bins that hold signal and looks; over the other bins, which hold noise alone, the
 largest magnitude is drawn exactly from its order statistic. Both take the bins' noise as
-independent, as the closed forms do.
+independent, as the closed forms do. Where effects are random, each draw has a spectrum and
+probabilities of its own (:mod:`sweep.model.realisations`), and its noise with them.
 
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from sweep.model import chances, philox
-from sweep.model.detection import assess
-from sweep.model.equivalent import MOST_NODES
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import CORE
+from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import DRAW_OUTPUTS
-from sweep.model.preparation import Parameters, Shots, prepare
-from sweep.model.segments import ROOM, segment_spectrum
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.realisations import Means, certain, outputs_of, random_effects, realise
+from sweep.model.segments import inspect_bins, workspace
+from sweep.model.shot import evaluate
 
 METHODS = ("probabilities", "noise")
 
@@ -44,6 +49,19 @@ _MAXIMUM = np.array(
 )
 
 
+class Rows(NamedTuple):
+    """Spectra, (m,) each, that a stretch of draws is taken of."""
+
+    point: np.ndarray
+    """int64: the point whose counts they add to."""
+    keys: np.ndarray
+    """(m, 2) uint64: random key of that point."""
+    first: np.ndarray
+    """int64: number of the first draw."""
+    last: np.ndarray
+    """int64: number after the last."""
+
+
 def draw(
     parameters: Parameters,
     outputs: Mapping[str, np.ndarray],
@@ -52,13 +70,14 @@ def draw(
     first_draw: int,
     batch_sizes: Sequence[int],
     method: str,
+    effects: Collection[str] = CORE,
 ) -> dict[str, np.ndarray]:
-    """Counts of detections and false alarms over batches of draws.
+    """Counts of detections and false alarms over batches of draws, nothing but noise random.
 
     Parameters
     ----------
-    parameters : mapping
-        As for :func:`sweep.model.shot.evaluate`.
+    parameters, effects
+        As for :func:`sweep.model.shot.evaluate`; random effects have no effect here.
     outputs : mapping
         What that gave, (n,) each.
     keys : (n, 2) uint64
@@ -75,22 +94,92 @@ def draw(
     dict of (n, batches) int64 ndarray
         By the names of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
-    ends = first_draw + np.cumsum([0, *batch_sizes])
-    counts = np.zeros((len(DRAW_OUTPUTS), len(keys), len(batch_sizes)), np.int64)
+    ends, counts = _batches(len(keys), first_draw, batch_sizes, method)
     if method == "probabilities":
-        _draw_probabilities(keys, ends, *_chances(outputs), _DETECTION, _FALSE_ALARM, counts)
-    elif method == "noise":
-        for index, shots in prepare(parameters):
-            group = np.zeros((len(DRAW_OUTPUTS), index.size, len(batch_sizes)), np.int64)
-            _draw_noise(
-                keys[index], ends, shots.point_table(), shots.row, shots.footprint,
-                shots.segments, shots.incoherent, _base_count(shots), shots.kernel(), _NOISE,
-                _MAXIMUM, group,
-            )  # fmt: skip
-            counts[:, index] = group
+        _count_by_chance(_all_draws(np.arange(len(keys)), keys, ends), ends, outputs, counts)
     else:
-        raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
+        for index, shots in prepare(parameters, effects):
+            _count_in_noise(_all_draws(index, keys[index], ends), ends, shots, counts)
     return dict(zip(DRAW_OUTPUTS, counts, strict=True))
+
+
+def simulate(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    batch_sizes: Sequence[int],
+    method: str,
+) -> dict[str, np.ndarray]:
+    """Outputs, their errors, and counts over batches of draws, with all effects.
+
+    Parameters
+    ----------
+    parameters, effects
+        As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
+        are means over the same draws that are counted.
+    keys, first_draw, batch_sizes, method
+        As of :func:`draw`.
+
+    Returns
+    -------
+    dict of ndarray
+        (n,) by the names of OUTPUTS and ERROR_OUTPUTS, (n, batches) int64 by those of
+        DRAW_OUTPUTS of :mod:`sweep.model.outputs`.
+    """
+    n = len(keys)
+    if not random_effects(effects):
+        values = evaluate(parameters, effects)
+        outputs = {name: np.broadcast_to(value, (n,)) for name, value in values.items()}
+        counts = draw(
+            parameters, outputs, keys=keys, first_draw=first_draw, batch_sizes=batch_sizes,
+            method=method, effects=effects,
+        )  # fmt: skip
+        return outputs | certain(outputs) | counts
+    ends, tallies = _batches(n, first_draw, batch_sizes, method)
+    means = Means(n)
+    for point, number, shots in realise(
+        parameters, effects, keys=keys, first_draw=first_draw, draws=sum(batch_sizes)
+    ):
+        found = outputs_of(shots)
+        means.add(point, found)
+        rows = Rows(point, keys[point], number, number + 1)
+        if method == "probabilities":
+            _count_by_chance(rows, ends, found, tallies)
+        else:
+            _count_in_noise(rows, ends, shots, tallies)
+    return means.results() | dict(zip(DRAW_OUTPUTS, tallies, strict=True))
+
+
+def _batches(
+    points: int, first_draw: int, sizes: Sequence[int], method: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of draws between batches, (batches + 1,); counts of 0, (names, points, batches)."""
+    if method not in METHODS:
+        raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
+    counts = np.zeros((len(DRAW_OUTPUTS), points, len(sizes)), np.int64)
+    return first_draw + np.cumsum([0, *sizes]), counts
+
+
+def _all_draws(point: np.ndarray, keys: np.ndarray, ends: np.ndarray) -> Rows:
+    """Each point's one spectrum for all of its draws."""
+    return Rows(point, keys, np.full(point.size, ends[0]), np.full(point.size, ends[-1]))
+
+
+def _count_by_chance(
+    rows: Rows, ends: np.ndarray, outputs: Mapping[str, np.ndarray], counts: np.ndarray
+) -> None:
+    _draw_probabilities(rows, ends, *_chances(outputs), _DETECTION, _FALSE_ALARM, counts)
+
+
+def _count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
+    for stretch in stretches(shots):
+        _draw_noise(
+            Rows(*(column[stretch.part] for column in rows)), ends, stretch.points, stretch.row,
+            stretch.scene, shots.segments, choices(shots), _base_count(shots), shots.kernel(),
+            workspace(stretch.lines, shots.fft_size), _NOISE, _MAXIMUM, counts,
+        )  # fmt: skip
 
 
 def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -123,59 +212,69 @@ def _tally(counts, i, batch, found, alarm):
 
 
 @njit(cache=True, nogil=True)
-def _draw_probabilities(keys, ends, found, alarm, found_stream, alarm_stream, counts):
+def _draw_probabilities(rows, ends, found, alarm, found_stream, alarm_stream, counts):
     """Uniform numbers against the probabilities of each segment."""
     hit, false = np.zeros(3, np.int64), np.zeros(3, np.int64)
-    for i in range(keys.shape[0]):
-        a, b = keys[i]
-        for batch in range(ends.size - 1):
-            for number in range(ends[batch], ends[batch + 1]):
-                for s in range(3):
-                    hit[s] = philox.uniform(a, b, number, found_stream[s], 0) < found[s, i]
-                    false[s] = philox.uniform(a, b, number, alarm_stream[s], 0) < alarm[s, i]
-                _tally(counts, i, batch, hit, false)
+    for j in range(rows.point.size):
+        a, b = rows.keys[j]
+        batch = 0
+        for number in range(rows.first[j], rows.last[j]):
+            while number >= ends[batch + 1]:
+                batch += 1
+            for s in range(3):
+                hit[s] = philox.uniform(a, b, number, found_stream[s], 0) < found[s, j]
+                false[s] = philox.uniform(a, b, number, alarm_stream[s], 0) < alarm[s, j]
+            _tally(counts, rows.point[j], batch, hit, false)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_noise(
-    keys, ends, points, row, footprint, segments, power, counted, kernel, noise, maximum,
+    rows, ends, points, row, scene, segments, choices, counted, kernel, work, noise, maximum,
     counts,
 ):  # fmt: skip
     """Noise in every bin: drawn where signal is, by its largest value elsewhere."""
-    fft_size = kernel[0][0]
-    room = np.empty((ROOM, max(footprint[0].shape[1], MOST_NODES, fft_size // 2 + 1)))
-    exempt = np.empty(fft_size // 2 + 1, np.bool_)
-    draws = ends[-1] - ends[0]
+    room, exempt, _ = work
+    draws = (rows.last - rows.first).max()
     hit, false = np.zeros((draws, 3), np.int64), np.zeros((draws, 3), np.int64)
-    for i in range(points.shape[1]):
-        p = points[:, i].copy()
-        sigma, level, floor = p[10], p[11], p[12]
+    for j in range(points.shape[1]):
+        p, first = points[:, j].copy(), rows.first[j]
+        sigma, level = p[10], p[11]
+        floor = p[12] if choices[2] else np.inf  # no bin but the detection is looked at
         for s in range(3):
             if not segments[s]:
                 continue
-            _, count = segment_spectrum(s, p, footprint, row[i], floor * sigma, power, kernel, room)
-            peak, exempted, _ = assess(room[0], count, sigma, level, floor, exempt)
+            _, count, peak, exempted, _ = inspect_bins(
+                s, p, scene, (row[j], j), choices, kernel, room, exempt
+            )
             others = counted[0] - (exempted if counted[1] else 0.0)
             signals = room[0, :count] / sigma
-            for d in range(draws):
+            for d in range(rows.last[j] - first):
                 hit[d, s], false[d, s] = _look(
-                    keys[i], ends[0] + d, noise[s], maximum[s], signals, exempt, peak, floor,
-                    level / sigma, others,
+                    rows.keys[j], first + d, noise[s], maximum[s], signals, exempt, peak, floor,
+                    (level / sigma, p[13] / sigma), others,
                 )  # fmt: skip
-        for batch in range(ends.size - 1):
-            for d in range(ends[batch] - ends[0], ends[batch + 1] - ends[0]):
-                _tally(counts, i, batch, hit[d], false[d])
+        batch = 0
+        for d in range(rows.last[j] - first):
+            while first + d >= ends[batch + 1]:
+                batch += 1
+            _tally(counts, rows.point[j], batch, hit[d], false[d])
 
 
 @njit(cache=True, error_model="numpy")
-def _look(key, number, stream, maximum_stream, signals, exempt, peak, floor, beta, others):
-    """Whether one draw of noise lifts the peak over the threshold, and any other bin."""
+def _look(key, number, stream, maximum_stream, signals, exempt, peak, floor, levels, others):
+    """Whether one draw of noise lifts the peak over the threshold, and any other bin.
+
+    ``levels`` are the threshold and the noise under the lines, over the noise of any other bin.
+    """
     a, b = key
+    beta, under_lines = levels
     found, alarm = False, False
     for i in range(signals.size):
         if i != peak and (exempt[i] or signals[i] < floor):
             continue
         re, im = philox.normal_pair(a, b, number, stream, i)
+        if i == peak:
+            re, im = re * under_lines, im * under_lines
         crosses = (signals[i] + re) ** 2 + im**2 >= beta * beta
         if i == peak:
             found = crosses

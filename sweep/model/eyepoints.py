@@ -5,13 +5,16 @@ depend on laser power, receiver or processing. It is worked out once and serves 
 radiometric studies [T 3.2].
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sweep.model import reflectance
+from sweep.model.chain import prepare_cast
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.atmosphere import PATH_ELEVATION
+from sweep.model.effects.catalogue import CORE
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.beamlet_rays import beamlet_rays
 from sweep.model.geometry.jitter import PointingJitter
@@ -20,7 +23,10 @@ from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
 from sweep.model.geometry.scanner import Scanner
 from sweep.model.geometry.surfaces import Surface
-from sweep.model.preparation import Footprints, Parameters, Shots, prepare_footprints
+from sweep.model.ground import Cast, Footprints
+from sweep.model.preparation import Parameters, Shots
+
+_HEIGHT = "atmosphere.target_height"
 
 
 class Eyepoints(NamedTuple):
@@ -58,6 +64,11 @@ class Eyepoints(NamedTuple):
         """Shots of which any beamlet hits something, (n,) bool."""
         return np.isfinite(self.range)
 
+    @property
+    def reference(self) -> np.ndarray:
+        """Reference beamlet, the first that hits anything, (n,)."""
+        return np.asarray((self.surface >= 0).argmax(axis=1))
+
     def some(self, shots: slice | np.ndarray) -> "Eyepoints":
         """Some of the shots, by a slice, their places or a mask."""
         return Eyepoints._make([*(values[shots] for values in self[:-1]), self.weight])
@@ -74,6 +85,7 @@ def observe(
     pattern: str = "hexagonal",
     bodies: Sequence[Flight | None] | None = None,
     jitter: PointingJitter | None = None,
+    rotation: bool = True,
 ) -> Eyepoints:
     """Eyepoints of shots by number.
 
@@ -94,6 +106,8 @@ def observe(
     jitter : PointingJitter, optional
         Turns the light of each shot, of which the instrument knows nothing: position, velocity
         and `direction` stay those commanded. None draws nothing.
+    rotation : bool
+        Whether the surfaces of turning bodies move as they turn.
     """
     index = np.asarray(index)
     shots = scanner.shots(index)
@@ -105,7 +119,7 @@ def observe(
     moving = [None if body is None else body.state(time) for body in bodies or ()]
     poses = [None if body is None else Pose(body.position, body.attitude) for body in moving]
     bundle = caster.bundle(state.position, rays, poses=poses or None)
-    velocity = _radial_velocity(state, rays, bundle, moving)
+    velocity = _radial_velocity(state, rays, bundle, moving, rotation)
     rows = np.arange(len(time))
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
     return Eyepoints(
@@ -116,7 +130,11 @@ def observe(
 
 
 def _radial_velocity(
-    state: State, rays: np.ndarray, bundle: Bundle, moving: Sequence[State | None]
+    state: State,
+    rays: np.ndarray,
+    bundle: Bundle,
+    moving: Sequence[State | None],
+    rotation: bool,
 ) -> np.ndarray:
     """Closing speed of instrument and surface along every beamlet [m/s], (n, b); nan for a miss.
 
@@ -127,19 +145,38 @@ def _radial_velocity(
     for body, motion in enumerate(moving):
         if motion is None:
             continue
-        hit = np.where(bundle.body == body, bundle.range[:, None] + bundle.offset, 0.0)
-        point = state.position[:, None] + rays * hit[..., None]
-        arm = point - motion.position[:, None]
-        surface = motion.velocity[:, None] + np.cross(motion.rate[:, None], arm)
-        receding = np.einsum("nbi,nbi->nb", rays, surface)
+        surface = motion.velocity[:, None]
+        if rotation and motion.rate.any():
+            hit = np.where(bundle.body == body, bundle.range[:, None] + bundle.offset, 0.0)
+            arm = state.position[:, None] + rays * hit[..., None] - motion.position[:, None]
+            surface = surface + np.cross(motion.rate[:, None], arm)
+        receding = (rays * surface).sum(axis=-1)
         closing = np.where(bundle.body == body, closing - receding, closing)
     return np.where(bundle.valid, closing, np.nan)
 
 
 def prepare_eyepoints(
-    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface]
+    eyepoints: Eyepoints,
+    parameters: Parameters,
+    surfaces: Sequence[Surface],
+    effects: Collection[str] = CORE,
 ) -> Shots:
     """Radiometry's shots of eyepoints that all see something.
+
+    Parameters
+    ----------
+    eyepoints, parameters, surfaces
+        As of :func:`seen_ground`.
+    effects : collection of str
+        Names of the effects that are simulated.
+    """
+    return prepare_cast(*seen_ground(eyepoints, parameters, surfaces), effects)
+
+
+def seen_ground(
+    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface]
+) -> tuple[Parameters, Cast]:
+    """Parameters of shots, and what their beams meet.
 
     Parameters
     ----------
@@ -165,14 +202,23 @@ def prepare_eyepoints(
     doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
     lit, back = _scattered(eyepoints, surfaces)
     footprints = Footprints(np.arange(len(hit)), relative, doppler, back / (1 + relative) ** 2)
+    axis = eyepoints.surface[np.arange(len(hit)), eyepoints.reference]
+    ground = Cast(footprints, hit & (eyepoints.surface != axis[:, None]))
     shots = dict(parameters) | {
         "target.range": eyepoints.range,
         "target.radial_velocity": eyepoints.radial_velocity,
         "target.reflectance": 1.0,
+        PATH_ELEVATION: -np.arcsin(eyepoints.direction[:, 2]),
+        _HEIGHT: parameters.get(_HEIGHT, 0.0) + _height_of_target(eyepoints),
     }
     # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
     shots["target.solar_irradiance"] = np.asarray(parameters["target.solar_irradiance"]) * lit
-    return prepare_footprints(shots, footprints)
+    return shots, ground
+
+
+def _height_of_target(eyepoints: Eyepoints) -> np.ndarray:
+    """Height in the world where the beam's axis ends [m], (n,)."""
+    return eyepoints.position[:, 2] + eyepoints.range * eyepoints.direction[:, 2]
 
 
 def _scattered(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, np.ndarray]:

@@ -47,8 +47,8 @@ LARGEST_ANGLE = 0.06
 MOST_POINTS = 200
 """Gauss points on one side of the lines, at the most."""
 
-_TILE = 24
-"""Bins of the near field that are done together: a number known when compiling."""
+_TILE = (0,) * 24
+"""Bins of the near field that are done together: a tuple, whose length is known when compiling."""
 
 _LARGEST_ORDER = 12
 _GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
@@ -119,20 +119,20 @@ def _kernel(q, delta, coefficients, square):
 
 
 @njit(cache=True, error_model="numpy")
-def _add_tile(first, delta, re, im, n, image, fft_size, coefficients, power, out_re, out_im):
-    """Adds the kernels of n lines, or images, to the bins of one tile."""
+def _add_tile(tile, first, delta, re, im, n, image, fft_size, coefficients, power, out_re, out_im):
+    """Adds the kernels of n lines, or images, to the bins of one tile: as many as it is long."""
     square = (math.pi / fft_size) ** 2
     scale = fft_size / math.pi
     for j in range(n):
         d, b = delta[j], -im[j] * scale
         if power:
             a = re[j] * scale * scale
-            for i in range(_TILE):
+            for i in range(len(tile)):
                 k = _kernel(first + i, d, coefficients, square)
                 out_re[i] = fma(a * k, k, out_re[i])
         else:
             a = re[j] * scale if image else -re[j] * scale
-            for i in range(_TILE):
+            for i in range(len(tile)):
                 k = _kernel(first + i, d, coefficients, square)
                 out_re[i] = fma(a, k, out_re[i])
                 out_im[i] = fma(b, k, out_im[i])
@@ -162,16 +162,34 @@ def add_near_field(
     out_re, out_im : (count,) float64
         Result.
     """
-    sum_re, sum_im = tile[0, :_TILE], tile[1, :_TILE]
-    for start in range(0, out_re.size, _TILE):
-        sum_re[:] = 0.0
-        sum_im[:] = 0.0
+    count = out_re.size
+    if count <= len(_TILE) - 8:
+        size = (count + 7) // 8 * 8  # whole vectors
+        sum_re, sum_im = tile[0, :size], tile[1, :size]
+        _clear(sum_re, sum_im)
         _add_tile(
-            first + start, delta, re, im, n, image, fft_size, coefficients, power, sum_re, sum_im
+            sum_re, first, delta, re, im, n, image, fft_size, coefficients, power, sum_re, sum_im
         )
-        for i in range(min(_TILE, out_re.size - start)):
+        for i in range(count):
+            out_re[i] += sum_re[i]
+            out_im[i] += sum_im[i]
+        return
+    sum_re, sum_im = tile[0, : len(_TILE)], tile[1, : len(_TILE)]
+    for start in range(0, count, len(_TILE)):
+        _clear(sum_re, sum_im)
+        _add_tile(
+            _TILE, first + start, delta, re, im, n, image, fft_size, coefficients, power, sum_re,
+            sum_im,
+        )  # fmt: skip
+        for i in range(min(len(_TILE), count - start)):
             out_re[start + i] += sum_re[i]
             out_im[start + i] += sum_im[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _clear(re, im):
+    re[:] = 0.0
+    im[:] = 0.0
 
 
 @njit(cache=True, error_model="numpy")

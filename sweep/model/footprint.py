@@ -123,3 +123,32 @@ def plane_footprint(
     offset = np.where(hits, (stretch * sine - y * cosine) / safe, 0.0)
     cos_incidence = np.where(hits, height / (1 + stretch), 0.0)
     return offset, cos_incidence, np.where(hits, share, 0.0)
+
+
+def velocity_offsets(
+    *,
+    radial: np.ndarray,
+    transverse: np.ndarray,
+    beam_divergence: np.ndarray,
+    number: int,
+    pattern: str = "hexagonal",
+) -> np.ndarray:
+    """Closing speed of each beamlet less that of the beam's axis [m/s], (n, number).
+
+    A beamlet y off the axis towards the plane's near side, and x across, sees
+    (v_r + v_t y) / |d| with |d|^2 = 1 + x^2 + y^2.
+
+    Parameters
+    ----------
+    radial, transverse : (n,) ndarray
+        Velocity along the axis, positive closing, and across it towards the near side [m/s].
+    beam_divergence, number, pattern
+        As of :func:`plane_footprint`.
+    """
+    (across, along), _ = beamlets(number, pattern)
+    sigma = np.asarray(beam_divergence, float)[:, None] / 4
+    x, y = across * sigma, along * sigma
+    square = x * x + y * y
+    stretch = square / (1 + np.sqrt(1 + square))  # |d| - 1
+    closing = np.asarray(transverse)[:, None] * y - np.asarray(radial)[:, None] * stretch
+    return np.asarray(closing / (1 + stretch))

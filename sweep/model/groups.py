@@ -13,6 +13,7 @@ from numba import njit
 from sweep.model.crossings import crossing_series
 from sweep.model.elementary import borrowed
 from sweep.model.marcum import marcum_q1_pair
+from sweep.model.modulation import Stretch, choices, stretches
 from sweep.model.preparation import Shots
 from sweep.model.segments import inspect_segment, lent, workspace
 
@@ -50,44 +51,52 @@ class Groups(NamedTuple):
 def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
 
-    ``every_bin`` as of :func:`sweep.model.segments.inspect_segment`.
+    ``every_bin`` as of :func:`sweep.model.shot.find`.
     """
-    n = shots.range.size
+    found = [_of_stretch(shots, stretch, most, every_bin) for stretch in stretches(shots)]
+    if len(found) == 1:
+        return found[0]
+    return Groups(*(np.concatenate(fields) for fields in zip(*found, strict=True)))
+
+
+def _of_stretch(shots: Shots, stretch: Stretch, most: int, every_bin: bool) -> Groups:
+    n = stretch.row.size
     bins = np.full((3, n, 3, most), -1, np.int64)
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     _find_groups(
-        shots.point_table(), shots.row, shots.footprint, shots.segments,
-        (shots.incoherent, every_bin), shots.kernel(),
-        workspace(shots.offset.shape[1], shots.fft_size), bins, neighbours, pd, exempted, leakage,
+        stretch.points, stretch.row, stretch.scene, shots.segments,
+        choices(shots, every_bin=every_bin), shots.kernel(),
+        workspace(stretch.lines, shots.fft_size), bins, neighbours, pd, exempted, leakage,
     )  # fmt: skip
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_groups(
-    points, row, footprint, segments, choices, kernel, work, bins, neighbours, pd, exempted, leakage
+    points, row, scene, segments, choices, kernel, work, bins, neighbours, pd, exempted, leakage
 ):
     """Groups of every point and segment, into arrays of the shapes of :class:`Groups`."""
     half = kernel[0][0] // 2
-    footprint, kernel, (room, exempt, series) = lent(footprint, kernel, work)
+    scene, kernel, (room, exempt, series) = lent(scene, kernel, work)
     bins = borrowed(bins)
     p = np.empty(points.shape[0])
     for i in range(points.shape[1]):
         p[:] = points[:, i]
         sigma, level = p[10], p[11]
-        crossing_series(level / sigma, series)
+        if choices[2]:
+            crossing_series(level / sigma, series)
         for s in range(3):
             if not segments[s]:
                 continue
             low, count, peak, exempted[i, s], leakage[i, s] = inspect_segment(
-                s, p, footprint, row[i], choices[0], choices[1], kernel, room, exempt, series
+                s, p, scene, (row[i], i), choices, kernel, room, exempt, series
             )
             magnitude = room[0, :count]
             found = _list_groups(magnitude, peak, level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]
-                pd[i, s, g] = marcum_q1_pair(magnitude[k] / sigma, level / sigma)[0]
+                pd[i, s, g] = marcum_q1_pair(magnitude[k] / p[13], level / p[13])[0]
                 for side in range(3):
                     neighbours[i, s, g, side] = _beside(magnitude, low, k + side - 1, half)
                 bins[:, i, s, g] += low

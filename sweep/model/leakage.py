@@ -20,8 +20,19 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
-from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
-from sweep.model.spectrum import set_tangents
+from sweep.model.far_field import CLEARANCE, add_far_field
+from sweep.model.runs import (
+    DELTA,
+    IMAGES,
+    SOURCES,
+    STRENGTH_IM,
+    STRENGTH_RE,
+    magnitudes,
+    near_bins,
+    prepare_field,
+    stays_below,
+    sum_afar,
+)
 
 APRON = 3
 """Bins on either side of an integral's near end that its corrections look at."""
@@ -29,38 +40,9 @@ APRON = 3
 SMOOTHNESS = 1e-7
 """Largest last correction at the near end of an integral, relative to all that leaks."""
 
-DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
-"""Rows of scratch that hold the lines."""
-
-SOURCES, IMAGES = 13, 16
-"""First of three rows each that hold the sources of lines and of images."""
-
 
 @njit(cache=True, error_model="numpy")
-def smooth(kernel):
-    """Whether spectra are smooth between lines: closed form of the window, no padding."""
-    return kernel[1][4].size == 0 and kernel[0][0] == kernel[0][1]
-
-
-@njit(cache=True, error_model="numpy")
-def reach_of(level, weights, envelope, reach):
-    """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
-    if not weights > 0.0:
-        return 1.0
-    low, high = 0, envelope.size - 1
-    if envelope[high] * weights > level:
-        return np.inf
-    while low < high:
-        middle = (low + high) // 2
-        if envelope[middle] * weights > level:
-            low = middle + 1
-        else:
-            high = middle
-    return reach[low]
-
-
-@njit(cache=True, error_model="numpy")
-def inspect(origin, n, noise, power, kernel, room, exempt, series):
+def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     """Run of bins, detection and leakage of a segment's lines.
 
     Parameters
@@ -70,7 +52,7 @@ def inspect(origin, n, noise, power, kernel, room, exempt, series):
         ``power`` |C_b|^2 and nothing; they become strengths.
     noise : (float, float)
         sigma per quadrature; threshold.
-    power, kernel
+    choices, kernel
         As of :func:`sweep.model.segments.segment_spectrum`.
     room : (ROOM, width) float64
         Scratch; |X| of the run in row 0.
@@ -87,22 +69,28 @@ def inspect(origin, n, noise, power, kernel, room, exempt, series):
     leakage : float
     """
     half_size = kernel[0][0] // 2
+    power, image = choices[0], choices[1]
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
-    near, mirrored, fits = _near_bins(origin, lowest, highest, kernel)
+    near, mirrored, fits = near_bins(
+        origin, lowest, highest, CLEARANCE + len(kernel[1][2]), image, kernel
+    )
     if not fits:
         return 0, 0, 0, 0, 0.0
-    field, total = _prepare(origin, n, total, (lowest, highest), power, kernel, room)
-    reach = _least_reach(total, highest - lowest, noise, field[0], kernel)
+    spread = lowest, highest
+    poles = len(kernel[1][2])
+    total = math.sqrt(total) if power else sum_afar(re, im, n, total, spread, poles)
+    field = prepare_field(origin, n, spread, True, choices, kernel, room)
+    reach = _least_reach(total, highest - lowest, noise, field[0], image, kernel)
     while True:
         low, high = near[0] - reach, near[1] + reach
         low = 0 if low <= reach + APRON else low
         high = half_size if half_size - high <= reach + APRON else high
         count = high - low + 1
-        _magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
+        magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
         peak, exempted = mark(room[0], count, noise[1], exempt)
         leakage, settled = _leakage(
-            low, count, peak, field, noise, power, kernel, room, exempt, series
+            low, count, peak, field, noise, choices, kernel, room, exempt, series
         )
         if settled:
             return low, count, peak, exempted, leakage
@@ -110,124 +98,23 @@ def inspect(origin, n, noise, power, kernel, room, exempt, series):
 
 
 @njit(cache=True, error_model="numpy")
-def _near_bins(origin, lowest, highest, kernel):
-    """First and last bin near a line; whether images are near too; whether angles are small."""
-    fft_size = kernel[0][0]
-    half_size = fft_size // 2
-    clearance = CLEARANCE + len(kernel[1][2])
-    low = origin + math.floor(lowest) - clearance
-    high = origin + math.ceil(highest) + clearance
-    # Lines beyond DC or Nyquist are seen as their images, which fold back into the band.
-    if low < 0:
-        high = max(high, -low)
-    if high > half_size:
-        low = min(low, fft_size - high)
-    low, high = max(low, 0), min(high, half_size)
-    below, above = low + origin + lowest, fft_size - high - origin - highest
-    mirrored = min(below, above) < clearance
-    farthest = max(high - origin - lowest, origin + highest - low)
-    if mirrored:
-        sum_, other = high + origin + highest, fft_size - low - origin - lowest
-        farthest = max(farthest, sum_ if below < above else other)
-    fits = (farthest + clearance) * math.pi < LARGEST_ANGLE * fft_size
-    return (low, high), mirrored, fits
-
-
-@njit(cache=True, error_model="numpy")
-def _prepare(origin, n, total, spread, power, kernel, room):
-    """What the far field needs, and the summed strengths as they are seen from afar.
-
-    The field is: bin that distances count from, number of sources of the lines and of their
-    images, what the window's first sample adds to every bin.
-    """
-    fft_size, poles = kernel[0][0], len(kernel[1][2])
-    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    centre = abs(origin + math.floor(0.5 * (spread[0] + spread[1]) + 0.5))
-    centre = fft_size - centre if centre > fft_size // 2 else centre  # where it is seen
-    lines, images = far_field.far_sources(
-        delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
-        room[SOURCES:], room[5:11],
-    )  # fmt: skip
-    edge = far_field.edge_field(re if power else im, n, kernel[1][3], power)
-    afar = math.sqrt(total) if power else _sum_afar(re, im, n, total, spread, poles)
-    return (centre, lines, images, edge), afar
-
-
-@njit(cache=True, error_model="numpy")
-def _sum_afar(re, im, n, total, spread, poles):
-    """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
-
-    By how much kernels may differ over the bundle, from the clearance on: the spread times their
-    derivative, (2 poles + 1) over the distance.
-    """
-    sum_re, sum_im = 0.0, 0.0
-    for b in range(n):
-        sum_re += re[b]
-        sum_im += im[b]
-    differ = (2 * poles + 1) * 0.5 * (spread[1] - spread[0]) / CLEARANCE
-    return min(total, math.hypot(sum_re, sum_im) + differ * total)
-
-
-@njit(cache=True, error_model="numpy")
-def _least_reach(total, spread, noise, centre, kernel):
+def _least_reach(total, spread, noise, centre, image, kernel):
     """Bins beyond the near ones that the run has to take in: see the module."""
     sigma, level = noise
     window_sum, envelope, reach = kernel[2]
     half_size = kernel[0][0] // 2
     clearance = CLEARANCE + len(kernel[1][2])
     weight = total * window_sum
-    crossing = reach_of(0.9 * level, weight, envelope, reach)
-    far = min(centre, half_size - centre) - 0.5 * spread - 1.0
-    if far < 32.0 * crossing:  # else images add less than a tenth
-        crossing = reach_of(0.5 * level, weight, envelope, reach)
+    crossing = stays_below(level, weight, spread, centre, image, kernel)
     at = np.searchsorted(reach, float(clearance))
     beside = envelope[min(at, envelope.size - 1)] * weight / sigma
     gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
-    least = max(crossing + 1.5, max(gentle, 0.75 * spread)) - clearance
+    least = max(crossing, max(gentle, 0.75 * spread)) - clearance
     return int(min((max(math.ceil(least), 0.0) + 2 * APRON + 7) // 8 * 8, half_size))
 
 
 @njit(cache=True, error_model="numpy")
-def _magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room):
-    """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
-    coefficients, numerator, poles, _, _ = kernel[1]
-    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
-    centre, lines_used, images_used, edge = field
-    re, im, t = room[0, :count], room[1, :count], room[2, :count]
-    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
-    re[:] = edge
-    im[:] = 0.0
-    set_tangents(low - centre, count, fft_size, kernel[4], t)
-    first, last = near[0] - low, near[1] - low + 1
-    for start, end in ((0, first), (last, count)):
-        if start < end:
-            at, part_re, part_im = t[start:end], re[start:end], im[start:end]
-            add_far_field(at, lines, lines_used, numerator, poles, power, part_re, part_im)
-            if mirrored:
-                add_far_field(at, images, images_used, numerator, poles, power, part_re, part_im)
-    if not mirrored:
-        add_far_field(t, images, images_used, numerator, poles, power, re, im)
-    delta, strength_re, strength_im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    first_bin, near_re, near_im = near[0] - origin, re[first:last], im[first:last]
-    add_near_field(
-        first_bin, delta, strength_re, strength_im, n, False, fft_size, coefficients, power,
-        room[5:7], near_re, near_im,
-    )  # fmt: skip
-    if mirrored:
-        for b in range(n):
-            room[7, b] = -delta[b]
-        first_bin = near[0] + origin - (fft_size if 2 * near[0] > half_size else 0)
-        add_near_field(
-            first_bin, room[7], strength_re, strength_im, n, True, fft_size, coefficients, power,
-            room[5:7], near_re, near_im,
-        )  # fmt: skip
-    for i in range(count):
-        square = re[i] if power else re[i] * re[i] + im[i] * im[i]
-        re[i] = math.sqrt(square if square > 0.0 else 0.0)
-
-
-@njit(cache=True, error_model="numpy")
-def _leakage(low, count, peak, field, noise, power, kernel, room, exempt, series):
+def _leakage(low, count, peak, field, noise, choices, kernel, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
     sigma, level = noise
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
@@ -248,12 +135,14 @@ def _leakage(low, count, peak, field, noise, power, kernel, room, exempt, series
             return 0.0, False
         tail += correction
         rest += last
-        points = _points_beyond(side, low, count, field[0], steepness, kernel, room, points)
+        points = _points_beyond(
+            side, low, count, field[0], steepness, choices[1], kernel, room, points
+        )
     while points % 8:  # whole vectors: what is left over costs as much as all of them
         room[9, points], room[10, points] = room[9, points - 1], 0.0
         points += 1
     far_field.points_to_bins(room[9, :points], room[10, :points], fft_size)
-    largest_beyond = _far_chances(points, field, scale, beta, power, kernel, room, series)
+    largest_beyond = _far_chances(points, field, scale, beta, choices[0], kernel, room, series)
     tail += weighted_silence(chance[:points], room[10, :points])
     most = min(0.45 * beta * beta, magnitude[peak] * magnitude[peak] * scale)
     if not (largest_beyond <= most and rest <= SMOOTHNESS * (some + tail)):
@@ -292,8 +181,12 @@ def _near_end(side, count, chance, exempt):
 
 
 @njit(cache=True, error_model="numpy")
-def _points_beyond(side, low, count, centre, steepness, kernel, room, points):
-    """Adds the points and weights of one side's integral to rows 9 and 10."""
+def _points_beyond(side, low, count, centre, steepness, image, kernel, room, points):
+    """Adds the points and weights of one side's integral to rows 9 and 10.
+
+    With images the spectrum is even about DC and Nyquist; without, it goes on, and the integral
+    out to half a bin beyond is corrected by the first difference there.
+    """
     fft_size, half_size, tangent = kernel[0][0], kernel[0][0] // 2, kernel[4]
     odd = 2 * half_size != fft_size
     if side < 0:
@@ -301,14 +194,24 @@ def _points_beyond(side, low, count, centre, steepness, kernel, room, points):
     else:
         last, far_bin, half = low + count - 1 - APRON - centre, half_size, odd
     v, weight = room[9], room[10]
+    last_bin = abs(far_bin - centre)
+    goes_on = not image and last_bin < half_size
+    half = half or goes_on
     far = max(far_field.half_bin_cotangent(abs(far_bin - centre), half, fft_size, tangent), 1e-9)
     points = far_field.far_points(
         float(side), far_field.half_bin_cotangent(last, True, fft_size, tangent), far,
         steepness * (last + 0.5), v, weight, points,
     )  # fmt: skip
-    if not half:  # the far end is a bin: half of it lies beyond the integral
+    bin_ = math.pi / fft_size
+    if goes_on:
+        for k in range(2):
+            at = far_field.half_bin_cotangent(last_bin + k, False, fft_size, tangent)
+            v[points] = side * at
+            weight[points] = (1.0 - 2.0 * k) / 24.0 * bin_ * (1.0 + at * at)
+            points += 1
+    elif not half:  # the far end is a bin: half of it lies beyond the integral
         v[points] = side * far
-        weight[points] = 0.5 * math.pi / fft_size * (1.0 + far * far)
+        weight[points] = 0.5 * bin_ * (1.0 + far * far)
         points += 1
     return points
 
@@ -317,10 +220,10 @@ def _points_beyond(side, low, count, centre, steepness, kernel, room, points):
 def _far_chances(points, field, scale, beta, power, kernel, room, series):
     """Added chances at the points of the integrals, into row 4; the largest a^2/2 there."""
     _, numerator, poles, _, _ = kernel[1]
-    _, lines_used, images_used, edge = field
+    _, lines_used, images_used, edge_re, edge_im = field
     t, re, im, x = room[9, :points], room[11, :points], room[12, :points], room[3]
-    re[:] = edge
-    im[:] = 0.0
+    re[:] = edge_re
+    im[:] = edge_im
     lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
     add_far_field(t, lines, lines_used, numerator, poles, power, re, im)
     add_far_field(t, images, images_used, numerator, poles, power, re, im)

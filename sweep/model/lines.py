@@ -33,7 +33,7 @@ def folded_origin(centre, fft_size):
 
 @njit(cache=True, error_model="numpy")
 def segment_lines(
-    segment, chirp, optics, record, offset, doppler, amplitude, delta, re, im, power=False
+    segment, chirp, optics, record, offset, doppler, amplitude, phases, delta, re, im, power=False
 ):  # fmt: skip
     """Lines of a segment: positions and complex weights C_b of :mod:`sweep.model.spectrum`.
 
@@ -50,6 +50,8 @@ def segment_lines(
         Sample rate [Hz], FFT size N, window length L, acquisition delay t_0 [s].
     offset, doppler, amplitude : (n,) float64
         (R_b - R_0)/R_0, beta_b - beta_0 and relative amplitude of each beamlet.
+    phases : (n,) or (0,) float64
+        Phases [cycles] that beamlets have besides; or none.
     delta, re, im : (>= n,) float64
         Result: bins from the returned origin, and C_b.
     power : bool
@@ -64,8 +66,7 @@ def segment_lines(
     rate, range_0, beta, scale = chirp
     sample_rate, fft_size, length, start = record
     bins = fft_size / sample_rate
-    per_metre = sign * rate * (2.0 / SPEED_OF_LIGHT)
-    centre_frequency = carrier * beta - per_metre * (1.0 + beta) * range_0
+    per_metre, centre_frequency = _axis(segment, chirp)
     centre = centre_frequency * bins
     origin, turns, fold = folded_origin(centre, fft_size)
     delta_0 = fold * (centre - turns) - origin
@@ -86,6 +87,8 @@ def segment_lines(
         delay = (range_0 + further) * (2.0 / SPEED_OF_LIGHT)
         phase = phase_0 - product_fraction(high, low, further)
         phase += fraction_of_cycle(square * delay * delay) + beat * start
+        if phases.size:
+            phase += phases[b]
         delta[b] = delta_0 + fold * beat * bins
         sine, cosine = sincos_cycles(fold * phase + turn_0 + half_ratio * delta[b])
         frequency = centre_frequency + beat
@@ -95,6 +98,22 @@ def segment_lines(
         re[b] = weight * (cosine * p + sine * q)
         im[b] = weight * (sine * p - cosine * q)
     return origin
+
+
+@njit(cache=True, error_model="numpy")
+def folding(segment, chirp, record):
+    """-1 where the lines of a segment are seen as their images, else +1; see `segment_lines`."""
+    _, centre_frequency = _axis(segment, chirp)
+    return folded_origin(centre_frequency * (record[1] / record[0]), record[1])[2]
+
+
+@njit(inline="always")
+def _axis(segment, chirp):
+    """Change of the beat with range [Hz/m]; beat on the beam's axis [Hz]."""
+    sign, carrier = segment
+    rate, range_0, beta, _ = chirp
+    per_metre = sign * rate * (2.0 / SPEED_OF_LIGHT)
+    return per_metre, carrier * beta - per_metre * (1.0 + beta) * range_0
 
 
 @njit(inline="always")

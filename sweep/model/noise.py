@@ -7,8 +7,6 @@ import numpy as np
 from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 from sweep.model.link import aperture_area
 
-SOURCES = ("local_oscillator_shot", "signal_shot", "solar_shot", "detector", "amplifier", "thermal")
-
 
 def solar_power(
     *,
@@ -29,48 +27,61 @@ def solar_power(
     return radiance * aperture_area(aperture) * solid_angle * optical_passband * optical_efficiency
 
 
-def current_variances(
+def shot_noise(
+    *,
+    power: np.ndarray | float,
+    apd_gain: np.ndarray,
+    excess_noise_factor: np.ndarray,
+    responsivity: np.ndarray,
+    electrical_bandwidth: np.ndarray,
+) -> np.ndarray:
+    """Current variance 2 q M^2 F Re P B_e [A^2] of light of power P [W] on the detector."""
+    gain = np.asarray(apd_gain) ** 2 * excess_noise_factor
+    return 2 * ELEMENTARY_CHARGE * gain * responsivity * power * electrical_bandwidth
+
+
+def receiver_currents(
     architecture: str,
     *,
     local_oscillator_power: np.ndarray,
-    echo_power: np.ndarray,
-    solar_power: np.ndarray,
     apd_gain: np.ndarray,
     excess_noise_factor: np.ndarray,
     responsivity: np.ndarray,
     noise_equivalent_power: np.ndarray,
     amplifier_noise_current: np.ndarray,
     electrical_bandwidth: np.ndarray,
-    noise_figure: np.ndarray,
     load_resistance: np.ndarray,
     temperature: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Input-referred current variance of each source [A^2] inside the electrical bandwidth.
+    """Current variance of each source in the receiver [A^2] inside the electrical bandwidth.
 
-    Shot noise is 2 q M^2 F Re P B_e for each light on the detector, the detector's own
-    (M Re NEP)^2 B_e, the amplifier's its rms current squared. Direct detection has no local
-    oscillator and adds its load's thermal noise 4 k T B_e / R_L [T 2.22]. Heterodyne detection
-    mixes an IF down: noise from both sides of the IF lands in the record, which makes the
+    The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
+    current squared. Direct detection has no local oscillator and adds its load's thermal noise
+    4 k T B_e / R_L [T 2.22]. What light from outside adds are effects.
+    """
+    detector = (apd_gain * responsivity * noise_equivalent_power) ** 2 * electrical_bandwidth
+    own = {"detector": detector, "amplifier": np.asarray(amplifier_noise_current) ** 2}
+    if architecture == "direct":
+        thermal = 4 * BOLTZMANN * temperature * electrical_bandwidth / load_resistance
+        return own | {"thermal": thermal}
+    oscillator = shot_noise(
+        power=local_oscillator_power,
+        apd_gain=apd_gain,
+        excess_noise_factor=excess_noise_factor,
+        responsivity=responsivity,
+        electrical_bandwidth=electrical_bandwidth,
+    )
+    return {"local_oscillator_shot": oscillator} | own
+
+
+def current_scale(architecture: str, *, noise_figure: np.ndarray) -> np.ndarray:
+    """Factor on all current variances: 2 F_RF for a heterodyne receiver, else 1.
+
+    It mixes an IF down: noise from both sides of the IF lands in the record, which makes the
     shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's; its RF noise figure
     multiplies all of it.
     """
-    per_watt = (
-        2 * ELEMENTARY_CHARGE * apd_gain**2 * excess_noise_factor * responsivity
-    ) * electrical_bandwidth
-    direct = architecture == "direct"
-    variances = {
-        "local_oscillator_shot": per_watt * (0.0 if direct else local_oscillator_power),
-        "signal_shot": per_watt * echo_power,
-        "solar_shot": per_watt * solar_power,
-        "detector": (apd_gain * responsivity * noise_equivalent_power) ** 2 * electrical_bandwidth,
-        "amplifier": amplifier_noise_current**2,
-        "thermal": (
-            4 * BOLTZMANN * temperature * electrical_bandwidth / load_resistance if direct else 0.0
-        ),
-    }
-    if architecture == "heterodyne":
-        return {source: 2 * noise_figure * value for source, value in variances.items()}
-    return variances
+    return np.asarray(2.0 * noise_figure if architecture == "heterodyne" else 1.0)
 
 
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:

@@ -82,3 +82,18 @@ DRAW_OUTPUTS: dict[str, Output] = {
     "n_false_alarm_down": _count("a false alarm in the down-chirp segment"),
     "n_false_alarm_shot": _count("a false alarm in both chirp segments"),
 }
+
+
+def _error(segment: str, comment: str = "") -> Output:
+    text = "over draws; 0 where nothing random is simulated, nan with a single draw"
+    name = f"standard error of the mean probability of detection, {segment}"
+    return Output("1", name, "; ".join(filter(None, (text, comment))))
+
+
+ERROR_OUTPUTS: dict[str, Output] = {
+    "pd_up_error": _error("up-chirp"),
+    "pd_down_error": _error("down-chirp"),
+    "pd_doppler_error": _error("Doppler segment", NO_DOPPLER),
+    "pd_shot_error": _error("shot"),
+}
+"""Floats, one a point, of studies with draws; each of the output that it is named after."""

@@ -56,8 +56,8 @@ def draw_by_chance(address, streams, listed, noise, others, alarm, tables, half,
         A row of :data:`STREAMS`.
     listed : tuple
         (bins (3, most), pd (most,), magnitudes (most, 3)) of the segment's groups.
-    noise : (float, float)
-        sigma per quadrature; threshold over sigma.
+    noise : (float, float, float)
+        sigma per quadrature; over it, the threshold and the noise of bins that hold lines.
     others, alarm : float
         Bins of noise alone; probability of a false alarm, by noise or leaked signal.
     tables : tuple
@@ -74,7 +74,7 @@ def draw_by_chance(address, streams, listed, noise, others, alarm, tables, half,
     """
     a, b, draw = address
     bins, pd, magnitudes = listed
-    sigma, beta = noise
+    sigma, beta, under_lines = noise
     count = 0
     for g in range(pd.size):
         if bins[0, g] < 0:
@@ -82,7 +82,7 @@ def draw_by_chance(address, streams, listed, noise, others, alarm, tables, half,
         if philox.uniform(a, b, draw, streams[0], g) < pd[g]:
             m = magnitudes[g]
             delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
-            error = sub_bin_error(delta, ratio, tables)
+            error = sub_bin_error(delta, ratio / under_lines, tables)
             normal, _ = philox.normal_pair(a, b, draw, streams[2], g)
             fine = bins[0, g] + delta + error * normal
             _put(peaks[count], bins[0, g], fine, error, ratio, half)
@@ -114,7 +114,7 @@ def draw_in_noise(
     """
     a, b, draw = address
     bins, pd, magnitudes = listed
-    _, beta = noise
+    beta = noise[1]
     low = run[0]
     count = 0
     for g in range(pd.size):
@@ -140,17 +140,18 @@ def draw_in_noise(
 def _look(address, stream, centre, low, magnitudes, noise, tables, half, peak):
     """Whether the strongest bin crosses with its noise; the peak of three bins as it is found."""
     a, b, draw = address
-    sigma, beta = noise
+    sigma, beta, under_lines = noise
     k = centre - low
     re, im = philox.normal_pair(a, b, draw, stream, k)
+    re, im = re * under_lines, im * under_lines
     m0 = magnitudes[1] / sigma
     if (m0 + re) ** 2 + im**2 < beta * beta:
         return False
     # neighbours are exempt from false alarms, so their bins' own numbers are free
     re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
     re_above, im_above = philox.normal_pair(a, b, draw, stream, k + 1)
-    real = noise_triple(re, re_below, re_above, tables)
-    imaginary = noise_triple(im, im_below, im_above, tables)
+    real = noise_triple(re, re_below * under_lines, re_above * under_lines, tables)
+    imaginary = noise_triple(im, im_below * under_lines, im_above * under_lines, tables)
     below = math.hypot(magnitudes[0] / sigma + real[0], imaginary[0])
     middle = math.hypot(m0 + re, im)
     above = math.hypot(magnitudes[2] / sigma + real[2], imaginary[2])
@@ -158,7 +159,7 @@ def _look(address, stream, centre, low, magnitudes, noise, tables, half, peak):
     shift = 0
     if max(below, above) > middle:
         shift = 1 if above > below else -1
-    error = sub_bin_error(delta, middle, tables)
+    error = sub_bin_error(delta, middle / under_lines, tables)
     _put(peak, centre + shift, centre + delta, error, max(below, middle, above), half)
     return True
 

@@ -1,19 +1,24 @@
-"""Points made ready for the spectrum: link budget, noise and geometry worked out.
+"""Points made ready for the spectrum: link budget, receiver noise, and one line on the beam's axis.
+
+What is prepared here is the least that any shot has. Everything else is an effect
+(:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.chain`.
 
 Points that share their categories (architecture, window, law, sizes ...) are prepared together; a
 footprint's geometry is worked out once and serves every point that has it, whatever its
 radiometry.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, footprint, link, noise, receiver, reflectance, waveform
+from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.equivalent import AMPLITUDE_TOLERANCE, POWER_TOLERANCE, node_limits
+from sweep.model.ground import Ground
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -22,61 +27,98 @@ Parameters = Mapping[str, float | int | str | np.ndarray]
 LASER, CHIRP, TELESCOPE, RECEIVER, PROCESSING = (
     f"instrument.{part}." for part in ("laser", "chirp", "telescope", "receiver", "processing")
 )
-CATEGORIES = (
-    RECEIVER + "architecture",
-    PROCESSING + "window",
-    PROCESSING + "bins_counted",
-    PROCESSING + "fft_size",
-    "target.reflectance_law",
-    "footprint.phases",
-    "footprint.beamlets",
-)
+CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
+"""Numbers that points must share to be prepared together; words they must share all."""
+
+UNSEEN = frozenset({"signal_shot"})
+"""Noise sources that come with an echo: the threshold is not set on them."""
 
 
-class Footprints(NamedTuple):
-    """Where beamlets fall and what they send back, in rows that points share."""
+class PhaseError(NamedTuple):
+    """A deterministic phase error over the record, common to the lines of a footprint."""
 
-    row: np.ndarray
-    """(n,) int64: the row of each point."""
-    offset: np.ndarray
-    """(rows, beamlets): (R_b - R_0) / R_0."""
-    doppler: np.ndarray
-    """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
-    echo: np.ndarray
-    """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
+    phase: Callable[..., np.ndarray]
+    """Phase [cycles], (n, m), at places x (m,) of the record, given ``sign`` and the values."""
+    values: dict[str, Any]
+    """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
+
+    def of(self, segment: int, index: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Phase [cycles] of some points at places x of a segment's record."""
+        chosen = {}
+        for name, value in self.values.items():
+            value = value[segment] if isinstance(value, tuple) else value
+            chosen[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
+        return self.phase(x, sign=waveform.SIGNS[segment], **chosen)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Shots:
-    """Points of one category, ready for the spectrum: link, noise and geometry worked out.
+    """Points of one category, ready for the spectrum.
 
-    Arrays are (n,) unless said otherwise; SI throughout.
+    Arrays are (n,) or scalars unless said otherwise; SI throughout. What follows ``amplitude`` is
+    there only where an effect has put it there.
     """
 
     architecture: str
     window: Window
     fft_size: int
     bins_counted: str
-    incoherent: bool
+    tnr: np.ndarray
     range: np.ndarray
+    """(n,): of the target on the beam's axis."""
     radial_velocity: np.ndarray
+    """(n,): likewise; what the lines show of it is ``beta``."""
     bandwidth: np.ndarray
     duration: np.ndarray
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
     sample_rate: np.ndarray
     acquisition_delay: np.ndarray
-    beat_scale: np.ndarray
     detector_bandwidth: np.ndarray
     amplifier_bandwidth: np.ndarray
-    noise_sources: dict[str, np.ndarray]
-    noise_variance: np.ndarray
-    bin_deviation: np.ndarray
-    threshold: np.ndarray
     leakage_floor: np.ndarray
+    echo_scale: np.ndarray
+    """Echo power [W] for a relative echo of 1/sr."""
+    beat_scale: np.ndarray
+    """Amplitude of the beat [V] for a relative amplitude of 1."""
+    noise_scale: np.ndarray
+    """Noise variance at the ADC [V^2] that 1 A^2 of current makes."""
+    shot_noise_scale: np.ndarray
+    """Noise variance at the ADC [V^2] that 1 W of light makes."""
+    noise_sources: dict[str, np.ndarray]
+    """Noise variance of each source at the ADC [V^2]."""
     row: np.ndarray
+    """(n,) int64: row of each point in the three arrays that follow, (rows, beamlets)."""
     offset: np.ndarray
+    """(R_b - R_0) / R_0."""
     doppler: np.ndarray
+    """beta_b - beta_0, beta = 2 v_r / c."""
     amplitude: np.ndarray
+    """Relative amplitude: root of the relative echo, for direct detection the echo itself."""
+
+    ground_transmission: np.ndarray | float = 1.0
+    """Share of light from the ground that reaches the receiver."""
+    beta: np.ndarray | float = 0.0
+    """Doppler ratio 2 v_r / c of the line on the axis."""
+    incoherent: bool = True
+    """Whether beamlets add as powers."""
+    phase: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
+    """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
+    phase_errors: tuple[PhaseError, ...] = ()
+    gaussian_width: np.ndarray | None = None
+    """(n,): FWHM [Hz] of the beat's Gaussian line."""
+    pedestal: np.ndarray | float = 0.0
+    """Noise variance at the ADC [V^2] that stands under the lines, and nowhere else."""
+    noise_gain: np.ndarray | float = 1.0
+    """Factor on the noise variance by what happens to the record after the threshold was set."""
+    image: bool = False
+    """Whether the lines' images at negative frequencies are summed."""
+    leakage: bool = False
+    """Whether the bins beside the detection are looked at for groups of leaked signal."""
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return self.range.size
 
     @property
     def chirp_rate(self) -> np.ndarray:
@@ -84,14 +126,56 @@ class Shots:
         return self.bandwidth / self.duration
 
     @property
-    def beta(self) -> np.ndarray:
-        """Doppler ratio 2 v_r / c."""
-        return 2 * self.radial_velocity / SPEED_OF_LIGHT
+    def record_duration(self) -> np.ndarray:
+        """Length of the record L/fs [s]."""
+        return self.window.length / self.sample_rate
+
+    @cached_property
+    def relative_echo(self) -> np.ndarray:
+        """Echo of all beamlets [1/sr], (n,)."""
+        echo = self.amplitude if self.architecture == "direct" else self.amplitude**2
+        return echo.sum(axis=1)[self.row]
 
     @property
-    def footprint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude of beamlets, (rows, beamlets)."""
-        return self.offset, self.doppler, self.amplitude
+    def echo_power(self) -> np.ndarray:
+        """Echo power on the detector [W], (n,)."""
+        return self.echo_scale * self.relative_echo
+
+    @cached_property
+    def quiet_variance(self) -> np.ndarray:
+        """Noise variance without an echo, which the threshold is set on [V^2], (n,)."""
+        seen = (v for name, v in self.noise_sources.items() if name not in UNSEEN)
+        return np.asarray(sum(seen)) + np.zeros(self.size)
+
+    @cached_property
+    def noise_variance(self) -> np.ndarray:
+        """Noise variance sigma_x^2 at the ADC [V^2], (n,)."""
+        unseen = (v for name, v in self.noise_sources.items() if name in UNSEEN)
+        return (self.quiet_variance + sum(unseen)) * self.noise_gain
+
+    @cached_property
+    def bin_deviation(self) -> np.ndarray:
+        """Noise sigma of a bin, per quadrature [V], (n,)."""
+        return self._deviation(self.noise_variance)
+
+    @cached_property
+    def line_deviation(self) -> np.ndarray:
+        """The same in a bin that holds lines, (n,)."""
+        return self._deviation(self.noise_variance + self.pedestal)
+
+    @cached_property
+    def threshold(self) -> np.ndarray:
+        """Threshold on |X| [V], (n,)."""
+        return detection.threshold(tnr=self.tnr, bin_deviation=self._deviation(self.quiet_variance))
+
+    def _deviation(self, variance: np.ndarray) -> np.ndarray:
+        energy = np.asarray(self.window.energy)
+        return noise.bin_deviation(noise_variance=variance, window_energy=energy)
+
+    @property
+    def footprint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude (rows, beamlets); phases."""
+        return self.offset, self.doppler, self.amplitude, self.phase
 
     @property
     def segments(self) -> np.ndarray:
@@ -99,11 +183,12 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Columns of :func:`sweep.model.segments.evaluate_segments`, (13, n)."""
+        """Columns of :func:`sweep.model.segments.evaluate_segments`, (14, n)."""
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.leakage_floor,
+            self.line_deviation,
         )  # fmt: skip
         return np.array(np.broadcast_arrays(*columns), dtype=float)
 
@@ -125,13 +210,22 @@ class Shots:
         return np.maximum(self.fft_size // 2 - exempted, 0.0)
 
 
-def prepare(parameters: Parameters) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Splits points by category: (indices, :class:`Shots`) for each."""
-    arrays = _arrays(parameters)
+def categories(
+    parameters: Parameters, further: Collection[str] = ()
+) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Splits points by category: (indices, parameters as arrays) for each.
+
+    Among the parameters is ``record``, the length of the record in samples. ``further`` names
+    numbers that points must share besides :data:`CATEGORIES`.
+    """
+    arrays = as_arrays(parameters)
     size = max((a.size for a in arrays.values() if a.ndim), default=1)
-    varying = [path for path in (*CATEGORIES, "record") if arrays[path].ndim]
+    shared = {*CATEGORIES, *further}
+    varying = [
+        path for path, a in arrays.items() if a.ndim and (path in shared or a.dtype.kind in "UO")
+    ]
     if not varying:
-        yield np.arange(size), _shots(arrays, size, _plane(arrays, size))
+        yield np.arange(size), arrays
         return
     codes = [np.unique(arrays[path], return_inverse=True)[1] for path in varying]
     _, member = np.unique(np.stack(codes), axis=1, return_inverse=True)
@@ -139,25 +233,10 @@ def prepare(parameters: Parameters) -> Iterator[tuple[np.ndarray, Shots]]:
     for group in range(member.max() + 1):
         index = np.flatnonzero(member == group)
         chosen = {path: a[index] if a.ndim else a for path, a in arrays.items()}
-        chosen |= {path: chosen[path][0] for path in varying}
-        yield index, _shots(chosen, index.size, _plane(chosen, index.size))
+        yield index, chosen | {path: chosen[path][0] for path in varying}
 
 
-def prepare_footprints(parameters: Parameters, footprints: Footprints) -> Shots:
-    """Shots whose footprints are given, all of one category.
-
-    Parameters
-    ----------
-    parameters : mapping
-        As for :func:`sweep.model.shot.evaluate`, scalars or (n,) arrays. Ranges and radial
-        velocities are those of the beam's centre; grazing angle and law are not looked at.
-    footprints : Footprints
-        One row number for each of the n points.
-    """
-    return _shots(_arrays(parameters), footprints.row.size, footprints)
-
-
-def _arrays(parameters: Parameters) -> dict[str, np.ndarray]:
+def as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
     """Parameters as arrays, with the length of the record among them."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
     arrays["record"] = waveform.record_length(
@@ -169,24 +248,29 @@ def _arrays(parameters: Parameters) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _shots(p: Mapping[str, np.ndarray], size: int, footprints: Footprints) -> Shots:
-    """Link and noise of points that share their categories."""
+def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
+    """Points of one category with nothing but the echo on the beam's axis and receiver noise.
+
+    Parameters
+    ----------
+    p : mapping
+        Of :func:`categories`.
+    size : int
+        Points n.
+    ground : Ground
+        What the beams meet.
+    """
     architecture = str(p[RECEIVER + "architecture"])
-    shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
-    row, offset, doppler, echo = footprints
-    power_scale, current_scale = _link_scales(architecture, p)
-    sources = _noise_sources(architecture, p, power_scale * echo.sum(axis=1)[row])
-    without_echo = np.asarray(sum(v for name, v in sources.items() if name != "signal_shot"))
-    variance = without_echo + sources["signal_shot"]
-    energy = np.asarray(shape.energy)
-    quiet = noise.bin_deviation(noise_variance=without_echo, window_energy=energy)
+    echo_scale, current_scale = _link_scales(architecture, p)
+    per_ampere, per_watt, sources = _noise(architecture, p)
+    row, offset, doppler, echo = ground.axis(size)
     everywhere = np.zeros(size)
     return Shots(
         architecture=architecture,
-        window=shape,
+        window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
         fft_size=int(p[PROCESSING + "fft_size"]),
         bins_counted=str(p[PROCESSING + "bins_counted"]),
-        incoherent=_incoherent(p),
+        tnr=p[PROCESSING + "tnr"],
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,
         bandwidth=p[CHIRP + "bandwidth"],
@@ -199,19 +283,30 @@ def _shots(p: Mapping[str, np.ndarray], size: int, footprints: Footprints) -> Sh
         ),
         sample_rate=p[PROCESSING + "sample_rate"] + everywhere,
         acquisition_delay=p[PROCESSING + "acquisition_delay"],
-        beat_scale=current_scale * p[RECEIVER + "transimpedance"],
-        **_receiver(p, "detector_bandwidth", "amplifier_bandwidth"),
-        noise_sources=sources,
-        noise_variance=variance + everywhere,
-        bin_deviation=noise.bin_deviation(noise_variance=variance, window_energy=energy)
-        + everywhere,
-        threshold=detection.threshold(tnr=p[PROCESSING + "tnr"], bin_deviation=quiet) + everywhere,
+        detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
+        amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=p["accuracy.leakage_floor"],
+        echo_scale=echo_scale,
+        beat_scale=current_scale * p[RECEIVER + "transimpedance"],
+        noise_scale=per_ampere,
+        shot_noise_scale=per_watt,
+        noise_sources=sources,
         row=row,
         offset=offset,
         doppler=doppler,
-        amplitude=echo if architecture == "direct" else np.sqrt(echo),
+        amplitude=relative_amplitude(architecture, echo),
+        incoherent=architecture != "direct",
     )
+
+
+def relative_amplitude(architecture: str, echo: np.ndarray) -> np.ndarray:
+    """Relative amplitude of the beat from the relative echo; direct detection beats with power."""
+    return echo if architecture == "direct" else np.sqrt(echo)
+
+
+def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
+    """Doppler ratio beta = 2 v_r / c."""
+    return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
 def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -232,61 +327,33 @@ def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.nda
     )
 
 
-def _incoherent(p: Mapping[str, np.ndarray]) -> bool:
-    """Whether beamlets add as powers; direct detection adds their radio-frequency beats."""
-    coherent = str(p["footprint.phases"]) == "coherent"
-    return not coherent and str(p[RECEIVER + "architecture"]) != "direct"
-
-
 def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
     return {name: p[RECEIVER + name] for name in names}
 
 
-def _plane(p: Mapping[str, np.ndarray], size: int) -> Footprints:
-    """Footprints on a flat plane: one row for each distinct grazing angle and divergence."""
-    grazing, divergence = np.broadcast_arrays(
-        p["target.grazing_angle"], p[LASER + "beam_divergence"]
-    )
-    shapes, row = np.unique(
-        np.stack([np.atleast_1d(grazing), np.atleast_1d(divergence)]), axis=1, return_inverse=True
-    )
-    offset, cos_incidence, weights = footprint.plane_footprint(
-        grazing_angle=shapes[0],
-        beam_divergence=shapes[1],
-        number=int(p["footprint.beamlets"]),
-        pattern="hexagonal" if _incoherent(p) else "sunflower",
-    )
-    law = str(p["target.reflectance_law"])
-    echo = weights * reflectance.backscatter(law, cos_incidence) / (1 + offset) ** 2
-    row = np.broadcast_to(row.ravel(), size).astype(np.int64)
-    return Footprints(row, offset, np.zeros_like(offset), echo)
-
-
-def _noise_sources(
-    architecture: str, p: Mapping[str, np.ndarray], echo_power: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Noise variance of each source at the ADC [V^2]."""
+def _noise(
+    architecture: str, p: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Variance at the ADC [V^2] of 1 A^2, of the shot noise of 1 W, and of the receiver's own."""
     bandwidth = receiver.electrical_bandwidth(
         **_receiver(p, "detector_bandwidth", "amplifier_bandwidth")
     )
-    sun = noise.solar_power(
-        solar_irradiance=p["target.solar_irradiance"],
-        reflectance=p["target.reflectance"],
-        aperture=p[TELESCOPE + "aperture"],
-        beam_divergence=p[LASER + "beam_divergence"],
-        optical_passband=p[RECEIVER + "optical_passband"],
-        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
+    scale = (
+        noise.current_scale(architecture, noise_figure=p[RECEIVER + "noise_figure"])
+        * p[RECEIVER + "transimpedance"] ** 2
     )
-    currents = noise.current_variances(
+    per_watt = noise.shot_noise(
+        power=1.0,
+        electrical_bandwidth=bandwidth,
+        **_receiver(p, "apd_gain", "excess_noise_factor", "responsivity"),
+    )
+    currents = noise.receiver_currents(
         architecture,
-        echo_power=echo_power,
-        solar_power=sun,
         electrical_bandwidth=bandwidth,
         **_receiver(
             p, "local_oscillator_power", "apd_gain", "excess_noise_factor", "responsivity",
-            "noise_equivalent_power", "amplifier_noise_current", "noise_figure",
-            "load_resistance", "temperature",
+            "noise_equivalent_power", "amplifier_noise_current", "load_resistance", "temperature",
         ),
     )  # fmt: skip
-    gain = p[RECEIVER + "transimpedance"] ** 2
-    return {source: np.asarray(value * gain) for source, value in currents.items()}
+    sources = {source: np.asarray(value * scale) for source, value in currents.items()}
+    return np.asarray(scale), np.asarray(per_watt * scale), sources

@@ -31,11 +31,10 @@ import numpy as np
 from numba import njit
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import assess
 from sweep.model.draws import METHODS
-from sweep.model.equivalent import MOST_NODES
 from sweep.model.groups import FIRST, LAST, Groups, groups
 from sweep.model.interpolation import interpolator, spread_error
+from sweep.model.modulation import choices, stretches
 from sweep.model.pairing import (
     FALSE_ALARM,
     MISPAIRED,
@@ -48,8 +47,8 @@ from sweep.model.pairing import (
     common_beamlet,
     pair_peaks,
     resolve_reading,
-    workspace,
 )
+from sweep.model.pairing import workspace as pairing_workspace
 from sweep.model.peaks import (
     ABSENT,
     ERROR,
@@ -63,7 +62,7 @@ from sweep.model.peaks import (
     draw_in_noise,
 )
 from sweep.model.preparation import Shots
-from sweep.model.segments import ROOM, segment_spectrum
+from sweep.model.segments import inspect_bins, workspace
 
 __all__ = ["Groups", "Returns", "draw_returns", "groups"]
 
@@ -144,13 +143,18 @@ def draw_returns(
     bins = np.stack([found.bin, found.first, found.last])
     chirp = np.array(np.broadcast_arrays(shots.bandwidth, shots.duration, shots.range)[:2], float)
     counted = float(shots.counted_bins(np.zeros(()))), shots.bins_counted != "all"
-    _draw(
-        keys, int(first_draw), (shots.point_table(), chirp, shots.row, shots.footprint),
-        (shots.segments, shots.incoherent, method == "noise", float(tolerance)), counted,
-        shots.kernel(), tuple(interpolator(shots.window, shots.fft_size)),
-        (bins, found.pd, found.neighbours, found.exempted, found.leakage), STREAMS,
-        (np.empty((most + 1, 4), np.int64), workspace(most + 1)), (values, flags, beamlet, group),
-    )  # fmt: skip
+    for stretch in stretches(shots):
+        part = stretch.part
+        _draw(
+            keys[part], int(first_draw), (stretch.points, chirp[:, part].copy(), stretch.row),
+            stretch.scene, (shots.segments, choices(shots), method == "noise", float(tolerance)),
+            counted, shots.kernel(), tuple(interpolator(shots.window, shots.fft_size)),
+            (bins[:, part].copy(), found.pd[part], found.neighbours[part], found.exempted[part],
+             found.leakage[part]),
+            STREAMS, (np.empty((most + 1, 4), np.int64), pairing_workspace(most + 1)),
+            workspace(stretch.lines, shots.fft_size),
+            (values[part], flags[part], beamlet[part], group[part]),
+        )  # fmt: skip
     columns = [values[..., k] for k in range(values.shape[-1])]
     return Returns._make([*columns, flags, beamlet, group])
 
@@ -160,14 +164,17 @@ _inlined = njit(cache=True, error_model="numpy", inline="always")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, streams, work, out):
+def _draw(
+    keys, first_draw, shots, scene, how, counted, kernel, tables, found, streams, work, spectra, out
+):  # fmt: skip
     """All draws of all points: peaks of the three segments, then what they report."""
-    points, chirp, row, footprint = scene
-    segments, power, noisy, tolerance = choices
+    points, chirp, row = shots
+    footprint = scene[0]
+    segments, choices, noisy, tolerance = how
+    power = choices[0]
     half, beamlets = kernel[0][0] // 2, footprint[0].shape[1]
     draws, most = out[1].shape[1], out[1].shape[2]
-    room = np.empty((ROOM, max(beamlets, MOST_NODES, half + 1)))
-    exempt = np.empty(half + 1, np.bool_)
+    room, exempt, _ = spectra
     peaks = np.zeros((3, draws, most + 1, 4))
     which, number = np.empty((3, draws, most + 1), np.int64), np.empty((3, draws), np.int64)
     lines, spread = np.empty((3, beamlets)), np.empty(most)
@@ -182,9 +189,10 @@ def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, stre
             others = counted[0] - (found[3][i, s] if counted[1] else 0.0)
             run = 0, room[0, :0], exempt, p[12]
             if noisy:
-                run = _run(s, p, footprint, row[i], power, kernel, room, exempt)
+                run = _run(s, p, scene, (row[i], i), choices, kernel, room, exempt)
             _draw_segment(
-                (keys[i], first_draw, streams[s]), listed, (p[10], p[11] / p[10]), others,
+                (keys[i], first_draw, streams[s]), listed,
+                (p[10], p[11] / p[10], p[13] / p[10]), others,
                 found[4][i, s], noisy, run, tables, half, peaks[s], which[s], number[s],
             )  # fmt: skip
             _spread_lines(listed[0], lines[s], footprint[2][row[i]], spread)
@@ -199,14 +207,11 @@ def _draw(keys, first_draw, scene, choices, counted, kernel, tables, found, stre
 
 
 @_inlined
-def _run(segment, p, footprint, row, power, kernel, room, exempt):
+def _run(segment, p, scene, at, choices, kernel, room, exempt):
     """Bins that hold a segment's signal, as :func:`sweep.model.peaks.draw_in_noise` takes them."""
-    sigma, level, floor = p[10], p[11], p[12]
-    low, count = segment_spectrum(
-        segment, p, footprint, row, floor * sigma, power, kernel, room
-    )  # fmt: skip
-    assess(room[0], count, sigma, level, floor, exempt)
-    return low, room[0, :count] / sigma, exempt, floor
+    low, count, _, _, _ = inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
+    floor = p[12] if choices[2] else np.inf  # no bin but the groups is looked at
+    return low, room[0, :count] / p[10], exempt, floor
 
 
 @_inlined

@@ -91,6 +91,15 @@ STATISTICS: dict[str, SceneOutput] = {
 }
 """Probabilities of each shot, before any draw; nan where nothing is seen."""
 
+SIMULATED: dict[str, SceneOutput] = {
+    "effects": _shot("1", "effects that were simulated", dtype="uint32"),
+    "effects_error": _shot(
+        "1", "largest change of a probability by effects that were left out",
+        comment="sum over the three segments of what they may change of pd",
+    ),
+}  # fmt: skip
+"""What was simulated of each shot; none of the effects where nothing is seen."""
+
 POINTS: dict[str, SceneOutput] = {
     "position": _point("m", "position of the point", XYZ, comment="from the interpolated range"),
     "range": _point("m", "range by whole bins"),

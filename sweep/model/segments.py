@@ -5,15 +5,17 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.detection import assess
+from sweep.model.crossings import MOST_TERMS, crossing_series, largest
+from sweep.model.detection import assess, mark
 from sweep.model.elementary import borrowed
-from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
-from sweep.model.leakage import DELTA, STRENGTH_IM, STRENGTH_RE, inspect, reach_of, smooth
-from sweep.model.lines import segment_lines
+from sweep.model.leakage import inspect
+from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.spectrum import bin_magnitudes
+from sweep.model.modulation import modulate, reduce_lines
+from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
+from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 SIGNS = (1.0, 0.0, -1.0)
 
@@ -25,25 +27,26 @@ SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 
 
 @njit(cache=True, error_model="numpy")
-def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
+def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     """|X| of the bins in which a segment's lines stand above a level, into room's first row.
 
     Parameters
     ----------
     segment : int
         0 up, 1 Doppler, 2 down.
-    p : (13,) float64
-        The point's column of :meth:`sweep.model.shot.Shots.point_table`.
-    footprint, row : tuple of (rows, beamlets) float64, int
-        (R_b - R_0)/R_0, beta_b - beta_0 and relative beat amplitude of each beamlet; the point's
-        row in them.
+    p : (14,) float64
+        The point's column of :meth:`sweep.model.preparation.Shots.point_table`.
+    scene, at : tuple, (int, int)
+        Footprint, parts and shifts of :class:`sweep.model.modulation.Stretch`; the point's row in
+        the first, and its place in the others.
     level : float
-        Bins in which lines stay below it, and their images too, may be left out; 0 keeps all.
-    power : bool
-        Whether beamlets add as powers.
+        Bins in which lines stay below it, and their images too, may be left out; 0 keeps all. If
+        none is above it, bins that the largest is known to exceed are.
+    choices : (bool, bool, bool, bool)
+        :func:`sweep.model.modulation.choices`.
     kernel : tuple
-        :meth:`sweep.model.shot.Shots.kernel`.
-    room : (ROOM, >= max(beamlets, MOST_NODES, N // 2 + 1)) float64
+        :meth:`sweep.model.preparation.Shots.kernel`.
+    room : (ROOM, >= width of :func:`workspace`) float64
         Scratch; the result in row 0.
 
     Returns
@@ -51,50 +54,108 @@ def segment_spectrum(segment, p, footprint, row, level, power, kernel, room):
     low, count : int
         First bin, number of bins.
     """
-    sizes, shape, sidelobes, limits, tangent = kernel
-    fft_size, length = sizes
-    origin = _lines_of(segment, p, footprint, row, power, sizes, room[DELTA:])
-    n = footprint[0].shape[1]
-    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    few_delta, few_re, few_im = room[4], room[5], room[6]
-    band = math.pi * length / fft_size * (2.0 if power else 1.0)
-    few = equivalent_lines(
-        delta, re, im, n, band, limits, few_delta, few_re, few_im, room[7:12]
-    )  # fmt: skip
-    low, high = _bins_above(
-        level, few_delta, few_re, few_im, few, origin, power, sizes, sidelobes
-    )  # fmt: skip
-    bin_magnitudes(
-        low, high, origin, few_delta, few_re, few_im, few, sizes, shape, power, tangent,
-        room[0], room[1], room[7:10],
-    )  # fmt: skip
+    power, image = choices[0], choices[1]
+    origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
+    few = reduce_lines(n, power, kernel, room)
+    _, parts, shifts = scene
+    reach = _extent(segment, at[1], fold, few, parts, shifts, power, kernel, room)
+    low, high = _bins_above(level, reach, origin, kernel)
+    while True:
+        _magnitudes(
+            low, high, origin, few, segment, at[1], fold, parts, shifts, choices, kernel, room
+        )
+        most = largest(room[0, : high - low + 1])
+        if most >= level:
+            break
+        level = most
+        first, last = _bins_above(level * (0.5 if image else 1.0), reach, origin, kernel)
+        if first >= low and last <= high:
+            break
+        low, high = min(low, first), max(high, last)
     return low, high - low + 1
 
 
 @njit(cache=True, error_model="numpy")
-def _lines_of(segment, p, footprint, row, power, sizes, lines):
-    """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into (3, n); their origin."""
+def _lines_of(segment, p, scene, at, power, kernel, room):
+    """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into rows DELTA ..
+
+    Returns their origin, their number, and -1 where they are seen as their images, else 1.
+    """
+    footprint, parts, shifts = scene
+    row, sizes = at[0], kernel[0]
     offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
+    phase = footprint[3][segment, row]  # without phases a row of none
+    which = SIGNS[segment], p[9] if segment == 2 else p[8]
+    chirp, record = (p[2], p[0], p[1], p[3]), (p[6], sizes[0], sizes[1], p[7])
     origin = segment_lines(
-        (SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-        (p[6], sizes[0], sizes[1], p[7]), offset, doppler, amplitude, lines[0], lines[1],
-        lines[2], power,
+        which, chirp, (p[4], p[5]), record, offset, doppler, amplitude, phase, room[DELTA],
+        room[STRENGTH_RE], room[STRENGTH_IM], power,
     )  # fmt: skip
-    return origin
+    n, fold = offset.size, 1.0
+    if parts[0].size or shifts[0].size:
+        fold = folding(which, chirp, record)
+        n = modulate(segment, at[1], n, fold, parts, shifts, power, kernel, room)
+    return origin, n, fold
 
 
 @njit(cache=True, error_model="numpy")
-def inspect_segment(
-    segment, p, footprint, row, power, every_bin, kernel, room, exempt, series
+def _magnitudes(
+    low, high, origin, n, segment, i, fold, parts, shifts, choices, kernel, room
 ):  # fmt: skip
+    """|X| of bins low .. high of n lines in rows 4 to 6, into row 0."""
+    sizes, shape, _, _, tangent = kernel
+    power, image = choices[0], choices[1]
+    delta, re, im = room[4], room[5], room[6]
+    if power and parts[0].size:
+        own = parts[4][i]
+        number = parts[3][segment, own]
+        place = room[10, :number]
+        for k in range(number):
+            place[k] = fold * parts[0][segment, own, k] * sizes[0] / sizes[1]
+        split = place, parts[1][segment, own, :number], parts[2][segment, own, :number]
+        split_magnitudes(
+            low, high, origin, delta, re, n, split, fold, sizes, shape, tangent, room[0],
+            room[11:19], image,
+        )  # fmt: skip
+    elif not power and shifts[0].size:
+        _average(low, high, origin, n, i, fold, shifts, image, kernel, room)
+    else:
+        bin_magnitudes(
+            low, high, origin, delta, re, im, n, sizes, shape, power, tangent, room[0], room[1],
+            room[7:10], image,
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
+    """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
+    sizes, shape, _, _, tangent = kernel
+    total, moved = room[0, : high - low + 1], room[10]
+    total[:] = 0.0
+    for m in range(shifts[0].shape[1]):
+        share = shifts[1][i, m]
+        if share > 0.0:
+            apart = fold * shifts[0][i, m] * sizes[0] / sizes[1]
+            for j in range(n):
+                moved[j] = room[4, j] + apart
+            bin_magnitudes(
+                low, high, origin, moved, room[5], room[6], n, sizes, shape, False, tangent,
+                room[1], room[2], room[7:10], image,
+            )  # fmt: skip
+            for k in range(total.size):
+                total[k] += share * (room[1, k] * room[1, k])
+    for k in range(total.size):
+        total[k] = math.sqrt(total[k])
+
+
+@njit(cache=True, error_model="numpy")
+def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series):
     """What a segment's spectrum shows, without noise.
 
     Parameters
     ----------
-    segment, p, footprint, row, power, kernel, room
+    segment, p, scene, at, choices, kernel, room
         As of :func:`segment_spectrum`.
-    every_bin : bool
-        Look at each bin by itself where leakage could be summed as an integral.
     exempt : (room's width,) bool
         Result: bins of the run that can't raise a false alarm.
     series : (MOST_TERMS,) float64
@@ -107,38 +168,70 @@ def inspect_segment(
     peak, exempted : int
         Index of the largest bin; number of exempt bins.
     leakage : float
-        Of all bins; where the window has no closed form or the record is padded, or for
-        ``every_bin``, of those above the leakage floor.
+        Of all bins; where the window has no closed form or the record is padded, where the
+        spectrum is a mean of several, or for ``every_bin``, of those above the leakage floor.
+        0 where leakage is left out.
+
+    Notes
+    -----
+    Means of several spectra are those of amplitudes over shifts, and those of powers whose lines
+    are split: their bins are looked at one by one.
     """
-    sigma, level, floor = p[10], p[11], p[12]
-    if smooth(kernel) and not every_bin:
-        origin = _lines_of(segment, p, footprint, row, power, kernel[0], room[DELTA:])
-        low, count, peak, exempted, leakage = inspect(
-            origin, footprint[0].shape[1], (sigma, level), power, kernel, room, exempt, series
-        )
+    power, _, leakage, every_bin = choices
+    several = scene[1][0].size if power else scene[2][0].size
+    if smooth(kernel) and not every_bin and not several:
+        origin, n, _ = _lines_of(segment, p, scene, at, power, kernel, room)
+        chance = 0.0
+        if leakage:
+            low, count, peak, exempted, chance = inspect(
+                origin, n, (p[10], p[11]), choices, kernel, room, exempt, series
+            )
+        else:
+            low, count, peak, exempted = detect(origin, n, p[11], choices, kernel, room, exempt)
         if count:
-            return low, count, peak, exempted, leakage
-    low, count = segment_spectrum(segment, p, footprint, row, floor * sigma, power, kernel, room)
-    peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
-    return low, count, peak, exempted, leakage
+            return low, count, peak, exempted, chance
+    return inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
 
 
-def workspace(beamlets: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scratch of :func:`inspect_segment`: room (ROOM, width), exempt (width,), series."""
-    width = max(beamlets, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS) + 16
+@njit(cache=True, error_model="numpy")
+def inspect_bins(segment, p, scene, at, choices, kernel, room, exempt):
+    """The same, bin by bin."""
+    sigma, level, floor = p[10], p[11], p[12]
+    if choices[2]:
+        low, count = segment_spectrum(
+            segment, p, scene, at, floor * sigma, choices, kernel, room
+        )  # fmt: skip
+        peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
+        return low, count, peak, exempted, leakage
+    least = level * (0.5 if choices[1] else 1.0)
+    low, count = segment_spectrum(segment, p, scene, at, least, choices, kernel, room)
+    peak, exempted = mark(room[0], count, level, exempt)
+    return low, count, peak, exempted, 0.0
+
+
+def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scratch of :func:`inspect_segment`: room (ROOM, width), exempt (width,), series.
+
+    ``lines`` as of :class:`sweep.model.modulation.Stretch`.
+    """
+    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS) + 16
     return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 
 @njit(cache=True, error_model="numpy")
-def lent(footprint, kernel, work):
-    """Footprint, kernel and workspace for the length of a call, their use uncounted."""
-    offset, doppler, amplitude = footprint
+def lent(scene, kernel, work):
+    """Scene, kernel and workspace for the length of a call, their use uncounted."""
+    (offset, doppler, amplitude, phase), (apart, re, im, number, which), (shift, share) = scene
     sizes, shape, sidelobes, limits, tangent = kernel
     coefficients, numerator, poles, edge, table = shape
     window_sum, envelope, reach = sidelobes
     room, exempt, series = work
     return (
-        (borrowed(offset), borrowed(doppler), borrowed(amplitude)),
+        (
+            (borrowed(offset), borrowed(doppler), borrowed(amplitude), borrowed(phase)),
+            (borrowed(apart), borrowed(re), borrowed(im), borrowed(number), borrowed(which)),
+            (borrowed(shift), borrowed(share)),
+        ),
         (
             sizes,
             (coefficients, numerator, poles, edge, borrowed(table)),
@@ -151,16 +244,41 @@ def lent(footprint, kernel, work):
 
 
 @njit(cache=True, error_model="numpy")
-def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
-    """First and last bin, within 0..N/2, that n lines can lift above a level."""
-    fft_size, length = sizes
-    window_sum, envelope, reach = sidelobes
+def _extent(segment, i, fold, n, parts, shifts, power, kernel, room):
+    """Summed weight of n lines in rows 4 to 6 as |X| may have it, and their lowest and highest.
+
+    Parts and shifts that are not lines of their own yet are reckoned with.
+    """
+    delta, re, im = room[4], room[5], room[6]
     total = 0.0
     lowest, highest = delta[0], delta[0]
     for j in range(n):
         total += abs(re[j]) if power else math.hypot(re[j], im[j])
         lowest, highest = min(lowest, delta[j]), max(highest, delta[j])
     total = math.sqrt(total) if power else total
+    below, above = 0.0, 0.0
+    if power and parts[0].size:
+        each = 0.0
+        own = parts[4][i]
+        for k in range(parts[3][segment, own]):
+            apart = fold * parts[0][segment, own, k]
+            each += math.hypot(parts[1][segment, own, k], parts[2][segment, own, k])
+            below, above = min(below, apart), max(above, apart)
+        total *= each
+    elif not power and shifts[0].size:
+        for k in range(shifts[0].shape[1]):
+            if shifts[1][i, k] > 0.0:
+                below, above = min(below, shifts[0][i, k]), max(above, shifts[0][i, k])
+    bins = kernel[0][0] / kernel[0][1]
+    return total, lowest + below * bins, highest + above * bins
+
+
+@njit(cache=True, error_model="numpy")
+def _bins_above(level, extent, origin, kernel):
+    """First and last bin, within 0..N/2, that lines of an extent can lift above a level."""
+    fft_size, length = kernel[0]
+    window_sum, envelope, reach = kernel[2]
+    total, lowest, highest = extent
     beyond = reach_of(level, total * window_sum, envelope, reach) * fft_size / length + 2.0
     half = fft_size // 2
     low, high = origin + lowest - beyond, origin + highest + beyond
@@ -175,40 +293,37 @@ def _bins_above(level, delta, re, im, n, origin, power, sizes, sidelobes):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate_segments(points, row, footprint, segments, power, every_bin, kernel, work, out):
+def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
     """Every point's segments: detection probability, peak, exempt bins, leakage.
 
     Parameters
     ----------
-    points : (13, n) float64
-        :meth:`sweep.model.shot.Shots.point_table`.
-    row : (n,) int64
-        The point's row in the geometry.
-    footprint : tuple of (rows, beamlets) float64
-        As in :func:`segment_spectrum`.
+    points, row, scene
+        Of a :class:`sweep.model.modulation.Stretch` of m points.
     segments : (3,) bool
         Segments to evaluate.
-    power, every_bin, kernel
+    choices, kernel
         As in :func:`inspect_segment`.
     work : tuple
         :func:`workspace`.
-    out : (3, 6, n) float64
+    out : (3, 6, m) float64
         Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
     """
     fft_size = kernel[0][0]
-    footprint, kernel, (room, exempt, series) = lent(footprint, kernel, work)
+    scene, kernel, (room, exempt, series) = lent(scene, kernel, work)
     p = np.empty(points.shape[0])
     for i in range(points.shape[1]):
         p[:] = points[:, i]
         sigma, level = p[10], p[11]
-        crossing_series(level / sigma, series)
+        if choices[2]:
+            crossing_series(level / sigma, series)
         for s in range(3):
             if not segments[s]:
                 continue
             low, _, peak, exempted, leakage = inspect_segment(
-                s, p, footprint, row[i], power, every_bin, kernel, room, exempt, series
+                s, p, scene, (row[i], i), choices, kernel, room, exempt, series
             )
-            found, missed = marcum_q1_pair(room[0, peak] / sigma, level / sigma)
+            found, missed = marcum_q1_pair(room[0, peak] / p[13], level / p[13])
             out[s, 0, i] = found
             out[s, 1, i] = missed
             out[s, 2, i] = room[0, peak]

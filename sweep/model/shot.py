@@ -3,30 +3,34 @@
 This module composes; the physics is in the others.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 
 from sweep.model import chances, waveform
-from sweep.model.preparation import Parameters, Shots, prepare
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import CORE
+from sweep.model.modulation import choices, stretches
+from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import evaluate_segments, workspace
 
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
 
 
-def evaluate(parameters: Parameters) -> dict[str, np.ndarray]:
+def evaluate(parameters: Parameters, effects: Collection[str] = CORE) -> dict[str, np.ndarray]:
     """Statistics of n shots on a flat plane.
 
     Parameters
     ----------
-    parameters : mapping
-        Dotted path to SI scalar, string, or (n,) array, for every parameter of instrument,
-        target, footprint and accuracy.
+    parameters, effects
+        As of :func:`sweep.model.chain.prepare`.
 
     Returns
     -------
     dict of (n,) ndarray
         One entry per name in :data:`sweep.model.outputs.OUTPUTS`.
     """
-    groups = list(prepare(parameters))
+    groups = list(prepare(parameters, effects))
     if len(groups) == 1:
         return statistics(groups[0][1])
     size = sum(index.size for index, _ in groups)
@@ -69,15 +73,18 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
 def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
     """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
 
-    ``every_bin`` as of :func:`sweep.model.segments.inspect_segment`.
+    ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
     """
-    out = np.full((3, 6, shots.range.size), np.nan)
-    evaluate_segments(
-        shots.point_table(), shots.row, shots.footprint, shots.segments,
-        shots.incoherent, every_bin, shots.kernel(),
-        workspace(shots.offset.shape[1], shots.fft_size), out,
-    )  # fmt: skip
-    return out
+    found = []
+    for stretch in stretches(shots):
+        out = np.full((3, 6, stretch.row.size), np.nan)
+        evaluate_segments(
+            stretch.points, stretch.row, stretch.scene, shots.segments,
+            choices(shots, every_bin=every_bin), shots.kernel(),
+            workspace(stretch.lines, shots.fft_size), out,
+        )  # fmt: skip
+        found.append(out)
+    return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
 
 
 def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:

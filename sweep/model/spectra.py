@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from sweep.model import segments
-from sweep.model.equivalent import MOST_NODES
+from sweep.model import modulation, segments
 from sweep.model.preparation import Shots
 
 
@@ -26,10 +25,10 @@ def segment_spectrum(
     bins : (m,) int ndarray
     magnitude : (m,) ndarray
     """
-    width = max(shots.offset.shape[1], MOST_NODES, shots.fft_size // 2 + 1)
-    room = np.empty((segments.ROOM, width))
+    point = modulation.single(shots, i)
+    room, _, _ = segments.workspace(point.lines, shots.fft_size)
     low, count = segments.segment_spectrum(
-        segment, shots.point_table()[:, i].copy(), shots.footprint, shots.row[i], level,
-        shots.incoherent, shots.kernel(), room,
+        segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0), level,
+        modulation.choices(shots), shots.kernel(), room,
     )  # fmt: skip
     return np.arange(low, low + count), room[0, :count].copy()

@@ -205,8 +205,9 @@ def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
 
 @njit(cache=True, error_model="numpy")
 def bin_magnitudes(
-    low, high, origin, delta, re, im, n, sizes, shape, power, tangent, out_re, out_im, work
-):
+    low, high, origin, delta, re, im, n, sizes, shape, power, tangent, out_re, out_im, work,
+    image=True,
+):  # fmt: skip
     """|X[k]| for k = low .. high (0 <= low, high <= N/2), lines and their images, into out_re.
 
     Parameters
@@ -230,31 +231,94 @@ def bin_magnitudes(
         Result; scratch.
     work : (3, >= high - low + 1) float64
         Scratch.
+    image : bool
+        Whether the lines' images are summed; if not, nothing of them is computed.
 
     Notes
     -----
     Within 1e-12 of the largest magnitude (Hann and Hamming, N = 2^17, tests/model).
     """
     count = high - low + 1
-    _, numerator, poles, edge, table = shape
-    margin = (len(poles) + 0.5) * sizes[0] / sizes[1]
-    t, sine_q, cosine_q = work[0], work[1], work[2]
     for i in range(count):
         out_re[i] = 0.0
         out_im[i] = 0.0
     for mirror in (-1, 1):  # the lines, then their images
-        first = low + mirror * origin
-        if not table.size:
-            _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q)
-            _add_far(
-                first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge,
-                power, t, sine_q, cosine_q, out_re, out_im,
+        if mirror < 0 or image:
+            first = low + mirror * origin
+            _prepare(first, count, sizes, shape, tangent, work)
+            _add(
+                first, count, mirror, delta, re, im, n, sizes, shape, power, work, out_re, out_im
             )  # fmt: skip
-        _add_near(
-            first, count, mirror, delta, re, im, n, sizes, margin, shape, power, out_re, out_im
-        )
     for i in range(count):
         if power:
             out_re[i] = math.sqrt(max(out_re[i], 0.0))
         else:
             out_re[i] = math.sqrt(out_re[i] * out_re[i] + out_im[i] * out_im[i])
+
+
+@njit(cache=True, error_model="numpy")
+def split_magnitudes(
+    low, high, origin, delta, weight, n, parts, fold, sizes, shape, tangent, out, room, image
+):
+    """|X[k]| of lines that add as powers, each of them split into parts that add as amplitudes.
+
+    Parameters
+    ----------
+    low, high, origin, sizes, shape, tangent, image
+        As of :func:`bin_magnitudes`.
+    delta, weight : (>= n,) float64
+        Positions of the lines [bins from origin]; |C_b|^2.
+    parts : tuple of (k,) float64
+        Places from their line [bins of fs/N], real and imaginary weight.
+    fold : float
+        -1 to conjugate the weights.
+    out : (>= high - low + 1,) float64
+        Result.
+    room : (7, >= max(k, high - low + 1)) float64
+        Scratch.
+    """
+    count = high - low + 1
+    place, other, re, im, work = room[0], room[1], room[2], room[3], room[4:7]
+    for i in range(count):
+        out[i] = 0.0
+    for k in range(parts[0].size):
+        other[k] = fold * parts[2][k]
+    for mirror in (-1, 1):
+        if mirror > 0 and not image:
+            break
+        first = low + mirror * origin
+        _prepare(first, count, sizes, shape, tangent, work)
+        for b in range(n):
+            for k in range(parts[0].size):
+                place[k] = delta[b] + parts[0][k]
+            for i in range(count):
+                re[i] = 0.0
+                im[i] = 0.0
+            _add(
+                first, count, mirror, place, parts[1], other, parts[0].size, sizes, shape, False,
+                work, re, im,
+            )  # fmt: skip
+            for i in range(count):
+                out[i] += weight[b] * (re[i] * re[i] + im[i] * im[i])
+    for i in range(count):
+        out[i] = math.sqrt(max(out[i], 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _prepare(first, count, sizes, shape, tangent, work):
+    """What far kernels need to know of bins; a tabulated window has none of them."""
+    if not shape[4].size:
+        _prepare_bins(first, count, sizes, tangent, work[0], work[1], work[2])
+
+
+@njit(cache=True, error_model="numpy")
+def _add(first, count, mirror, delta, re, im, n, sizes, shape, power, work, out_re, out_im):
+    """Adds n lines, or their images, to prepared bins."""
+    _, numerator, poles, edge, table = shape
+    margin = (len(poles) + 0.5) * sizes[0] / sizes[1]
+    if not table.size:
+        _add_far(
+            first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge, power,
+            work[0], work[1], work[2], out_re, out_im,
+        )  # fmt: skip
+    _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, power, out_re, out_im)

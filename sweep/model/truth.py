@@ -83,7 +83,7 @@ def _start_phase(sign: int, carrier: float, rate: float, range_0: float, further
     return float(phase - round(phase))
 
 
-def _at(column: np.ndarray, i: int) -> np.ndarray:
+def _at(column: np.ndarray | float, i: int) -> np.ndarray:
     """Point i of a column that may be one value for all."""
     column = np.asarray(column)
     return column[i] if column.ndim else column

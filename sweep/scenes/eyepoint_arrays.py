@@ -38,8 +38,8 @@ def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
         name: np.asarray(getattr(eyepoints, field), stored[name].dtype)
         for name, field in _FIELDS.items()
     }
-    first = (eyepoints.surface >= 0).argmax(axis=1)
-    arrays["beam_surface"] = arrays["surface"][np.arange(len(first)), first]
+    shots = np.arange(len(eyepoints.time))
+    arrays["beam_surface"] = arrays["surface"][shots, eyepoints.reference]
     return arrays
 
 

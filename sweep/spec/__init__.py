@@ -16,13 +16,24 @@ from sweep.spec.loading import from_stored, load
 from sweep.spec.mistakes import Mistake, SpecError
 from sweep.spec.scene_spec import SceneSpec
 from sweep.spec.schema import json_schema
-from sweep.spec.sections import Accuracy, Draws, Execution, Footprint, Storage, Target
+from sweep.spec.sections import (
+    Accuracy,
+    Atmosphere,
+    Draws,
+    Effects,
+    Execution,
+    Footprint,
+    Storage,
+    Target,
+)
 
 __all__ = [
     "Accuracy",
+    "Atmosphere",
     "Axis",
     "Chirp",
     "Draws",
+    "Effects",
     "Execution",
     "FalseAlarmTable",
     "Figure",

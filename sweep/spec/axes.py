@@ -112,7 +112,8 @@ def member_of(path: str, pieces: list[Any], location: Location) -> Member:
                 location, f"has {size} values, and an axis takes at most {MOST_VALUES}", "", ABSENT
             )
         )
-    unit = pieces[0].unit
+    # Not in decibels where some piece is not: those have no zero.
+    unit = next((piece.unit for piece in pieces if not piece.unit.decibel), pieces[0].unit)
     values = np.concatenate([piece.si for piece in pieces])
     display = np.concatenate([piece.displayed(unit) for piece in pieces])
     if values.dtype == np.int64 and unit.text == "":

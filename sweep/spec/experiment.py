@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from sweep.model import VERSION
 from sweep.spec.axes import Axis
+from sweep.spec.effect_check import without_draws, written_modes
 from sweep.spec.fields import SECTIONS, values_of
 from sweep.spec.figure_check import figure_findings
 from sweep.spec.figures import Figure
 from sweep.spec.identity import axis_identity
+from sweep.spec.limits import readable
 from sweep.spec.mistakes import Finding
 from sweep.spec.sections import Draws, Storage, Target
 from sweep.spec.study import Study
@@ -44,8 +47,13 @@ class Spec(Study):
         base: Path | None,
         axes_are_whole: bool,
     ) -> list[Finding]:
-        """Figures of what the study lacks."""
-        return figure_findings(written, axes) if axes_are_whole else []
+        """Figures of what the study lacks, and random effects without draws."""
+        findings = figure_findings(written, axes) if axes_are_whole else []
+        with suppress(ValidationError):
+            if not Draws.model_validate(written.get("draws", {})).number:
+                values = readable(written, axes)
+                findings += without_draws(values, axes, written_modes(written))
+        return findings
 
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
@@ -66,6 +74,7 @@ class Spec(Study):
             "parameters": self.parameters_off_axes(),
             "axes": [axis_identity(axis) for axis in self.axes],
             "draws": values_of(self.draws, ""),
+            "effects": self.modes(),
             "seed": self.seed,
             "storage": values_of(self.storage, ""),
         }

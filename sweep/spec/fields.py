@@ -12,11 +12,12 @@ from pydantic import BaseModel
 from sweep.spec.instrument import Instrument
 from sweep.spec.mistakes import near_miss
 from sweep.spec.rules import Rule, Text
-from sweep.spec.sections import Accuracy, Footprint, Target
+from sweep.spec.sections import Accuracy, Atmosphere, Footprint, Target
 
 SECTIONS: dict[str, type[BaseModel]] = {
     "instrument": Instrument,
     "target": Target,
+    "atmosphere": Atmosphere,
     "footprint": Footprint,
     "accuracy": Accuracy,
 }
@@ -118,4 +119,5 @@ def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
     suggestion = near_miss(path, rules) or near_miss(tail, by_tail)
     for short, known in by_tail.items():
         suggestion = suggestion.replace(f"'{short}'", f"'{known}'")
-    return suggestion or "axes take fields of instrument, target, footprint and accuracy"
+    *others, last = SECTIONS
+    return suggestion or f"axes take fields of {', '.join(others)} and {last}"

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
+from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.spec.axes import Axis
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure
@@ -73,17 +73,18 @@ def _coordinate_findings(figure: Figure, axes: tuple[Axis, ...], index: int) -> 
 def _variable_findings(figure: Figure, with_draws: bool, index: int) -> list[Finding]:
     """A variable that the study does not store."""
     variable = getattr(figure, "variable", None)
-    if variable is None or variable in OUTPUTS or (with_draws and variable in DRAW_OUTPUTS):
+    drawn = DRAW_OUTPUTS | ERROR_OUTPUTS
+    if variable is None or variable in OUTPUTS or (with_draws and variable in drawn):
         return []
     location: Location = ("figures", index, "variable")
-    if variable in DRAW_OUTPUTS:
+    if variable in drawn:
         return [
             Finding(
                 location,
-                "is counted over draws, and this study has none",
+                "is found over draws, and this study has none",
                 "set draws: {number: ...}",
                 variable,
             )
         ]
-    stored = [*OUTPUTS, *DRAW_OUTPUTS]
+    stored = [*OUTPUTS, *drawn]
     return [Finding(location, "is no stored quantity", near_miss(variable, stored), variable)]

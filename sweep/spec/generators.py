@@ -216,6 +216,9 @@ def _read_bounds(
     if findings:
         raise Rejected(*findings)
     first = units[0]
+    if any(unit.decibel != first.decibel for unit in units):
+        rule_broken = "mixes decibels with a plain unit"
+        raise Rejected(Finding(location, rule_broken, "take one of them", ABSENT))
     pairs = zip(numbers, units, strict=True)
     return [_in_unit(n, u, first, i) for i, (n, u) in enumerate(pairs)], first
 

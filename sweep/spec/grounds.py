@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -99,7 +100,7 @@ class Craters(Part):
         return carve(terrain, craters)
 
 
-class Ground(Material):
+class Ground(Material, ABC):
     """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
 
     owns_coordinates: ClassVar[bool] = False
@@ -143,9 +144,9 @@ class Ground(Material):
             terrain = Terrain(heights, terrain.spacing, terrain.origin)
         return terrain if self.craters is None else self.craters.carved(terrain)
 
+    @abstractmethod
     def survey(self, files: Files) -> Terrain:
         """The ground before anything is done to it."""
-        raise NotImplementedError
 
     def check(self) -> None:
         """Looks at what can be seen without making the ground.
@@ -178,9 +179,9 @@ class PlacedGround(Ground):
         corner = np.array([-(columns - 1) / 2 * dx, -(rows - 1) / 2 * dy, 0.0])
         return Terrain(grid.heights, grid.spacing, corner + self.position)
 
+    @abstractmethod
     def grid(self, files: Files) -> Terrain:
         """Heights, wherever they are."""
-        raise NotImplementedError
 
 
 class Jacksboro(PlacedGround):

@@ -113,6 +113,8 @@ def _told(path: str, value: Any) -> str:
     units = f" {unit}" if unit else ""
     if value is None:
         return "(none)"
+    if isinstance(value, str):
+        return value
     if path in ("axes", "objects"):
         return ", ".join(value) or "(none)"
     if isinstance(value, list):

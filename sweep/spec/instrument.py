@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
 
+from sweep.spec.effect_fields import with_parameters
 from sweep.spec.rules import Choice, Numeric
 from sweep.spec.window_rule import Window
 
@@ -19,6 +20,7 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+@with_parameters("instrument.laser")
 class Laser(Part):
     """Transmitter: wavelength, power and beam."""
 
@@ -40,6 +42,7 @@ class Laser(Part):
     ]
 
 
+@with_parameters("instrument.chirp")
 class Chirp(Part):
     """Linear frequency sweep of one segment."""
 
@@ -61,6 +64,7 @@ class Chirp(Part):
     ]
 
 
+@with_parameters("instrument.telescope")
 class Telescope(Part):
     """Receiving optics."""
 
@@ -78,6 +82,7 @@ class Telescope(Part):
     ] = 1.0
 
 
+@with_parameters("instrument.receiver")
 class Receiver(Part):
     """Detector, local oscillator and amplifiers."""
 
@@ -203,6 +208,7 @@ class Receiver(Part):
     ] = 290.0
 
 
+@with_parameters("instrument.processing")
 class Processing(Part):
     """Sampling, transform and threshold."""
 

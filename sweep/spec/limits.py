@@ -5,21 +5,85 @@ They are held against the whole grid of a study, by its extremes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec.axes import Axis
-from sweep.spec.mistakes import ABSENT, Finding
+from sweep.spec.fields import default_of, parameter_rules
+from sweep.spec.mistakes import ABSENT, Finding, Location
+from sweep.units import QuantityError
 
 RANGE = "target.range"
 DURATION = "instrument.chirp.duration"
 DELAY = "instrument.processing.acquisition_delay"
 SAMPLE_RATE = "instrument.processing.sample_rate"
 
+Condition = Callable[[np.ndarray], np.ndarray]
+"""What holds or does not for each of several values."""
 
-def grid_findings(values: Mapping[str, float], axes: tuple[Axis, ...]) -> list[Finding]:
+
+def readable(written: Mapping[str, Any], axes: Iterable[Axis]) -> dict[str, Any]:
+    """SI values of the parameters off the axes by dotted path, as far as they can be read."""
+    on_axes = {member.path for axis in axes for member in axis.members}
+    values: dict[str, Any] = {}
+    for path, rule in parameter_rules().items():
+        found: Any = written
+        for name in path.split("."):
+            found = found.get(name, ABSENT) if isinstance(found, Mapping) else ABSENT
+        if path in on_axes:
+            continue
+        with suppress(QuantityError):
+            value = default_of(path) if found is ABSENT else rule.read(found)
+            if value is not None:
+                values[path] = value
+    return values
+
+
+def place_on_grid(path: str, axes: tuple[Axis, ...]) -> Location:
+    """Where the values of a parameter stand in a spec: on its axis, if it has one."""
+    for axis in axes:
+        if any(member.path == path for member in axis.members):
+            return ("axes", axis.name if axis.zipped else path)
+    return tuple(path.split("."))
+
+
+def has_point(
+    conditions: Mapping[str, Condition], values: Mapping[str, Any], axes: tuple[Axis, ...]
+) -> bool:
+    """Whether some point of a grid meets conditions on parameters, all of them.
+
+    Axes vary apart, and the members of one together: each axis must have a place that meets all
+    conditions on its members.
+
+    Parameters
+    ----------
+    conditions : mapping
+        By dotted path.
+    values : mapping
+        SI values of the parameters off the axes, as far as they could be read.
+    axes : tuple of Axis
+        The axes.
+    """
+    on_axes = {member.path for axis in axes for member in axis.members}
+    for path in set(conditions) - on_axes:
+        if path not in values or not conditions[path](np.asarray(values[path])):
+            return False
+    for axis in axes:
+        met = [
+            conditions[member.path](np.asarray(member.values))
+            for member in axis.members
+            if member.path in conditions
+        ]
+        if met and not np.logical_and.reduce(met).any():
+            return False
+    return True
+
+
+def grid_findings(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[Finding]:
     """What is wrong with the combinations of values in a study's grid.
 
     Parameters
@@ -32,7 +96,7 @@ def grid_findings(values: Mapping[str, float], axes: tuple[Axis, ...]) -> list[F
     known = set(values) | {member.path for axis in axes for member in axis.members}
     if not {DURATION, DELAY} <= known:
         return []
-    location = tuple(DURATION.split("."))
+    location = place_on_grid(DURATION, axes)
     if RANGE in known:
         spare = _smallest_sum(
             {DURATION: 1.0, DELAY: -1.0, RANGE: -2.0 / SPEED_OF_LIGHT}, values, axes
@@ -61,7 +125,7 @@ def _sum_along(axis: Axis, weights: Mapping[str, float]) -> np.ndarray | float:
 
 
 def _smallest_sum(
-    weights: Mapping[str, float], values: Mapping[str, float], axes: tuple[Axis, ...]
+    weights: Mapping[str, float], values: Mapping[str, Any], axes: tuple[Axis, ...]
 ) -> float:
     """Smallest weighted sum over the grid: each axis adds its own smallest part."""
     on_axes = {member.path for axis in axes for member in axis.members}
@@ -69,7 +133,7 @@ def _smallest_sum(
     return float(off_axes + sum(np.min(_sum_along(axis, weights)) for axis in axes))
 
 
-def _fewest_samples(values: Mapping[str, float], axes: tuple[Axis, ...]) -> float:
+def _fewest_samples(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> float:
     """Fewest samples of one segment over the grid."""
     weights = {DURATION: 1.0, DELAY: -1.0}
     for axis in axes:
@@ -80,4 +144,4 @@ def _fewest_samples(values: Mapping[str, float], axes: tuple[Axis, ...]) -> floa
             rest = {path: weight for path, weight in weights.items() if path not in own}
             spare = _smallest_sum(rest, values, others) + _sum_along(axis, weights)
             return float(np.min(spare * rates[0]))
-    return _smallest_sum(weights, values, axes) * values[SAMPLE_RATE]
+    return _smallest_sum(weights, values, axes) * float(values[SAMPLE_RATE])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 Vector = tuple[float, ...]
 
 
-class Solid(Material):
+class Solid(Material, ABC):
     """An object of its own, at rest or moving.
 
     One that moves is placed by its path; its rotation is that in the moving body's frame.
@@ -46,9 +47,9 @@ class Solid(Material):
         """
         return self.shape(files).placed(rotation=self.rotation.turn())
 
+    @abstractmethod
     def shape(self, files: Files) -> Facets:
         """Its facets before they are turned."""
-        raise NotImplementedError
 
 
 class MeshObject(Solid):

@@ -12,9 +12,11 @@ from pydantic import Field, PrivateAttr
 from sweep.model import VERSION
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
+from sweep.spec.effect_check import not_in_flights, written_modes
 from sweep.spec.fields import values_of
 from sweep.spec.files import Files, named_files
 from sweep.spec.identity import axis_identity, digest
+from sweep.spec.limits import readable
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
 from sweep.spec.motion import Platform
 from sweep.spec.reading import Document, plain
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 FILES = "files"
 """Section of a stored study: the digest of each file by its path."""
 
-SECTIONS = ("instrument", "footprint", "accuracy")
+SECTIONS = ("instrument", "atmosphere", "footprint", "accuracy")
 
 
 class SceneSpec(Study):
@@ -94,8 +96,9 @@ class SceneSpec(Study):
         base: Path | None,
         axes_are_whole: bool,
     ) -> list[Finding]:
-        """What is wrong with scene, flight, files and figures."""
+        """What is wrong with scene, flight, files, random effects and figures."""
         findings = scene_findings(written, base) + axis_findings(written, axes)
+        findings += not_in_flights(readable(written, axes), axes, written_modes(written))
         return findings + scene_figure_findings(written, axes if axes_are_whole else None)
 
     @classmethod
@@ -180,6 +183,12 @@ class SceneSpec(Study):
         sigma = self.platform.jitter
         return PointingJitter(sigma, self.seed) if sigma else None
 
+    @property
+    def rotating(self) -> bool:
+        """Whether any body of the scene turns."""
+        moving = (getattr(thing, "motion", None) for thing in self.scene.objects.values())
+        return any(motion is not None and motion.attitude.kind != "fixed" for motion in moving)
+
     def geometry(self, name: str) -> dict[str, Any]:
         """Content of what is seen through one scanner: all that rays depend on, and no more.
 
@@ -192,6 +201,7 @@ class SceneSpec(Study):
             "pattern": self.pattern,
             "beam_divergence": self.instrument.laser.beam_divergence,
             "seed": self.seed if self.platform.jitter else 0,
+            "rotation": self.modes()["rotation"] != "off",
         }
 
     def geometry_id(self, name: str) -> str:
@@ -220,6 +230,7 @@ class SceneSpec(Study):
             },
             "draws": values_of(self.draws, ""),
             "navigation": values_of(self.navigation, ""),
+            "effects": self.modes(),
             "seed": self.seed,
             "storage": values_of(self.storage, ""),
         }

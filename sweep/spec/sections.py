@@ -3,10 +3,13 @@
 from typing import Annotated
 
 from sweep.model.reflectance import LAWS
+from sweep.spec.effect_fields import with_modes, with_parameters
 from sweep.spec.instrument import Part
+from sweep.spec.quantities import count
 from sweep.spec.rules import Choice, Numeric, Text
 
 
+@with_parameters("target")
 class Target(Part):
     """A flat plane, seen at an angle."""
 
@@ -55,15 +58,11 @@ class Target(Part):
     ] = 0.0
 
 
+@with_parameters("footprint")
 class Footprint(Part):
     """The spot on the target, as a sum of beamlets."""
 
-    beamlets: Annotated[
-        int,
-        Numeric(
-            about="Number of beamlets", example="109", at_least="1", at_most="100000", whole=True
-        ),
-    ] = 109
+    beamlets: Annotated[int, count("Number of beamlets", "109", at_most="100000")] = 109
     phases: Annotated[
         str,
         Choice(
@@ -73,9 +72,29 @@ class Footprint(Part):
     ] = "incoherent"
 
 
+@with_parameters("atmosphere")
+class Atmosphere(Part):
+    """The air between instrument and target."""
+
+
+@with_modes
+class Effects(Part):
+    """Which physical effects are simulated: where the scene calls for it, always or never."""
+
+
 class Accuracy(Part):
     """How far the computation goes; part of a study's identity."""
 
+    tolerance: Annotated[
+        float,
+        Numeric(
+            about="Largest change of a probability that effects left out may make, all together; "
+            "0 simulates all that the scene has",
+            example="1e-3",
+            at_least="0",
+            at_most="1",
+        ),
+    ] = 1e-3
     leakage_floor: Annotated[
         float,
         Numeric(
@@ -93,24 +112,11 @@ class Draws(Part):
 
     number: Annotated[
         int,
-        Numeric(
-            about="Draws a point; 0 computes probabilities alone",
-            example="10000",
-            at_least="0",
-            at_most="1e12",
-            whole=True,
+        count(
+            "Draws a point; 0 computes probabilities alone", "10000", at_least="0", at_most="1e12"
         ),
     ] = 0
-    batch: Annotated[
-        int,
-        Numeric(
-            about="Draws that are counted together",
-            example="100",
-            at_least="1",
-            at_most="1e9",
-            whole=True,
-        ),
-    ] = 100
+    batch: Annotated[int, count("Draws that are counted together", "100", at_most="1e9")] = 100
     method: Annotated[
         str,
         Choice(
@@ -124,14 +130,7 @@ class Storage(Part):
     """How results are cut up in the store; part of a study's identity."""
 
     block_points: Annotated[
-        int,
-        Numeric(
-            about="Points that one block holds at most",
-            example="65536",
-            at_least="1",
-            at_most="1e9",
-            whole=True,
-        ),
+        int, count("Points that one block holds at most", "65536", at_most="1e9")
     ] = 65536
 
 
@@ -139,21 +138,9 @@ class Execution(Part):
     """How a study is run; never part of its identity, as it changes no result."""
 
     workers: Annotated[
-        int,
-        Numeric(
-            about="Worker processes; 0 for one a core",
-            example="4",
-            at_least="0",
-            at_most="100000",
-            whole=True,
-        ),
+        int, count("Worker processes; 0 for one a core", "4", at_least="0", at_most="100000")
     ] = 0
-    threads: Annotated[
-        int,
-        Numeric(
-            about="Threads of one worker", example="1", at_least="1", at_most="10000", whole=True
-        ),
-    ] = 1
+    threads: Annotated[int, count("Threads of one worker", "1", at_most="10000")] = 1
     scheduler: Annotated[
         str,
         Text(

@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import copy
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
+import numpy as np
 from pydantic import ConfigDict, PrivateAttr, ValidationError
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.axis_reading import paths_on_axes, read_axes
+from sweep.spec.effect_check import effect_findings, written_modes
 from sweep.spec.fields import (
     UNSTORED,
-    default_of,
     fill,
     leaves,
     parameter_rules,
     parameter_suggestion,
+    values_of,
 )
 from sweep.spec.identity import digest
 from sweep.spec.instrument import Instrument, Part
-from sweep.spec.limits import grid_findings
+from sweep.spec.limits import grid_findings, readable
 from sweep.spec.mistakes import ABSENT, Finding, Location, Mistake, SpecError, dotted, shown
+from sweep.spec.progressions import values_in
 from sweep.spec.reading import Document, plain, resolve_instrument
 from sweep.spec.rules import Numeric, Rule, Text
-from sweep.spec.sections import Accuracy, Execution, Footprint
+from sweep.spec.sections import Accuracy, Atmosphere, Effects, Execution, Footprint
 from sweep.spec.translation import findings_of
 from sweep.units import QuantityError
 
@@ -46,7 +50,7 @@ class _ReadAxes(Rule):
         return written
 
 
-class Study(Part):
+class Study(Part, ABC):
     """A study as its user declared it, every value read and checked.
 
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
@@ -57,7 +61,9 @@ class Study(Part):
     title: Annotated[str, Text(about="What the study is called")]
     question: Annotated[str, Text(about="The question that the study answers")] = ""
     instrument: Instrument
+    atmosphere: Atmosphere = Atmosphere()
     footprint: Footprint = Footprint()
+    effects: Effects = Effects()
     accuracy: Accuracy = Accuracy()
     seed: Annotated[int, _SEED] = 0
     execution: Execution = Execution()
@@ -115,7 +121,9 @@ class Study(Part):
             spec = cls.model_validate({**written, "axes": axes})
         except ValidationError as error:
             findings += findings_of(error, cls)
-        findings += grid_findings(_readable(written, axes), axes)
+        values = readable(written, axes)
+        findings += grid_findings(values, axes)
+        findings += effect_findings(values, axes, written_modes(written))
         findings += _size_finding(axes)
         findings += cls.further_findings(written, axes, base, axes_are_whole)
         # What is wrong with an axis or an instrument's file is told there, and there alone.
@@ -159,9 +167,13 @@ class Study(Part):
         """
         return []
 
+    @abstractmethod
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
-        raise NotImplementedError
+
+    def modes(self) -> dict[str, str]:
+        """Whether each effect, by its name, is simulated: `auto`, `on` or `off`."""
+        return values_of(self.effects, "")
 
     def parameters_at(self, at: Mapping[str, object]) -> dict[str, float | int | str]:
         """Parameters with some set anew, written as in a spec.
@@ -190,7 +202,8 @@ class Study(Part):
                 findings.append(Finding((name,), error.rule, error.suggestion, written))
             findings += self.unvaried(path, parameters[path], (name,))
         if not findings:
-            findings = grid_findings(parameters, ())  # type: ignore[arg-type]
+            findings = grid_findings(parameters, ())
+            findings += effect_findings(parameters, (), self.modes())
         if findings:
             raise SpecError(Document({}).mistake(finding) for finding in findings)
         return parameters
@@ -229,13 +242,15 @@ class Study(Part):
             return str(rule.read(written))
         number, unit = rule.exact(written)
         display = rule.exact(f"1 {member.units}" if member.units else 1)[1]
+        if unit.decibel != display.decibel:
+            return float(values_in(display, np.array([unit.to_si(number)]))[0])
         if unit.decibel:
             return float(number)
         return float((unit.factor * number + unit.offset - display.offset) / display.factor)
 
+    @abstractmethod
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values."""
-        raise NotImplementedError
 
     def parameters_off_axes(self) -> dict[str, float | int | str]:
         """SI values of the parameters that no axis overrides, by dotted path."""
@@ -268,25 +283,6 @@ class Study(Part):
     def to_json(self) -> str:
         """The spec as JSON text, for a store to hold."""
         return json.dumps(self.to_yaml_mapping(), ensure_ascii=False, allow_nan=False)
-
-
-def _readable(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> dict[str, float]:
-    """Numeric parameters off the axes, as far as they can be read."""
-    on_axes = {member.path for axis in axes for member in axis.members}
-    values: dict[str, float] = {}
-    for path, rule in parameter_rules().items():
-        found: Any = written
-        for name in path.split("."):
-            found = found.get(name, ABSENT) if isinstance(found, Mapping) else ABSENT
-        if path in on_axes or not isinstance(rule, Numeric):
-            continue
-        try:
-            value = default_of(path) if found is ABSENT else rule.read(found)
-        except QuantityError:
-            continue
-        if value is not None:
-            values[path] = value
-    return values
 
 
 def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.tasks.calling import EFFECTS, ERROR, Called
 from sweep.tasks.grid import Grid, Value, canonical_rows
 from sweep.tasks.study import Results
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from sweep.spec import Spec
 
 #: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
-#: worker's memory does not grow with the block.
+#: worker's memory does not grow with the block. Their draws are cut further by the model.
 SUB_BATCH = 1 << 16
 
 #: Counts of draws held at once; many batches make a point larger.
@@ -24,7 +25,7 @@ SUB_BATCH_COUNTS = 1 << 19
 DOMAIN = "sweep.draws"
 
 
-def evaluate_block(spec: Spec, grid: Grid, block: int) -> Results:
+def evaluate_block(spec: Spec, grid: Grid, block: int, called: Called) -> Results:
     """Results of one block.
 
     Parameters
@@ -33,32 +34,59 @@ def evaluate_block(spec: Spec, grid: Grid, block: int) -> Results:
         The study and its grid.
     block
         Number of the block.
+    called
+        What is simulated at each of its points, in C order over it.
 
     Returns
     -------
     dict of ndarray
-        Each output of the model with the block's extent as its shape; counts of draws with a last
-        dimension over batches, where the study draws.
+        Each output of the model with the block's extent as its shape, and what was simulated;
+        counts of draws with a last dimension over batches, where the study draws.
     """
     extent, parameters = grid.extent(block), grid.parameters(block)
     order = grid.geometry_order(block)
-    results: Results = {}
-    for points in np.split(order, range(_step(spec), len(order), _step(spec))):
-        found = evaluate_points(spec, select(parameters, points), len(points))
-        for name, values in found.items():
-            if name not in results:
-                results[name] = np.empty((len(order), *values.shape[1:]), values.dtype)
-            results[name][points] = values
+    results: Results = {EFFECTS: called.flags, ERROR: called.error}
+    for members, effects in called.some(order).groups():
+        for points in np.split(order[members], range(_step(spec), len(members), _step(spec))):
+            found = evaluate_points(spec, select(parameters, points), len(points), effects)
+            for name, values in found.items():
+                room = (len(order), *values.shape[1:])
+                results.setdefault(name, np.empty(room, values.dtype))[points] = values
     return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
 
-def evaluate_points(spec: Spec, parameters: Mapping[str, Value], count: int) -> Results:
-    """Results of points, (count,) each; counts of draws (count, batches)."""
+def evaluate_points(
+    spec: Spec,
+    parameters: Mapping[str, Value],
+    count: int,
+    effects: Collection[str],
+) -> Results:
+    """Results of points, (count,) each; counts of draws (count, batches).
+
+    Parameters
+    ----------
+    spec, parameters
+        The study; dotted path to scalars, strings or arrays (count,).
+    count
+        Number of points.
+    effects
+        Names of the effects that are simulated in all of them. Outputs are means over the
+        study's draws where random ones are among them.
+
+    Raises
+    ------
+    ValueError
+        An effect is random and the study has no draws.
+    """
+    if spec.draws.number:
+        return _drawn(spec, parameters, count, effects)
+    from sweep.model.realisations import random_effects
     from sweep.model.shot import evaluate
 
-    outputs = evaluate(parameters)
-    outputs = {name: np.broadcast_to(values, (count,)) for name, values in outputs.items()}
-    return {**outputs, **_draws(spec, parameters, outputs, count)}
+    if random := [effect.name for effect in random_effects(effects)]:
+        raise ValueError(f"{', '.join(random)}: simulated by draws, and the study has none")
+    outputs = evaluate(parameters, effects)
+    return {name: np.broadcast_to(values, (count,)) for name, values in outputs.items()}
 
 
 def select(parameters: Mapping[str, Value], points: np.ndarray) -> dict[str, Value]:
@@ -79,22 +107,31 @@ def batch_sizes(spec: Spec) -> list[int]:
     return [min(batch, number - first) for first in range(0, number, batch)]
 
 
-def _draws(spec: Spec, parameters: Mapping[str, Value], outputs: Results, count: int) -> Results:
-    if spec.draws.number == 0:
-        return {}
-    from sweep.model.draws import draw
+def _drawn(
+    spec: Spec, parameters: Mapping[str, Value], count: int, effects: Collection[str]
+) -> Results:
+    from sweep.model.draws import simulate
     from sweep.model.philox import point_keys
 
-    return draw(
+    # The same draws however closely they are looked at.
+    physical = {path: v for path, v in parameters.items() if not path.startswith("accuracy.")}
+    return simulate(
         parameters,
-        outputs,
-        keys=point_keys(canonical_rows(parameters, count), domain=DOMAIN, seed=spec.seed),
-        first_draw=0,
+        effects,
+        keys=point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed),
         batch_sizes=batch_sizes(spec),
         method=spec.draws.method,
     )
 
 
-def compile_kernels(grid: Grid) -> None:
-    """Compile what the model compiles, once, before workers get blocks and find it on disk."""
-    evaluate_points(grid.spec, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1)
+def compile_kernels(spec: Spec, grid: Grid) -> None:
+    """Compile what the model compiles, once, before workers get blocks and find it on disk.
+
+    One point with every effect that may be called for, and one with none.
+    """
+    from sweep.model.effects.catalogue import EFFECTS as ALL
+
+    modes, draws = spec.modes(), spec.draws.number > 0
+    may_be = [e.name for e in ALL if modes[e.name] != "off" and (draws or not e.is_random)]
+    for effects in (may_be, ()):
+        evaluate_points(spec, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)

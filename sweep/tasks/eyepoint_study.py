@@ -164,6 +164,13 @@ class EyepointStudy:
         shots = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return shots | self._cycles(shots)
 
+    def spread(self, cycles: int) -> np.ndarray:
+        """Numbers of the shots of some cycles, spread over the flight."""
+        first = np.unique(np.linspace(0, self.cycles - 1, cycles).astype(np.int64))
+        return np.asarray(
+            (first[:, None] * self.shots_a_cycle + np.arange(self.shots_a_cycle)).ravel()
+        )
+
     def _observe(self, index: np.ndarray) -> Eyepoints:
         from sweep.model.eyepoints import observe
 
@@ -178,6 +185,7 @@ class EyepointStudy:
             number=self.beamlets,
             pattern=self.spec.pattern,
             jitter=self.spec.pointing_jitter(),
+            rotation=self.spec.modes()["rotation"] != "off",
         )
 
     def _cycles(self, shots: Results) -> Results:

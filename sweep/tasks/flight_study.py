@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS, SceneOutput
+from sweep.model.effects.flags import flag_attributes
+from sweep.model.scene_outputs import (
+    CYCLES,
+    NAVIGATION,
+    POINTS,
+    SHOTS,
+    SIMULATED,
+    STATISTICS,
+    SceneOutput,
+)
+from sweep.tasks.calling import EFFECTS, TILE_SHOTS, Called, ShotsPlan, plan_shots
 from sweep.tasks.eyepoint_reader import EyepointReader
 from sweep.tasks.eyepoint_study import (
     SIZES,
@@ -127,7 +138,8 @@ class FlightStudy:
         return arrays
 
     def _outputs(self, stretches: Stretches) -> dict[str, SceneOutput]:
-        return SHOTS | CYCLES | STATISTICS | POINTS | (NAVIGATION if stretches.navigates else {})
+        own = SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS
+        return own | (NAVIGATION if stretches.navigates else {})
 
     def _array(self, stretches: Stretches, name: str) -> ArrayLayout:
         output = self._outputs(stretches)[name]
@@ -143,13 +155,14 @@ class FlightStudy:
             "cycle": stretches.block_cycles,
             "draw": stretches.block_draws,
         }
-        return scene_array(
+        layout = scene_array(
             name,
             output,
             (*stretches.axes[: len(axes)], *(sizes[dim] for dim in output.dims)),
             (*(1 for _ in axes), *(cut[dim] for dim in output.dims)),
             axes=axes,
         )
+        return replace(layout, attributes=flag_attributes()) if name == EFFECTS else layout
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """Chunks of a block: what has no draws goes with the first, and so does the geometry."""
@@ -171,7 +184,9 @@ class FlightStudy:
         reader = self._reader(part.scanner)
         shots, eyepoints = reader.shots(first, stop)
         results = shots | reader.cycles(*stretches.cycle_range(part))
-        results |= self.look(part, shots, eyepoints, first=first)
+        called = self._called(part, first, stop)
+        results |= {"effects": called.flags, "effects_error": called.error}
+        results |= self.look(part, shots, eyepoints, called, first=first)
         depth = len(part.axes)
         return {
             f"{part.scanner}/{name}": values.reshape((1,) * depth + values.shape)
@@ -186,9 +201,39 @@ class FlightStudy:
         for stretches in self._stretches:
             part = stretches.part(0)
             shots, eyepoints = self._reader(part.scanner).shots(0, stretches.shots_a_cycle)
-            self.look(part, shots, eyepoints, first=0)
+            self.look(part, shots, eyepoints, self.call(part, eyepoints), first=0)
 
-    def look(self, part: Part, shots: Results, eyepoints: Eyepoints, *, first: int) -> Results:
+    def _called(self, part: Part, first: int, stop: int) -> Called:
+        """What is simulated of some shots, whatever the block: whole tiles are looked at."""
+        stretches = self.scanners[part.scanner]
+        begin, total = first // TILE_SHOTS * TILE_SHOTS, stretches.total_cycles
+        end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total * stretches.shots_a_cycle)
+        _, around = self._reader(part.scanner).shots(begin, end)
+        called = self.call(part, around, first=begin)
+        own = slice(first - begin, stop - begin)
+        return Called(called.flags[own], called.error[own])
+
+    def call(self, part: Part, eyepoints: Eyepoints, *, first: int = 0) -> Called:
+        """What is simulated of shots, the first of this number."""
+        number = len(eyepoints.time)
+        planned = self.planned(part, eyepoints, (first + np.arange(number)) // TILE_SHOTS)
+        nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
+        return nothing if planned is None else planned.called(number)
+
+    def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
+        """Plans of shots whose tiles have these numbers, (n,), rising."""
+        return plan_shots(
+            eyepoints,
+            self._parameters(part),
+            self.spec.surfaces(),
+            modes=self.spec.modes(),
+            tiles=tiles,
+            rotating=self.spec.rotating,
+        )
+
+    def look(
+        self, part: Part, shots: Results, eyepoints: Eyepoints, called: Called, *, first: int
+    ) -> Results:
         """Radiometry, draws and navigation of some shots.
 
         Parameters
@@ -197,27 +242,15 @@ class FlightStudy:
             Scanner, place along the axes and stretch of draws.
         shots, eyepoints
             Whole cycles of them.
+        called
+            What is simulated of each.
         first
             Number of the first.
         """
-        from sweep.model.clouds import cloud
         from sweep.model.cycles import solve
-        from sweep.model.philox import point_keys
 
-        stretches, numbers = self.scanners[part.scanner], first + np.arange(len(shots["time"]))
-        begin, end = stretches.draw_range(part)
-        found = cloud(
-            eyepoints,
-            parameters=self._parameters(part),
-            surfaces=self.spec.surfaces(),
-            keys=point_keys(
-                numbers[:, None].astype(float), domain=DOMAIN, seed=int(self.spec.seed)
-            ),
-            first_draw=begin,
-            draws=end - begin,
-            method=self.spec.draws.method,
-            returns=int(self.spec.draws.returns),
-        )
+        stretches = self.scanners[part.scanner]
+        found = self._cloud(part, eyepoints, called, first)
         if not stretches.navigates:
             return found
         navigation = self.spec.navigation
@@ -230,6 +263,31 @@ class FlightStudy:
             relief=navigation.relief,
             jitter=self.spec.platform.jitter,
         )
+
+    def _cloud(self, part: Part, eyepoints: Eyepoints, called: Called, first: int) -> Results:
+        from sweep.model.clouds import cloud
+        from sweep.model.philox import point_keys
+
+        begin, end = self.scanners[part.scanner].draw_range(part)
+        numbers = first + np.arange(called.flags.size)
+        keys = point_keys(numbers[:, None].astype(float), domain=DOMAIN, seed=int(self.spec.seed))
+        found: Results = {}
+        for index, effects in called.groups():
+            some = cloud(
+                eyepoints.some(index),
+                parameters=self._parameters(part),
+                surfaces=self.spec.surfaces(),
+                keys=keys[index],
+                first_draw=begin,
+                draws=end - begin,
+                method=self.spec.draws.method,
+                returns=int(self.spec.draws.returns),
+                effects=effects,
+            )
+            for name, values in some.items():
+                room = (called.flags.size, *values.shape[1:])
+                found.setdefault(name, np.empty(room, values.dtype))[index] = values
+        return found
 
     def _parameters(self, part: Part) -> Mapping[str, Any]:
         parameters = dict(self.spec.parameters())
@@ -270,4 +328,5 @@ def _belongs(name: str, part: Part) -> bool:
     """Whether an array has a chunk that is this block's to write."""
     if name in POINTS or name in NAVIGATION:
         return True
-    return part.draws == 0 and (name in STATISTICS or not any(part.axes))
+    once = name in STATISTICS or name in SIMULATED
+    return part.draws == 0 and (once or not any(part.axes))

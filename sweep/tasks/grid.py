@@ -21,7 +21,13 @@ Value = float | int | str | np.ndarray
 
 #: Parameters that move the beamlets over the target; every other one only scales or reads lines
 #: that are already placed, and is cheap once they are.
-GEOMETRIC = ("target.range", "target.grazing_angle", "target.radial_velocity")
+GEOMETRIC = (
+    "target.range",
+    "target.grazing_angle",
+    "target.radial_velocity",
+    "target.transverse_velocity",
+    "target.pointing_jitter",
+)
 GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
 
 
@@ -75,7 +81,7 @@ class Grid:
 
     def __init__(self, spec: Spec) -> None:
         self.spec = spec
-        self._fixed: dict[str, float | int | str] = dict(spec.parameters())
+        self.fixed: dict[str, float | int | str] = dict(spec.parameters())
         self._axes = tuple(spec.axes)
         self.dims = tuple(axis.name for axis in self._axes)
         self.shape = tuple(int(axis.size) for axis in self._axes)
@@ -155,14 +161,15 @@ class Grid:
         return self._select(list(np.unravel_index(points, self.shape)) if self.shape else [])
 
     def _select(self, indices: list[np.ndarray]) -> dict[str, Value]:
-        selected: dict[str, Value] = dict(self._fixed)
-        for values, along in zip(self._values, indices, strict=True):
+        selected: dict[str, Value] = dict(self.fixed)
+        for values, along in zip(self.values, indices, strict=True):
             for path, array in values.items():
                 selected[path] = array[along]
         return selected
 
     @cached_property
-    def _values(self) -> list[dict[str, np.ndarray]]:
+    def values(self) -> list[dict[str, np.ndarray]]:
+        """Values along each axis by the parameters they set."""
         return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
 
     def point_rows(self, block: int) -> np.ndarray:

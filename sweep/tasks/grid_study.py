@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
 from sweep.tasks.study import ArrayLayout, Results
@@ -22,9 +23,10 @@ NO_COUNT = -1
 
 def output_names(spec: Spec) -> list[str]:
     """Names of the arrays that blocks write, sorted."""
-    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
+    from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 
-    return sorted([*OUTPUTS, *(DRAW_OUTPUTS if spec.draws.number else ())])
+    drawn = (*ERROR_OUTPUTS, *DRAW_OUTPUTS) if spec.draws.number else ()
+    return sorted([*OUTPUTS, *drawn, EFFECTS, ERROR])
 
 
 class GridStudy:
@@ -41,6 +43,7 @@ class GridStudy:
     def __init__(self, spec: Spec) -> None:
         self.spec = spec
         self.grid = Grid(spec)
+        self.calling = Calling(spec, self.grid)
         self._names = output_names(spec)
 
     @property
@@ -89,13 +92,14 @@ class GridStudy:
         arrays = coordinates(self.spec.axes)
         if self.spec.draws.number:
             arrays.append(_batches(np.array(batch_sizes(self.spec), dtype=np.int64)))
-        return arrays + [self._output(name) for name in self._names]
+        arrays += layouts(self.grid.shape, self.grid.block_shape, self.grid.dims)
+        return arrays + [self._output(n) for n in self._names if n not in (EFFECTS, ERROR)]
 
     def _output(self, name: str) -> ArrayLayout:
-        from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS
+        from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 
-        counted = name not in OUTPUTS
-        output = DRAW_OUTPUTS[name] if counted else OUTPUTS[name]
+        counted = name in DRAW_OUTPUTS
+        output = (OUTPUTS | ERROR_OUTPUTS | DRAW_OUTPUTS)[name]
         batches = (len(batch_sizes(self.spec)),) if counted else ()
         return ArrayLayout(
             name=name,
@@ -109,18 +113,18 @@ class GridStudy:
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """The block's chunk of every output."""
-        from sweep.model.outputs import OUTPUTS
+        from sweep.model.outputs import DRAW_OUTPUTS
 
         position = self.grid.position(block)
-        return {name: position + (() if name in OUTPUTS else (0,)) for name in self._names}
+        return {name: position + ((0,) if name in DRAW_OUTPUTS else ()) for name in self._names}
 
     def evaluate(self, block: int) -> Results:
         """Outputs of a block."""
-        return evaluate_block(self.spec, self.grid, block)
+        return evaluate_block(self.spec, self.grid, block, self.calling.of_block(block))
 
     def compile(self) -> None:
         """Compile the model's kernels."""
-        compile_kernels(self.grid)
+        compile_kernels(self.spec, self.grid)
 
 
 def coordinates(axes: tuple[Axis, ...]) -> list[ArrayLayout]:

@@ -10,6 +10,7 @@ import numpy as np
 import psutil
 
 from sweep.tasks import cluster
+from sweep.tasks.calling import Calling
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_points, select
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import output_names
@@ -70,10 +71,10 @@ def plan(spec: Spec, *, workers: int | None = None) -> Plan:
 
 
 def point_bytes(spec: Spec, names: list[str]) -> int:
-    """Bytes of one point's results: a float64 an output, an int64 a batch of each count."""
-    from sweep.model.outputs import OUTPUTS
+    """Bytes of one point's results: 8 an output, 8 a batch of each count."""
+    from sweep.model.outputs import DRAW_OUTPUTS
 
-    counted = sum(name not in OUTPUTS for name in names)
+    counted = sum(name in DRAW_OUTPUTS for name in names)
     return 8 * (len(names) - counted + counted * len(batch_sizes(spec)))
 
 
@@ -90,14 +91,15 @@ def measured(spec: Spec, grid: Grid) -> float:
 
     Whole sets of points that share a geometry are taken, so that sharing shows as it will.
     """
-    compile_kernels(grid)
+    compile_kernels(spec, grid)
+    calling = Calling(spec, grid)
     points, begun = 0, time.perf_counter()
     rows = 1
     while time.perf_counter() - begun < MEASURING / 2:
         points = 0
         round_begun = time.perf_counter()
         for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
-            points += _evaluate_some(spec, grid, int(block), rows)
+            points += _evaluate_some(spec, calling, int(block), rows)
         taken = time.perf_counter() - round_begun
         if points >= grid.points or taken > MEASURING / 4:
             break
@@ -105,12 +107,14 @@ def measured(spec: Spec, grid: Grid) -> float:
     return taken / points
 
 
-def _evaluate_some(spec: Spec, grid: Grid, block: int, rows: int) -> int:
-    sharing = 1
+def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> int:
+    grid, sharing = calling.tiles.grid, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
     sets = grid.geometry_order(block).reshape(-1, sharing)
     few = np.unique(np.linspace(0, len(sets) - 1, rows).astype(np.int64))
     chosen = sets[few].ravel()
-    evaluate_points(spec, select(grid.parameters(block), chosen), len(chosen))
+    parameters = grid.parameters(block)
+    for members, effects in calling.of_block(block).some(chosen).groups():
+        evaluate_points(spec, select(parameters, chosen[members]), len(members), effects)
     return len(chosen)

@@ -103,9 +103,10 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
 
     def timed(cycles: int) -> tuple[float, float]:
         begun = time.perf_counter()
-        seen = eyepoints.see(_spread(eyepoints, cycles))
+        seen = eyepoints.see(eyepoints.spread(cycles))
         cast = time.perf_counter()
-        study.look(part, seen, from_arrays(seen, weight), first=0)
+        shots = from_arrays(seen, weight)
+        study.look(part, seen, shots, study.call(part, shots), first=0)
         return cast - begun, time.perf_counter() - cast
 
     timed(1)  # compiles what there is to compile
@@ -124,10 +125,3 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         seconds_a_ray=casting / eyepoints.rays_in(shots),
         seconds_a_draw=looking / (shots * (end - first_draw)),
     )
-
-
-def _spread(eyepoints: EyepointStudy, cycles: int) -> np.ndarray:
-    """Numbers of the shots of some cycles, spread over the flight."""
-    first = np.unique(np.linspace(0, eyepoints.cycles - 1, cycles).astype(np.int64))
-    each = eyepoints.shots_a_cycle
-    return (first[:, None] * each + np.arange(each)).ravel()

@@ -14,7 +14,7 @@ from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
 from sweep.analysis.scenes.opening import open_scene, stretches
 from sweep.model.eyepoints import observe
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,9 @@ def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_sto
     assert set(tree.children) == {"square", "pair"}
     for name, navigates in (("square", True), ("pair", False)):
         group = tree.children[name].to_dataset(inherit=False)
-        outputs = SHOTS | CYCLES | STATISTICS | POINTS | (NAVIGATION if navigates else {})
+        outputs = (
+            SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS | (NAVIGATION if navigates else {})
+        )
         assert set(group.data_vars) == set(outputs)
         for output, described in outputs.items():
             along = ("power",) if output not in SHOTS | CYCLES else ()

@@ -10,6 +10,7 @@ from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
 from sweep.analysis.scenes.opening import opened
 from sweep.analysis.scenes.places import place
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.flags import names_of
 from sweep.model.pairing import TRUE
 
 
@@ -31,7 +32,9 @@ def arrays(scene_store):
 def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(eyepoints_of(scene_store, recording.dataset), np.array([number]))
     parameters = place(spec, {"power": "1 W"}).parameters(spec)
-    return eyepoints, shot_figure.simulated(eyepoints, parameters, spec.surfaces(), seed=seed)
+    effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
+    surfaces = spec.surfaces()
+    return eyepoints, shot_figure.simulated(eyepoints, parameters, surfaces, effects, seed=seed)
 
 
 def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recording, arrays):

@@ -6,9 +6,9 @@ import pytest
 from scipy import integrate, stats
 
 from sweep.model import shot, truth
+from sweep.model.chain import prepare
 from sweep.model.detection import RAYLEIGH_DEVIATION, assess, threshold
 from sweep.model.marcum import marcum_q1
-from sweep.model.preparation import prepare
 from sweep.model.spectra import segment_spectrum
 from sweep.model.window import samples
 

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from sweep.model import philox
-from sweep.model.draws import draw
+from sweep.model.draws import draw, simulate
+from sweep.model.effects.catalogue import CORE
+from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.model.realisations import outputs_of, realise
 from sweep.model.shot import evaluate
 
 DRAWS = 40_000
@@ -88,6 +91,76 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         )  # fmt: skip
         assert counts["n_detected_doppler"].sum() == 0
         assert counts["n_detected_up"].sum() == 50
+
+
+RANDOM = {
+    "nothing": (),
+    "speckle": ("speckle",),
+    "scintillation": ("scintillation",),
+    "jitter": ("pointing_jitter",),
+    "all three": ("speckle", "scintillation", "pointing_jitter"),
+    "all three on a pedestal": ("speckle", "scintillation", "pointing_jitter", "line_width"),
+}
+UNSTEADY = {
+    "target.roughness": 1e-5,
+    "target.pointing_jitter": 1e-5,
+    "atmosphere.turbulence": "uniform",
+    "atmosphere.structure_constant": 3e-15,
+    "instrument.laser.line_width": 20e3,
+    "instrument.laser.line_shape": "lorentzian",
+}
+
+
+@pytest.mark.parametrize("effects", RANDOM.values(), ids=RANDOM)
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_counts_over_random_effects_have_the_means_over_their_draws(effects, method, table_4_1):
+    """A draw's Bernoulli variance is p (1 - p) of its own p: 5 sigma of their sum.
+
+    Three more where hardly one is due, as a Poisson number of mean 0.01 exceeds 2 in 2e-7.
+    """
+    parameters = _points(table_4_1, tnr=6.0) | UNSTEADY
+    parameters |= {
+        "instrument.processing.fft_size": 8192,
+        "instrument.laser.power": 1.5,
+        "instrument.processing.window": "rectangular",
+        "footprint.phases": "incoherent",
+        "footprint.beamlets": 7,
+    }
+    chosen, draws = (*CORE, *effects), 8000
+    found = simulate(parameters, chosen, keys=_keys(6), batch_sizes=[5000, 3000], method=method)
+    names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
+    table = {name: np.empty((6, draws)) for name in names}
+    for point, number, shots in realise(parameters, chosen, keys=_keys(6), draws=draws):
+        outputs = outputs_of(shots)
+        quiet = (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
+        for name, values in (outputs | {"alarm": 1 - quiet}).items():
+            if name in table:
+                table[name][point, number] = values
+    counted = {f"pd_{s}": f"n_detected_{s}" for s in ("up", "doppler", "down", "shot")}
+    for name, count in (counted | {"alarm": "n_false_alarm_up"}).items():
+        p = table[name]
+        sigma = np.sqrt((p * (1 - p)).sum(axis=1))
+        assert (abs(found[count].sum(axis=1) - p.sum(axis=1)) <= 5 * sigma + 3).all(), name
+        assert ((p.mean(axis=1) > 0.02) & (p.mean(axis=1) < 0.98)).sum() >= 2, name
+        if name in OUTPUTS:
+            np.testing.assert_allclose(found[name], p.mean(axis=1), rtol=1e-10)
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_batches_split_the_same_draws_of_random_effects(method, table_4_1):
+    parameters = _points(table_4_1, tnr=6.0) | UNSTEADY
+    parameters |= {"instrument.processing.fft_size": 4096, "instrument.laser.power": 1.5}
+    parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
+    arguments = {"keys": _keys(6), "method": method}
+    effects = (*CORE, *RANDOM["all three"])
+    whole = simulate(parameters, effects, batch_sizes=[300], **arguments)
+    parts = simulate(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
+    later = simulate(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)
+    for name in DRAW_OUTPUTS:
+        np.testing.assert_array_equal(parts[name].sum(axis=1), whole[name][:, 0])
+        np.testing.assert_array_equal(parts[name][:, 1], later[name][:, 0])
+    for name in (*OUTPUTS, *ERROR_OUTPUTS):
+        np.testing.assert_array_equal(parts[name], whole[name])
 
 
 def test_an_unknown_method_is_refused(table_4_1):

@@ -4,7 +4,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from sweep.model import truth
+from sweep.model import modulation, truth
+from sweep.model.chain import prepare, prepare_cast
 from sweep.model.crossings import (
     MOST_TERMS,
     added_crossings,
@@ -12,8 +13,8 @@ from sweep.model.crossings import (
     crossing_series,
     silence,
 )
+from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
-from sweep.model.preparation import Footprints, prepare, prepare_footprints
 from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 
@@ -104,7 +105,7 @@ def test_leakage_of_two_surfaces_apart_in_range_and_velocity(table_4_1, phases):
     parameters = table_4_1(phases=phases, leakage_floor=1e-12, fft_size=2**14, tnr=5.0) | {
         "target.range": generator.uniform(50.0, 3000.0, rows)
     }
-    held(prepare_footprints(parameters, footprints))
+    held(prepare_cast(parameters, Cast(footprints)))
 
 
 RANGE_BIN, DOPPLER_BIN = 149_896_229 * 600e6 / 2e12, 1550e-9 * 600e6 / 299_792_458
@@ -136,7 +137,7 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
     echo = rng.exponential(size=bins.shape) / beamlets / 6
     offset = bins * RANGE_BIN / fft_size / ranges[:, None]
     shift = doppler * DOPPLER_BIN / fft_size
-    return prepare_footprints(parameters, Footprints(np.arange(shots), offset, shift, echo))
+    return prepare_cast(parameters, Cast(Footprints(np.arange(shots), offset, shift, echo)))
 
 
 @pytest.mark.parametrize("fft_size", [64, 100, 255, 512, 1023, 2048, 4099, 8192])
@@ -155,13 +156,12 @@ def test_leakage_where_all_lines_lie_past_dc_or_nyquist(table_4_1, place, past):
         parameters = table_4_1(window=window, fft_size=fft_size, leakage_floor=1e-12, tnr=5.0)
         velocity = (place + np.array([-1e5, 0.0, 1e4])) * 1550e-9 / 2
         bins = past + 0.1 * np.arange(beamlets) - 0.3
-        shots = prepare_footprints(
-            parameters | {"target.radial_velocity": velocity, "target.range": 300.0},
-            Footprints(
-                np.zeros(3, int), np.zeros((1, beamlets)), bins[None] * DOPPLER_BIN / fft_size,
-                np.full((1, beamlets), 0.01),
-            ),
+        footprints = Footprints(
+            np.zeros(3, int), np.zeros((1, beamlets)), bins[None] * DOPPLER_BIN / fft_size,
+            np.full((1, beamlets), 0.01),
         )  # fmt: skip
+        moving = parameters | {"target.radial_velocity": velocity, "target.range": 300.0}
+        shots = prepare_cast(moving, Cast(footprints))
         held(shots)
 
 
@@ -180,12 +180,13 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
             }
         )
         room, exempt, series = workspace(19, 8192)
-        point = shots.point_table()[:, 0].copy()
+        alone = modulation.single(shots, 0)
+        point = alone.points[:, 0].copy()
         crossing_series(point[11] / point[10], series)
         for segment in range(3):
             low, count, *_ = inspect_segment(
-                segment, point, shots.footprint, 0, shots.incoherent, False, shots.kernel(), room,
-                exempt, series,
+                segment, point, alone.scene, (0, 0), modulation.choices(shots), shots.kernel(),
+                room, exempt, series,
             )  # fmt: skip
             exact = truth.spectrum(shots, 0, segment, range_walk=False)
             assert 20 < count < 4097

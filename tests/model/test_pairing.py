@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import waveform
+from sweep.model.chain import prepare
 from sweep.model.pairing import (
     ASSUMED,
     TOLERANCE,
@@ -19,7 +20,6 @@ from sweep.model.pairing import (
     resolve_reading,
     workspace,
 )
-from sweep.model.preparation import prepare
 
 N, FS = 2**17, 600e6
 WIDTH = FS / N

@@ -7,11 +7,11 @@ import pytest
 from scipy import ndimage, stats
 
 from sweep.model import philox, truth
+from sweep.model.chain import prepare
 from sweep.model.draws import draw
 from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
 from sweep.model.peaks import RATIO, WHOLE, _free_bin, _largest, draw_in_noise
-from sweep.model.preparation import prepare
 from sweep.model.returns import draw_returns, groups
 from sweep.model.shot import evaluate, find, report
 from sweep.model.window import samples, window
@@ -283,7 +283,16 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
     drawn = []
     for d in range(4000):
         number = draw_in_noise(
-            (key[0], key[1], d), streams, listed, (1.0, beta), n, run, tables, half, peaks, which
+            (key[0], key[1], d),
+            streams,
+            listed,
+            (1.0, beta, 1.0),
+            n,
+            run,
+            tables,
+            half,
+            peaks,
+            which,
         )
         drawn += [peaks[0].copy()] if number else []
     drawn = np.array(drawn)
@@ -316,7 +325,7 @@ def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
     moved = 0
     for d in range(DRAWS):
         draw_in_noise(
-            (key[0], key[1], d), np.array([1, 4, 7, 10]), listed, (sigma, 5.0), 0.0, run,
+            (key[0], key[1], d), np.array([1, 4, 7, 10]), listed, (sigma, 5.0, 1.0), 0.0, run,
             tables, 32, peaks, which,
         )  # fmt: skip
         moved += peaks[0, WHOLE] == 17

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import c as speed_of_light
 
+from sweep.model.chain import prepare
 from sweep.model.equivalent import (
     AMPLITUDE_TOLERANCE,
     MOST_NODES,
@@ -14,7 +15,6 @@ from sweep.model.equivalent import (
     node_limits,
 )
 from sweep.model.lines import folded_origin, segment_lines
-from sweep.model.preparation import prepare
 from sweep.model.segments import reach_of
 from sweep.model.spectra import segment_spectrum
 from sweep.model.spectrum import bin_magnitudes, tangents
@@ -224,7 +224,8 @@ def test_lines_have_the_beat_and_the_phase_of_the_delay_in_sixty_digits(
     carrier = p[9] if sign < 0 else p[8]
     origin = segment_lines(
         (float(sign), carrier), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-        (p[6], fft_size, length, p[7]), shots.offset[0], doppler, shots.amplitude[0], delta, re, im,
+        (p[6], fft_size, length, p[7]), shots.offset[0], doppler, shots.amplitude[0],
+        np.empty(0), delta, re, im,
     )  # fmt: skip
     assert 0 <= origin <= fft_size // 2
     worst_position, worst_weight = 0.0, 0.0

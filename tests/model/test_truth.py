@@ -7,7 +7,7 @@ import pytest
 from scipy.constants import c as speed_of_light
 
 from sweep.model import spectra, truth
-from sweep.model.preparation import prepare
+from sweep.model.chain import prepare
 
 AGREEMENT = 1e-9
 """Largest difference of |X| over the peak between fast path and truth, all bins."""

@@ -15,12 +15,18 @@ RANGE = "target.range"
 LIGHT = 299_792_458.0
 
 
+def values_of_zip(written):
+    return written["zip"] if isinstance(written, dict) else ()
+
+
 def refused(changes=None, **sections):
     try:
         Spec.from_mapping(written(changes, **sections))
     except SpecError as error:
         (mistake,) = error.mistakes
-        assert mistake.path == DURATION
+        axes = sections.get("axes", {})
+        on = [key for key, values in axes.items() if DURATION in (key, *values_of_zip(values))]
+        assert mistake.path == (f"axes.{on[0]}" if on else DURATION)
         return str(mistake)
     return ""
 
@@ -40,6 +46,12 @@ def test_a_record_of_fewer_than_two_samples_is_refused():
 def test_extremes_of_plain_axes_are_combined():
     assert not refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["420 us", "500 us"]})
     assert refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["390 us", "500 us"]})
+
+
+def test_a_chirp_that_stands_on_an_axis_alone_is_held_to_the_same_rules():
+    mapping = {DURATION: ..., RANGE: "60 km"}
+    assert not refused(mapping, axes={DURATION: ["401 us", "500 us"]})
+    assert "echo's delay 2R/c" in refused(mapping, axes={DURATION: ["400 us", "500 us"]})
 
 
 def test_zipped_values_are_combined_only_as_they_occur():

@@ -13,7 +13,7 @@ from small_flights import SCENE, small_scene
 from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 from sweep.spec import SpecError
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run
@@ -62,8 +62,10 @@ def no_rays(monkeypatch):
 def test_a_study_holds_every_array_that_the_model_names(undisturbed):
     found = opened(undisturbed.store)
     assert set(found.children) == {"three", "line"}
-    assert set(found["three"].data_vars) == {*SHOTS, *CYCLES, *STATISTICS, *POINTS, *NAVIGATION}
-    assert set(found["line"].data_vars) == {*SHOTS, *CYCLES, *STATISTICS, *POINTS}
+    assert set(found["three"].data_vars) == {
+            *SHOTS, *CYCLES, *STATISTICS, *SIMULATED, *POINTS, *NAVIGATION,
+        }  # fmt: skip
+    assert set(found["line"].data_vars) == {*SHOTS, *CYCLES, *STATISTICS, *SIMULATED, *POINTS}
     three = found["three"]
     assert three.range.dims == ("power", "shot", "draw", "return_number")
     assert three.range.shape == (2, 222, 5, 3) and three.velocity.shape == (2, 74, 5, 3)

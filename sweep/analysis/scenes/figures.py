@@ -28,6 +28,7 @@ from sweep.analysis.scenes.places import Place, place
 from sweep.analysis.scenes.quantities import QUANTITIES
 from sweep.analysis.scenes.recording import Interval, Recording
 from sweep.analysis.scenes.terrain import Ground
+from sweep.model.effects.flags import names_of
 from sweep.spec import SceneSpec
 from sweep.spec.scene_figures import (
     CloudFigure,
@@ -209,8 +210,13 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet:
     eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), np.array([number]))
     if not eyepoints.seen.all():
         return canvas.empty(f"{study.spec.title}: shot {number} sees nothing")
+    simulated = recording.read("effects", slice(number, number + 1))
     shot = shot_figure.simulated(
-        eyepoints, at.parameters(study.spec), study.spec.surfaces(), seed=study.spec.seed
+        eyepoints,
+        at.parameters(study.spec),
+        study.spec.surfaces(),
+        names_of(int(simulated[0])),
+        seed=study.spec.seed,
     )
     told = (
         f"shot {number:,} of {recording.shots:,} at {eyepoints.time[0]:.6g} s, "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure as Sheet
@@ -49,17 +49,19 @@ def simulated(
     eyepoints: Eyepoints,
     parameters: Mapping[str, float | int | str],
     surfaces: Sequence[Surface],
+    effects: Collection[str],
     *,
     seed: int | None,
 ) -> Shot:
-    """One shot of a scene, with noise drawn where there is a seed.
+    """One shot of a scene with some effects, and with noise drawn where there is a seed.
 
     Raises
     ------
     ValueError
         Where it sees nothing.
     """
-    return simulated_shot(prepare_eyepoints(eyepoints, parameters, surfaces), parameters, seed=seed)
+    prepared = prepare_eyepoints(eyepoints, parameters, surfaces, effects)
+    return simulated_shot(prepared, parameters, seed=seed)
 
 
 def draw(

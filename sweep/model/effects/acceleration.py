@@ -9,13 +9,27 @@ in cycles. The first is the drift of 2 a / lambda per second; the others, by S t
 are kept. Acceleration is positive when it makes the radial velocity grow (PHYSICS section 1).
 """
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.phase_bounds import phase_change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.phase_bounds import (
+    Error,
+    by_segment,
+    counted,
+    error_change,
+    over_record,
+)
 from sweep.model.effects.range_walk import record_times
-from sweep.model.window import Window
+from sweep.model.preparation import PhaseError, Shots
+from sweep.model.waveform import SIGNS
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
 def phase(
@@ -67,35 +81,63 @@ def drift_bins(
     return 2 * np.asarray(carrier) * acceleration / SPEED_OF_LIGHT * np.asarray(duration) ** 2
 
 
-def bound(
-    *,
-    sign: int,
-    carrier: np.ndarray,
-    chirp_rate: np.ndarray,
-    range: np.ndarray,
-    radial_velocity: np.ndarray,
-    acceleration: np.ndarray,
-    start: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    concentration: np.ndarray | None = None,
-) -> Change:
-    """What leaving acceleration out can change of a segment's detecting bin.
+@counted
+def error(block: "Block") -> Error | None:
+    """The phase that acceleration adds over a block's tiles."""
+    if not block.has("target.acceleration"):
+        return None
+    alpha = block["target.acceleration"] / SPEED_OF_LIGHT
+    delay = (2 / SPEED_OF_LIGHT) * block.range
+    record = {"start": block.start, "duration": block.record_duration}
+    errors: list[Error | None] = []
+    for segment, sign in enumerate(SIGNS):
+        if not block.segment_exists[segment]:
+            errors.append(None)
+            continue
+        slope = sign * block.chirp_rate
+        terms = {
+            2: alpha * (block.carrier(segment) - slope * delay),
+            3: alpha * slope * (1 + block.beta),
+            4: alpha**2 * slope * 0.5,
+        }
+        errors.append(over_record(terms if sign else {2: terms[2]}, **record))
+    return by_segment(block, *errors)
 
-    Parameters as of :func:`phase` and :func:`sweep.model.effects.phase_bounds.phase_change`.
-    """
-    return phase_change(
-        lambda x: phase(
-            x,
-            sign=sign,
-            carrier=carrier,
-            chirp_rate=chirp_rate,
-            range=range,
-            radial_velocity=radial_velocity,
-            acceleration=acceleration,
-            start=start,
-            duration=duration,
+
+def bound(block: "Block") -> Change | None:
+    """What leaving acceleration out can change of the detecting bins, (3, tiles)."""
+    return error_change(block, error)
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """The drift of the Doppler frequency, in the record of every segment."""
+    values = {
+        "carrier": shots.carriers,
+        "chirp_rate": shots.chirp_rate,
+        "range": shots.range,
+        "radial_velocity": shots.radial_velocity,
+        "acceleration": scene.parameters["target.acceleration"],
+        "start": shots.acquisition_delay,
+        "duration": shots.record_duration,
+    }
+    return replace(shots, phase_errors=(*shots.phase_errors, PhaseError(phase, values)))
+
+
+EFFECT = Effect(
+    name="acceleration",
+    about="drift of the Doppler frequency",
+    stage="record",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path="target.acceleration",
+            about="Rate at which the radial velocity grows",
+            si_unit="m/s^2",
+            default=0.0,
+            example="10 m/s^2",
+            at_least="-1e6 m/s^2",
+            at_most="1e6 m/s^2",
         ),
-        window=window,
-        concentration=concentration,
-    )
+    ),
+)

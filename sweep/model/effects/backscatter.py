@@ -18,14 +18,30 @@ Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
 """
 
 import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.effects import added_noise
-from sweep.model.effects.change import Change, Interval
-from sweep.model.effects.extinction import Profile, optical_depth
+from sweep.model.effects.atmosphere import (
+    Path,
+    Profile,
+    optical_depth,
+    path_heights,
+    path_of,
+    profile_of,
+    profile_over,
+)
+from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.span import Span
 from sweep.model.link import aperture_area
+from sweep.model.preparation import Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _FOLDS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
@@ -84,67 +100,52 @@ def power(
     return np.asarray(collected * returned / near[..., 0] / ratio[..., 0])
 
 
-def power_bounds(
+def largest_power(
     profile: Profile,
+    path: Path,
     *,
-    start_height: ArrayLike,
-    end_height: ArrayLike,
-    range: ArrayLike,
-    laser_power: ArrayLike,
-    aperture: ArrayLike,
-    optical_efficiency: ArrayLike,
-    beam_divergence: ArrayLike,
-    lidar_ratio: ArrayLike,
-) -> Interval:
-    """Least and largest value [W] that :func:`power` can have, from optical depths alone.
+    laser_power: Span,
+    aperture: Span,
+    optical_efficiency: Span,
+    beam_divergence: Span,
+    lidar_ratio: Span,
+) -> np.ndarray:
+    """Largest value [W] that :func:`power` can have over tiles, from optical depths alone.
 
     As d(T^2) = -2 alpha T^2 dr, the integral over a piece of the path is the fall of T^2 over it,
-    by 2 S, times a mean of 1/(r^2 + r_0^2), which lies between its values at the piece's ends.
+    by 2 S, times a mean of 1/(r^2 + r_0^2), at most its value at the piece's near end. The fall is
+    largest where the air up to the piece is thinnest, and that in it densest.
     """
-    h0, h1, far, near, ratio = _columns(
-        start_height, end_height, range, np.asarray(aperture, float) / beam_divergence, lidar_ratio
+    near, far = (aperture / beam_divergence).low, path.range.high
+    near, far, *_ = (
+        v[..., None] for v in np.broadcast_arrays(near, far, path.target.low, path.sine.low)
     )
     r = np.minimum(np.asarray(_BRACKETS) * near, far)
-    depth = optical_depth(profile, start_height=h0, end_height=h0 + (h1 - h0) * r / far, range=r)
-    fall = np.exp(-2 * depth[..., :-1]) * -np.expm1(-2 * np.maximum(np.diff(depth), 0.0))
-    farther = fall / 2 / ratio / (r[..., 1:] ** 2 + near**2)
-    nearer = fall / 2 / ratio / (r[..., :-1] ** 2 + near**2)
-    collected = _collected(laser_power, aperture, optical_efficiency)
-    least, largest = (collected * piece.sum(axis=-1) for piece in (farther, nearer))
-    return least, largest
+    thin, dense = (_depth_to(profile, path, r, densest=densest) for densest in (False, True))
+    fall = np.exp(-2 * thin[..., :-1]) * -np.expm1(-2 * np.maximum(np.diff(dense), 0.0))
+    returned = (fall / 2 / (r[..., :-1] ** 2 + near**2)).sum(axis=-1)
+    collected = _collected(laser_power.high, aperture.high, optical_efficiency.high)
+    return np.asarray(collected * returned / lidar_ratio.low)
 
 
-def bound(
-    *,
-    backscattered_power: Interval,
-    apd_gain: ArrayLike,
-    excess_noise_factor: ArrayLike,
-    responsivity: ArrayLike,
-    electrical_bandwidth: ArrayLike,
-    noise_variance: ArrayLike,
-) -> Change:
-    """Change by the shot noise of backscatter; the threshold is set on it.
+def _depth_to(profile: Profile, path: Path, r: np.ndarray, *, densest: bool) -> np.ndarray:
+    """Depth from the lidar to distances r in the densest or the thinnest air of some tiles.
 
-    Parameters
-    ----------
-    backscattered_power : interval
-        Of :func:`power_bounds` [W].
-    apd_gain, excess_noise_factor, responsivity, electrical_bandwidth : array_like
-        As for :func:`sweep.model.noise.current_variances`.
-    noise_variance : array_like
-        Current variance [A^2] of all other sources, before a heterodyne receiver's factor.
+    Air is thinner the higher. So many metres from the lidar a beam is the lower the lower its
+    target, the flatter it is and, unless it looks up, the nearer. Beyond the end of the path that
+    is looked at the air is no denser, or no thinner, than on its target.
     """
-    least, largest = (
-        added_noise.shot_noise(
-            power=light,
-            apd_gain=apd_gain,
-            excess_noise_factor=excess_noise_factor,
-            responsivity=responsivity,
-            electrical_bandwidth=electrical_bandwidth,
-        )
-        for light in backscattered_power
+    target, sine = (v.low if densest else v.high for v in (path.target, path.sine))
+    nearest = (np.asarray(sine) >= 0) == densest
+    length = np.where(nearest, path.range.low, path.range.high)
+    target, sine, length = (np.asarray(v, float)[..., None] for v in (target, sine, length))
+    within = np.minimum(r, length)
+    lidar = target + length * sine
+    depth = optical_depth(
+        profile, start_height=lidar, end_height=lidar - within * sine, range=within
     )
-    return added_noise.change(least=least, largest=largest, noise_variance=noise_variance)
+    beyond = optical_depth(profile, start_height=target, end_height=target, range=r - within)
+    return depth + beyond
 
 
 def _cut_heights(profile: Profile) -> np.ndarray:
@@ -170,3 +171,65 @@ def _collected(power: ArrayLike, aperture: ArrayLike, efficiency: ArrayLike) -> 
 def _columns(*values: ArrayLike) -> tuple[np.ndarray, ...]:
     """Arrays of one shape with an axis for places along the path behind."""
     return tuple(a[..., None] for a in np.broadcast_arrays(*(np.asarray(v, float) for v in values)))
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Shot noise of the light that the air sends back."""
+    p = scene.parameters
+    air = profile_of(p)
+    if air is None:
+        return shots
+    lidar, target = path_heights(p, shots.range)
+    light = power(
+        air,
+        start_height=lidar,
+        end_height=target,
+        range=shots.range,
+        laser_power=p["instrument.laser.power"],
+        aperture=p["instrument.telescope.aperture"],
+        optical_efficiency=p["instrument.telescope.optical_efficiency"],
+        beam_divergence=p["instrument.laser.beam_divergence"],
+        lidar_ratio=p["atmosphere.lidar_ratio"],
+    )
+    sources = {"backscatter_shot": np.asarray(shots.shot_noise_scale * light)}
+    return replace(shots, noise_sources=shots.noise_sources | sources)
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving backscatter out can change, (tiles,)."""
+    air = profile_over(block)
+    if air is None:
+        return None
+    light = largest_power(
+        air,
+        path_of(block),
+        laser_power=block["instrument.laser.power"],
+        aperture=block["instrument.telescope.aperture"],
+        optical_efficiency=block["instrument.telescope.optical_efficiency"],
+        beam_divergence=block["instrument.laser.beam_divergence"],
+        lidar_ratio=block["atmosphere.lidar_ratio"],
+    )
+    return added_noise.change(
+        least=0.0,
+        largest=block.shot_noise_scale.high * light,
+        noise_variance=block.noise_variance,
+    )
+
+
+EFFECT = Effect(
+    name="backscatter",
+    about="shot noise of light that the air sends back",
+    stage="noise",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path="atmosphere.lidar_ratio",
+            about="Extinction over backscatter",
+            si_unit="sr",
+            default=50.0,
+            example="50 sr",
+            above="0 sr",
+        ),
+    ),
+)

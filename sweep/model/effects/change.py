@@ -1,21 +1,24 @@
 """What an effect can change, and what that can make of the probability of detection."""
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1
 
 Interval = tuple[ArrayLike, ArrayLike]
 
 NONE: Interval = (1.0, 1.0)
+_HUGE = 1e12
 
 
 class Change(NamedTuple):
     """Factors, least and largest, by which an effect can change what is computed without it.
 
-    Each is (n,) or a scalar.
+    Each is of one shape, (tiles,) or (3, tiles) by segment, or a scalar.
     """
 
     signal: Interval = NONE
@@ -25,6 +28,41 @@ class Change(NamedTuple):
     threshold_follows: bool = True
     """Whether the threshold is set on the changed noise, as for noise that is always there; else
     it stays where it was, as for noise that comes with the signal."""
+    added: ArrayLike = 0.0
+    """What is besides added to that magnitude, or taken from it, at the most: as a share of the
+    block's amplitude times what the other effects make of it. For sums of amplitudes, which may
+    cancel: a share of what they leave cannot be told."""
+    shift: ArrayLike = 0.0
+    """Bins by which it moves what is measured; they count as a change of a probability does."""
+
+
+class Mean(NamedTuple):
+    """What drawing an effect can change of mean probabilities, from whatever the others make."""
+
+    change: Callable[[Span, Span], np.ndarray]
+    """Bound on it, (3, tiles), from spans of magnitude (3, tiles) and threshold over sigma."""
+
+
+Bound = Change | Mean | np.ndarray
+"""Factors; or what can be told of a probability itself, (tiles,) or (3, tiles)."""
+
+
+def within_changes(
+    changes: Iterable[Change], *, amplitude: Span, threshold: Span
+) -> tuple[Span, Span]:
+    """Magnitudes and thresholds over sigma that any of some changes may leave."""
+    low, high = np.asarray(amplitude.low), np.asarray(amplitude.high)
+    lower, upper = np.asarray(threshold.low), np.asarray(threshold.high)
+    added: np.ndarray = np.zeros(1)
+    for change in changes:
+        quiet, loud = (1 / np.sqrt(np.asarray(v)) for v in change.noise)
+        weak, strong = (np.asarray(v, float) for v in change.signal)
+        low = low * np.minimum(weak * loud, 1.0)
+        high = high * np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)
+        added = added + np.asarray(change.added, float)
+        if not change.threshold_follows:
+            lower, upper = lower * np.minimum(loud, 1.0), upper * np.maximum(quiet, 1.0)
+    return Span(np.maximum(low - high * added, 0.0), high * (1 + added)), Span(lower, upper)
 
 
 def pd_change(change: Change, *, amplitude: ArrayLike, threshold: ArrayLike) -> np.ndarray:

@@ -15,13 +15,24 @@ over time, the beat (delayed wave less local oscillator, PHYSICS section 2) gain
 about -tau e(t): nothing at no range, and the more the farther. The Doppler segment has no sweep.
 """
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.phase_bounds import phase_change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.phase_bounds import Error, by_segment, counted, error_change
 from sweep.model.effects.range_walk import record_times
-from sweep.model.window import Window
+from sweep.model.effects.span import Span
+from sweep.model.preparation import PhaseError, Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
+
+_SHAPES = ("quadratic", "cubic", "sinusoidal")
+_PEAKS = tuple(f"instrument.chirp.{shape}_error" for shape in _SHAPES)
 
 
 def frequency_error(
@@ -118,40 +129,94 @@ def _integral_over_step(
     return np.asarray(h * mean)
 
 
-def bound(
-    *,
-    sign: int,
-    chirp_duration: np.ndarray,
-    range: np.ndarray,
-    radial_velocity: np.ndarray,
-    quadratic: np.ndarray,
-    cubic: np.ndarray,
-    sinusoidal: np.ndarray,
-    periods: np.ndarray,
-    start: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    concentration: np.ndarray | None = None,
-) -> Change:
-    """What leaving the sweep's error out can change of a segment's detecting bin.
+@counted
+def error(block: "Block") -> Error | None:
+    """The phase that the sweep's error adds over a block's tiles.
 
-    Parameters as of :func:`phase` and :func:`sweep.model.effects.phase_bounds.phase_change`.
+    That of square and cube is a polynomial in the place in the record; the sine's is taken at its
+    largest.
     """
-    return phase_change(
-        lambda x: phase(
-            x,
-            sign=sign,
-            chirp_duration=chirp_duration,
-            range=range,
-            radial_velocity=radial_velocity,
-            quadratic=quadratic,
-            cubic=cubic,
-            sinusoidal=sinusoidal,
-            periods=periods,
-            start=start,
-            duration=duration,
-        ),
-        window=window,
-        concentration=concentration,
-        periods=float(np.max(periods)) if np.any(sinusoidal) else 0.0,
+    if not block.has(*_PEAKS):
+        return None
+    quadratic, cubic, sinusoidal = (block[path] for path in _PEAKS)
+    half = 0.5 * block.record_duration
+    middle, per_length = block.start + half, 2 / block["instrument.chirp.duration"]
+    passed = -1 * block.beta * half
+    delay = [(2 / SPEED_OF_LIGHT) * block.range - block.beta * middle, passed]
+    rest = delay[0].magnitude + passed.magnitude
+    errors = []
+    for sign in (1, -1):
+        step = [-sign * per_length * part for part in delay]
+        place = [sign * (per_length * middle - 1) + 0.5 * step[0], sign * per_length * half]
+        place[1] = place[1] + 0.5 * step[1]
+        square, small = _product(place, place), _product(step, step)
+        mean = [2 * quadratic * a + quadratic * b / 6 for a, b in zip(square, small, strict=True)]
+        mean[0] = mean[0] - quadratic
+        factor = [4 * a + b for a, b in zip(square, small, strict=True)]
+        factor[0] = factor[0] - 3
+        cube = [cubic * part for part in _product(place, factor)]
+        mean = [a + b for a, b in zip([*mean, Span.of(0.0)], cube, strict=True)]
+        constant, *powers = (part.magnitude for part in _product(delay, mean))
+        errors.append(Error(tuple(powers), rest * sinusoidal.magnitude, constant))
+    return by_segment(block, errors[0], None, errors[1])
+
+
+def _product(one: list[Span], other: list[Span]) -> list[Span]:
+    """Coefficients of a product of polynomials, lowest power first."""
+    product = [Span.of(0.0)] * (len(one) + len(other) - 1)
+    for i, a in enumerate(one):
+        for j, b in enumerate(other):
+            product[i + j] = product[i + j] + a * b
+    return product
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving the sweep's error out can change of the detecting bins, (3, tiles)."""
+    return error_change(block, error)
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """The sweep's error in the record of the two chirps."""
+    p = scene.parameters
+    values = {
+        "chirp_duration": shots.duration,
+        "range": shots.range,
+        "radial_velocity": shots.radial_velocity,
+        **{shape: p[path] for shape, path in zip(_SHAPES, _PEAKS, strict=True)},
+        "periods": p["instrument.chirp.error_periods"],
+        "start": shots.acquisition_delay,
+        "duration": shots.record_duration,
+    }
+    return replace(shots, phase_errors=(*shots.phase_errors, PhaseError(phase, values)))
+
+
+def _error(shape: str, about: str) -> Parameter:
+    return Parameter(
+        path=f"instrument.chirp.{shape}_error",
+        about=about,
+        si_unit="Hz",
+        default=0.0,
+        example="100 kHz",
     )
+
+
+EFFECT = Effect(
+    name="chirp_nonlinearity",
+    about="departure of the sweep from a straight line",
+    stage="record",
+    bound=bound,
+    act=act,
+    parameters=(
+        _error("quadratic", "Peak of the sweep's frequency error that goes as a square"),
+        _error("cubic", "Peak of the sweep's frequency error that goes as a cube"),
+        _error("sinusoidal", "Peak of the sweep's frequency error that goes as a sine"),
+        Parameter(
+            path="instrument.chirp.error_periods",
+            about="Periods of the sinusoidal error over the sweep",
+            default=1.0,
+            example="5",
+            above="0",
+            at_most="1000",
+        ),
+    ),
+)

@@ -1,58 +1,63 @@
 """Doppler: the shift 2 v_r / lambda of every line.
 
 Without it nothing is known of velocity at all, whatever the detection probability says: it is
-left out where nothing moves, :func:`shift` telling by how much lines would move. Otherwise the
+left out only where lines would not move by any share of a bin that matters. Otherwise the
 bound says what the shift does to detection: the receiver's transfer at the new frequency, and
 where between two bins the line comes to lie.
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import footprint_phase
 from sweep.model.effects.change import Change
-from sweep.model.effects.line_spread import NO_SPREAD, Line, Moments, moved_change
-from sweep.model.preparation import Shots
+from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.line_spread import NO_SPREAD, NOT_AWAY, moved_change
+from sweep.model.preparation import Shots, doppler_ratio
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
-def shift(
-    *,
-    radial_velocity: ArrayLike,
-    range: ArrayLike,
-    carrier: ArrayLike,
-    chirp_rate: ArrayLike,
-    bin_width: ArrayLike,
-) -> np.ndarray:
-    """Bins by which the Doppler effect moves a line at the most, >= 0 (unfolded).
+def bound(block: "Block") -> Change | None:
+    """What the shift can change in the largest bin, from the block's amplitude, which has it.
 
-    f beta, and the S tau beta by which it stretches the beat of the range.
+    Its size in bins counts besides, as velocity is measured by it. A line that goes elsewhere is
+    not left out, nor is it any other effect's business where it was.
     """
-    beta = 2 * np.abs(np.asarray(radial_velocity, float)) / SPEED_OF_LIGHT
-    beat = np.asarray(chirp_rate, float) * (2 / SPEED_OF_LIGHT) * np.asarray(range, float)
-    return np.asarray(beta * (np.asarray(carrier) + beat) / np.asarray(bin_width))
+    if not block.has("target.radial_velocity"):
+        return None
+    moved = block.doppler_shift
+    away = np.any(moved > NOT_AWAY, axis=0)
+    change = Change(shift=np.where(away, 1.0, moved))
+    if away.all():
+        return change
+    if block.architecture != "direct":
+        factors = moved_change(
+            block.lines, block.resting_lines, moved, NO_SPREAD, block.spread, block.number
+        )
+        low, high = factors.signal
+        with np.errstate(divide="ignore"):
+            least, most = (np.where(away, 1.0, 1 / np.asarray(end)) for end in (high, low))
+        change = change._replace(signal=(least, most))
+    if block.adds_amplitudes:
+        bins = moved * (1 + block.spread.extreme)  # the beat of a range stretches too
+        added = footprint_phase.sum_added(block, block.lines, bins)
+        change = change._replace(added=np.where(away, 0.0, added))
+    return change
 
 
-def bound(
-    moving: Line, resting: Line, *, shift: ArrayLike, spread: Moments, beamlets: int
-) -> Change:
-    """What the shift can change in the largest bin of a segment.
-
-    Parameters
-    ----------
-    moving, resting : Line
-        Of the axis, at its radial velocity and at none.
-    shift : array_like
-        Bins between them, unfolded: :func:`shift`.
-    spread : Moments
-        Bins by which ranges and velocities put the lines off the axis's.
-    beamlets : int
-        Their number.
-    """
-    return moved_change(moving, resting, shift, NO_SPREAD, spread, beamlets)
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Lines shifted by the radial velocity on the axis."""
+    return replace(shots, beta=doppler_ratio(shots.radial_velocity))
 
 
-def without(shots: Shots) -> Shots:
-    """The same points with their axes at rest; beamlets keep their differences of velocity."""
-    return replace(shots, radial_velocity=np.zeros_like(shots.radial_velocity))
+EFFECT = Effect(
+    name="doppler",
+    about="shift of all lines by the radial velocity",
+    stage="lines",
+    bound=bound,
+    act=act,
+)

@@ -5,34 +5,58 @@ Called for when 2/lambda |v_perp| div is not small against a bin (100 m/s across
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.model.effects import footprint_phase
 from sweep.model.effects.change import Change
-from sweep.model.effects.footprint import collapsed
-from sweep.model.effects.line_spread import NO_SPREAD, Line, Moments, spread_change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.line_spread import spread_change
 from sweep.model.preparation import Shots
 
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
-def bound(line: Line, *, velocities: Moments, ranges: Moments = NO_SPREAD, beamlets: int) -> Change:
-    """What differences of velocity can change in the largest bin of a segment.
 
-    Parameters
-    ----------
-    line : Line
-        Of the axis.
-    velocities, ranges : Moments
-        Bins by which velocities and ranges put the lines off it (ranges: 0 in the Doppler
-        segment, and for a footprint that is left out).
-    beamlets : int
-        Their number.
+def bound(block: "Block") -> Change | None:
+    """What differences of velocity can change in the largest bin.
+
+    That the ranges are there already makes no difference to whether this is a bound, as powers;
+    of amplitudes that add, lines in phase change by their own moves.
     """
-    return spread_change(line, velocities, ranges, beamlets)
+    velocities = block.velocity_spread
+    if not np.any(np.asarray(velocities.extreme) > 0):
+        return None
+    change = Change()
+    if block.architecture != "direct":
+        change = spread_change(block.lines, velocities, block.range_spread, block.number)
+    if not block.adds_amplitudes:
+        return change
+    return change._replace(added=footprint_phase.sum_added(block, block.lines, velocities.extreme))
 
 
-def without(shots: Shots) -> Shots:
-    """The same points with every beamlet at the axis's radial velocity."""
-    level = replace(shots, doppler=np.zeros_like(shots.doppler))
-    if shots.incoherent and not shots.offset.any():
-        return collapsed(level)
-    return level
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Beamlets at their own radial velocities."""
+    return replace(shots, doppler=scene.ground.beamlets.doppler)
+
+
+EFFECT = Effect(
+    name="doppler_spread",
+    about="radial velocities that differ over the footprint",
+    stage="lines",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path="target.transverse_velocity",
+            about="Speed across the line of sight, positive towards the near side of the footprint",
+            si_unit="m/s",
+            default=0.0,
+            example="100 m/s",
+            at_least="-1000 km/s",
+            at_most="1000 km/s",
+        ),
+    ),
+    within="footprint",
+)

@@ -7,51 +7,63 @@ an effect of their own (:mod:`sweep.model.effects.footprint_phase`), the velocit
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.model.effects import footprint_phase
 from sweep.model.effects.change import Change
-from sweep.model.effects.line_spread import NO_SPREAD, Line, Moments, spread_change
-from sweep.model.preparation import Shots
+from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.line_spread import NO_SPREAD, spread_change
+from sweep.model.effects.span import Span
+from sweep.model.preparation import Shots, relative_amplitude
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
-def bound(line: Line, *, ranges: Moments, velocities: Moments = NO_SPREAD, beamlets: int) -> Change:
-    """What the footprint's spread of range can change in the largest bin of a segment.
+def bound(block: "Block") -> Change | None:
+    """What the ranges of the footprint can change in the largest bin, and how much more it echoes.
 
-    Parameters
-    ----------
-    line : Line
-        Of the axis.
-    ranges, velocities : Moments
-        Bins by which ranges (0 in the Doppler segment) and velocities put the lines off it. That
-        the velocities' are there already makes no difference to whether this is a bound.
-    beamlets : int
-        Their number.
+    Of powers, without velocities, other surfaces or phases: these are within it. In direct
+    detection the echoes' beats always add as amplitudes, with the phases that the ranges give to
+    the radio frequency.
     """
-    return spread_change(line, ranges, velocities, beamlets)
+    if block.number == 1:
+        return None
+    spread, ratio = block.of_ranges(block.geometry.own_ranges), block.echo_ratio
+    if block.architecture != "direct":
+        change = spread_change(block.lines, spread, NO_SPREAD, block.number)
+        ratio = ratio.sqrt()
+    else:
+        uphill = np.exp(np.minimum(block.lines.tilt * spread.extreme, 50.0))
+        most = 2.1 * uphill / block.lines.lobe.least(np.asarray(0.5))  # all, and their images
+        phase = footprint_phase.phase_reach(block, block.geometry.own_ranges, NO_SPREAD)
+        change = footprint_phase.sum_change(
+            block.lines, phase=phase, gain=Span.of(1.0), spread=spread, most=most
+        )
+    low, high = change.signal
+    return Change(signal=(np.multiply(low, ratio.low), np.multiply(high, ratio.high)))
 
 
-def without(shots: Shots) -> Shots:
-    """The same points with every beamlet at the axis's range.
-
-    Where their velocities are alike too, one beamlet with the echo power of all is left.
-
-    Raises
-    ------
-    ValueError
-        Where phases are coherent: they are nothing without the ranges, and go first. Direct
-        detection adds its beats in phase, as one surface across the beam has them.
-    """
-    if not shots.incoherent and shots.architecture != "direct" and shots.offset.shape[1] > 1:
-        raise ValueError("a footprint's phases go before its ranges: leave them out first")
-    level = replace(shots, offset=np.zeros_like(shots.offset))
-    return level if shots.doppler.any() else collapsed(level)
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Beamlets at their own ranges, those on other surfaces at the axis's, all of its velocity."""
+    row, offset, _, echo = scene.ground.beamlets
+    if scene.ground.beside is not None:
+        offset = np.where(scene.ground.beside, 0.0, offset)
+    return replace(
+        shots,
+        row=row,
+        offset=offset,
+        doppler=np.zeros_like(offset),
+        amplitude=relative_amplitude(shots.architecture, echo),
+    )
 
 
-def collapsed(shots: Shots) -> Shots:
-    """One beamlet on the axis with all power."""
-    echo = shots.amplitude
-    direct = shots.architecture == "direct"
-    whole = echo.sum(axis=1) if direct else np.sqrt((echo**2).sum(axis=1))
-    nothing = np.zeros((len(echo), 1))
-    return replace(shots, offset=nothing, doppler=nothing, amplitude=whole[:, None])
+EFFECT = Effect(
+    name="footprint",
+    about="beamlets at ranges of their own",
+    stage="lines",
+    bound=bound,
+    act=act,
+)

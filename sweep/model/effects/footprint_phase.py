@@ -10,71 +10,68 @@ It acts on the sum of the lines: without it their powers add.
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.line_spread import Line, Moments
-from sweep.model.preparation import Shots
+from sweep.model.effects.span import Span
+from sweep.model.preparation import CHIRP, Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
-def phase_reach(
-    *,
-    carrier: ArrayLike,
-    bandwidth: ArrayLike,
-    range: ArrayLike,
-    ranges: Moments,
-    velocity_bins: Moments,
-    record_ratio: ArrayLike,
-) -> np.ndarray:
-    """Largest phase of a beamlet against the axis's at the record's middle [rad], (n,).
+def phase_reach(block: "Block", ranges: Moments, velocities: Moments) -> np.ndarray:
+    """Largest phase of a beamlet against the axis's at the record's middle [rad], (3, tiles).
 
     2 pi f tau_b with f the optical frequency then, which is between the carrier and a bandwidth
     from it; pi for each bin of the window's by which its velocity moves its line.
 
     Parameters
     ----------
-    carrier, bandwidth, range : array_like
-        [Hz], [Hz], [m].
+    block : Block
+        The tiles.
     ranges : Moments
         Of (R_b - R_0) / R_0.
-    velocity_bins : Moments
+    velocities : Moments
         Bins by which velocities put the lines off the axis's.
-    record_ratio : array_like
-        Bins from there to cycles: (t_0 + L / (2 fs)) fs / N, at L = N and no delay 1/2.
     """
-    highest = np.asarray(carrier, float) + 2 * np.asarray(bandwidth, float)
-    away = np.asarray(range, float) * np.asarray(ranges.extreme, float)
+    bandwidth = block[CHIRP + "bandwidth"].high
+    highest = np.stack([np.atleast_1d(c.high + 2 * bandwidth) for c in block.carriers])
+    away = block.range.high * np.asarray(ranges.extreme, float)
     further = 4 * np.pi * highest / SPEED_OF_LIGHT * away
-    return np.asarray(further + 2 * np.pi * np.multiply(velocity_bins.extreme, record_ratio))
+    return np.asarray(further + velocities.extreme * turn_of_bin(block))
 
 
-def bound(
-    line: Line,
-    *,
-    phase: ArrayLike,
-    gain: ArrayLike,
-    spread: Moments,
-    beamlets: int,
+def turn_of_bin(block: "Block") -> np.ndarray | float:
+    """Largest phase [rad] at the record's middle of a line one bin away: pi for L = N, t_0 = 0."""
+    middle = block.start.high + 0.5 * block.record_duration.high
+    return 2 * np.pi * middle * block.bin_width.high
+
+
+def sum_change(
+    line: Line, *, phase: np.ndarray, gain: Span, spread: Moments, most: ArrayLike
 ) -> Change:
-    """What phases can change in the largest bin of a segment.
+    """What phases can change in the largest bin of amplitudes that add.
 
     Parameters
     ----------
     line : Line
         Of the axis.
-    phase : array_like
+    phase : ndarray
         :func:`phase_reach` [rad].
-    gain : array_like
+    gain : Span
         g, of the footprint: 1..sqrt(N).
     spread : Moments
         Bins by which ranges and velocities put the lines off the axis's.
-    beamlets : int
-        N.
+    most : array_like
+        What no phases can exceed.
     """
-    phase, g = np.asarray(phase, float), np.asarray(gain, float)
     f, extreme = line.lobe, np.asarray(spread.extreme, float)
     apart = line.edge - extreme
     near = 2 * apart < 8 * f.margin
@@ -83,30 +80,64 @@ def bound(
     with np.errstate(invalid="ignore", over="ignore"):
         # by how much a bin may differ from line to line
         tilt = np.sqrt(f.curvature) * extreme / worst + line.tilt * extreme
-        low = g * (1 - phase**2 / 2) * (1 - tilt) - g * image
-        high = g * ((1 + tilt) / (1 - tilt) + image)
+        low = gain.low * (1 - phase**2 / 2) * (1 - tilt) - gain.high * image
+        high = gain.high * ((1 + tilt) / (1 - tilt) + image)
     tight = ~near & (tilt < 0.5)
-    most = np.sqrt(beamlets * np.where(near, 2.0, 1.01))
     low = np.where(tight & (low > 0), low, 0.0)
     return Change(signal=(low, np.where(tight, np.fmin(high, most), most)))
 
 
-def gain(shots: Shots) -> np.ndarray:
-    """Gain g of each footprint, (n,): worked out once a row of the geometry."""
-    echo = shots.amplitude
-    with np.errstate(invalid="ignore"):
-        rows = echo.sum(axis=1) / np.sqrt((echo**2).sum(axis=1))
-    return np.asarray(np.where(rows > 0, rows, 1.0)[shots.row])
+def sum_added(block: "Block", lines: Line, bins: ArrayLike) -> np.ndarray:
+    """What moving lines whose amplitudes add can change at most, of their magnitude in phase.
 
+    A line moved by some bins changes by these times |W'|, |H'| and the phase at the record's
+    middle.
 
-def without(shots: Shots) -> Shots:
-    """The same points with beamlets that add as powers.
-
-    Raises
-    ------
-    ValueError
-        For direct detection, whose beats are of one radio frequency and add in any case.
+    Parameters
+    ----------
+    block : Block
+        The tiles.
+    lines : Line
+        Of the axis, with or without the effect.
+    bins : array_like
+        Largest distance that it moves any line, (3, tiles).
     """
-    if shots.architecture == "direct":
-        raise ValueError("direct detection adds beats, not powers: its phases cannot be left out")
-    return replace(shots, incoherent=True)
+    f, reach = lines.lobe, np.asarray(block.spread.extreme) + bins
+    each = np.sqrt(f.curvature) + 2 * lines.tilt + turn_of_bin(block)
+    with np.errstate(over="ignore", invalid="ignore"):
+        uphill = np.exp(np.minimum(lines.tilt * reach, 50.0))
+        # with its image, as its magnitude may lie between two bins
+        change = 2 * uphill * np.minimum(each * bins, 2.0) / f.least(np.asarray(0.5))
+    return np.asarray(np.where(np.asarray(bins) > 0, change, 0.0))
+
+
+def bound(block: "Block") -> Change | None:
+    """What phases can change in the largest bin."""
+    if not block.coherent or block.architecture == "direct":
+        return None
+    lines, spread = block.lines, block.spread
+    near = 2 * (lines.edge - np.asarray(spread.extreme)) < 8 * lines.lobe.margin
+    return sum_change(
+        lines,
+        phase=phase_reach(block, block.ranges, block.velocity_spread),
+        gain=block.gain,
+        spread=spread,
+        most=np.sqrt(block.number * np.where(near, 2.0, 1.01)),
+    )
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Beamlets that add as amplitudes, where the spec says that their phases follow the surface."""
+    if str(scene.parameters["footprint.phases"]) != "coherent":
+        return shots
+    return replace(shots, incoherent=False)
+
+
+EFFECT = Effect(
+    name="footprint_phase",
+    about="optical phases of a smooth surface",
+    stage="lines",
+    bound=bound,
+    act=act,
+    within="footprint",
+)

@@ -10,22 +10,52 @@ threshold, all over sigma.
 """
 
 import math
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.line_spread import Line
 from sweep.model.marcum import excess_crossing
-from sweep.model.segments import SEGMENT_FIELDS
+from sweep.model.preparation import Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
+
 
 _STEPS = 40
+_NEGLIGIBLE = 1e-14
+"""Chance that needs no closer look."""
+_HIGHER = 1.25
+"""How much more leaks, at the most, with a higher threshold than one of 2 sigma or more: only bins
+that reach the threshold, whose chance to cross then rises from 0.468 to 0.556."""
 
 
-def bound() -> Change:
-    """What leakage can change in the detecting bin: nothing."""
-    return Change()
+def bound(block: "Block") -> np.ndarray:
+    """Bound on the chance that leaked signal raises an extra group, (3, tiles)."""
+    lines, spread = block.lines, block.spread
+    uphill = np.exp(np.minimum(lines.tilt * np.asarray(spread.extreme), 50.0))
+    peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)
+    ratio = np.maximum(block.echo_ratio.high, 1.0)
+    whole = ratio if block.architecture == "direct" else np.sqrt(ratio)
+    powers = not block.adds_amplitudes
+    lower, upper = block.threshold.low, block.threshold.high
+    found = probability_bound(
+        lines,
+        amplitude=peak * whole * (1.0 if powers else block.gain.high),
+        threshold=lower,
+        extreme=spread.extreme,
+        fft_size=block.fft_size,
+        powers=powers,
+    )
+    if not block.segment_exists[1]:
+        found[1] = 0.0
+    one = np.equal(lower, upper)
+    return np.asarray(np.where(one, found, np.where(np.greater(lower, 2), _HIGHER * found, 1.0)))
 
 
 def probability_bound(
@@ -53,39 +83,58 @@ def probability_bound(
         Whether lines, and images, add as powers: then the largest bin is nearest to lines that
         lie close, and it and its neighbours, less than a bin from them, cannot leak.
     """
-    steps = np.unique(np.r_[0.0, np.geomspace(0.75, fft_size / 2 + 1, _STEPS)])
+    steps = _steps(fft_size)
     columns = np.broadcast_arrays(
         *(np.asarray(v, float) for v in (amplitude, threshold, extreme)), line.edge
     )
     a, b, e, edge = (np.array(v) for v in columns)
     image = line.lobe.tail(edge - e)
     envelope, bins = line.lobe.tail(steps[:-1]), np.diff(steps)
-    return np.asarray(_union(a, b, e, image, envelope, bins, fft_size / 2, powers))
+    flat = np.stack([v.ravel() for v in (a, b, e, image)])
+    total = _union(flat, envelope, bins, fft_size / 2, powers)
+    return np.asarray(total.reshape(a.shape))
+
+
+@lru_cache(maxsize=32)
+def _steps(fft_size: int) -> np.ndarray:
+    """Distances [bins] between which the sidelobes are taken to be even."""
+    return np.unique(np.r_[0.0, np.geomspace(0.75, fft_size / 2 + 1, _STEPS)])
 
 
 @njit(cache=True, error_model="numpy")
-def _union(amplitude, threshold, extreme, image, envelope, bins, half, powers):
+def _union(columns, envelope, bins, half, powers):
     """Sum of the chances of all bins, step of distance by step, (n,)."""
-    out = np.empty(amplitude.size)
-    for i in range(amplitude.size):
-        a, b, aside = amplitude[i], threshold[i], image[i]
-        close = powers and extreme[i] < 0.125
+    out = np.empty(columns.shape[1])
+    for i in range(out.size):
+        a, b, extreme, aside = columns[:, i]
+        close = powers and extreme < 0.125
         total = 0.0
         if not close:
-            inside = min(2.0 * extreme[i] + 1.0, half)
+            inside = min(2.0 * extreme + 1.0, half)
             total = inside * excess_crossing(min(2.0 * a, b), b)
         for j in range(1 if close else 0, bins.size):
             beside = envelope[j]
             both = math.hypot(beside, aside) if powers else beside + aside
             # to either side; steps need not begin on a bin
             number = 2.0 * bins[j] + (2.0 if j < 2 else 0.0)
-            total += number * excess_crossing(min(a * both, b), b)
+            chance = excess_crossing(min(a * both, b), b)
+            if chance * half < _NEGLIGIBLE or total > 1.0:
+                total += 2.0 * half * chance  # sidelobes fall, so does the chance
+                break
+            total += number * chance
         out[i] = min(total / -math.expm1(-0.5 * b * b), 1.0)
     return out
 
 
-def without(found: np.ndarray) -> np.ndarray:
-    """What is found in the spectra, (3, fields, n), with no leakage: what need not be summed."""
-    quiet = found.copy()
-    quiet[:, SEGMENT_FIELDS.index("leakage")] = 0.0
-    return quiet
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Bins beside the detection looked at too."""
+    return replace(shots, leakage=True)
+
+
+EFFECT = Effect(
+    name="leakage",
+    about="further groups raised by sidelobes below the threshold",
+    stage="detection",
+    bound=bound,
+    act=act,
+)

@@ -11,6 +11,8 @@ whose period is longer than the record (a Fourier extension), which converge geo
 smooth phase without its being periodic. The w_k are least squares on Chebyshev nodes, from a
 singular value decomposition that depends on the number of lines alone and is kept. Its factors
 are applied one after the other: their product, the pseudo-inverse, would lose half the digits.
+All sums are in an order of their own (a library's would depend on the number of its threads), and
+no row's bits depend on the rows beside it.
 
 Weights are referred to the middle of the record. Where C = 1/2 a e^{i (phi + pi nu r)} is a line
 of :mod:`sweep.model.spectrum` at nu bins of fs/N, r = L/N, the lines that take its place are
@@ -24,6 +26,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
+
+from sweep.model.elementary import sincos_cycles
+from sweep.model.equivalent import dot
 
 Phase = Callable[[np.ndarray], np.ndarray]
 """Phase error [cycles], (n, m), at places x of the record, (m,), -1..1."""
@@ -37,6 +43,11 @@ CUTOFF = 1e-12
 """Least singular value, relative to the largest, that is made use of."""
 
 _SLOPE_NODES = 129
+
+_ORTHOGONAL = 1e-14
+"""Cosine of the angle between two columns that counts as none."""
+
+_MOST_SWEEPS = 60
 
 
 class Split(NamedTuple):
@@ -92,10 +103,11 @@ def split_lines(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
         if not tried.size:
             continue
         fit = _fit(lines, spacing)
-        factor = _factor(phase, fit.nodes, centre, tried)
-        weight = (factor @ fit.to_modes) @ fit.from_modes
-        missing = weight @ fit.at_checks.T - _factor(phase, fit.checks, centre, tried)
-        error = np.abs(missing).max(axis=1)
+        weight, error = np.zeros((tried.size, lines), complex), np.zeros(tried.size)
+        _fit_rows(
+            _slow(phase, fit.nodes, centre, tried), _slow(phase, fit.checks, centre, tried),
+            fit.to_modes, fit.from_modes, fit.at_checks, weight, error,
+        )  # fmt: skip
         good = error <= tolerance
         offset = centre[tried[good], None] + fit.offset
         fits.append((tried[good], offset, weight[good], error[good]))
@@ -128,10 +140,41 @@ def _slopes(phase: Phase) -> tuple[np.ndarray, np.ndarray]:
     return (low + high) / 2, (high - low) / 2
 
 
-def _factor(phase: Phase, x: np.ndarray, centre: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The phase factor of some rows at x with the middle of its slope taken off."""
-    cycles = phase(x)[rows] - centre[rows, None] * x / 2
-    return np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+def _slow(phase: Phase, x: np.ndarray, centre: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Phase of some rows at x [cycles], with the middle of its slope taken off."""
+    return np.ascontiguousarray(phase(x)[rows] - centre[rows, None] * x / 2)
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_rows(at_nodes, at_checks, to_modes, from_modes, lines, weight, error):
+    """Weights of lines that make up phase factors, and the largest error at the checks.
+
+    Parameters
+    ----------
+    at_nodes, at_checks : (m, nodes) and (m, checks) float64
+        Phases [cycles].
+    to_modes, from_modes, lines : (nodes, modes), (modes, k) and (checks, k) complex
+        Of :class:`_Fit`.
+    weight, error : (m, k) complex, (m,) float64
+        Results, zero at first.
+    """
+    modes = np.empty(to_modes.shape[1], np.complex128)
+    for row in range(weight.shape[0]):
+        modes[:] = 0.0
+        for i in range(to_modes.shape[0]):
+            sine, cosine = sincos_cycles(at_nodes[row, i])
+            factor = complex(cosine, sine)
+            for m in range(modes.size):
+                modes[m] += factor * to_modes[i, m]
+        for m in range(modes.size):
+            for k in range(weight.shape[1]):
+                weight[row, k] += modes[m] * from_modes[m, k]
+        for i in range(lines.shape[0]):
+            sine, cosine = sincos_cycles(at_checks[row, i])
+            missing = complex(-cosine, -sine)
+            for k in range(weight.shape[1]):
+                missing += weight[row, k] * lines[i, k]
+            error[row] = max(error[row], abs(missing))
 
 
 @lru_cache(maxsize=1)
@@ -162,7 +205,7 @@ def _fit(lines: int, spacing: float) -> _Fit:
     halves = [(even, 1.0)] + ([(2 * np.sin(turn), -1.0)] if above.size else [])
     to_modes, from_modes, values = [], [], []
     for matrix, parity in halves:
-        u, s, v = np.linalg.svd(matrix, full_matrices=False)
+        u, s, v = _decomposed(matrix)
         root = math.sqrt(2) if parity > 0 else math.sqrt(2) * 1j  # sines come with an i
         side = v[:, : above.size] / math.sqrt(2)
         centre = v[:, above.size :] if parity > 0 else np.zeros((s.size, 1))
@@ -176,7 +219,48 @@ def _fit(lines: int, spacing: float) -> _Fit:
         np.concatenate([right, -right]),
         checks,
         offset,
-        np.hstack(to_modes)[:, kept] / size[kept],
-        np.vstack(from_modes)[kept],
+        np.ascontiguousarray(np.hstack(to_modes)[:, kept] / size[kept]),
+        np.vstack(from_modes)[kept] + 0j,
         np.exp(1j * np.pi * np.outer(checks, offset)),
     )
+
+
+def _decomposed(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """u, s, v with u diag(s) v = matrix (m, n), m >= n: (m, n), (n,), (n, n); s in no order."""
+    columns, turned = matrix.T.copy(), np.eye(matrix.shape[1])
+    _orthogonalise(columns, turned)
+    s = np.sqrt((columns**2).sum(axis=1))
+    return (columns / np.maximum(s, 1e-300)[:, None]).T, s, turned
+
+
+@njit(cache=True, error_model="numpy")
+def _orthogonalise(columns, turned):
+    """Rotates rows of columns (n, m), two at a time, until all are orthogonal; `turned` likewise.
+
+    Hestenes's and Jacobi's way to singular values, exact to rounding for the smallest ones too.
+    """
+    n, m = columns.shape
+    for _ in range(_MOST_SWEEPS):
+        rotated = False
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                one, other = columns[p], columns[q]
+                a, b, c = dot(one, one, m), dot(other, other, m), dot(one, other, m)
+                if not abs(c) > _ORTHOGONAL * math.sqrt(a * b):
+                    continue
+                rotated = True
+                zeta = (b - a) / (2.0 * c)
+                tangent = math.copysign(1.0, zeta) / (abs(zeta) + math.hypot(1.0, zeta))
+                cosine = 1.0 / math.hypot(1.0, tangent)
+                _rotate(one, other, cosine, cosine * tangent)
+                _rotate(turned[p], turned[q], cosine, cosine * tangent)
+        if not rotated:
+            return
+
+
+@njit(cache=True, error_model="numpy")
+def _rotate(one, other, cosine, sine):
+    for i in range(one.size):
+        x, y = one[i], other[i]
+        one[i] = cosine * x - sine * y
+        other[i] = sine * x + cosine * y

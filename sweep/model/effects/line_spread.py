@@ -15,7 +15,8 @@ bins around, of which the largest holds the mean at least; and no footprint's la
 less than its strongest beamlet's line. No bin holds more than all power on the lobe's peak.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,27 +24,40 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
 from sweep.model.effects.lobes import Lobe, lobe
+from sweep.model.effects.span import Span
 from sweep.model.footprint import beamlets
-from sweep.model.preparation import Shots
+from sweep.model.window import Window
 
-SIGNS = (1.0, 0.0, -1.0)
 _CHEBYSHEV = (1.4, 1.8, 2.5, 4.0, 8.0)
 _NEAR_EDGE = 8.0
 """Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
 
 
 class Line(NamedTuple):
-    """The line on the beam's axis in one segment, (n,) each."""
+    """The line on the beam's axis, over the points of each tile; arrays of one shape."""
 
     bin_offset: np.ndarray
-    """Distance from the nearest bin [bins], 0..1/2."""
+    """Largest distance from the nearest bin [bins], 0..1/2."""
+    bin_offset_least: np.ndarray
+    """Least distance from it."""
     edge: np.ndarray
-    """Distance of the folded line from the nearer of DC and Nyquist [bins], >= 0."""
+    """Least distance of the folded line from the nearer of DC and Nyquist [bins], >= 0."""
     transfer: np.ndarray
-    """|H| at the line over that at DC, 0..1."""
+    """Largest |H| at the line over that at DC, 0..1."""
+    transfer_least: np.ndarray
+    """Least of it."""
     tilt: np.ndarray
     """Bound c on the relative change of |H|^2 a bin, near the line [1/bin]."""
     lobe: Lobe
+
+    def over(self, tiles: int) -> "Line":
+        """All three segments' for a number of tiles."""
+        arrays: dict[str, Any] = {
+            name: np.broadcast_to(getattr(self, name), (3, tiles))
+            for name in self._fields
+            if name != "lobe"
+        }
+        return self._replace(**arrays)
 
 
 class Moments(NamedTuple):
@@ -60,64 +74,68 @@ class Moments(NamedTuple):
 
 NO_SPREAD = Moments(0.0, 0.0, 0.0)
 
+NOT_AWAY = 0.1
+"""Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
-def axis_line(
-    segment: int,
+
+def axis_lines(
     *,
-    name: str,
-    length: int,
+    window: Window,
     fft_size: int,
-    range: ArrayLike,
-    beta: ArrayLike,
-    chirp_rate: ArrayLike,
-    carrier: ArrayLike,
-    sample_rate: ArrayLike,
-    detector_bandwidth: ArrayLike,
-    amplifier_bandwidth: ArrayLike,
+    range: Span,
+    beta: Span,
+    chirp_rate: Span,
+    carriers: Sequence[Span],
+    sample_rate: Span,
+    detector_bandwidth: Span,
+    amplifier_bandwidth: Span,
 ) -> Line:
-    """The axis's line in a segment (0 up, 1 Doppler, 2 down), as in :mod:`sweep.model.lines`."""
-    rate = SIGNS[segment] * np.asarray(chirp_rate, float) * (2 / SPEED_OF_LIGHT)
-    beta, width = np.asarray(beta, float), np.asarray(sample_rate, float) / fft_size
-    frequency = np.asarray(carrier) * beta - rate * (1 + beta) * np.asarray(range, float)
-    one, two = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
-    transfer = 1 / (np.hypot(1, frequency / one) * np.hypot(1, frequency / two))
+    """The axis's line in up, Doppler and down segment, (3, tiles), as :mod:`sweep.model.lines`."""
+    beat = chirp_rate * (2 / SPEED_OF_LIGHT) * (1 + beta) * range
+    shift, later = carriers[0] * beta, carriers[2] * beta
+    segments = (shift - beat, carriers[1] * beta, later + beat)
+    ends = np.broadcast_arrays([0.0], *(end for f in segments for end in (f.low, f.high)))[1:]
+    frequency = Span(np.stack(ends[::2]), np.stack(ends[1::2]))
+    width = sample_rate / fft_size
     position = frequency / width
-    folded = abs(position - fft_size * np.rint(position / fft_size))
+    signed = abs(frequency)
+    transfers = [
+        1 / (np.hypot(1, f / one) * np.hypot(1, f / two))
+        for f, one, two in zip(
+            (signed.high, signed.low),
+            (detector_bandwidth.low, detector_bandwidth.high),
+            (amplifier_bandwidth.low, amplifier_bandwidth.high),
+            strict=True,
+        )
+    ]
+    least, largest = _from_whole(position)
+    tilt = (1 / detector_bandwidth.low + 1 / amplifier_bandwidth.low) * width.high
     return Line(
-        bin_offset=np.asarray(abs(folded - np.rint(folded))),
-        edge=np.asarray(np.minimum(folded, fft_size / 2 - folded)),
-        transfer=np.asarray(transfer),
-        tilt=np.asarray((1 / one + 1 / two) * width),
-        lobe=lobe(name, length, fft_size),
+        bin_offset=largest,
+        bin_offset_least=least,
+        edge=_from_edge(position, fft_size),
+        transfer=np.asarray(transfers[1]),
+        transfer_least=np.asarray(transfers[0]),
+        tilt=np.broadcast_to(tilt, least.shape),
+        lobe=lobe(window.name, window.length, fft_size),
     )
 
 
-def line_of(shots: Shots, segment: int) -> Line:
-    """The axis's line of prepared points; what they do not share in it is scalars a point."""
-    return axis_line(
-        segment,
-        name=shots.window.name,
-        length=shots.window.length,
-        fft_size=shots.fft_size,
-        range=shots.range,
-        beta=shots.beta,
-        chirp_rate=shots.chirp_rate,
-        carrier=shots.carriers[segment],
-        sample_rate=shots.sample_rate,
-        detector_bandwidth=shots.detector_bandwidth,
-        amplifier_bandwidth=shots.amplifier_bandwidth,
-    )
+def _from_whole(position: Span) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest distance from a whole number."""
+    low, high = np.asarray(position.low), np.asarray(position.high)
+    one, two = (np.abs(x - np.rint(x)) for x in (low, high))
+    least = np.where(np.floor(high) > np.floor(low), 0.0, np.minimum(one, two))
+    halves = np.floor(high + 0.5) > np.floor(low + 0.5)
+    return least, np.where(halves, 0.5, np.maximum(one, two))
 
 
-def axis_amplitude(shots: Shots, segment: int) -> np.ndarray:
-    """Magnitude of the largest bin, over sigma, had the axis's line all power and no image, (n,).
-
-    What the bounds of all effects on the lines start from.
-    """
-    line, echo = line_of(shots, segment), shots.amplitude
-    together = echo.sum(axis=1) if shots.architecture == "direct" else np.sqrt((echo**2).sum(1))
-    peak = 0.5 * shots.beat_scale * together[shots.row] * shots.window.sum
-    return np.asarray(peak * line.transfer * line.lobe.least(line.bin_offset) / shots.bin_deviation)
+def _from_edge(position: Span, fft_size: int) -> np.ndarray:
+    """Least distance of the folded line from DC and Nyquist."""
+    half = fft_size / 2
+    turns = [np.asarray(x) / half for x in (position.low, position.high)]
+    distance = np.minimum(*(np.abs(x - np.rint(x)) for x in turns)) * half
+    return np.where(np.floor(turns[1]) > np.floor(turns[0]), 0.0, distance)
 
 
 def plane_range_moments(
@@ -132,7 +150,7 @@ def plane_range_moments(
     """
     if number == 1:
         return NO_SPREAD
-    radius = _radius(number, pattern)
+    radius = reach_of(number, pattern)
     sigma = np.asarray(beam_divergence, float) / 4
     rms = sigma / np.tan(np.asarray(grazing_angle, float))
     widest, bulge = radius * rms, (radius * sigma) ** 2 / 2
@@ -163,7 +181,7 @@ def plane_velocity_moments(
     """
     if number == 1:
         return NO_SPREAD
-    radius = _radius(number, pattern)
+    radius = reach_of(number, pattern)
     sigma = np.asarray(beam_divergence, float) / 4
     slope = sigma / np.tan(np.asarray(grazing_angle, float))
     widest = np.minimum(radius * slope, 1.0)
@@ -178,7 +196,7 @@ def plane_velocity_moments(
     )
 
 
-def _radius(number: int, pattern: str) -> float:
+def reach_of(number: int, pattern: str) -> float:
     """Largest angle of a beamlet off the axis, in standard deviations."""
     points, _ = beamlets(number, pattern)
     return float(np.sqrt((points**2).sum(axis=0)).max())
@@ -208,13 +226,14 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
     mean, rms, extreme = (np.asarray(value, float) for value in spread)
     f = line.lobe
     double = image_factor(line, extreme)
-    on_axis = f.least(line.bin_offset) ** 2
+    on_axis, one_place = f.least(line.bin_offset) ** 2, line.bin_offset == line.bin_offset_least
     with np.errstate(invalid="ignore"):
         second = 0.5 * f.curvature * rms**2
         slant = np.minimum(f.slope, f.curvature * line.bin_offset)
         least = on_axis - slant * mean - second - line.tilt * rms
         uphill = np.exp(np.minimum(line.tilt * extreme, 50.0))
-        most = np.where(rms > 0, f.most(line.bin_offset) ** 2, on_axis)
+        most = f.most(line.bin_offset_least) ** 2
+        most = np.where(one_place & (rms == 0), on_axis, most)
         most = most + f.slope * mean + second
         most = (
             double
@@ -222,7 +241,7 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
             * (1 + uphill * np.fmin(line.tilt * rms, 50.0))
         )
     least = np.fmax(least, np.exp(-line.tilt * extreme) * f.least(np.asarray(0.5)) ** 2 / beamlets)
-    for t in _CHEBYSHEV:
+    for t in _CHEBYSHEV if np.any(rms > 0) else ():
         wide = t * rms
         mean_bin = (1 - 1 / t**2) * f.energy / (2 * wide + 2 * f.margin + 1)
         least = np.fmax(least, mean_bin * np.exp(-line.tilt * wide))
@@ -281,8 +300,15 @@ def moved_change(
         change = f.slope * (mean + shift) + f.curvature * (present.rms * rms + rms**2 / 2)
         change = double * uphill * (change + still.tilt * (rms + shift)) / least
     change = np.where(np.isnan(change), np.inf, change)
-    gain = np.asarray(moved.transfer / still.transfer) ** 2
-    low = np.maximum(1 - change, gain * with_least / most)
-    high = np.minimum(1 + change, gain * with_most / least)
+    less, more = _gain(moved, still, shift)
+    low = np.maximum(1 - change, less * with_least / most)
+    high = np.minimum(1 + change, more * with_most / least)
     same = (extreme == 0) & (shift == 0)
     return Change(signal=(np.sqrt(np.where(same, 1.0, low)), np.sqrt(np.where(same, 1.0, high))))
+
+
+def _gain(moved: Line, still: Line, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest factor on |H|^2 by a shift."""
+    steepest = np.exp(np.minimum(still.tilt * shift, 50.0))
+    less = np.maximum((moved.transfer_least / still.transfer) ** 2, 1 / steepest)
+    return less, np.minimum((moved.transfer / still.transfer_least) ** 2, steepest)

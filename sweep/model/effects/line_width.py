@@ -23,24 +23,42 @@ own length only: there the record's length takes the delay's place in the split.
 """
 
 import math
+from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.phase_bounds import shape
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.gaussian_line import gaussian_bound
+from sweep.model.effects.phase_bounds import (
+    DEVIATION_OF_FWHM,
+    Error,
+    Peak,
+    added,
+    errors_of,
+    images_of,
+    missed,
+    peak_of,
+)
+from sweep.model.effects.span import Operand, Span
+from sweep.model.preparation import Shots
 from sweep.model.window import Window, samples
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 TOLERANCE = 1e-12
 """Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
 
-DEVIATION_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
-"""Standard deviation of a Gaussian over its full width at half maximum."""
-
 _GONE = 40.0
 """Gamma T from where exp(-Gamma T) is nothing."""
+
+_MOST_NOISE = 1.7932821329
+"""Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
 
 
 class Shifts(NamedTuple):
@@ -64,7 +82,8 @@ def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
 
     Notes
     -----
-    19 shifts for lines narrow against a bin, 15 more for each bin of standard deviation. With
+    One shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
+    deviation; weights of 0 fill rows with fewer than k. With
     step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
     summation formula; the Gaussian's tails are cut where they hold as much.
     """
@@ -77,7 +96,9 @@ def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
     weight = np.where(
         np.abs(place) <= reach + 1 / per_deviation[:, None], np.exp(-(place**2) / 2), 0.0
     )
-    weight /= weight.sum(axis=1, keepdims=True)
+    weight[deviation == 0] = np.arange(-most, most + 1) == 0
+    # One after the other, so that zeros beside them, and thus other rows, change no bit.
+    weight /= np.cumsum(weight, axis=1)[:, -1:]
     return Shifts(deviation[:, None] * place, weight)
 
 
@@ -213,101 +234,126 @@ def _lag(
     return gamma, lag
 
 
-def gaussian_bound(
-    *,
-    fwhm: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    concentration: np.ndarray | None = None,
-) -> Change:
-    """What leaving a Gaussian line's width out can change of the largest bin's rms magnitude.
-
-    The mean power under the line departs from |X|^2 by at most
-
-        (2 pi s)^2 var_w (sum |w|)^2,   s the deviation and var_w the variance of the place in
-        the record under |w|, in bins of fs/L and in records,
-
-    and lies below the peak's; wide lines keep at least the Gaussian's density times the main
-    lobe's area, and at most its peak density times the whole area (ENBW).
-
-    Parameters
-    ----------
-    fwhm, duration : (n,) ndarray
-        As of :func:`gaussian_shifts`.
-    window, concentration
-        As of :func:`sweep.model.effects.phase_bounds.phase_change`.
-    """
-    form = shape(window)
-    deviation = np.atleast_1d(DEVIATION_OF_FWHM * np.asarray(fwhm, float) * duration)
-    variance = float((form.x**2 * form.weight).sum()) / 4 / form.absolute
-    missed = form.absolute**2 * np.minimum(1.0, (2 * np.pi * deviation) ** 2 * variance)
-    if concentration is not None:
-        share = missed / np.asarray(concentration) ** 2
-        return Change(signal=(np.sqrt(np.maximum(1 - share, 0.0)), np.sqrt(1 + share)))
-    floor = form.scalloped**2
-    least, most = 1 - missed / floor, np.minimum(1 + missed / floor, form.top**2 / floor)
-    safe = np.maximum(deviation, 1e-3)
-    peak = 1 / (math.sqrt(2 * math.pi) * safe)
-    for half in (0.5, 1.0):
-        area = _lobe_area(window, half) / form.top**2
-        least = np.maximum(least, peak * np.exp(-(((half + 0.5) / safe) ** 2) / 2) * area)
-    whole = window.equivalent_noise_bandwidth * (1 + 1e-6)
-    most = np.minimum(most, np.where(deviation > 1e-3, peak * whole / floor, np.inf))
-    return Change(signal=(np.sqrt(np.minimum(least, 1.0)), np.sqrt(most)))
-
-
-@lru_cache(maxsize=64)
-def _lobe_area(window: Window, half: float) -> float:
-    """Integral of |W|^2 over +-half bins, relative to (sum w)^2 [bins], rounded down."""
-    y, weight = np.polynomial.legendre.leggauss(16)
-    form = shape(window)
-    values = np.cos(np.pi * np.outer(half * y, form.x)) @ form.signed
-    return float((values**2 * weight).sum() * half) * (1 - 1e-3)
-
-
 def lorentzian_bound(
     *,
-    line_width: np.ndarray,
-    delay: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    sample_rate: np.ndarray,
-    cnr: np.ndarray | float = 0.0,
-    concentration: np.ndarray | None = None,
+    line_width: Operand,
+    delay: Operand,
+    duration: Operand,
+    sample_rate: Operand,
+    cnr: Operand = 0.0,
 ) -> Change:
-    """What leaving a Lorentzian laser's line width out can change: peak, and noise in the bins.
+    """What leaving a Lorentzian laser's line width out can change: the line, and noise under it.
 
-    The pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w). The pedestal is nowhere
-    negative, nowhere above what is missing from the line put onto a bin's centre, and in no bin
-    above sum w^2 fs S(0): noise that comes with the signal, from line and image.
+    The pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w). The pedestal is in no bin
+    above sum w^2 fs S(0), which rises with the delay, and with the width up to g = 1.79: noise
+    that comes with the signal, from line and image.
 
     Parameters
     ----------
-    line_width, delay, duration : (n,) ndarray
+    line_width, delay, duration : Span or array_like
         As of :func:`coherent_share`.
-    window, concentration
-        As of :func:`sweep.model.effects.phase_bounds.phase_change`.
-    sample_rate : (n,) ndarray
+    sample_rate : Span or array_like
         Sample rate [Hz].
-    cnr : (n,) ndarray
-        The beats' power sum a^2 / 2 over the noise variance, in the record; 0 leaves the
-        pedestal's part as noise out.
-
-    Returns
-    -------
-    Change
-        ``signal`` holds for the pure line's magnitude and for the root of the mean bin power.
+    cnr : Span or array_like
+        The beats' power sum a^2 / 2 over the noise variance, in the record.
     """
-    form = shape(window)
-    gamma, lag = _lag(line_width, delay, duration)
-    share = np.exp(-gamma * lag)
-    least_bin = form.scalloped if concentration is None else np.asarray(concentration)
-    most = share + (1 - share) * (form.top / least_bin) ** 2
+    width = Span.of(line_width)
+    longest = np.asarray(Span.of(delay).minimum(duration).high)
+    share = coherent_share(
+        line_width=np.asarray(width.high), delay=longest, duration=np.asarray(np.inf)
+    )
+    with np.errstate(divide="ignore"):
+        most_noise = _MOST_NOISE / (2 * np.pi * longest)
     density = pedestal_density(
-        np.array(0.0), line_width=line_width, delay=np.minimum(delay, duration)
+        np.array(0.0), line_width=np.clip(most_noise, width.low, width.high), delay=longest
     )
+    raised = 1 + (Span.of(cnr) * sample_rate).high * density
     return Change(
-        signal=(np.sqrt(share), np.sqrt(most)),
-        noise=(1.0, 1 + np.asarray(cnr) * sample_rate * density),
-        threshold_follows=False,
+        signal=(np.sqrt(share), np.ones_like(share)), noise=(1.0, raised), threshold_follows=False
     )
+
+
+_WIDTH, _SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving the width out can change of the detecting bins, (3, tiles)."""
+    width = block[_WIDTH]
+    if not block.has(_WIDTH):
+        return None
+    if block.word(_SHAPE) == "lorentzian":
+        relative = block.echo * block.echo_ratio
+        power = block.beat_scale**2 * (relative**2 if block.architecture == "direct" else relative)
+        return lorentzian_bound(
+            line_width=width,
+            delay=(2 / SPEED_OF_LIGHT) * block.range,
+            duration=block.record_duration,
+            sample_rate=block.sample_rate,
+            cnr=0.5 * power / block.noise_variance,
+        )
+    errors = errors_of(block)
+    images, cancelling = images_of(block, errors)
+    peak = peak_of(block, images, broadened=False)
+    beside = missed(errors, block.window)
+    peak = Peak(
+        np.maximum(peak.least - beside, 0.0), peak.most + beside, peak.single and not beside.any()
+    )
+    change = gaussian_bound(
+        fwhm=width, duration=block.record_duration, window=block.window, peak=peak
+    )
+    deviation = DEVIATION_OF_FWHM * width.high * block.record_duration.high
+    shift = Error((0.5 * deviation, 0.0, 0.0, 0.0), constant=0.5 * deviation)
+    low, high = (np.where(cancelling, 1.0, end) for end in change.signal)
+    return Change(
+        signal=(low, high),
+        added=np.where(cancelling, added(block, shift, images), 0.0),
+    )
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """A Gaussian line of the beat; or a pure line, dimmed, over a pedestal of noise.
+
+    The pedestal is taken at its height under the lines.
+    """
+    width = np.asarray(scene.parameters[_WIDTH], float)
+    if str(scene.parameters[_SHAPE]) == "gaussian":
+        return replace(shots, gaussian_width=width + np.zeros(shots.size))
+    delay = 2 * shots.range / SPEED_OF_LIGHT
+    timing = {
+        "line_width": width + np.zeros(shots.size),
+        "delay": delay,
+        "duration": shots.record_duration,
+    }
+    below = pedestal_power(np.zeros((shots.size, 1)), window=shots.window, **timing)[:, 0]
+    power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
+    return replace(
+        shots,
+        beat_scale=shots.beat_scale * np.sqrt(coherent_share(**timing)),
+        pedestal=power * below / shots.window.energy,
+    )
+
+
+EFFECT = Effect(
+    name="line_width",
+    about="width of the laser's line",
+    stage="record",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path=_WIDTH,
+            about="Full width at half maximum of the laser's line; Gaussian: of the beat's",
+            si_unit="Hz",
+            default=0.0,
+            example="10 kHz",
+            at_least="0 Hz",
+        ),
+        Parameter(
+            path=_SHAPE,
+            about="Gaussian, slow against the record; or the Lorentzian of a laser mixed with "
+            "itself after the echo's delay",
+            default="gaussian",
+            options=("gaussian", "lorentzian"),
+        ),
+    ),
+)

@@ -19,8 +19,8 @@ too; the turned beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
 """
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,17 +28,19 @@ from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Parameter, Realisation
+from sweep.model.effects.span import Span
 from sweep.model.footprint import beamlets as pattern_of
 from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair
-from sweep.model.shot import Parameters, evaluate
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 RARE = 1e-6
-"""Chance of a draw whose beam is further off than :func:`bound` takes it to be."""
+"""Chance of a draw whose beam is further off than :func:`turned_change` takes it to be."""
 
-STRETCH = 4096
-"""Turned shots that are evaluated at once."""
 
-PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
+_JITTER = "target.pointing_jitter"
 
 
 class Turned(NamedTuple):
@@ -52,32 +54,18 @@ class Turned(NamedTuple):
     """[m/s], positive when closing."""
 
 
-def angles(*, keys: np.ndarray, first_draw: int, draws: int, sigma: ArrayLike) -> np.ndarray:
-    """Angles (a, b) by which beams are off, (n, draws, 2) [rad].
-
-    Parameters
-    ----------
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw, draws : int
-        Angles depend on key and number of the draw (stream ``STREAM_POINTING_JITTER``), on
-        nothing else.
-    sigma : array_like
-        Standard deviation of each angle [rad], (n,) or a scalar.
-    """
-    keys = np.asarray(keys, np.uint64)
-    values = np.empty((len(keys), draws, 2))
-    _draw(keys, first_draw, STREAM_POINTING_JITTER, values)
-    return values * np.broadcast_to(np.asarray(sigma, float), len(keys))[:, None, None]
+def angles(realisation: Realisation, sigma: np.ndarray) -> np.ndarray:
+    """Angles (a, b) by which beams of this standard deviation are off, (n, 2) [rad]."""
+    values = np.empty((realisation.draw.size, 2))
+    _draw(realisation.keys, realisation.draw, STREAM_POINTING_JITTER, values)
+    return values * np.asarray(sigma, float)[..., None]
 
 
 @njit(cache=True, nogil=True)
-def _draw(keys, first_draw, stream, out):
-    """One pair of standard normal numbers for each point and draw."""
-    for i in range(out.shape[0]):
-        for d in range(out.shape[1]):
-            pair = normal_pair(keys[i, 0], keys[i, 1], first_draw + d, stream, 0)
-            out[i, d, 0], out[i, d, 1] = pair
+def _draw(keys, draw, stream, out):
+    """One pair of standard normal numbers for each point's draw."""
+    for i in range(draw.size):
+        out[i, 0], out[i, 1] = normal_pair(keys[i, 0], keys[i, 1], draw[i], stream, 0)
 
 
 def turned(
@@ -115,74 +103,7 @@ def turned(
     )
 
 
-def conditional_detection(
-    parameters: Parameters,
-    *,
-    keys: np.ndarray,
-    first_draw: int = 0,
-    draws: int,
-    sigma: ArrayLike,
-    velocity_across: ArrayLike = (0.0, 0.0),
-    names: Iterable[str] = PROBABILITIES,
-) -> dict[str, np.ndarray]:
-    """Probabilities over the noise of each draw of the beam's direction.
-
-    Parameters
-    ----------
-    parameters : mapping
-        As for :func:`sweep.model.shot.evaluate`, of n points.
-    keys, first_draw, draws, sigma
-        As for :func:`angles`.
-    velocity_across : (2,) or (n, 2) array_like
-        As for :func:`turned`.
-    names : iterable of str
-        Which of :data:`sweep.model.outputs.OUTPUTS`. Errors of range and velocity are against
-        the turned beam's own; 0 for a probability where the beam misses the plane, nan else.
-
-    Returns
-    -------
-    dict of (n, draws) ndarray
-        The names asked for, and ``range``, ``grazing_angle`` and ``radial_velocity`` of the draw.
-    """
-    n, names = len(keys), tuple(names)
-    aimed = {
-        name: np.broadcast_to(np.asarray(parameters[f"target.{name}"], float), n)[:, None]
-        for name in Turned._fields
-    }
-    across = np.broadcast_to(np.asarray(velocity_across, float), (n, 2))[:, None]
-    off = angles(keys=keys, first_draw=first_draw, draws=draws, sigma=sigma)
-    seen = turned(**aimed, angles=off, velocity_across=across)
-    results = {name: np.empty((n, draws)) for name in names}
-    step = max(1, STRETCH // n)
-    for start in range(0, draws, step):
-        part = slice(start, start + step)
-        found = _evaluated(parameters, Turned(*(values[:, part] for values in seen)), names)
-        for name, values in found.items():
-            results[name][:, part] = values
-    return results | seen._asdict()
-
-
-def _evaluated(
-    parameters: Parameters, seen: Turned, names: tuple[str, ...]
-) -> dict[str, np.ndarray]:
-    """Outputs (n, draws) of turned shots."""
-    shape = seen.range.shape
-    hits = np.isfinite(seen.range)
-    repeated = {
-        path: np.repeat(np.asarray(value), shape[1]) if np.ndim(value) else value
-        for path, value in parameters.items()
-    }
-    geometry = {
-        "target.range": np.where(hits, seen.range, 1.0),
-        "target.grazing_angle": np.where(hits, seen.grazing_angle, 0.5 * math.pi),
-        "target.radial_velocity": seen.radial_velocity,
-    }
-    outputs = evaluate(repeated | {path: values.ravel() for path, values in geometry.items()})
-    missed = {name: 0.0 if name in PROBABILITIES else np.nan for name in names}
-    return {name: np.where(hits, outputs[name].reshape(shape), missed[name]) for name in names}
-
-
-def bound(
+def turned_change(
     *,
     sigma: ArrayLike,
     range: ArrayLike,
@@ -200,6 +121,9 @@ def bound(
     direct: bool = False,
     speed_across: ArrayLike = 0.0,
     record: ArrayLike = 1.0,
+    spread: ArrayLike = 0.0,
+    edge: ArrayLike = np.inf,
+    tail: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
 ) -> Change:
     """What jitter can change in the detecting bin and its noise, in all draws but few.
 
@@ -214,9 +138,12 @@ def bound(
       moves by a factor within 1 +- pi D (L/N) / c, and c to 1/c;
     - the receiver's transfer by no more than a beat's shift by its poles.
 
-    Beats are taken to be clear of DC and Nyquist: what sidelobes of their images add is left out.
-    A footprint whose phases follow its geometry may fade altogether, or not any more: of those,
-    nothing is promised.
+    Near DC and Nyquist images may double powers. A footprint whose phases follow its geometry may
+    fade altogether, or not any more, and so may lines with their images: of those, nothing is
+    promised.
+
+    All rises with sigma, range, speeds, divergence and chirp rate and falls with the grazing
+    angle, sample rate, wavelength and poles, so that one end of each serves a whole tile.
 
     Parameters
     ----------
@@ -240,6 +167,10 @@ def bound(
         Speed across the beam [m/s].
     record : array_like
         L/N.
+    spread, edge : array_like
+        Bins over which lines are spread besides, and from the axis's line to DC or Nyquist.
+    tail : callable
+        Largest magnitude of a bin at least so many from a line, over the least in the nearest.
     """
     off = np.asarray(sigma, float) * math.sqrt(2 * math.log(1 / RARE))
     aimed, record = np.asarray(grazing_angle, float), np.asarray(record, float)
@@ -254,14 +185,17 @@ def bound(
     shift = slope * (1 / np.sin(lower) - 1 / np.sin(lowest))
     shift = shift + 2 * doppler / np.asarray(wavelength, float)
     bins = np.asarray(fft_size, float) / np.asarray(sample_rate, float)
-    length = slope * (1 / np.sin(lowest) - 1 / np.sin(highest)) * bins
+    length = slope * (1 / np.sin(lowest) - 1 / np.sin(highest)) * bins + spread
     transfer = np.exp(-shift * sum(1 / np.asarray(pole, float) for pole in bandwidths))
     weak, strong = ((np.sin(v) / np.sin(lowest)) ** 3 for v in (lower, higher))
     kept, kept_after = (_kept(v, record) for v in (length, length + 2 * shift * bins))
     moved = math.pi * record * shift * bins / kept
     power = 1.0 if direct else 0.5
-    low = (weak * transfer * np.maximum(1 - moved, kept_after)) ** power
-    high = (strong / transfer * np.minimum(1 + moved, 1 / kept)) ** power
+    image = np.minimum(tail(2 * (np.asarray(edge) - length - shift * bins) - 1), 1.0)
+    least, most = (1 - image, 1 + image) if coherent else (1.0, np.sqrt(1 + image**2))
+    low = (weak * transfer * np.maximum(1 - moved, kept_after)) ** power * least / most
+    with np.errstate(divide="ignore"):
+        high = (strong / transfer * np.minimum(1 + moved, 1 / kept)) ** power * most / least
     known = sure & (not coherent or beamlets == 1)
     share = np.asarray(signal_shot_share, float)
     loudest = np.where(sure, 1 + share * (strong - 1), np.where(share > 0, np.inf, 1.0))
@@ -277,3 +211,77 @@ def _kept(length: np.ndarray, record: np.ndarray) -> np.ndarray:
     nearest = (2 / math.pi) ** 2 / (np.floor(length) + 2)
     together = np.minimum((0.5 + 0.5 * length) * record, 1.0)
     return np.asarray(np.maximum(nearest, np.sinc(together) ** 2))
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving jitter out can change in all draws but few, (3, tiles) by segment."""
+    if not block.has(_JITTER):
+        return None
+    echo = block.shot_noise_scale * block.echo_scale * block.echo * Span.hull(1.0, block.echo_ratio)
+    own, lobe = (echo / block.noise_variance).high, block.lines.lobe
+    rates = np.outer([1.0, 0.0, 1.0], np.broadcast_to(block.chirp_rate.high, block.size))
+    return turned_change(
+        sigma=block[_JITTER].high,
+        range=block.range.high,
+        grazing_angle=block.grazing_angle.low,
+        radial_velocity=block.radial_velocity.magnitude,
+        wavelength=SPEED_OF_LIGHT / block.carriers[2].high,
+        beam_divergence=block["instrument.laser.beam_divergence"].high,
+        chirp_rate=rates,
+        sample_rate=block.sample_rate.low,
+        fft_size=block.fft_size,
+        bandwidths=(
+            block["instrument.receiver.detector_bandwidth"].low,
+            block["instrument.receiver.amplifier_bandwidth"].low,
+        ),
+        signal_shot_share=own / (1 + own),
+        beamlets=block.number,
+        coherent=block.adds_amplitudes or block.has("target.roughness"),
+        direct=block.architecture == "direct",
+        speed_across=block["target.transverse_velocity"].magnitude,
+        record=block.window.length / block.fft_size,
+        spread=2 * np.asarray(block.velocity_spread.extreme),
+        edge=block.lines.edge,
+        tail=lambda bins: lobe.tail(bins) / lobe.least(np.asarray(0.5)),
+    )
+
+
+def turn(p: dict[str, np.ndarray], realisation: Realisation) -> dict[str, np.ndarray]:
+    """Range, grazing angle and velocities of beams that are off; no echo where they miss."""
+    angles_off = angles(realisation, p[_JITTER])
+    across = np.zeros_like(angles_off)
+    across[:, 0] = -p["target.transverse_velocity"]  # towards the near side is off grazing
+    seen = turned(
+        range=p["target.range"],
+        grazing_angle=p["target.grazing_angle"],
+        radial_velocity=p["target.radial_velocity"],
+        angles=angles_off,
+        velocity_across=across,
+    )
+    hits = np.isfinite(seen.range)
+    return p | {
+        "target.range": np.where(hits, seen.range, 1.0),
+        "target.grazing_angle": np.where(hits, seen.grazing_angle, math.pi / 2),
+        "target.radial_velocity": seen.radial_velocity,
+        "target.reflectance": np.where(hits, p["target.reflectance"], 0.0),
+    }
+
+
+EFFECT = Effect(
+    name="pointing_jitter",
+    about="a beam that wanders from shot to shot",
+    stage="draws",
+    bound=bound,
+    turn=turn,
+    parameters=(
+        Parameter(
+            path=_JITTER,
+            about="Standard deviation of the beam's direction, on each axis, from shot to shot",
+            si_unit="rad",
+            default=0.0,
+            example="20 urad",
+            at_least="0 rad",
+            at_most="10 deg",
+        ),
+    ),
+)

@@ -16,12 +16,22 @@ effect of its own (saturation).
 """
 
 import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.span import Span, monotone
+from sweep.model.preparation import Shots
 
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
+
+
+_BITS = "instrument.processing.bits"
 _TERMS = 8
 _SMALLEST = 1e-30
 """Stands for a factor of which no more is known than that it is positive."""
@@ -53,14 +63,30 @@ def truth_quantise(voltage: np.ndarray, *, full_scale: float, bits: int) -> np.n
     return (code + 0.5) * lsb
 
 
-def bound(
-    *,
-    step: ArrayLike,
-    noise_variance: ArrayLike,
-    magnitude: ArrayLike,
-    window_sum: ArrayLike,
+def bound(block: "Block") -> Change | None:
+    """Change by rounding, without clipping; the threshold is set on it."""
+    bits = block[_BITS]
+    if not np.any(bits.high > 0):
+        return None
+    lsb = monotone(
+        step, falling=("bits",), full_scale=block["instrument.processing.full_scale"], bits=bits
+    )
+    magnitude = block.amplitude.low * block.deviation.low
+    change = rounding_change(
+        step=lsb, noise_variance=block.noise_variance, magnitude=magnitude,
+        window_sum=block.window.sum,
+    )  # fmt: skip
+    if np.any(bits.low <= 0):  # no steps at all, in some points
+        least, most = change.noise
+        least = np.where(np.less_equal(bits.low, 0), np.minimum(least, 1.0), least)
+        change = change._replace(noise=(least, most))
+    return change
+
+
+def rounding_change(
+    *, step: Span, noise_variance: Span, magnitude: ArrayLike, window_sum: float
 ) -> Change:
-    """Change by rounding, without clipping; the threshold is set on it.
+    """Change by steps of a size.
 
     The error's mean given the signal is at most d = lsb/pi sum q^(m^2)/m in any sample, and never
     above lsb/2, so it adds at most d sum(w) to a bin. The variance of a sample is the noise's,
@@ -70,28 +96,28 @@ def bound(
 
     Parameters
     ----------
-    step : array_like
-        lsb [V], (n,) or scalar, as all.
-    noise_variance : array_like
+    step : Span
+        lsb [V].
+    noise_variance : Span
         Of the voltage before rounding [V^2], > 0.
     magnitude : array_like
-        |X| of the detecting bin [V], >= 0, in the convention of X = sum w x.
-    window_sum : array_like
+        |X| of the detecting bin [V] at the least, >= 0, in the convention of X = sum w x.
+    window_sum : float
         sum(w).
     """
-    lsb, s = np.asarray(step, float), np.sqrt(np.asarray(noise_variance, float))
-    exponent = -2 * (math.pi * s / np.maximum(lsb, 1e-100)) ** 2
+    s, lsb = noise_variance.sqrt(), step.high
+    exponent = -2 * (math.pi * s.low / np.maximum(lsb, 1e-100)) ** 2
     plain, once, twice = (_series(exponent, power) for power in (0, 1, 2))
     mean_error = np.minimum(lsb / 2, lsb / math.pi * once)
-    with np.errstate(divide="ignore"):
-        relative = mean_error * np.asarray(window_sum, float) / np.asarray(magnitude, float)
-    signal = (np.maximum(1 - relative, _SMALLEST), np.minimum(1 + relative, 1 / _SMALLEST))
-    ratio = lsb / s
-    white = 1 + ratio**2 / 12
+    added = mean_error * window_sum / np.maximum(magnitude, _SMALLEST)
+    ratio, least_ratio = lsb / s.low, step.low / s.high
     spread = 4 * plain + (ratio / math.pi) ** 2 * twice
-    low = np.maximum(white - spread - (mean_error / s) ** 2, np.maximum(1 - ratio / 2, 0.0) ** 2)
-    high = np.minimum(white + spread, (1 + ratio / 2) ** 2)
-    return Change(signal=signal, noise=(np.maximum(low, _SMALLEST), high))
+    low = np.maximum(
+        1 + least_ratio**2 / 12 - spread - (mean_error / s.low) ** 2,
+        np.maximum(1 - ratio / 2, 0.0) ** 2,
+    )
+    high = np.minimum(1 + ratio**2 / 12 + spread, (1 + ratio / 2) ** 2)
+    return Change(noise=(np.maximum(low, _SMALLEST), high), added=added)
 
 
 def _series(exponent: np.ndarray, power: int) -> np.ndarray:
@@ -104,3 +130,30 @@ def _series(exponent: np.ndarray, power: int) -> np.ndarray:
     with np.errstate(divide="ignore"):
         rest = np.exp(first**2 * exponent) / -np.expm1(2 * first * exponent) / first**power
     return np.asarray(total + rest)
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """White noise of lsb^2/12, where the ADC has a number of bits."""
+    bits = np.asarray(scene.parameters[_BITS], float)
+    lsb = step(full_scale=scene.parameters["instrument.processing.full_scale"], bits=bits)
+    noise = {"quantisation": np.where(bits > 0, variance(step=lsb), 0.0)}
+    return replace(shots, noise_sources=shots.noise_sources | noise)
+
+
+EFFECT = Effect(
+    name="quantisation",
+    about="the ADC's steps",
+    stage="noise",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path=_BITS,
+            about="Effective number of bits of the ADC; 0 for one without steps",
+            default=0.0,
+            example="12",
+            at_least="0",
+            at_most="64",
+        ),
+    ),
+)

@@ -10,12 +10,25 @@ the Doppler segment. Time runs from the segment's start: the line moves by the d
 middle of the record and spreads over what drifts within it.
 """
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.phase_bounds import phase_change
-from sweep.model.window import Window
+from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.phase_bounds import (
+    Error,
+    by_segment,
+    counted,
+    error_change,
+    over_record,
+)
+from sweep.model.preparation import PhaseError, Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
 def phase(
@@ -63,29 +76,36 @@ def drift_bins(
     return 2 * sign * chirp_rate * beta * (1 + beta / 2) * np.asarray(duration) ** 2
 
 
-def bound(
-    *,
-    sign: int,
-    chirp_rate: np.ndarray,
-    radial_velocity: np.ndarray,
-    start: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    concentration: np.ndarray | None = None,
-) -> Change:
-    """What leaving range walk out can change of a segment's detecting bin.
+@counted
+def error(block: "Block") -> Error | None:
+    """The phase that range walk adds over a block's tiles."""
+    if not block.has("target.radial_velocity"):
+        return None
+    drift = block.chirp_rate * block.beta * (1 + 0.5 * block.beta)
+    walk = over_record({2: drift}, start=block.start, duration=block.record_duration)
+    return by_segment(block, walk, None, walk)
 
-    Parameters as of :func:`phase` and :func:`sweep.model.effects.phase_bounds.phase_change`.
-    """
-    return phase_change(
-        lambda x: phase(
-            x,
-            sign=sign,
-            chirp_rate=chirp_rate,
-            radial_velocity=radial_velocity,
-            start=start,
-            duration=duration,
-        ),
-        window=window,
-        concentration=concentration,
-    )
+
+def bound(block: "Block") -> Change | None:
+    """What leaving range walk out can change of the detecting bins, (3, tiles)."""
+    return error_change(block, error)
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """The drift of the beat, in the record of the two chirps."""
+    values = {
+        "chirp_rate": shots.chirp_rate,
+        "radial_velocity": shots.radial_velocity,
+        "start": shots.acquisition_delay,
+        "duration": shots.record_duration,
+    }
+    return replace(shots, phase_errors=(*shots.phase_errors, PhaseError(phase, values)))
+
+
+EFFECT = Effect(
+    name="range_walk",
+    about="drift of the beat as the target moves",
+    stage="record",
+    bound=bound,
+    act=act,
+)

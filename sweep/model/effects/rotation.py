@@ -6,12 +6,14 @@ thus what a velocity -omega x (O - X) of the instrument would be, whatever the b
 Doppler shift by its component along the beam, a Doppler spread by that across it.
 """
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import TYPE_CHECKING
 
-from sweep.model.effects.change import Change
-from sweep.model.effects.line_spread import Line, Moments, moved_change
-from sweep.model.geometry.platform import State
+import numpy as np
+
+from sweep.model.effects.effect import Effect
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 
 def equivalent_velocity(
@@ -29,31 +31,14 @@ def equivalent_velocity(
     return np.asarray(-np.cross(rate, np.asarray(instrument) - np.asarray(pivot)))
 
 
-def bound(
-    turning: Line,
-    still: Line,
-    *,
-    shift: ArrayLike,
-    velocities: Moments,
-    present: Moments,
-    beamlets: int,
-) -> Change:
-    """What a rotation can change in the largest bin of a segment.
-
-    Parameters
-    ----------
-    turning, still : Line
-        Of the axis, with the rotation's radial velocity and without.
-    shift : array_like
-        Bins between them (:func:`sweep.model.effects.doppler.shift`).
-    velocities, present : Moments
-        Bins by which it spreads the lines, and those of the spread there is without it.
-    beamlets : int
-        Their number.
-    """
-    return moved_change(turning, still, shift, velocities, present, beamlets)
+def bound(block: "Block") -> np.ndarray | None:
+    """Whether anything turns: what it does to velocities is in the scene, and not left out."""
+    return np.ones(block.size) if block.rotating else None
 
 
-def without(state: State) -> State:
-    """The motion of a body that keeps its path and its attitudes, its surface not turning."""
-    return state._replace(rate=np.zeros_like(state.rate))
+EFFECT = Effect(
+    name="rotation",
+    about="surfaces of turning bodies",
+    stage="lines",
+    bound=bound,
+)

@@ -16,20 +16,39 @@ an envelope that changes over the record, which clips less than its peak says.
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from sweep.model import receiver, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import (
+    backscatter,
+    quantisation,
+    relative_intensity_noise,
+    solar_background,
+)
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Parameter, Scene
+from sweep.model.effects.span import Span
+from sweep.model.preparation import Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _CUTS = np.array([-8.0, 0.0, 8.0])
 """Where the quarter of a period is cut, in deviations of the noise off full scale: the integrands
 are smooth in between."""
 _SMALLEST = 1e-30
-"""Stands for a factor of which no more is known than that it is positive."""
+"""Stands for what is no more than positive."""
+_NO_LIMIT = 1e100
+_FAINTEST = 1e-5
+"""Deviations of the noise below which beats are taken for that strong: their gain is the same to
+the square of this, and could not be told from the rounding of 1."""
 
 
 class Clipping(NamedTuple):
@@ -56,6 +75,7 @@ def clipping(*, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLik
         Largest voltage that does not clip, to either side [V], > 0.
     """
     a, s, v = _columns(amplitude, deviation, full_scale)
+    a = np.maximum(a, _FAINTEST * s)
     phase, weight = _phases(a, s, v)
     sine = np.sin(phase)
     loss, spread = _lost(a * sine, s, v)
@@ -82,41 +102,28 @@ def harmonic_amplitude(
     return np.asarray(line - 2 * (weight * loss * np.sin(order * phase)).sum(axis=-1))
 
 
-def bound(
-    *,
-    peak: ArrayLike,
-    deviation: ArrayLike,
-    full_scale: ArrayLike,
-    magnitude: ArrayLike,
-    window_sum: ArrayLike,
-) -> Change:
-    """Change by clipping, whatever the envelope; the threshold is taken to stay.
+def clipped(*, amplitude: ArrayLike, deviation: Span, full_scale: ArrayLike) -> Change:
+    """Change by clipping of a sine of some amplitude or less; the threshold stays.
 
-    A sample loses at most, in the mean, what the highest does: d = peak - m(peak), so a bin at
-    most d sum(w). Clipping contracts, so the variance of a sample never rises, and by the
-    inequality of Cramer and Rao, Var f(n) >= (s E f')^2, it is at least the square of the chance
-    that the highest sample is not clipped. Noise alone is taken to fit within full scale.
+    The line's gain falls as beat or noise grow against full scale. Clipping contracts, so the
+    variance of a sample never rises, and by the inequality of Cramer and Rao, Var f(n) >=
+    (s E f')^2, it is at least the square of the chance that the highest sample is not clipped.
+    Where noise grows that chance falls, or rises and then falls: its least is at an end. Noise
+    alone is taken to fit within full scale.
 
     Parameters
     ----------
-    peak : array_like
-        Highest |voltage| of the record without noise [V], or above: the sum of all amplitudes.
-    deviation, full_scale : array_like
-        As of :func:`clipping`.
-    magnitude : array_like
-        |X| of the detecting bin [V], >= 0, in the convention of X = sum w x.
-    window_sum : array_like
-        sum(w).
+    amplitude, full_scale : array_like
+        As of :func:`clipping` [V]: the largest, and the least.
+    deviation : Span
+        Likewise.
     """
-    x, s, v = (np.asarray(value, float) for value in (peak, deviation, full_scale))
-    loss, _ = _lost(x, s, v)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = loss * np.asarray(window_sum, float) / np.asarray(magnitude, float)
-    relative = np.where(loss > 0, relative, 0.0)
-    signal = (np.maximum(1 - relative, _SMALLEST), np.minimum(1 + relative, 1 / _SMALLEST))
-    unclipped = ndtr((v - x) / s) - ndtr((-v - x) / s)
+    x, v = np.asarray(amplitude, float), np.asarray(full_scale, float)
+    least = clipping(amplitude=x, deviation=deviation.high, full_scale=v).signal_gain
+    ends = (np.asarray(deviation.low), np.asarray(deviation.high))
+    unclipped = np.minimum(*(ndtr((v - x) / s) - ndtr((-v - x) / s) for s in ends))
     noise = (np.maximum(unclipped**2, _SMALLEST), np.ones_like(unclipped))
-    return Change(signal=signal, noise=noise, threshold_follows=False)
+    return Change(signal=(least, np.ones_like(least)), noise=noise, threshold_follows=False)
 
 
 def _columns(*values: ArrayLike) -> tuple[np.ndarray, ...]:
@@ -148,3 +155,95 @@ def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.n
     cut = (density[0] - a * above) - (density[1] + b * below)
     square = a * a * above + b * b * below + (ndtr(a) - below) + b * density[1] - a * density[0]
     return s * np.maximum(cut, 0.0), s * s * np.maximum(square - cut * cut, 0.0)
+
+
+_FULL_SCALE = "instrument.processing.full_scale"
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Line and noise as clipping leaves them; its harmonics are left out.
+
+    The record is taken for one sine with the power of all lines.
+    """
+    full_scale = np.asarray(scene.parameters[_FULL_SCALE], float)
+    limited = full_scale > 0
+    if not limited.any():
+        return shots
+    left = clipping(
+        amplitude=np.maximum(beat_amplitude(shots), _SMALLEST),
+        deviation=np.sqrt(shots.noise_variance),
+        full_scale=np.where(limited, full_scale, _NO_LIMIT),
+    )
+    return replace(
+        shots,
+        beat_scale=shots.beat_scale * left.signal_gain,
+        noise_gain=shots.noise_gain * left.noise_gain,
+    )
+
+
+def beat_amplitude(shots: Shots) -> np.ndarray:
+    """Amplitude at the ADC [V] of a sine with the power of all lines, (n,).
+
+    In the segment that passes the receiver best: at its lowest frequency.
+    """
+    beats = [
+        waveform.beat_frequency(
+            sign,
+            carrier=carrier,
+            chirp_rate=shots.chirp_rate,
+            range=shots.range,
+            radial_velocity=shots.beta * SPEED_OF_LIGHT / 2,
+        )
+        for sign, carrier in zip(waveform.SIGNS, shots.carriers, strict=True)
+    ]
+    gain = receiver.transfer(
+        np.min(np.abs(beats), axis=0),
+        detector_bandwidth=shots.detector_bandwidth,
+        amplifier_bandwidth=shots.amplifier_bandwidth,
+        transimpedance=np.ones(1),
+    )
+    together = shots.relative_echo
+    together = together if shots.architecture == "direct" else np.sqrt(together)
+    return np.asarray(shots.beat_scale * together * np.abs(gain))
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving clipping out can change, (tiles,), whatever else is noise or dims the echo."""
+    limits = [np.asarray(v, float) for v in (block[_FULL_SCALE].low, block[_FULL_SCALE].high)]
+    if not np.any(limits[1] > 0):
+        return None
+    echo = block.echo * Span.hull(1.0, block.echo_ratio)
+    together = echo if block.architecture == "direct" else echo.sqrt()
+    amplitude = (block.beat_scale * together).high * block.lines.transfer.max(axis=0)
+    quiet = block.noise_variance
+    loud = quiet + block.shot_noise_scale * block.echo_scale * echo
+    for source in (solar_background, backscatter, relative_intensity_noise, quantisation):
+        change = source.bound(block)
+        if change is not None:
+            loud = loud * np.asarray(change.noise[1])
+    # a tile with points without a limit, at 0, has the others' between 0 and their largest
+    limit = np.where(limits[0] > 0, limits[0], np.where(limits[1] > 0, _SMALLEST, _NO_LIMIT))
+    return clipped(
+        amplitude=np.maximum(amplitude, _SMALLEST),
+        deviation=Span.hull(quiet, loud).sqrt(),
+        full_scale=limit,
+    )
+
+
+EFFECT = Effect(
+    name="saturation",
+    about="clipping at the ADC's full scale",
+    stage="record",
+    bound=bound,
+    act=act,
+    parameters=(
+        Parameter(
+            path=_FULL_SCALE,
+            about="Largest voltage, to either side, that the ADC takes; 0 V for no limit",
+            si_unit="V",
+            default=0.0,
+            example="1 V",
+            at_least="0 V",
+        ),
+    ),
+)

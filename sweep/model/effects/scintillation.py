@@ -1,11 +1,9 @@
 """Scintillation: turbulent air makes the echo's power twinkle from shot to shot.
 
-The strength of turbulence C_n^2(h) gives the Rytov variance of a plane or a spherical wave over
-the path, and this the variances of the logarithms of large and small eddies' factors, averaged
-over an aperture, at any strength [Andrews and Phillips, Laser Beam Propagation through Random
-Media, 2nd ed. 2005, ch. 9, 10; zero inner scale, infinite outer scale]. The irradiance, of unit
-mean, is the product of both factors: log-normal (weak turbulence) or each gamma-distributed, the
-gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001), for any strength.
+The irradiance, of unit mean, is the product of a factor by large and one by small eddies, whose
+log variances :mod:`sweep.model.effects.turbulence` gives: log-normal (weak turbulence) or each
+gamma-distributed, the gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001), for
+any strength.
 
 The beam goes there and back. What is taken: on the way out a plane wave twinkles on the target,
 averaged over the footprint; on the way back a spherical wave twinkles in the receiver's aperture;
@@ -15,9 +13,10 @@ a small rough target next to the axis would show as enhanced backscatter, is lef
 spreading of the beam and the loss of mixing over the aperture.
 """
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -25,145 +24,27 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from sweep.model import philox
-from sweep.model.effects.change import Change
+from sweep.model.effects.atmosphere import path_heights, path_of
+from sweep.model.effects.change import Mean
+from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene
+from sweep.model.effects.span import Span
+from sweep.model.effects.turbulence import (
+    HUFNAGEL_VALLEY,
+    LogVariances,
+    Turbulence,
+    both_ways,
+    largest_both_ways,
+)
 from sweep.model.marcum import marcum_q1
+from sweep.model.preparation import Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
 DISTRIBUTIONS = ("log_normal", "gamma_gamma")
-WAVES = ("plane", "spherical")
-
-_ENDS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
-"""Powers of the distances to receiver and source in the integral over the path."""
-_LARGE = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
-_CHANCES = np.array([1e-12, 1e-9, 1e-6, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.35, 0.5])
+_CHANCES = np.array([1e-9, 1e-6, 1e-4, 1e-2])
+_HUGE = 1e9
 _LEAST_SPREAD = 1e-5
-
-
-class Turbulence(NamedTuple):
-    """Profile of the refractive index's structure constant over height above the ground."""
-
-    uniform: float = 0.0
-    """Part that is the same at all heights [m^(-2/3)]: alone, a constant C_n^2."""
-    surface: float = 0.0
-    """Hufnagel and Valley's A [m^(-2/3)] on the ground, e-folding over 100 m: 1.7e-14."""
-    wind: float = 0.0
-    """Their rms wind speed aloft [m/s]: 21."""
-    middle: float = 0.0
-    """Their [m^(-2/3)] of e-folding height 1500 m: 2.7e-16."""
-
-
-HUFNAGEL_VALLEY = Turbulence(surface=1.7e-14, wind=21.0, middle=2.7e-16)
-"""The 5/7 model: at 0.5 um 5 cm of coherence and 7 urad of isoplanatic angle [Valley 1980]."""
-
-
-class LogVariances(NamedTuple):
-    """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
-
-    large: np.ndarray
-    small: np.ndarray
-
-
-def structure_constant(turbulence: Turbulence, height: ArrayLike) -> np.ndarray:
-    """C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground that on it."""
-    h = np.maximum(np.asarray(height, float), 0.0)
-    aloft = 0.00594 * (turbulence.wind / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
-    middle = turbulence.middle * np.exp(-h / 1.5e3)
-    return turbulence.uniform + aloft + middle + turbulence.surface * np.exp(-h / 100)
-
-
-def rytov_variance(
-    wave: str,
-    turbulence: Turbulence,
-    *,
-    wavelength: ArrayLike,
-    range: ArrayLike,
-    start_height: ArrayLike,
-    end_height: ArrayLike,
-) -> np.ndarray:
-    """Variance of the log irradiance of weak turbulence along a straight path, (n,).
-
-    2.25 k^(7/6) integral of C_n^2 (L - z)^(5/6) [(z/L)^(5/6) for a spherical wave] over z from
-    source to receiver; 1.23 and 0.50 C_n^2 k^(7/6) L^(11/6) in even turbulence. By a rule of
-    Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height.
-
-    Parameters
-    ----------
-    wave : str
-        ``plane`` or ``spherical``.
-    wavelength, range, start_height, end_height : array_like
-        [m], (n,) or scalar; start is the wave's source.
-    """
-    to_receiver, to_source = _ENDS[wave]
-    x, weights = special.roots_jacobi(64, to_receiver, to_source)
-    share = (1 + x) / 2
-    weights = weights / 2 ** (1 + to_receiver + to_source)
-    h0, h1 = (np.asarray(h, float)[..., None] for h in (start_height, end_height))
-    mean = (structure_constant(turbulence, h0 + (h1 - h0) * share) * weights).sum(axis=-1)
-    k = 2 * math.pi / np.asarray(wavelength, float)
-    return np.asarray(2.25 * k ** (7 / 6) * np.asarray(range, float) ** (11 / 6) * mean)
-
-
-def log_variances(
-    wave: str,
-    *,
-    rytov_variance: ArrayLike,
-    wavelength: ArrayLike,
-    range: ArrayLike,
-    aperture: ArrayLike,
-) -> LogVariances:
-    """What large and small eddies make of the irradiance averaged over an aperture.
-
-    exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
-    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. As it serves any strength
-    the published fit averages too little over wide apertures: in weak turbulence it is 1.3 times
-    Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where it is 10.
-
-    Parameters
-    ----------
-    wave : str
-        ``plane`` or ``spherical``.
-    rytov_variance : array_like
-        Of that wave, >= 0, (n,) or scalar, as all.
-    wavelength, range, aperture : array_like
-        [m]; the diameter of the aperture that averages, 0 for a point.
-    """
-    v = np.asarray(rytov_variance, float)
-    k = 2 * math.pi / np.asarray(wavelength, float)
-    d2 = k * np.asarray(aperture, float) ** 2 / (4 * np.asarray(range, float))
-    strength = v**1.2  # sigma_R^(12/5)
-    by_aperture, by_strength = _LARGE[wave]
-    large = 0.49 * v / (1 + by_aperture * d2 + by_strength * strength) ** (7 / 6)
-    small = 0.51 * v * (1 + 0.69 * strength) ** (-5 / 6)
-    return LogVariances(large, small / (1 + 0.90 * d2 + 0.62 * d2 * strength))
-
-
-def both_ways(
-    turbulence: Turbulence,
-    *,
-    wavelength: ArrayLike,
-    range: ArrayLike,
-    lidar_height: ArrayLike,
-    target_height: ArrayLike,
-    aperture: ArrayLike,
-    beam_divergence: ArrayLike,
-) -> tuple[LogVariances, LogVariances]:
-    """Log variances of the way out, averaged over the footprint, and back, over the aperture."""
-    out = rytov_variance(
-        "plane", turbulence, wavelength=wavelength, range=range,
-        start_height=lidar_height, end_height=target_height,
-    )  # fmt: skip
-    back = rytov_variance(
-        "spherical", turbulence, wavelength=wavelength, range=range,
-        start_height=target_height, end_height=lidar_height,
-    )  # fmt: skip
-    footprint = np.asarray(aperture, float) + np.asarray(beam_divergence, float) * range
-    return (
-        log_variances(
-            "plane", rytov_variance=out, wavelength=wavelength, range=range, aperture=footprint
-        ),
-        log_variances(
-            "spherical", rytov_variance=back, wavelength=wavelength, range=range, aperture=aperture
-        ),
-    )
 
 
 def index(legs: Sequence[LogVariances]) -> np.ndarray:
@@ -172,14 +53,9 @@ def index(legs: Sequence[LogVariances]) -> np.ndarray:
 
 
 def factors(
-    distribution: str,
-    legs: Sequence[LogVariances],
-    *,
-    keys: np.ndarray,
-    first_draw: int,
-    draws: int,
+    distribution: str, legs: Sequence[LogVariances], realisation: Realisation
 ) -> np.ndarray:
-    """Random factors of unit mean on the echo's power, (n, draws).
+    """Random factors of unit mean on the echo's power, (n,).
 
     Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies, turned into factors
     by the inverse of their distribution.
@@ -190,104 +66,98 @@ def factors(
         ``log_normal`` or ``gamma_gamma``.
     legs : sequence of LogVariances
         Those of one to two ways, (n,) each or scalar; they are independent.
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw, draws : int
-        Number of the first draw, and how many.
+    realisation : Realisation
+        Which draws.
     """
-    uniforms = np.empty((len(keys), draws, 4))
-    _fill(keys, first_draw, uniforms)
-    total = np.ones(uniforms.shape[:2])
-    for i, variance in enumerate(_parts(legs, len(keys))):
-        total *= _inverse(distribution, uniforms[..., i], variance[:, None])
+    uniforms = np.empty((realisation.draw.size, 4))
+    _fill(realisation.keys, realisation.draw, uniforms)
+    total = np.ones(realisation.draw.size)
+    for i, variance in enumerate(_parts(legs, total.size)):
+        total *= _inverse(distribution, uniforms[:, i], variance)
     return total
 
 
-def bound(distribution: str, legs: Sequence[LogVariances], *, chance: float = 1e-6) -> Change:
-    """Interval that a bin's magnitude leaves with no more than a chance, (n,).
-
-    Where f, the probability of detection, rises with the magnitude, its mean over the factors is
-    within f at the ends of the interval, but for the chance: the mean changes by no more than
-    ``pd_change`` of this and ``chance`` on top.
-
-    Parameters
-    ----------
-    distribution, legs
-        As of :func:`factors`.
-    chance : float
-        0 < . < 1, for both sides together.
-    """
-    low, high = _interval(distribution, legs, np.array(chance / 2))
-    return Change(signal=(np.sqrt(low), np.sqrt(high)))
-
-
 def mean_pd_bound(
-    distribution: str,
-    legs: Sequence[LogVariances],
-    *,
-    amplitudes: Sequence[ArrayLike],
-    threshold: ArrayLike,
+    distribution: str, legs: Sequence[LogVariances], *, amplitude: Span, threshold: Span
 ) -> np.ndarray:
-    """Bound on how far the mean probability of detection lies from that of the mean echo, (n,).
+    """Bound on how far means of probabilities of detection lie from those of the mean echo, (k, n).
 
-    f(I) is the product over segments of Q_1(a sqrt(I), b), and E I = 1. Three bounds hold, and
-    the least is taken:
+    Their sum bounds that of the product of segments, which twinkle alike. With L half the
+    logarithm of the factor I, E I = 1, and h the probability over the logarithm of the amplitude,
+    the lesser of two bounds is taken:
 
-    - f is smooth and the factor's mean is 1, so |E f(I) - f(1)| <= sup|f''| Var(I) / 2. With
-      s = a^2 I / 2 and y = b^2 / 2, Q_1 is the mean over k ~ Poisson(s) of P(Poisson(y) <= k),
-      each derivative by s a difference in k: with p the law of Poisson(y), 0 <= dQ_1/ds <=
-      max_{j>=1} p(j) and |d^2Q_1/ds^2| <= max_{j>=1} |p(j+1) - p(j)|.
-    - f rises, so the mean falls by at most f(1) - (1 - e) f(q) with P(I < q) <= e, for any e;
-    - and rises by at most (1 - e) f(q') + e - f(1) with P(I > q') <= e.
+    - |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2, whatever the amplitude; in a
+      product the suprema of two slopes, times E L^2, come on top;
+    - h rises, so the mean falls by at most h - (1 - e) h(q) with P(I < q) <= e, for any e, and
+      rises by at most (1 - e) h(q') + e - h with P(I > q') <= e; both may happen in a product.
 
     Parameters
     ----------
     distribution, legs
-        As of :func:`factors`.
-    amplitudes : sequence of array_like
+        As of :func:`factors`, (n,).
+    amplitude : Span
         Magnitude of the detecting bin without scintillation over the noise's standard deviation
-        in a quadrature, >= 0, for each segment that must detect: one for its own probability, up
-        and down for the shot's.
-    threshold : array_like
-        Threshold over the same deviation, >= 0.
+        in a quadrature, >= 0, (k, n) by segment.
+    threshold : Span
+        Threshold over the same deviation, >= 0, (n,).
     """
-    a, b = [np.asarray(v, float) for v in amplitudes], np.asarray(threshold, float)
-    slope, bend = _steepest(b * b / 2)
-    gains = [v * v / 2 for v in a]
-    squares = sum(gain * gain for gain in gains)
-    curvature = bend * squares + slope**2 * (sum(gains) ** 2 - squares)
-    smooth = 0.5 * curvature * index(legs)
+    mean, square = _moments(distribution, legs)
+    slope, bend = steepest(np.asarray(threshold.high))
+    smooth = slope * mean + 0.5 * (bend + slope**2) * square
     low, high = _interval(distribution, legs, _CHANCES)
+    a, b = (
+        Span(np.minimum(v.low, _HUGE)[..., None], np.minimum(v.high, _HUGE)[..., None])
+        for v in (amplitude, threshold)
+    )
+    least, most = marcum_q1(a.low, b.high).q, marcum_q1(a.high, b.low).q
+    fall = most - (1 - _CHANCES) * marcum_q1(a.low * np.sqrt(low), b.high).q
+    rise = (1 - _CHANCES) * marcum_q1(a.high * np.sqrt(high), b.low).q + _CHANCES - least
+    apart = np.maximum(fall.min(axis=-1), 0.0) + np.maximum(rise.min(axis=-1), 0.0)
+    return np.minimum(smooth, apart)
 
-    def pd(factor: np.ndarray | float) -> np.ndarray:
-        root = np.sqrt(factor)
-        chances = [marcum_q1(v[..., None] * root, b[..., None]).q for v in a]
-        return np.asarray(np.prod(np.broadcast_arrays(*chances), axis=0))
 
-    without = pd(1.0)
-    fall = (without - (1 - _CHANCES) * pd(low)).min(axis=-1)
-    rise = ((1 - _CHANCES) * pd(high) + _CHANCES - without).min(axis=-1)
-    return np.minimum(smooth, np.maximum(np.maximum(fall, rise), 0.0))
+def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarray, np.ndarray]:
+    """|E L| and E L^2, or more, of half the logarithm of the whole factor.
 
-
-def _steepest(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Largest p(j) and largest |p(j+1) - p(j)| over whole j >= 1, p(j) = exp(-y) y^j / j!.
-
-    p is largest at the whole part of y, and its difference extreme where the second one changes
-    sign, at j = y - 3/2 +- sqrt(y + 1/4).
+    A gamma law of shape 1/s has ln I of mean above -(s/2 + s^2/12) and a variance below
+    s + s^2/2 + s^3/6, of the digamma function's and its derivative's enveloping series.
     """
-    largest = _poisson(np.maximum(np.floor(y), 1.0), y)
-    turn = np.sqrt(y + 0.25)
-    steepest = np.zeros(np.shape(y))
-    for place in (y - 1.5 - turn, y - 1.5 + turn):
-        for shift in (-1, 0, 1, 2):
-            j = np.maximum(np.floor(place) + shift, 1.0)
-            steepest = np.maximum(steepest, _poisson(j, y) * np.abs(y / (j + 1) - 1))
-    return largest, steepest
+    variances = [np.asarray(v, float) for leg in legs for v in leg]
+    if distribution == "log_normal":
+        spread = sum(variances)
+        mean = spread / 2
+    else:
+        shapes = [np.expm1(v) for v in variances]
+        mean = sum(s / 2 + s**2 / 12 for s in shapes)
+        spread = sum(s + s**2 / 2 + s**3 / 6 for s in shapes)
+    return np.asarray(mean / 2), np.asarray((mean**2 + spread) / 4)
 
 
-def _poisson(j: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.asarray(np.exp(special.xlogy(j, y) - y - special.gammaln(j + 1)))
+def steepest(threshold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Largest |h'| and |h''| of h(x) = Q_1(e^x, b) over all x, for thresholds up to b.
+
+    h' = g = z I_1(z) e^{-(a^2 + b^2)/2}, z = a b, and h'' = g (z I_0(z) / I_1(z) - a^2).
+    """
+    place, slopes, bends = _steepest_table()
+    b = np.asarray(threshold, float)
+    slope, bend = (np.interp(b, place, values) for values in (slopes, bends))
+    return slope * (1 + b), bend * (1 + b * b)
+
+
+@lru_cache(maxsize=1)
+def _steepest_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Thresholds, and the suprema over 1 + b and 1 + b^2, with 2 % for what lies between."""
+    b = np.linspace(0.0, 40.0, 161)[:, None]
+    a = np.maximum(b + np.linspace(-8.0, 8.0, 801), 1e-3)
+    z = np.maximum(a * b, 1e-12)
+    first, zeroth = special.ive(1, z), special.ive(0, z)
+    slope = z * first * np.exp(-((a - b) ** 2) / 2)
+    bend = np.abs(slope * (z * zeroth / first - a * a))
+    found = [
+        1.02 * np.maximum.accumulate(v.max(axis=1)) / (1 + b[:, 0] ** power)
+        for power, v in ((1, slope), (2, bend))
+    ]
+    return b[:, 0], found[0], found[1]
 
 
 def _interval(
@@ -341,10 +211,102 @@ def _inverse(
 
 
 @njit(cache=True)
-def _fill(keys, first_draw, out):
-    """The first four uniforms of the stream for points and draws, out (n, draws, 4)."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = philox.uniform4(
-                keys[i, 0], keys[i, 1], first_draw + j, philox.STREAM_SCINTILLATION, 0
-            )
+def _fill(keys, draw, out):
+    """The first four uniforms of the stream for each point's draw, out (n, 4)."""
+    for i in range(draw.size):
+        out[i] = philox.uniform4(keys[i, 0], keys[i, 1], draw[i], philox.STREAM_SCINTILLATION, 0)
+
+
+_TURBULENCE, _CONSTANT = "atmosphere.turbulence", "atmosphere.structure_constant"
+_LAW = "atmosphere.scintillation_law"
+
+
+def turbulence_of(p: Mapping[str, np.ndarray]) -> Turbulence | None:
+    """Turbulence over height for points of one category; None in still air."""
+    name = str(p[_TURBULENCE])
+    if name == "uniform":
+        return Turbulence(uniform=float(p[_CONSTANT]))
+    return HUFNAGEL_VALLEY if name == "hufnagel_valley" else None
+
+
+def bound(block: "Block") -> Mean | None:
+    """What leaving twinkling out can change of mean probabilities."""
+    numbers = {_CONSTANT: np.ravel(block[_CONSTANT].low)[0]}
+    air = turbulence_of(numbers | {_TURBULENCE: block.word(_TURBULENCE)})
+    if air is None:
+        return None
+    legs = largest_both_ways(
+        air,
+        wavelength=block["instrument.laser.wavelength"],
+        path=path_of(block),
+        aperture=block["instrument.telescope.aperture"],
+        beam_divergence=block["instrument.laser.beam_divergence"],
+    )
+    law = block.word(_LAW)
+
+    def change(amplitude: Span, threshold: Span) -> np.ndarray:
+        return mean_pd_bound(law, legs, amplitude=amplitude, threshold=threshold)
+
+    return Mean(change)
+
+
+def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
+    """An echo that twinkles, alike in all segments of a shot."""
+    p = scene.parameters
+    air = turbulence_of(p)
+    if air is None:
+        return shots
+    lidar, target = path_heights(p, shots.range)
+    legs = both_ways(
+        air,
+        wavelength=p["instrument.laser.wavelength"],
+        range=shots.range,
+        lidar_height=lidar,
+        target_height=target,
+        aperture=p["instrument.telescope.aperture"],
+        beam_divergence=p["instrument.laser.beam_divergence"],
+    )
+    power = factors(str(p[_LAW]), legs, realisation)
+    beat = power if shots.architecture == "direct" else np.sqrt(power)
+    sources = shots.noise_sources
+    if "signal_shot" in sources:
+        sources = sources | {"signal_shot": sources["signal_shot"] * power}
+    return replace(
+        shots,
+        echo_scale=shots.echo_scale * power,
+        beat_scale=shots.beat_scale * beat,
+        noise_sources=sources,
+        pedestal=shots.pedestal * beat**2,
+    )
+
+
+EFFECT = Effect(
+    name="scintillation",
+    about="an echo that twinkles in turbulent air",
+    stage="draws",
+    bound=bound,
+    draw=draw,
+    parameters=(
+        Parameter(
+            path=_TURBULENCE,
+            about="Turbulence over height: none, even, or Hufnagel and Valley's 5/7 model",
+            default="none",
+            options=("none", "uniform", "hufnagel_valley"),
+        ),
+        Parameter(
+            path=_CONSTANT,
+            about="Structure constant of the refractive index of even turbulence",
+            si_unit="m^(-2/3)",
+            default=1e-14,
+            example="1e-14 m^(-2/3)",
+            at_least="0 m^(-2/3)",
+            category=True,
+        ),
+        Parameter(
+            path=_LAW,
+            about="Distribution of the irradiance",
+            default="gamma_gamma",
+            options=DISTRIBUTIONS,
+        ),
+    ),
+)

@@ -5,64 +5,63 @@ beamlets beside the axis's surface send their power back from the axis's own ran
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.line_spread import (
     NO_SPREAD,
-    Line,
     Moments,
     image_factor,
     power_range,
 )
 from sweep.model.preparation import Shots
 
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
 
-def bound(
-    line: Line, *, share: ArrayLike, apart: ArrayLike, spread: Moments, beamlets: int
-) -> Change:
-    """What the other surfaces' ranges can change in the largest bin of a segment, as powers.
 
-    With a power share f beside the axis's surface, whose own lines put a in their largest bin:
-    with the effect that bin holds a at the least, and no bin more than a + f; without it the
-    largest holds a at the least, and a and f's line on the axis at the most.
+def bound(block: "Block") -> Change | None:
+    """What the other surfaces' ranges can change in the largest bin.
 
-    Parameters
-    ----------
-    line : Line
-        Of the axis.
-    share : array_like
-        f, 0..1, of the echo power of the footprint.
-    apart : array_like
-        Largest distance of other surfaces' lines from the axis's [bins].
-    spread : Moments
-        Of the offsets on the axis's surface [bins].
-    beamlets : int
-        Their number.
+    As powers, with a share f beside the axis's surface, whose own lines put a in their largest
+    bin: with the effect that bin holds a at the least, and no bin more than a + f; without it the
+    largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that
+    add nothing is known but that no bin holds more than all in phase.
     """
-    f, apart = np.clip(np.asarray(share, float), 0.0, 1.0), np.asarray(apart, float)
-    own = (1 - f) * power_range(line, spread, beamlets)[0]
-    _, on_axis = power_range(line, NO_SPREAD, beamlets)
-    elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer**-2.0)
+    if not np.any(block.beside_share.high > 0):
+        return None
+    f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
+    apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme
+    spread = block.of_ranges(block.geometry.own_ranges)
+    own = (1 - f) * power_range(line, spread, block.number)[0]
+    _, on_axis = power_range(line, NO_SPREAD, block.number)
+    elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer_least**-2.0)
     elsewhere = elsewhere * image_factor(line, apart)
     with np.errstate(divide="ignore", invalid="ignore"):
         less, more = own / (own + f * on_axis), 1 + f * elsewhere / own
-    there = (f > 0) & (apart > 0)
-    return Change(signal=(np.sqrt(np.where(there, less, 1.0)), np.sqrt(np.where(there, more, 1.0))))
+    there = (f > 0) & (np.asarray(apart) > 0)
+    low, high = np.sqrt(np.where(there, less, 1.0)), np.sqrt(np.where(there, more, 1.0))
+    if block.adds_amplitudes:
+        all_in_phase = 2 / (line.transfer_least * line.lobe.least(np.asarray(0.5)))
+        low, high = np.where(f > 0, 0.0, low), np.where(f > 0, np.maximum(high, all_in_phase), high)
+    return Change(signal=(low, high))
 
 
-def without(shots: Shots, others: np.ndarray) -> Shots:
-    """The same points with the beamlets on other surfaces at the axis's range and velocity.
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Beamlets on other surfaces than the axis's at ranges of their own."""
+    if scene.ground.beside is None:
+        return shots
+    return replace(shots, offset=scene.ground.beamlets.offset)
 
-    Parameters
-    ----------
-    others : (rows, beamlets) bool ndarray
-        Those that do not lie on the axis's surface.
-    """
-    return replace(
-        shots,
-        offset=np.where(others, 0.0, shots.offset),
-        doppler=np.where(others, 0.0, shots.doppler),
-    )
+
+EFFECT = Effect(
+    name="several_returns",
+    about="more than one surface in a footprint",
+    stage="lines",
+    bound=bound,
+    act=act,
+    within="footprint",
+)

@@ -16,13 +16,16 @@ that one g_b serves all three: amplitudes at frequencies df apart have the corre
 exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and heights of 10 um (the roughness matters
 up to lambda or so, beyond which kappa is 0). Depth beyond roughness lies in the beamlets' ranges,
 and what it does between the segments in their lines' phases. What moves across the beam turns the
-beamlets against each other from one segment to the next, see :func:`turns`.
+beamlets against each other from one segment to the next, see :func:`turns`; coherent footprints
+with a share kappa left are taken not to, which makes their segments more alike than they are.
 
 It acts on the lines' amplitudes alone, before their spectrum; the mean echo, and so its shot
 noise, stays.
 """
 
 import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -31,10 +34,18 @@ from numpy.typing import ArrayLike
 from sweep.model import philox
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
+from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene
+from sweep.model.effects.line_spread import image_factor
+from sweep.model.effects.span import Operand, Span, monotone
 from sweep.model.marcum import marcum_q1
+from sweep.model.preparation import Shots
 
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
+
+_ROUGHNESS = "target.roughness"
 RARE = 1e-6
-"""Chance of a draw in which the amplitude changes by more than :func:`bound` says."""
+"""Chance of a draw in which the amplitude changes by more than :func:`drawn_change` says."""
 
 
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -62,96 +73,70 @@ def segment_coherence(*, roughness: ArrayLike, bandwidth: ArrayLike) -> np.ndarr
     return np.asarray(np.exp(-0.5 * (phase * np.asarray(roughness, float)) ** 2))
 
 
-def amplitudes(
-    *,
-    keys: np.ndarray,
-    first_draw: int,
-    draws: int,
-    beamlets: int,
-    coherent_share: ArrayLike = 0.0,
-    random_phases: bool = False,
-) -> np.ndarray:
-    """Factors g_b on the beamlets' amplitudes, (n, draws, beamlets) complex.
+def factors(
+    realisation: Realisation, *, beamlets: int, coherent_share: np.ndarray, random_phases: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Factors g_b on the beamlets' amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
 
     Parameters
     ----------
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw, draws, beamlets : int
-        A factor depends on key, number of the draw and number of the beamlet, on nothing else.
-    coherent_share : array_like
-        kappa of each point, (n,) or a scalar, 0..1.
+    realisation : Realisation
+        A factor depends on key, number of the draw and number of the beamlet, on nothing else:
+        pair b of ``STREAM_SPECKLE`` is z_b, number b of ``STREAM_FOOTPRINT_PHASE`` the phase of
+        u_b.
+    beamlets : int
+    coherent_share : (n,) ndarray
+        kappa, 0..1.
     random_phases : bool
         Whether the coherent share has an independent uniform phase in each beamlet.
     """
-    keys = np.asarray(keys, np.uint64)
-    shares = np.broadcast_to(np.asarray(coherent_share, float), len(keys))
-    factors = np.empty((len(keys), draws, beamlets), complex)
-    for key, share, values in zip(keys, shares, factors, strict=True):
-        steady, diffuse = parts(key, first_draw, draws, beamlets, float(share), random_phases)
-        np.add(steady, diffuse, out=values)
-    return factors
-
-
-def parts(
-    key: np.ndarray, first_draw: int, draws: int, beamlets: int, share: float, random: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coherent and diffuse part of one point's factors: (draws or 1, beamlets), (draws, beamlets).
-
-    Streams: ``STREAM_SPECKLE`` pair b of a draw is z_b, ``STREAM_FOOTPRINT_PHASE`` number b the
-    phase of u_b.
-    """
-    steady = np.full((draws if random and share > 0 else 1, beamlets), math.sqrt(share), complex)
-    diffuse = np.empty((draws, beamlets), complex)
-    if steady.shape[0] == draws and random and share > 0:
-        _random_phases(key[0], key[1], first_draw, philox.STREAM_FOOTPRINT_PHASE, steady)
-    scale = math.sqrt((1 - share) / 2)
-    _diffuse(key[0], key[1], first_draw, philox.STREAM_SPECKLE, scale, diffuse)
-    return steady, diffuse
+    share = np.asarray(coherent_share, float) + np.zeros(realisation.draw.size)
+    magnitude, cycles = np.empty((2, share.size, beamlets))
+    streams = philox.STREAM_SPECKLE, philox.STREAM_FOOTPRINT_PHASE
+    _fill(realisation.keys, realisation.draw, streams, share, random_phases, magnitude, cycles)
+    return magnitude, cycles
 
 
 @njit(cache=True, nogil=True)
-def _diffuse(key0, key1, first_draw, stream, scale, out):
-    """Circular complex normal numbers of standard deviation ``scale`` in each part."""
-    for d in range(out.shape[0]):
-        for b in range(out.shape[1]):
-            re, im = philox.normal_pair(key0, key1, first_draw + d, stream, b)
-            out[d, b] = complex(scale * re, scale * im)
+def _fill(keys, draw, streams, share, random_phases, magnitude, cycles):
+    """Diffuse part of every factor as Box and Muller have it, and the steady part on top."""
+    for i in range(draw.size):
+        a, b = keys[i]
+        steady, diffuse = math.sqrt(share[i]), math.sqrt(1.0 - share[i])
+        for k in range(magnitude.shape[1]):
+            if k % 2 == 0:
+                u0, u1, u2, u3 = philox.uniform4(a, b, draw[i], streams[0], k // 2)
+            else:
+                u0, u1 = u2, u3
+            radius, turn = diffuse * math.sqrt(-math.log(u0)), u1
+            if steady > 0.0:
+                angle = 0.0
+                if random_phases:
+                    angle = 2.0 * math.pi * philox.uniform(a, b, draw[i], streams[1], k)
+                re = radius * math.cos(2.0 * math.pi * turn) + steady * math.cos(angle)
+                im = radius * math.sin(2.0 * math.pi * turn) + steady * math.sin(angle)
+                radius, turn = math.hypot(re, im), math.atan2(im, re) / (2.0 * math.pi)
+            magnitude[i, k], cycles[i, k] = radius, turn
 
 
-@njit(cache=True, nogil=True)
-def _random_phases(key0, key1, first_draw, stream, out):
-    """Turns each number by a uniform phase."""
-    for d in range(out.shape[0]):
-        for b in range(out.shape[1]):
-            angle = 2.0 * math.pi * philox.uniform(key0, key1, first_draw + d, stream, b)
-            out[d, b] *= complex(math.cos(angle), math.sin(angle))
+def turns(*, carrier: ArrayLike, doppler: np.ndarray, interval: np.ndarray) -> np.ndarray:
+    """Phases [cycles] by which beamlets turn against the beam's centre within an interval.
 
-
-def turns(*, carrier: ArrayLike, doppler: np.ndarray, interval: ArrayLike) -> np.ndarray:
-    """Phases [cycles] by which beamlets turn against the beam's centre from segment to segment.
-
-    A segment begins ``interval`` [s] after the one before it. With the instrument moving across
-    the beam, the Doppler shifts differ over the footprint, and the pattern that their speckles
-    make has changed by then. All segments begin at the same range: what all beamlets share is
-    left out.
+    With the instrument moving across the beam, the Doppler shifts differ over the footprint, and
+    the pattern that their speckles make has changed by the time that another segment begins. All
+    segments begin at the same range: what all beamlets share is left out.
 
     Parameters
     ----------
     carrier : array_like
-        Optical frequency [Hz].
-    doppler : (beamlets,) ndarray
+        Optical frequency [Hz], (n,) or a scalar.
+    doppler : (n, beamlets) ndarray
         beta_b - beta_0, beta = 2 v_r / c.
-    interval : array_like
-        [s]
-
-    Returns
-    -------
-    (3, beamlets) ndarray
-        For the up, the Doppler and the down segment; the first is 0.
+    interval : (n,) ndarray
+        From the start of the first segment [s].
     """
-    step = np.asarray(carrier, float) * np.asarray(doppler, float) * np.asarray(interval, float)
-    return np.asarray(np.arange(3.0)[:, None] * step)
+    cycles = np.asarray(carrier, float) * np.asarray(interval, float)
+    return np.asarray(cycles[:, None] * doppler)
 
 
 def fixed_bin_detection(
@@ -213,7 +198,9 @@ def joint_detection(
     )
 
 
-def bound(*, coherent_share: ArrayLike, diffuse_over_found: ArrayLike, bins: ArrayLike) -> Change:
+def drawn_change(
+    *, coherent_share: Operand, diffuse_over_found: ArrayLike, bins: ArrayLike
+) -> Change:
     """What speckle can change in the magnitude of the detecting bin, in all draws but few.
 
     A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa) P.
@@ -225,7 +212,7 @@ def bound(*, coherent_share: ArrayLike, diffuse_over_found: ArrayLike, bins: Arr
 
     Parameters
     ----------
-    coherent_share : array_like
+    coherent_share : Span or array_like
         kappa, 0..1; 0 for incoherent footprints of several beamlets, whose coherent share is one
         of random phases.
     diffuse_over_found : array_like
@@ -235,9 +222,117 @@ def bound(*, coherent_share: ArrayLike, diffuse_over_found: ArrayLike, bins: Arr
     bins : array_like
         Bins among which the largest may be: those of the footprint and of the window's main lobe.
     """
-    kappa = np.asarray(coherent_share, float)
+    kappa = Span.of(coherent_share)
+    reach = _reach(bins) * np.sqrt(np.asarray(diffuse_over_found, float))
+    least = np.sqrt(kappa.low) - reach * np.sqrt(1 - np.asarray(kappa.low))
+    # sqrt(kappa) + reach sqrt(1 - kappa) rises up to here and falls from there
+    highest = np.clip(1 / (1 + reach**2), kappa.low, kappa.high)
+    most = np.sqrt(highest) + reach * np.sqrt(1 - highest)
+    return Change(signal=(np.maximum(least, 0.0), most))
+
+
+def bound(block: "Block") -> Change | None:
+    """What leaving speckle out can change in all draws but few, (3, tiles)."""
+    if not block.has(_ROUGHNESS):
+        return None
+    roughness, wavelength = block[_ROUGHNESS], block["instrument.laser.wavelength"]
+    kappa = monotone(
+        coherent_share, falling=("roughness",), roughness=roughness, wavelength=wavelength
+    )
+    several = block.number > 1
+    if several and not block.adds_amplitudes:
+        kappa = Span.of(0.0)
+    lines, extreme = block.lines, np.asarray(block.spread.extreme)
+    worst = lines.lobe.least(np.asarray(0.5))
+    bins = 2 * extreme + 2 * lines.lobe.margin + 1
+    image = lines.lobe.tail(2 * (lines.edge - extreme) - 1) / worst
+    low, high = drawn_change(coherent_share=kappa, diffuse_over_found=1.0, bins=bins).signal
+    near = image_factor(lines, extreme) > 1.5
+    low = np.where(near, 0.0, np.maximum(low * (1 - image), 0.0))
+    high = np.where(near, np.sqrt(2) * high, high * (1 + image))
+    if not block.adds_amplitudes:
+        return Change(signal=(low, high))
+    # What may have cancelled is no measure of what is scattered: the sum of powers is.
+    cancelling = near | several
+    steady = np.sqrt(np.asarray(kappa.low))
+    scattered = np.sqrt(2 * (1 - np.asarray(kappa.low))) * _reach(bins) / worst
+    return Change(
+        signal=(np.where(cancelling, steady, low), np.where(cancelling, 1.0, high)),
+        added=np.where(cancelling, scattered, 0.0),
+    )
+
+
+def _reach(bins: ArrayLike) -> np.ndarray:
+    """What the largest of some bins' diffuse parts exceeds, over its rms, in a share RARE."""
     square = np.log(np.asarray(bins, float) / RARE)
-    t = np.sqrt(square + 0.5 * np.log(2 * math.pi * (square + 3)))
-    reach = t * np.sqrt((1 - kappa) * np.asarray(diffuse_over_found, float))
-    steady = np.sqrt(kappa)
-    return Change(signal=(np.maximum(steady - reach, 0.0), steady + reach))
+    return np.asarray(np.sqrt(square + 0.5 * np.log(2 * math.pi * (square + 3))))
+
+
+_SMOOTH = 1e-6
+"""Share kappa above which a coherent footprint is not turned between segments."""
+_SMALLEST = 1e-300
+
+
+def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
+    """A footprint of its own for each point, its beamlets' amplitudes speckled.
+
+    Raises
+    ------
+    ValueError
+        Of direct detection. It adds up the intensities of all speckles in the aperture, in each of
+        which beamlets interfere: that is no factor on each beamlet's own echo.
+    """
+    if shots.architecture == "direct":
+        raise ValueError(
+            "speckle is simulated for homodyne and heterodyne receivers: what direct detection "
+            "sees depends on how many speckles its aperture averages, of which nothing is known"
+        )
+    share = coherent_share(
+        roughness=scene.parameters[_ROUGHNESS],
+        wavelength=scene.parameters["instrument.laser.wavelength"],
+    )
+    magnitude, cycles = factors(
+        realisation,
+        beamlets=shots.amplitude.shape[1],
+        coherent_share=share,
+        random_phases=shots.incoherent and shots.amplitude.shape[1] > 1,
+    )
+    offset, doppler, steady = (v[shots.row] for v in (shots.offset, shots.doppler, shots.amplitude))
+    amplitude = steady * magnitude
+    # The steady share of a smooth shape is at the start of each segment what it is in the others.
+    turning = shots.incoherent | (share < _SMOOTH)
+    interval = np.where(turning, shots.duration, 0.0) + np.zeros(shots.size)
+    phase = np.empty((3, *cycles.shape))
+    for s, carrier in enumerate(shots.carriers):
+        np.add(cycles, turns(carrier=carrier, doppler=doppler, interval=s * interval), out=phase[s])
+    brighter = (amplitude**2).sum(axis=1) / np.maximum((steady**2).sum(axis=1), _SMALLEST)
+    return replace(
+        shots,
+        row=np.arange(shots.size),
+        offset=offset,
+        doppler=doppler,
+        amplitude=amplitude,
+        phase=phase,
+        incoherent=False,
+        pedestal=shots.pedestal * brighter,
+    )
+
+
+EFFECT = Effect(
+    name="speckle",
+    about="amplitudes of a rough surface, at random",
+    stage="draws",
+    bound=bound,
+    draw=draw,
+    needs=("footprint", "doppler_spread"),  # by them the segments' speckles differ
+    parameters=(
+        Parameter(
+            path=_ROUGHNESS,
+            about="Standard deviation of the surface's height along the line of sight",
+            si_unit="m",
+            default=0.0,
+            example="10 um",
+            at_least="0 m",
+        ),
+    ),
+)

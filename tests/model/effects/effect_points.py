@@ -1,21 +1,28 @@
-"""Points over the whole reachable range, with what the effects' bounds take, and the measure."""
-
-from dataclasses import replace
+"""Scenes over the whole reachable range, as points and as tiles around them, and the measure."""
 
 import numpy as np
 
-from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import line_spread
-from sweep.model.footprint import beamlets as pattern_of
-from sweep.model.preparation import prepare
+from sweep.model.chain import prepare
+from sweep.model.effects.block import Block
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.span import Span
 from sweep.model.shot import find
 
 SIZES = (2**12, 2**13, 2**14, 2**15, 2**16, 2**17, 2**18)
 WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop", "kaiser(8.6)")
+CLOSED = WINDOWS[:5]
+
+ACROSS = "target.transverse_velocity"
+WIDENED = {
+    "target.range": 0.3, "target.grazing_angle": 0.1, "instrument.laser.beam_divergence": 0.1,
+    "target.radial_velocity": 0.3, "instrument.laser.power": 0.3, "instrument.processing.tnr": 0.1,
+    ACROSS: 0.3,
+}  # fmt: skip
+"""Parameters that tiles extend over, and how far at the most, relatively."""
 
 
-def drawn(table, number, seed, **fixed):
-    """Random points of one category: (shots, parameters)."""
+def scene(table, number, seed, **fixed):
+    """Random points of one category: parameters by path."""
     rng = np.random.default_rng((71, seed))
     values = {
         "range": 10 ** rng.uniform(0, 4, number),
@@ -31,85 +38,69 @@ def drawn(table, number, seed, **fixed):
         "beamlets": int(rng.choice([3, 7, 19, 61, 109])),
         "duration": float(rng.choice([500e-6, 200e-6])),
     }
+    across = 10 ** rng.uniform(-1, 3, number)
     slanted = rng.random(number) < 0.8
     values["grazing_angle"] = np.where(
         slanted, np.radians(rng.uniform(1, 90, number)), values["grazing_angle"]
     )
-    values |= fixed
-    parameters = table(**values)
-    ((_, shots),) = prepare(parameters)
-    return shots, values
+    across = fixed.pop("across", across)
+    return DEFAULTS | table(**values | fixed) | {ACROSS: across}
 
 
-def own_rows(shots):
-    """The same points with a row of the geometry each."""
-    return replace(
-        shots,
-        row=np.arange(shots.range.size),
-        **{name: getattr(shots, name)[shots.row] for name in ("offset", "doppler", "amplitude")},
+def small(seed):
+    """Sizes that many spectra can be had of."""
+    return 2 ** int(np.random.default_rng(seed).integers(12, 16))
+
+
+def point_block(parameters):
+    """Every point a tile of its own."""
+    return Block.of_plane(
+        {
+            path: str(value) if np.asarray(value).dtype.kind in "UO" else Span.of(value)
+            for path, value in (DEFAULTS | dict(parameters)).items()
+        }
     )
 
 
-def pattern(values):
-    return "hexagonal" if values["phases"] == "incoherent" else "sunflower"
+def tile_block(parameters, seed):
+    """Tiles that hold the points, each as wide as chance has it, and points from within."""
+    rng = np.random.default_rng((72, seed))
+    spans, inner = {}, dict(parameters)
+    number = max(np.size(value) for value in parameters.values())
+    wide = 10 ** rng.uniform(-7, 0, number)
+    for path, value in (DEFAULTS | dict(parameters)).items():
+        if path not in WIDENED:
+            words = np.asarray(value).dtype.kind in "UO"
+            spans[path] = str(value) if words else Span.of(value)
+            continue
+        middle = np.broadcast_to(np.asarray(value, float), (number,))
+        reach = abs(middle) * WIDENED[path] * wide * rng.choice([0, 1], number, p=[0.3, 0.7])
+        below, above = rng.random((2, number)) * reach
+        low, high = middle - below, middle + above
+        if path == "target.grazing_angle":
+            high = np.minimum(high, np.pi / 2)
+            low = np.minimum(low, high)
+        spans[path] = Span(low, high)
+        place = rng.random(number)
+        place = np.where(rng.random(number) < 0.3, np.rint(place), place)
+        inner[path] = np.clip(low + place * (high - low), low, high)
+    return Block.of_plane(spans), inner
 
 
-def moving_across(shots, values, across, along=0.0):
-    """The same points with the beamlets' differences of velocity, from their directions."""
-    (x, y), _ = pattern_of(values["beamlets"], pattern(values))
-    angle = np.random.default_rng(5).uniform(0, 2 * np.pi, shots.range.size)[:, None]
-    sigma = np.broadcast_to(values["beam_divergence"], shots.range.shape)[:, None] / 4
-    size = np.sqrt(1 + (x * x + y * y) * sigma**2)
-    sideways = (x * np.cos(angle) + y * np.sin(angle)) * sigma / size
-    velocity = np.asarray(across)[:, None] * sideways + np.asarray(along)[..., None] * (
-        1 / size - 1
-    )
-    return replace(own_rows(shots), doppler=2 * velocity / SPEED_OF_LIGHT)
+def shots_of(parameters, effects):
+    """Shots of points of one category."""
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
 
 
-def range_moments(shots, values, segment):
-    """Bins by which a plane's ranges put lines off the axis's."""
-    plane = line_spread.plane_range_moments(
-        grazing_angle=values["grazing_angle"],
-        beam_divergence=values["beam_divergence"],
-        number=values["beamlets"],
-        pattern=pattern(values),
-    )
-    if segment == 1:
-        return line_spread.NO_SPREAD
-    return plane.scaled(
-        line_spread.range_to_bins(
-            range=shots.range,
-            beta=shots.beta,
-            chirp_rate=shots.chirp_rate,
-            bin_width=shots.sample_rate / shots.fft_size,
-        )
-    )
+def found(parameters, effects):
+    """What the spectra of the points hold, :func:`sweep.model.shot.find`."""
+    return find(shots_of(parameters, effects))
 
 
-def velocity_moments(shots, values, segment, across, along=0.0):
-    """Bins by which a velocity across the beam puts lines off the axis's."""
-    plane = line_spread.plane_velocity_moments(
-        across=across,
-        along=along,
-        grazing_angle=values["grazing_angle"],
-        beam_divergence=values["beam_divergence"],
-        number=values["beamlets"],
-        pattern=pattern(values),
-    )
-    return plane.scaled(
-        line_spread.velocity_to_bins(
-            range=shots.range,
-            carrier=shots.carriers[segment],
-            chirp_rate=shots.chirp_rate,
-            bin_width=shots.sample_rate / shots.fft_size,
-        )
-    )
-
-
-def magnitudes(shots):
+def magnitudes(parameters, effects):
     """Largest bin's |X| of each segment, (3, n)."""
-    return find(shots)[:, 2]
+    return found(parameters, effects)[:, 2]
 
 
 ROUNDING = 1e-9
@@ -117,9 +108,8 @@ ROUNDING = 1e-9
 
 
 def held(change, with_effect, without):
-    """Whether the true factor lies within the interval, (n,), and interval / change in logs."""
-    low, high = np.broadcast_arrays(*change.signal)
-    low, high = np.broadcast_to(low, without.shape), np.broadcast_to(high, without.shape)
+    """Whether the true factor lies within the interval, and interval / change in logs."""
+    low, high = (np.broadcast_to(end, without.shape) for end in change.signal)
     factor = with_effect / without
     inside = (factor >= low * (1 - ROUNDING)) & (factor <= high * (1 + ROUNDING))
     with np.errstate(divide="ignore"):

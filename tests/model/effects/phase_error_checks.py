@@ -1,7 +1,10 @@
 """What tests of phase errors share: spectra of lines, and the peak with and without an error."""
 
 import numpy as np
+from effect_points import ROUNDING, magnitudes, point_block, small, tile_block
+from effect_points import scene as scene_of
 
+from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.window import samples, transform
 
 WINDOWS = (
@@ -39,3 +42,32 @@ def check_bound(change, ratio):
     assert (ratio <= high * (1 + 1e-12)).all()
     true = np.abs(np.log(ratio))
     return np.log(high[true > 0] / low[true > 0]) / true[true > 0]
+
+
+def check_blocks(name, table, further, *, others=(), seeds=6, number=40, **fixed):
+    """A bound holds at points and over tiles; returns interval over change of points, in logs.
+
+    ``further`` makes the effect's parameters from a random generator and a number of points.
+    """
+    (effect,) = (effect for effect in EFFECTS if effect.name == name)
+    base, idle = (*CORE, *others), []
+    for seed in range(seeds):
+        rng = np.random.default_rng((73, seed))
+        slow = rng.choice([-1, 1], number) * 10 ** rng.uniform(-2, 2.5, number)
+        values = {"fft_size": small(seed), "beamlets": 7, "radial_velocity": slow} | fixed
+        parameters = scene_of(table, number, seed, **values) | further(rng, number)
+        for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
+            change = effect.bound(block)
+            shape = (3, number)
+            low, high = (np.broadcast_to(end, shape) for end in change.signal)
+            together = block.echo_ratio.high if block.architecture == "direct" else 1.0
+            in_phase = np.sqrt(2 * block.echo_ratio.high) * block.gain.high * together
+            added = change.added * block.amplitude.high * block.deviation.high * in_phase
+            without, found = (magnitudes(points, names) for names in (base, (*base, name)))
+            assert (low * without * (1 - ROUNDING) - added <= found * (1 + ROUNDING)).all()
+            assert (found * (1 - ROUNDING) <= high * without * (1 + ROUNDING) + added).all()
+            if points is parameters:
+                moved = abs(np.log(found / without))
+                told = (moved > 1e-7) & (low > 0) & (np.broadcast_to(change.added, shape) == 0)
+                idle.append(np.log(high[told] / low[told]) / moved[told])
+    return np.concatenate(idle)

@@ -1,11 +1,15 @@
 """A phase error over the record as a few lines, against the phase itself."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sweep.model.effects.line_splitting import TOLERANCE, split_lines
+from sweep.model.effects.line_splitting import TOLERANCE, _decomposed, split_lines
 
 PLACES = np.random.default_rng(3).uniform(-1, 1, 500)
 
@@ -61,3 +65,49 @@ def test_a_mere_shift_is_one_line_elsewhere():
 def test_a_drift_beyond_all_lines_is_refused():
     with pytest.raises(ValueError, match="2e\\+03 bins wide"):
         split_lines(polynomial([0, 0, 2000 / 8]))
+
+
+def test_no_row_depends_on_the_rows_beside_it():
+    drifts = np.array([8.0, 0.0, 1e-3, 60.0, -3.0, 0.4, 1e-5])
+    together = split_lines(polynomial(*[[0.1, 2.3, d / 8] for d in drifts]))
+    for i, drift in enumerate(drifts):
+        alone = split_lines(polynomial([0.1, 2.3, drift / 8]))
+        lines = alone.number[0]
+        assert lines == together.number[i]
+        for name in ("offset", "weight"):
+            one, other = getattr(alone, name)[0, :lines], getattr(together, name)[i, :lines]
+            assert one.tobytes() == other.tobytes()
+
+
+THREADS = """
+import sys
+import numpy as np
+from sweep.model.effects.line_splitting import split_lines
+
+drift = np.array([1e-3, 0.1, 3.0, 20.0, 70.0, 150.0, 300.0])
+split = split_lines(lambda x: np.outer(drift / 8, x * x))
+open(sys.argv[1], "wb").write(split.weight.tobytes() + split.offset.tobytes())
+"""
+
+
+def test_the_number_of_threads_changes_no_bit(tmp_path):
+    """Products of matrices and decompositions of a library's would not hold that."""
+    for threads in ("1", "2"):
+        few = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), threads)
+        command = [sys.executable, "-c", THREADS, str(tmp_path / threads)]
+        subprocess.run(command, check=True, env=os.environ | few)
+    assert (tmp_path / "1").read_bytes() == (tmp_path / "2").read_bytes()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (9, 4), (40, 40), (130, 48)])
+def test_the_decomposition_is_one_and_its_values_are_lapacks(shape):
+    """Of matrices as of lines closer than a bin: values down to the last digit of the largest."""
+    turns = np.outer(np.linspace(-1, 1, shape[0]), np.arange(shape[1]))
+    matrix = np.cos(0.6 * turns)
+    u, s, v = _decomposed(matrix)
+    assert np.abs((u * s) @ v - matrix).max() < 1e-13 * s.max()
+    np.testing.assert_allclose(v @ v.T, np.eye(s.size), atol=1e-13)
+    large = s > 1e-13 * s.max()
+    np.testing.assert_allclose(u.T[large] @ u[:, large], np.eye(large.sum()), atol=1e-12)
+    expected = np.linalg.svd(matrix, compute_uv=False)
+    np.testing.assert_allclose(np.sort(s)[::-1], expected, atol=1e-14 * s.max())

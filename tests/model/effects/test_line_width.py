@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from effect_points import point_block, scene, shots_of, small, tile_block
+from phase_error_checks import check_blocks
 
 from sweep.model.effects import line_width
+from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.gaussian_line import gaussian_bound
 from sweep.model.window import samples, transform, window
 
 WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
@@ -75,6 +79,12 @@ def test_shifts_of_many_points_are_those_of_each():
     np.testing.assert_allclose(together.weight.sum(axis=1), 1)
     variance = (together.weight * together.offset**2).sum(axis=1)
     np.testing.assert_allclose(variance, np.array([0.0, 9.0, 400.0]) / (8 * np.log(2)), rtol=1e-9)
+    assert (together.weight[0] > 0).sum() == 1  # no width, one shift
+    for i, width in enumerate(fwhm):
+        alone = line_width.gaussian_shifts(fwhm=fwhm[[i]], duration=DURATION)
+        for one, other in zip(alone, together, strict=True):
+            kept = alone.weight[0] > 0, together.weight[i] > 0
+            assert one[0, kept[0]].tobytes() == other[i, kept[1]].tobytes(), width
 
 
 def wiener_records(rng, number, laser_width, delay):
@@ -160,9 +170,9 @@ def test_no_width_is_no_change():
     assert line_width.coherent_share(**laser)[0] == 1
     form = window("hann", LENGTH)
     assert not line_width.pedestal_power(np.array([[0.0, 3.0]]), window=form, **laser).any()
-    change = line_width.lorentzian_bound(**laser, window=form, sample_rate=RATE, cnr=10.0)
+    change = line_width.lorentzian_bound(**laser, sample_rate=RATE, cnr=10.0)
     assert change.signal[0] == 1 and change.noise[1] == 1
-    change = line_width.gaussian_bound(fwhm=np.array([0.0]), duration=DURATION, window=form)
+    change = gaussian_bound(fwhm=np.array([0.0]), duration=DURATION, window=form)
     assert change.signal == (1, 1)
 
 
@@ -192,7 +202,7 @@ def test_the_gaussian_bound_holds_and_is_not_idle(name):
     deviation = bins_fwhm / np.sqrt(8 * np.log(2))
     lag = np.arange(LENGTH) / LENGTH
     true = true_changes(name, np.exp(-2 * (np.pi * np.outer(deviation, lag)) ** 2), places)
-    change = line_width.gaussian_bound(
+    change = gaussian_bound(
         fwhm=bins_fwhm / DURATION, duration=DURATION, window=window(name, LENGTH)
     )
     assert check(change, true) < 30
@@ -204,13 +214,14 @@ def test_the_lorentzian_bound_holds_and_is_not_idle(name):
     laser_width, delay = 10 ** rng.uniform(0, 4.3, 60), 10 ** rng.uniform(-5, -3, 60)
     lags = np.minimum(np.arange(LENGTH) / RATE, delay[:, None])
     correlation = np.exp(-2 * np.pi * laser_width[:, None] * lags)
-    true = true_changes(name, correlation, rng.uniform(-0.5, 0.5, 60))
     form = window(name, LENGTH)
     change = line_width.lorentzian_bound(
-        line_width=laser_width, delay=delay, duration=DURATION, window=form, sample_rate=RATE,
-        cnr=0.3,
-    )  # fmt: skip
-    assert check(change, true) < 30
+        line_width=laser_width, delay=delay, duration=DURATION, sample_rate=RATE, cnr=0.3
+    )
+    pure = np.sqrt(correlation[:, -1])  # what is left at the longest lag
+    one_more = pure * np.exp(-np.pi * laser_width / RATE)  # a sample beyond
+    assert (change.signal[0] <= pure).all() and (change.signal[0] >= one_more * (1 - 1e-12)).all()
+    assert (change.signal[1] == 1).all()
     # No bin of the pedestal, with |C|^2 = a^2 / 4, is above what the bound says of noise.
     y = np.broadcast_to(np.arange(-10.0, 11), (60, 21))
     pedestal = line_width.pedestal_power(
@@ -219,3 +230,33 @@ def test_the_lorentzian_bound_holds_and_is_not_idle(name):
     raised = 1 + 0.3 / 2 * pedestal.max(axis=1) / form.energy
     assert (raised <= change.noise[1]).all()
     assert np.median((change.noise[1] - 1) / (raised - 1)) < 4
+
+
+def broad(rng, n):
+    return {"instrument.laser.line_width": 10 ** rng.uniform(2, 5, n)}
+
+
+@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
+@pytest.mark.parametrize("beamlets", [1, 7])
+def test_blocks_bound_what_a_gaussian_line_makes(table_4_1, phases, beamlets):
+    others = ("range_walk",)
+    idle = check_blocks(
+        "line_width", table_4_1, broad, phases=phases, beamlets=beamlets, others=others,
+        seeds=3, number=20,
+    )  # fmt: skip
+    if phases == "incoherent" or beamlets == 1:
+        assert np.median(idle) < 30
+
+
+def test_blocks_bound_what_a_lorentzian_line_makes(table_4_1):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        parameters = scene(table_4_1, 40, seed, fft_size=small(seed), beamlets=7)
+        parameters |= broad(rng, 40) | {"instrument.laser.line_shape": "lorentzian"}
+        for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
+            change = line_width.bound(block)
+            plain, wide = (shots_of(points, (*CORE, *more)) for more in ((), ("line_width",)))
+            factor = wide.beat_scale / plain.beat_scale
+            assert (change.signal[0] * (1 - 1e-12) <= factor).all() and (factor <= 1).all()
+            louder = 1 + wide.pedestal / wide.noise_variance
+            assert (louder <= change.noise[1]).all()

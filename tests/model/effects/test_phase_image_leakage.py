@@ -2,152 +2,138 @@
 
 import numpy as np
 import pytest
-from effect_points import drawn, held, magnitudes, range_moments
+from effect_points import CLOSED, found, held, magnitudes, point_block, scene, shots_of, tile_block
 
-from sweep.model.effects import footprint_phase, image, leakage, line_spread
+from sweep.model.effects import footprint_phase, image, leakage
 from sweep.model.effects.change import pd_change
 from sweep.model.shot import find
 from sweep.model.spectra import segment_spectrum
 
-CLOSED = ("hamming", "hann", "rectangular", "blackman", "flattop")
+POWERS = ("footprint", "doppler", "image")
 
 
-def phase_bound(shots, values, segment):
-    flat = line_spread.plane_range_moments(
-        grazing_angle=values["grazing_angle"],
-        beam_divergence=values["beam_divergence"],
-        number=values["beamlets"],
-        pattern="sunflower",
-    )
-    phase = footprint_phase.phase_reach(
-        carrier=shots.carriers[segment],
-        bandwidth=shots.bandwidth,
-        range=shots.range,
-        ranges=flat,
-        velocity_bins=line_spread.NO_SPREAD,
-        record_ratio=0.5,
-    )
-    return phase, footprint_phase.bound(
-        line_spread.line_of(shots, segment),
-        phase=phase,
-        gain=footprint_phase.gain(shots),
-        spread=range_moments(shots, values, segment),
-        beamlets=values["beamlets"],
-    )
+def near_edges(seed):
+    """Lines near DC and Nyquist, and elsewhere."""
+    return {"range": 10 ** np.random.default_rng(seed).uniform(-1, 2, 30)} if seed % 2 else {}
 
 
-def test_phases_change_no_more_than_bound(table_4_1):
+@pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
+def test_phases_change_no_more_than_bound(table_4_1, tiles):
     for seed in range(16):
-        small = {} if seed % 2 else {"range": 3.0, "grazing_angle": np.pi / 2}
-        shots, values = drawn(
-            table_4_1, 30, seed, fft_size=2**13, phases="coherent", window=CLOSED[seed % 5], **small
-        )
-        powers = footprint_phase.without(shots)
-        on, off = find(shots), find(powers)
+        close = {} if seed % 2 else {"range": 3.0, "grazing_angle": np.pi / 2}
+        parameters = scene(
+            table_4_1, 30, seed, fft_size=2**13, phases="coherent", window=CLOSED[seed % 5],
+            across=0.0, **close,
+        )  # fmt: skip
+        block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
+        inner = inner if tiles else parameters
+        shots = shots_of(inner, POWERS)
+        on, off = found(inner, (*POWERS, "footprint_phase")), find(shots)
+        change = footprint_phase.bound(block)
+        assert held(change, on[:, 2], off[:, 2])[0].all()
         sigma = shots.bin_deviation
-        for s in range(3):
-            _, change = phase_bound(shots, values, s)
-            assert held(change, on[s, 2], off[s, 2])[0].all()
-            most = pd_change(change, amplitude=off[s, 2] / sigma, threshold=shots.threshold / sigma)
-            assert (abs(on[s, 0] - off[s, 0]) <= most + 1e-9).all()
+        most = pd_change(change, amplitude=off[:, 2] / sigma, threshold=shots.threshold / sigma)
+        assert (abs(on[:, 0] - off[:, 0]) <= most + 1e-9).all()
 
 
 def test_a_footprint_of_small_phases_adds_up_to_its_gain(table_4_1):
-    shots, values = drawn(
+    parameters = scene(
         table_4_1, 40, 4, range=2.0, grazing_angle=np.pi / 2, phases="coherent", beamlets=61,
         beam_divergence=10 ** np.linspace(-5, -3.5, 40), window="hann", radial_velocity=50.0,
+        across=0.0, fft_size=2**14,
     )  # fmt: skip
-    on, off = magnitudes(shots), magnitudes(footprint_phase.without(shots))
-    phase, change = phase_bound(shots, values, 2)
-    low, high = change.signal
+    block = point_block(parameters)
+    on, off = (magnitudes(parameters, e) for e in ((*POWERS, "footprint_phase"), POWERS))
+    phase = footprint_phase.phase_reach(block, block.ranges, block.velocity_spread)[2]
+    change = footprint_phase.bound(block)
+    low, high = change.signal[0][2], change.signal[1][2]
     tight = phase < 0.3
     assert tight.sum() > 10 and (low[tight] > 0.9 * high[tight]).all()
     assert (low[~(phase < 2)] == 0).all()
-    assert np.median(held(change, on[2], off[2])[1]) <= 30
+    assert np.median(held(change, on, off)[1]) <= 30
 
 
-def test_direct_beats_have_no_powers(table_4_1):
-    shots, _ = drawn(table_4_1, 3, 0, architecture="direct")
-    with pytest.raises(ValueError, match="direct"):
-        footprint_phase.without(shots)
+def test_phases_are_a_matter_of_smooth_ground_and_optical_mixing(table_4_1):
+    for scene_of in ({"phases": "incoherent"}, {"architecture": "direct", "phases": "coherent"}):
+        assert footprint_phase.bound(point_block(scene(table_4_1, 3, 0, **scene_of))) is None
 
 
-def images_seen(shots, i, segment):
-    """Largest bin with images, by the model, and without, and their bins."""
-    bins, both = segment_spectrum(shots, i, segment)
-    near = np.unique((bins[both.argmax()] + np.arange(-8, 9)).clip(0, shots.fft_size // 2))
-    return both.max(), image.without(shots, i, segment, near).max()
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-def test_images_change_no_more_than_bound(table_4_1, phases):
+@pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
+def test_images_change_no_more_than_bound(table_4_1, tiles):
     ratios = []
-    for seed in range(10):
-        beamlets = 1 if phases == "coherent" else 7
-        shots, values = drawn(
-            table_4_1, 12, seed, fft_size=2**11, phases=phases, beamlets=beamlets,
-            window=CLOSED[seed % 5], beam_divergence=2e-4, grazing_angle=1.2,
+    for seed in range(20):
+        parameters = scene(
+            table_4_1, 30, seed, fft_size=2**11, beamlets=7, window=CLOSED[seed % 5],
+            beam_divergence=2e-4, grazing_angle=1.2, across=0.0, **near_edges(seed),
         )  # fmt: skip
-        for s in (0, 2):
-            change = image.bound(
-                line_spread.line_of(shots, s),
-                spread=range_moments(shots, values, s),
-                beamlets=beamlets,
-                powers=phases == "incoherent",
-            )
-            pairs = np.array([images_seen(shots, i, s) for i in range(12)]).T
-            inside, ratio = held(change, *pairs)
-            assert inside.all()
-            ratios.append(ratio)
-    assert 1 <= np.median(np.concatenate(ratios)) <= 30
+        block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
+        inner = inner if tiles else parameters
+        change = image.bound(block)
+        on, off = (magnitudes(inner, e) for e in (POWERS, POWERS[:-1]))
+        low = np.broadcast_to(change.signal[0], on.shape)
+        inside, ratio = held(change._replace(signal=(low, change.signal[1])), on, off)
+        assert inside.all()
+        ratios.append(ratio)
+    if not tiles:
+        assert 1 <= np.median(np.concatenate(ratios)) <= 30
+
+
+@pytest.mark.parametrize("beamlets", [1, 7])
+def test_images_add_no_more_to_amplitudes_than_bound(table_4_1, beamlets):
+    ratios = []
+    for seed in range(20):
+        parameters = scene(
+            table_4_1, 30, seed, fft_size=2**11, phases="coherent", beamlets=beamlets,
+            window=CLOSED[seed % 5], beam_divergence=2e-5, grazing_angle=1.2, across=0.0,
+            **near_edges(seed),
+        )  # fmt: skip
+        block = point_block(parameters)
+        change = image.bound(block)
+        phased = (*POWERS, "footprint_phase")
+        on, off = (magnitudes(parameters, set(phased) - without) for without in (set(), {"image"}))
+        shots = shots_of(parameters, phased)
+        whole = block.amplitude.high * shots.bin_deviation * block.gain.high
+        most = change.added * whole * np.sqrt(block.echo_ratio.high)
+        assert (abs(on - off) <= most * (1 + 1e-6) + 1e-12 * whole).all()
+        seen = abs(on - off) > 1e-9 * whole
+        ratios.append(most[seen] / abs(on - off)[seen])
+    assert np.median(np.concatenate(ratios)) <= 30
 
 
 def test_without_images_the_kernel_is_the_model_s_far_from_the_edges(table_4_1):
-    shots, _ = drawn(
+    parameters = scene(
         table_4_1, 6, 1, fft_size=2**11, phases="coherent", beamlets=7, window="blackman",
-        range=np.linspace(3000.0, 3100.0, 6), radial_velocity=0.0,
+        range=np.linspace(3000.0, 3100.0, 6), radial_velocity=0.0, across=0.0,
     )  # fmt: skip
+    phased = (*POWERS, "footprint_phase")
+    shots, alone = shots_of(parameters, phased), shots_of(parameters, set(phased) - {"image"})
     for i in range(6):
         bins, both = segment_spectrum(shots, i, 2)
         near = bins[both.argmax()] + np.arange(-5, 6)
-        assert image.without(shots, i, 2, near) == pytest.approx(both[near], abs=1e-5 * both.max())
+        kernel = dict(zip(*segment_spectrum(alone, i, 2), strict=True))
+        assert [kernel[k] for k in near] == pytest.approx(both[near], abs=1e-5 * both.max())
 
 
-def test_nothing_is_said_of_images_where_phases_may_cancel(table_4_1):
-    shots, values = drawn(table_4_1, 8, 1, phases="coherent")
-    change = image.bound(
-        line_spread.line_of(shots, 0),
-        spread=range_moments(shots, values, 0), beamlets=values["beamlets"], powers=False,
-        least=0.0,
-    )  # fmt: skip
-    assert (change.signal[0] == 0).all() and np.isinf(change.signal[1]).all()
-
-
-def test_leakage_is_no_more_than_bound_and_nothing_without(table_4_1):
+@pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
+def test_leakage_is_no_more_than_bound_and_nothing_without(table_4_1, tiles):
     bounds, truths = [], []
+    whole = ("footprint", "doppler", "image", "leakage")
     for seed in range(24):
         phases = "coherent" if seed % 2 else "incoherent"
         power = 10 ** np.random.default_rng(seed).uniform(-7, 1, 30)
-        shots, values = drawn(table_4_1, 30, seed, fft_size=2**13, phases=phases, power=power)
-        found = find(shots)
-        silent = leakage.without(found)
-        assert np.array_equal(found[:, :5], silent[:, :5]) and not silent[:, 5].any()
-        whole = shots.amplitude.sum(axis=1)
-        if shots.incoherent:
-            whole = np.sqrt((shots.amplitude**2).sum(axis=1))
-        peak = 0.5 * shots.beat_scale * whole[shots.row] * shots.window.sum
-        for s in range(3):
-            most = leakage.probability_bound(
-                line_spread.line_of(shots, s),
-                amplitude=peak / shots.bin_deviation,
-                threshold=shots.threshold / shots.bin_deviation,
-                extreme=range_moments(shots, values, s).extreme,
-                fft_size=shots.fft_size,
-                powers=shots.incoherent,
-            )
-            assert (found[s, 5] <= most + 1e-12).all()
-            bounds.append(most)
-            truths.append(found[s, 5])
+        parameters = scene(
+            table_4_1, 30, seed, fft_size=2**13, phases=phases, power=power, across=0.0
+        )
+        block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
+        inner = inner if tiles else parameters
+        effects = {*whole, "footprint_phase"} if phases == "coherent" else set(whole)
+        seen, silent = (found(inner, e) for e in (effects, effects - {"leakage"}))
+        np.testing.assert_allclose(seen[:, :5], silent[:, :5], 1e-9, 1e-300)
+        assert not silent[:, 5].any()
+        most = leakage.bound(block)
+        assert (seen[:, 5] <= most + 1e-12).all()
+        bounds.append(most.ravel())
+        truths.append(seen[:, 5].ravel())
     bounds, truths = np.concatenate(bounds), np.concatenate(truths)
     assert (truths > 1e-6).sum() > 100 and (bounds < 1e-3).sum() > 100
     assert (bounds[truths < 1e-12] < 0.1).sum() > 100

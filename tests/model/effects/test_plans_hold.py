@@ -1,112 +1,165 @@
-"""Plans on the model itself: what they leave out changes pd by no more than the tolerance."""
-
-from dataclasses import replace
+"""Plans on the model itself: no effect changes more than it may, what is left out no more than
+the tolerance, at single points and anywhere in tiles."""
 
 import numpy as np
 import pytest
-from effect_points import drawn, moving_across, range_moments, velocity_moments
+from effect_points import found, point_block, scene, shots_of, tile_block
 
-from sweep.model.effects import doppler_spread, footprint, footprint_phase, line_spread
-from sweep.model.effects.change import Change
+from sweep.model import shot
+from sweep.model.chain import prepare_cast
+from sweep.model.effects.block import Block
+from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
 from sweep.model.effects.planning import plan
+from sweep.model.ground import Cast, Footprints
 from sweep.model.shot import find
 
-INSIDE = {"footprint": ("phases",), "velocities": ("phases",)}
-"""Ranges and velocities make a coherent footprint's phases: they go after them."""
+POINTS = 30
+CHOICE = [effect for effect in EFFECTS if effect.name in CORE]
+WITHIN = {effect.name: effect.within for effect in CHOICE}
+KINDS = (
+    {"phases": "incoherent"},
+    {"phases": "coherent"},
+    {"phases": "coherent", "range": np.linspace(0.5, 9.0, POINTS), "beam_divergence": 2e-5},
+    {"phases": "coherent", "beamlets": 1},
+    {"architecture": "direct", "power": np.geomspace(1, 1e5, POINTS)},
+    {"architecture": "direct", "range": np.linspace(1, 30, POINTS), "power": 1e-2},
+    {"architecture": "heterodyne", "phases": "coherent"},
+    {"range": np.geomspace(0.3, 8.0, POINTS), "grazing_angle": 1.2},
+)
+ROUNDING = 1e-8
+STILL = {"doppler": "off"}
+"""Without it lines lie elsewhere: near DC for the Doppler segment."""
 
 
-def changes(shots, values, across, segment):
-    """Bounds of one segment by name."""
-    line, n = line_spread.line_of(shots, segment), values["beamlets"]
-    ranges = range_moments(shots, values, segment)
-    velocities = velocity_moments(shots, values, segment, across)
-    both = line_spread.Moments(*(a + b for a, b in zip(ranges, velocities, strict=True)))
-    bounds = {
-        "footprint": footprint.bound(line, ranges=ranges, velocities=velocities, beamlets=n),
-        "velocities": doppler_spread.bound(line, velocities=velocities, ranges=ranges, beamlets=n),
-    }
-    if shots.incoherent:
-        return bounds
-    phase = footprint_phase.phase_reach(
-        carrier=shots.carriers[segment],
-        bandwidth=shots.bandwidth,
-        range=shots.range,
-        ranges=line_spread.plane_range_moments(
-            grazing_angle=values["grazing_angle"],
-            beam_divergence=values["beam_divergence"],
-            number=n,
-            pattern="sunflower",
-        ),
-        velocity_bins=velocities,
-        record_ratio=0.5,
-    )
-    gain = footprint_phase.gain(shots)
-    return bounds | {
-        "phases": footprint_phase.bound(line, phase=phase, gain=gain, spread=both, beamlets=n)
-    }
+def some_of(rng, name):
+    """Any of the other effects, with what they need, but for those within this one."""
+    chosen = {n for n in CORE if n != name and WITHIN[n] != name and rng.random() < 0.6}
+    return {n for n in chosen if not WITHIN[n] or WITHIN[n] in chosen} | {WITHIN[name]} - {""}
 
 
-def up_and_down(shots, values, across):
-    """Bounds of the up and the down segment, stacked."""
-    up, down = (changes(shots, values, across, s) for s in (0, 2))
-    columns = {
-        name: [
-            np.stack(np.broadcast_arrays(up[name].signal[end], down[name].signal[end]))
-            for end in (0, 1)
-        ]
-        for name in up
-    }
-    return {name: Change(signal=tuple(ends)) for name, ends in columns.items()}
+def changed(on, off):
+    """Sum over segments of what pd changes by; direct detection has two of them."""
+    return np.nansum(abs(on[:, 0] - off[:, 0]), axis=0)
 
 
-def left_out(shots, names):
-    """The shots that a plan asks for."""
-    for name, without in (
-        ("phases", footprint_phase.without),
-        ("velocities", doppler_spread.without),
-        ("footprint", footprint.without),
-    ):
-        if name in names:
-            shots = without(shots)
-    return shots
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+@pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
+def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1, kind, tiles):
+    noticed = 0
+    for seed in range(6):
+        rng = np.random.default_rng((seed, kind))
+        parameters = scene(
+            table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
+            **{"beamlets": 7} | KINDS[kind],
+        )  # fmt: skip
+        block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
+        inner = inner if tiles else parameters
+        moving, still = (plan(block, modes, 1.0, CHOICE).change for modes in ({}, STILL))
+        for name in CORE:
+            others = some_of(rng, name)
+            changes = moving if "doppler" in others | {name} else still
+            most = dict(zip(CORE, changes, strict=True))
+            on, off = found(inner, others | {name}), found(inner, others)
+            assert (np.minimum(changed(on, off), 1) <= most[name] + ROUNDING).all(), (name, others)
+            if name == "leakage":
+                extra = np.nansum(on[:, 5], axis=0)
+                assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
+            if name == "signal_shot_noise":
+                alarms = [
+                    shot.statistics(shots_of(inner, e))["pfa_segment"]
+                    for e in (others | {name}, others)
+                ]
+                assert (abs(alarms[0] - alarms[1]) <= most[name] + ROUNDING).all()
+            noticed += (most[name] < 1).sum()
+    assert noticed > 500
 
 
-def only(shots, i):
-    """One of points with a row each."""
-    per_point = {
-        name: value[i : i + 1]
-        for name in shots.__dataclass_fields__
-        if isinstance(value := getattr(shots, name), np.ndarray) and value.shape[:1] == (30,)
-    }
-    return replace(shots, **per_point | {"row": np.zeros(1, np.int64)})
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
+def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
+    kept = dropped = 0
+    for seed in range(6):
+        parameters = scene(
+            table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
+        )
+        for tiles in (False, True):
+            block = point_block(parameters)
+            inner = parameters
+            if tiles:
+                block, inner = tile_block(parameters, seed)
+            made = plan(block, {}, tolerance, CHOICE)
+            truth = shot.evaluate(inner)
+            assert (made.error <= tolerance).all()
+            for column in np.unique(made.kept, axis=1).T:
+                names = [name for name, there in zip(made.names, column, strict=True) if there]
+                here = (made.kept == column[:, None]).all(axis=0)
+                of_kept = shot.evaluate(inner, names)
+                error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
+                assert (error <= tolerance + ROUNDING).all(), names
+                if "leakage" not in names:
+                    extra = truth["p_leakage_up"] + truth["p_leakage_down"]
+                    assert (extra[here] <= tolerance).all()
+            kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+    assert kept > 100 and dropped > 100
+
+
+def cast_scene(rng, shots, beamlets, beside_chance):
+    """Footprints on steps: offsets, closing speeds and echoes as rays might find them."""
+    surface = rng.random((shots, beamlets)) < beside_chance * rng.random((shots, 1))
+    surface[:, 0] = False
+    spread = 10 ** rng.uniform(-7, -3, (shots, 1))
+    offset = rng.normal(0, 1, (shots, beamlets)) * spread
+    offset += np.where(surface, 10 ** rng.uniform(-4, -1, (shots, 1)), 0.0)
+    offset[:, 0] = 0.0
+    doppler = rng.normal(0, 1, (shots, beamlets)) * 10 ** rng.uniform(-12, -8, (shots, 1))
+    doppler[:, 0] = 0.0
+    echo = rng.random((shots, beamlets)) / beamlets / 6
+    footprints = Footprints(np.arange(shots), offset, doppler, echo)
+    return footprints, surface if beside_chance else None
 
 
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
-def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, phases, tolerance):
+@pytest.mark.parametrize("stretch", [1, 5])
+def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, stretch):
     kept = dropped = 0
-    widest = -2.7 if phases == "incoherent" else -3.5
-    for seed in range(6):
-        shots, values = drawn(
-            table_4_1, 30, seed, fft_size=2**15, phases=phases, beamlets=19,
-            power=10 ** np.random.default_rng(seed).uniform(-4, 0, 30),
-            beam_divergence=10 ** np.random.default_rng(seed).uniform(-5, widest, 30),
+    for seed in range(10):
+        rng = np.random.default_rng((seed, stretch))
+        chance = [0.0, 0.3][seed % 2]
+        footprints, beside = cast_scene(rng, POINTS, 7, chance)
+        order = np.sort(10 ** rng.uniform(0.5, 3, POINTS))
+        parameters = DEFAULTS | table_4_1(
+            range=order, radial_velocity=np.sort(rng.normal(0, 30, POINTS)), beamlets=7,
+            fft_size=2**13, phases=phases, power=10 ** rng.uniform(-3, 0), window="hann",
         )  # fmt: skip
-        across = 10 ** np.random.default_rng(seed).uniform(-2, 3, 30)
-        shots = moving_across(shots, values, across)
-        bounds = up_and_down(shots, values, across)
-        a = np.stack([line_spread.axis_amplitude(shots, s) for s in (0, 2)])
-        b = shots.threshold / shots.bin_deviation
-        truth = find(shots)
-        for i in range(30):
-            each = {n: Change(signal=tuple(v[:, i : i + 1] for v in c.signal))
-                    for n, c in bounds.items()}  # fmt: skip
-            made = plan(
-                each, amplitude=a[:, i : i + 1], threshold=b[i], tolerance=tolerance,
-                inside=INSIDE if phases == "coherent" else None,
-            )  # fmt: skip
-            found = find(left_out(only(shots, i), made.left_out))
-            error = abs(found[0, 0, 0] * found[2, 0, 0] - truth[0, 0, i] * truth[2, 0, i])
-            assert made.within and error <= tolerance
-            kept, dropped = kept + len(made.kept), dropped + len(made.left_out)
-    assert kept > 20 and dropped > 20
+        edges = np.arange(0, POINTS + 1, stretch)
+        block = Block.of_cast(parameters, footprints, beside, edges)
+        tile = np.repeat(np.arange(block.size), stretch)
+        ground = Cast(footprints, beside)
+        made, still = (plan(block, modes, 0.05, CHOICE) for modes in ({}, STILL))
+        for place, name in enumerate(CORE):
+            others = some_of(rng, name)
+            changes = (made if "doppler" in others | {name} else still).change
+            most = changes[place, tile]
+            on, off = (find(prepare_cast(parameters, ground, e)) for e in (others | {name}, others))
+            assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
+        truth = find(prepare_cast(parameters, ground))
+        for i in range(block.size):
+            of_kept = find(prepare_cast(parameters, ground, made.effects(i)))
+            error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
+            assert (error[tile == i] <= 0.05 + ROUNDING).all()
+        has_beside = made.change[CORE.index("several_returns")].any()
+        assert has_beside == (beside is not None)
+        kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+    assert kept > 100 and dropped > 100
+
+
+def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
+    footprints, _ = cast_scene(np.random.default_rng(1), 4, 7, 0.0)
+    edges = np.array([0, 2, 4])
+    parameters = DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
+    turning, still = (
+        plan(Block.of_cast(parameters, footprints, None, edges, rotating=r), {}, 0.5,
+             [effect for effect in EFFECTS if effect.name == "rotation"])
+        for r in (True, False)
+    )  # fmt: skip
+    assert turning.kept.all() and not still.kept.any() and not still.error.any()

@@ -2,12 +2,23 @@
 
 import numpy as np
 import pytest
+from effect_points import point_block
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from sweep.model import window
-from sweep.model.effects.quantisation import bound, step, truth_quantise, variance
+from sweep.model.chain import prepare
+from sweep.model.effects.block import Block
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.quantisation import (
+    bound,
+    rounding_change,
+    step,
+    truth_quantise,
+    variance,
+)
+from sweep.model.effects.span import Span
 
 
 def test_levels_fill_the_full_scale_and_hold_at_its_ends():
@@ -58,7 +69,9 @@ def scene(s, amplitude, cycles, phase, second, name):
     turn = w * np.exp(-2j * np.pi * round(cycles) * n / n.size)
     plain = abs((turn * x).sum())
     true = abs((turn * mean).sum()) / plain, (w**2 * spread).sum() / ((w**2).sum() * s**2)
-    change = bound(step=1.0, noise_variance=s**2, magnitude=plain, window_sum=w.sum())
+    change = rounding_change(
+        step=Span.of(1.0), noise_variance=Span.of(s**2), magnitude=plain, window_sum=w.sum()
+    )
     return true, change
 
 
@@ -68,8 +81,9 @@ def scene(s, amplitude, cycles, phase, second, name):
 )  # fmt: skip
 def test_no_rounded_record_strays_beyond_the_bound(s, amplitude, cycles, phase, second, name):
     true, change = scene(s, amplitude, cycles, phase, second, name)
-    for factor, (low, high) in zip(true, (change.signal, change.noise), strict=True):
-        assert low * (1 - 1e-9) <= factor <= high * (1 + 1e-9)
+    low, high = change.noise
+    assert low * (1 - 1e-9) <= true[1] <= high * (1 + 1e-9)
+    assert abs(true[0] - 1) <= change.added * (1 + 1e-9) + 1e-9
 
 
 def test_the_bound_is_near_the_change():
@@ -86,10 +100,37 @@ def test_the_bound_is_near_the_change():
     assert np.median(ratios) < 1.5
 
 
+def rounded(step, magnitude=100.0):
+    return rounding_change(
+        step=step, noise_variance=Span.of(1.0), magnitude=magnitude, window_sum=200.0
+    )
+
+
 def test_fine_steps_change_nothing_and_any_step_but_the_white_part_once_noise_spans_it():
-    fine = bound(step=1e-9, noise_variance=1.0, magnitude=100.0, window_sum=200.0)
-    np.testing.assert_allclose([*fine.signal, *fine.noise], 1, atol=1e-12)
-    coarse = bound(step=1.0, noise_variance=1.0, magnitude=100.0, window_sum=200.0)
+    fine = rounded(Span.of(1e-9))
+    np.testing.assert_allclose(fine.noise, 1, atol=1e-12)
+    assert fine.added < 1e-12
+    coarse = rounded(Span.of(1.0))
     np.testing.assert_allclose(coarse.noise, 1 + 1 / 12, rtol=3e-8)
-    assert bound(step=0.0, noise_variance=1.0, magnitude=1.0, window_sum=1.0).noise == (1.0, 1.0)
+    assert rounded(Span.of(0.0)).noise == (1.0, 1.0)
     assert coarse.threshold_follows
+    wide = rounded(Span(0.5, 1.0))
+    np.testing.assert_allclose(wide.noise, [1 + 1 / 48, 1 + 1 / 12], rtol=3e-8)
+
+
+def test_the_scene_s_noise_gains_what_the_bound_says(table_4_1):
+    bits = np.array([0.0, 3.0, 5.5, 8.0, 12.0])
+    scene = DEFAULTS | table_4_1(fft_size=1024) | {
+        "instrument.processing.bits": bits, "instrument.processing.full_scale": 10e-3,
+    }  # fmt: skip
+    change = bound(point_block(scene))
+    ((_, shots),), ((_, without),) = (prepare(scene, e) for e in (("quantisation",), ()))
+    true = shots.noise_variance / without.noise_variance
+    low, high = change.noise
+    assert (low <= true * (1 + 1e-12)).all() and (true <= high * (1 + 1e-12)).all()
+    assert true[1] > 1.01 and high[3:] == pytest.approx(true[3:], rel=1e-6)
+    assert bound(point_block(scene | {"instrument.processing.bits": 0.0})) is None
+    mixed = {p: v if isinstance(v, str) else Span.of(v) for p, v in scene.items()}
+    mixed |= {"instrument.processing.bits": Span(np.array([0.0]), np.array([12.0]))}
+    low, high = bound(Block.of_plane(mixed)).noise
+    assert (low <= true).all() and (true <= high).all()

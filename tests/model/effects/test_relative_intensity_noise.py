@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from effect_points import point_block
 
 from sweep.model import window
+from sweep.model.chain import prepare
 from sweep.model.effects.change import pd_change
 from sweep.model.effects.relative_intensity_noise import bound, current_variance
 from sweep.model.marcum import marcum_q1
@@ -56,15 +58,27 @@ def test_it_outgrows_shot_noise_with_power_and_direct_detection_has_none():
     assert 10 * np.log10(one / balanced) == pytest.approx(25.0, rel=1e-12)
 
 
-def test_the_bound_is_the_change_itself():
+def test_the_bound_is_the_change_itself(table_4_1):
     rin = 10 ** -np.array([17.0, 16.0, 15.0, 14.0])
-    change = bound(**LASER | {"relative_intensity_noise": rin}, noise_variance=OTHERS)
+    scene = table_4_1(fft_size=1024) | {"instrument.laser.relative_intensity_noise": rin}
+    change = bound(point_block(scene))
     added = (1.1e-3) ** 2 * rin * 400e6
     assert change.signal == (1.0, 1.0) and change.threshold_follows
-    np.testing.assert_allclose(change.noise, [1 + added / OTHERS] * 2, rtol=1e-14)
+    np.testing.assert_allclose(change.noise, [1 + added / OTHERS] * 2, rtol=2e-5)
+    ((_, shots),), ((_, without),) = (
+        prepare(scene, effects) for effects in (("relative_intensity_noise",), ())
+    )
+    true = shots.noise_variance / without.noise_variance
+    np.testing.assert_allclose(change.noise, [true, true], rtol=1e-13)
     # With its threshold TNR 10 deviations of whatever noise there is, a loses by the root.
     b = 10 * np.sqrt(2 - np.pi / 2)
     for a in (3.0, 6.5, 9.0):
         true = marcum_q1(a, b).q - marcum_q1(a / np.sqrt(1 + added / OTHERS), b).q
         found = pd_change(change, amplitude=a, threshold=b)
-        np.testing.assert_allclose(found, true, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(found, true, rtol=1e-4, atol=1e-12)
+
+
+def test_scenes_without_it_call_for_nothing(table_4_1):
+    rin = {"instrument.laser.relative_intensity_noise": 1e-14}
+    assert bound(point_block(table_4_1(fft_size=1024))) is None
+    assert bound(point_block(table_4_1(fft_size=1024, architecture="direct") | rin)) is None

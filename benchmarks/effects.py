@@ -1,0 +1,156 @@
+"""All effects on against those that are called for: what it changes, what it saves.
+
+Run with `make effects`, some twenty minutes: every experiment in the repository, whole, with each
+effect forced on, and with effects on demand at three tolerances. All in one process, one variant
+of an experiment after the other; quote the ratios. Writes docs/effects_table.md.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.progress import Progress
+
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.spec import SceneSpec, Spec
+from sweep.spec.reading import read_document
+from sweep.tasks import driver
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.studies import study_of
+
+ROOT = Path(__file__).parents[1]
+TABLE = ROOT / "docs" / "effects_table.md"
+TOLERANCES = (1e-1, 1e-2, 1e-3)
+PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
+HEAD = """# Effects on demand, and all of them on
+
+Written by `make effects`. For each experiment, whole: the time with every effect forced on, each
+computed with the scene's own parameters; and with effects simulated only where they are called for,
+at three tolerances: how many times faster that is, planning included, and the largest change of any
+probability of detection anywhere, which has to stay below the tolerance. `planning` is its share of
+the time at the tightest.
+
+"""
+
+
+class Variant(NamedTuple):
+    """What a variant of an experiment came to."""
+
+    seconds: float
+    planning: float
+    probabilities: dict[str, np.ndarray]
+
+
+def variant(path: Path, tolerance: float | None) -> Spec | SceneSpec:
+    """An experiment with all effects on, for None, or on demand at a tolerance."""
+    written = read_document(path).value
+    kind = SceneSpec if "scene" in written else Spec
+    drawn = kind is Spec and "draws" in written
+    every = {e.name: "on" for e in EFFECTS if drawn or not e.is_random}
+    written["effects"] = every if tolerance is None else {}
+    written["accuracy"] = dict(written.get("accuracy", {}), tolerance=tolerance or 0.0)
+    return kind.from_mapping(written, base=path.parent)
+
+
+def blocks(spec: Spec | SceneSpec, folder: Path) -> Iterator[tuple[int, int, dict]]:
+    """Blocks of a study: number of them, points, results."""
+    store = folder / "study.zarr"
+    if isinstance(spec, SceneSpec) and not (folder / "eyepoints").exists():
+        driver.run(spec, store=store, progress=False)  # casts the rays
+    study = study_of(spec, store)
+    study.compile()
+    for block in range(study.n_blocks):
+        yield study, block, study.block_size(block)
+
+
+def evaluated(spec: Spec | SceneSpec, folder: Path, told: Progress, title: str) -> Variant:
+    """Probabilities of detection at every point, and the time that they took."""
+    found: dict[str, list[np.ndarray]] = {}
+    total = planning = 0.0
+    bar = None
+    for study, block, size in blocks(spec, folder):
+        bar = told.add_task(title, total=study.points) if bar is None else bar
+        begun = time.perf_counter()
+        planning += planned(study, block)
+        results = study.evaluate(block)
+        total += time.perf_counter() - begun
+        for name, values in results.items():
+            if name.rsplit("/", 1)[-1] in PROBABILITIES:
+                found.setdefault(name, []).append(values.ravel())
+        told.update(bar, advance=size)
+    told.remove_task(bar)
+    return Variant(total, planning, {name: np.concatenate(parts) for name, parts in found.items()})
+
+
+def planned(study, block: int) -> float:
+    """Time that a block's plan takes; it is kept, and not made again as the block is evaluated."""
+    if isinstance(study, FlightStudy):
+        return 0.0  # planned within the block's evaluation
+    begun = time.perf_counter()
+    study.calling.of_block(block)
+    return time.perf_counter() - begun
+
+
+def largest_change(one: Variant, other: Variant) -> float:
+    """Largest difference of any probability at any point; where one is nan, so is the other."""
+    worst = 0.0
+    for name, values in one.probabilities.items():
+        apart = np.abs(values - other.probabilities[name])
+        assert np.array_equal(np.isnan(values), np.isnan(other.probabilities[name])), name
+        worst = max(worst, float(np.nanmax(apart, initial=0.0)))
+    return worst
+
+
+def row(path: Path, told: Progress) -> str:
+    """An experiment's row of the table."""
+    cells = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, name = Path(temporary), path.stem
+        every = evaluated(variant(path, None), folder, told, f"{name}, all on")
+        points = sum(v.size for v in every.probabilities.values()) // 4
+        for tolerance in TOLERANCES:
+            called = evaluated(variant(path, tolerance), folder, told, f"{name}, {tolerance:g}")
+            change = largest_change(every, called)
+            cells.append(f"{every.seconds / called.seconds:.1f}x, {change:.1e}")
+            if change > tolerance:
+                print(f"{name}: {change:.2e} exceeds {tolerance:g}", file=sys.stderr)
+    share = f"{100 * called.planning / called.seconds:.1f} %" if called.planning else "-"
+    cells = [name.replace("_", " "), f"{points:,}", f"{every.seconds:.1f} s", *cells, share]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """The whole table."""
+    paths = sorted((ROOT / "experiments").glob("*.yaml"))
+    if names := sys.argv[1:]:
+        paths = [path for path in paths if path.stem in names]
+    head = ["experiment", "points", "all on", *(f"at {t:g}" for t in TOLERANCES), "planning"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    with Progress() as told:
+        for path in paths:
+            if missing := lacking(path):
+                print(f"{path.stem}: needs {missing}", file=sys.stderr)
+                continue
+            lines.append(row(path, told))
+            print(lines[-1], flush=True)
+    if not names:
+        TABLE.write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def lacking(path: Path) -> str:
+    """A file that an experiment needs and that is not here."""
+    from sweep.spec import SpecError, load
+
+    try:
+        load(path)
+    except SpecError as error:
+        return str(error).splitlines()[0]
+    return ""
+
+
+if __name__ == "__main__":
+    main()

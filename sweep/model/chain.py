@@ -1,0 +1,74 @@
+"""The chain of a simulation: bare shots, then the effects that are called for, one by one.
+
+A graph of this many nodes is all that a block of points is: what no scene calls for is in no node.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+
+import numpy as np
+
+from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, PARAMETERS
+from sweep.model.effects.effect import Effect, Scene
+from sweep.model.ground import Cast, Ground, Plane
+from sweep.model.preparation import Parameters, Shots, as_arrays, bare, categories
+
+SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
+"""Numbers of effects that points must share to be prepared together."""
+
+
+def nodes(effects: Collection[str]) -> tuple[Effect, ...]:
+    """Effects by name in the order in which they act.
+
+    Raises
+    ------
+    ValueError
+        No effect has such a name.
+    """
+    if unknown := sorted(set(effects) - set(NAMES)):
+        raise ValueError(f"no effect {', '.join(unknown)}: choose from {', '.join(NAMES)}")
+    return tuple(effect for effect in EFFECTS if effect.name in effects)
+
+
+def prepare(
+    parameters: Parameters, effects: Collection[str] = CORE
+) -> Iterator[tuple[np.ndarray, Shots]]:
+    """Shots on a flat plane, split by category: (indices, :class:`Shots`) for each.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Dotted path to SI scalar, string or (n,) array, for every parameter of instrument, target,
+        footprint and accuracy, and for those of effects that are not at their defaults.
+    effects : collection of str
+        Names of the effects that are simulated.
+    """
+    for index, p in categories(DEFAULTS | dict(parameters), SHARED):
+        yield index, assembled(p, index.size, Plane(p, index.size), effects)
+
+
+def prepare_cast(parameters: Parameters, ground: Cast, effects: Collection[str] = CORE) -> Shots:
+    """Shots whose footprints are given, all of one category.
+
+    Parameters
+    ----------
+    parameters, effects
+        As of :func:`prepare`. Ranges and radial velocities are those of the beam's centre;
+        grazing angle and law are not looked at.
+    ground : Cast
+        The footprints.
+    """
+    return assembled(
+        as_arrays(DEFAULTS | dict(parameters)), ground.beamlets.row.size, ground, effects
+    )
+
+
+def assembled(
+    p: Mapping[str, np.ndarray], size: int, ground: Ground, effects: Collection[str]
+) -> Shots:
+    """Bare shots with the effects put to them, but for random ones."""
+    scene = Scene(p, ground)
+    shots = bare(p, size, ground)
+    for effect in nodes(effects):
+        if effect.act is not None:
+            shots = effect.act(shots, scene)
+    return shots

@@ -1,0 +1,226 @@
+"""What the effects' bounds look at: the scene of some tiles at once, as spans over their points.
+
+A tile is a stretch of a study's points that is planned as a whole. Its block knows, for each
+tile, the least and the largest value of every parameter (:class:`~sweep.model.effects.span.Span`)
+and of what :func:`sweep.model.preparation.bare` would compute from them anywhere between, by the
+same formulas at the ends. Nothing is computed before it is asked for.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import line_spread, tile_geometry
+from sweep.model.effects.line_spread import NOT_AWAY, Line, Moments
+from sweep.model.effects.span import Span, monotone
+from sweep.model.effects.tile_geometry import Geometry
+from sweep.model.effects.tile_link import Parameters, TileLink
+from sweep.model.ground import Footprints
+from sweep.model.preparation import RECEIVER, relative_amplitude
+
+
+class Block(TileLink):
+    """Some tiles whose points are all of one category: of :meth:`of_plane` or :meth:`of_cast`.
+
+    Spans have one entry a tile, or are scalars where all tiles share them.
+    """
+
+    def __init__(
+        self, parameters: Parameters, size: int, geometry: Geometry, *, at_rest: bool = False
+    ) -> None:
+        super().__init__(parameters)
+        self.size, self.geometry = size, geometry
+        self._at_rest = at_rest
+        self.number = self.whole("footprint.beamlets")
+        self.coherent = self.word("footprint.phases") == "coherent"
+        self.segment_exists = (True, self.architecture != "direct", True)
+        self.adds_amplitudes = self.coherent or self.architecture == "direct"
+        self.grazing_angle, self.echo, self.echo_ratio, self.gain = (
+            geometry.grazing_angle, geometry.echo, geometry.echo_ratio, geometry.gain,
+        )  # fmt: skip
+        self.ranges, self.velocities = geometry.ranges, geometry.velocities
+        self.beside_share, self.beside_apart = geometry.beside_share, geometry.beside_apart
+        self.rotating = geometry.rotating
+
+    @classmethod
+    def of_plane(cls, parameters: Parameters) -> "Block":
+        """Tiles of points on a flat plane.
+
+        Parameters
+        ----------
+        parameters : mapping
+            Dotted path to a span over each tile, or to the word that all share: every parameter,
+            those that effects bring among them.
+        """
+        spans = [value for value in parameters.values() if isinstance(value, Span)]
+        ends = (end for span in spans for end in (span.low, span.high))
+        sizes = {end.size for end in ends if isinstance(end, np.ndarray) and end.ndim} - {1}
+        if len(sizes) > 1:
+            raise ValueError(f"spans over different numbers of tiles: {sizes}")
+        number = TileLink(parameters).whole("footprint.beamlets")
+        geometry = tile_geometry.plane(parameters, number)
+        return cls(parameters, max(sizes, default=1), geometry)
+
+    @classmethod
+    def of_cast(
+        cls,
+        parameters: Mapping[str, np.ndarray | float | str],
+        footprints: Footprints,
+        beside: np.ndarray | None,
+        edges: np.ndarray,
+        rotating: bool = False,
+    ) -> "Block":
+        """Tiles of shots whose footprints rays have found.
+
+        Parameters
+        ----------
+        parameters : mapping
+            As of :func:`sweep.model.chain.prepare_cast`: scalars, or (n,) by shot.
+        footprints : Footprints
+            Of the n shots.
+        beside : (rows, beamlets) bool ndarray, optional
+            Beamlets on other surfaces than the axis's.
+        edges : (tiles + 1,) int ndarray
+            Tile i holds the shots from ``edges[i]`` up to ``edges[i + 1]``, one at least.
+        rotating : bool
+            Whether any surface belongs to a body that turns.
+        """
+        edges = np.asarray(edges)
+        spans: dict[str, Span | str] = {}
+        for path, value in parameters.items():
+            array = np.asarray(value)
+            if array.dtype.kind in "UO":
+                spans[path] = str(array.flat[0])
+            else:
+                spans[path] = tile_geometry.over(array, edges) if array.ndim else Span.of(array[()])
+        amplitudes = str(spans[RECEIVER + "architecture"])
+        geometry = tile_geometry.cast(footprints, beside, edges, amplitudes)
+        return cls(spans, edges.size - 1, replace(geometry, rotating=rotating))
+
+    def at_rest(self) -> "Block":
+        """The same tiles without the Doppler effect."""
+        return Block(self._parameters, self.size, self.geometry, at_rest=True)
+
+    @cached_property
+    def lines(self) -> Line:
+        """The line on the beam's axis, (3, tiles) by segment.
+
+        Where the Doppler effect moves it so little that it may be left out, with and without it.
+        """
+        if self._at_rest:
+            return self.resting_lines
+        slow = np.any(self.doppler_shift <= NOT_AWAY, axis=0) & (self.beta.magnitude > 0)
+        beta = self.beta
+        if np.any(slow):
+            either = Span.hull(beta, 0.0)
+            beta = Span(
+                np.where(slow, either.low, beta.low), np.where(slow, either.high, beta.high)
+            )
+        return self._lines(beta)
+
+    @cached_property
+    def resting_lines(self) -> Line:
+        """The same at no radial velocity."""
+        return self._lines(Span.of(0.0))
+
+    @cached_property
+    def doppler_shift(self) -> np.ndarray:
+        """Bins by which the Doppler effect moves lines at the most, >= 0 (unfolded), (3, tiles).
+
+        f beta, and the S tau beta by which it stretches the beat of the range.
+        """
+        beat = self.chirp_rate * (2 / SPEED_OF_LIGHT) * self.range
+        shifts = [
+            self.beta.magnitude * ((carrier + beat) / self.bin_width).high
+            for carrier in self.carriers
+        ]
+        return np.stack([np.broadcast_to(shift, (self.size,)) for shift in shifts])
+
+    def _lines(self, beta: Span) -> Line:
+        lines = line_spread.axis_lines(
+            window=self.window,
+            fft_size=self.fft_size,
+            range=self.range,
+            beta=beta,
+            chirp_rate=self.chirp_rate,
+            carriers=self.carriers,
+            sample_rate=self.sample_rate,
+            **self._receiver("detector_bandwidth", "amplifier_bandwidth"),
+        )
+        if lines.edge.shape == (3, self.size):
+            return lines
+        return lines.over(self.size)
+
+    @cached_property
+    def beat(self) -> Span:
+        """Magnitude of the largest bin, had the bare line unit transfer and lay on a bin [V]."""
+        relative = monotone(
+            lambda echo: relative_amplitude(self.architecture, np.asarray(echo)), echo=self.echo
+        )
+        return 0.5 * self.beat_scale * relative * self.window.sum
+
+    @cached_property
+    def amplitude(self) -> Span:
+        """Magnitude of the largest bin of the bare line, moving, over sigma, (3, tiles).
+
+        No image is in it. In direct detection's Doppler segment, which does not exist, it is 0.
+        """
+        line, peak = self.lines, self.beat / self.deviation
+        low = peak.low * line.transfer_least * line.lobe.least(line.bin_offset)
+        most = np.where(
+            line.bin_offset == line.bin_offset_least,
+            line.lobe.least(line.bin_offset),
+            line.lobe.most(line.bin_offset_least),
+        )
+        high = peak.high * line.transfer * most
+        if self.architecture == "direct":
+            low[1] = high[1] = 0.0
+        return Span(low, high)
+
+    @cached_property
+    def range_bins(self) -> np.ndarray:
+        """Bins of a chirped segment for a relative difference of range of 1, at the most."""
+        return line_spread.range_to_bins(
+            range=self.range.high,
+            beta=self.beta.magnitude,
+            chirp_rate=self.chirp_rate.high,
+            bin_width=self.bin_width.low,
+        )
+
+    @cached_property
+    def range_spread(self) -> Moments:
+        """Bins by which ranges put the lines off the axis's, (3, tiles) at the most."""
+        return self.of_ranges(self.ranges)
+
+    def of_ranges(self, ranges: Moments) -> Moments:
+        """Moments of relative ranges in bins, (3, tiles) or (3, 1)."""
+        factor = np.outer([1.0, 0.0, 1.0], np.atleast_1d(self.range_bins))
+        return Moments(*(np.where(factor > 0, factor * v, 0.0) for v in _finite(ranges)))
+
+    @cached_property
+    def velocity_spread(self) -> Moments:
+        """Bins by which velocities put the lines off the axis's, (3, tiles) at the most."""
+        factors = [
+            line_spread.velocity_to_bins(
+                range=self.range.high,
+                carrier=carrier.high,
+                chirp_rate=self.chirp_rate.high,
+                bin_width=self.bin_width.low,
+            )
+            for carrier in self.carriers
+        ]
+        return self.velocities.scaled(np.stack([np.atleast_1d(f) for f in factors]))
+
+    @cached_property
+    def spread(self) -> Moments:
+        """Bins by which ranges and velocities put the lines off the axis's, (3, tiles)."""
+        pairs = zip(self.range_spread, self.velocity_spread, strict=True)
+        return Moments(*(np.add(one, two) for one, two in pairs))
+
+
+def _finite(moments: Moments) -> list[np.ndarray]:
+    """Infinite moments as numbers that may be multiplied by 0."""
+    return [np.minimum(value, 1e200) for value in moments]

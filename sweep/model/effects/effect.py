@@ -1,0 +1,96 @@
+"""What every physical effect is to the rest: where it acts, what it can change, what it does.
+
+An effect is one module with one :class:`Effect` in it, in :mod:`sweep.model.effects.catalogue`.
+Its parameters become fields of a spec by themselves; the planner asks its bound, block by block,
+whether the scene calls for it; :mod:`sweep.model.chain` applies it where it does. Where it does
+not, nothing of it is computed.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.model.effects.change import Bound
+from sweep.model.ground import Ground
+from sweep.model.preparation import Shots
+
+if TYPE_CHECKING:
+    from sweep.model.effects.block import Block
+
+STAGES = ("lines", "light", "noise", "record", "spectrum", "detection", "draws")
+"""Where in the chain effects act, in this order: on the lines of a footprint; on the light that
+comes back; on the noise; on the record and its phases; on the spectrum; on what is detected in it;
+and, draw by draw, on all of these at random."""
+
+MODES = ("auto", "on", "off")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A field that an effect brings into a spec: a number with a unit, or one of several words.
+
+    Bounds are written as a user would write them. The default is SI and means that there is
+    nothing of the effect.
+    """
+
+    path: str
+    about: str
+    default: float | int | str
+    example: str = ""
+    si_unit: str = ""
+    above: str | None = None
+    at_least: str | None = None
+    at_most: str | None = None
+    whole: bool = False
+    options: tuple[str, ...] = ()
+    category: bool = False
+    """Whether points are computed together only where they share it; words always are."""
+
+
+class Scene(NamedTuple):
+    """What an effect may look at besides the shots."""
+
+    parameters: Mapping[str, np.ndarray]
+    """By dotted path, (n,) or scalar."""
+    ground: Ground
+
+
+class Realisation(NamedTuple):
+    """Which random draws of some points are asked for: point i has those of its own key."""
+
+    keys: np.ndarray
+    """(n, 2) uint64: random key of each point."""
+    draw: np.ndarray
+    """(n,) int64: number of each point's draw."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """A physical effect."""
+
+    name: str
+    about: str
+    """What it is, in a few words, for tables and help."""
+    stage: str
+    """One of :data:`STAGES`."""
+    bound: "Callable[[Block], Bound | None]"
+    """What it can change in any point of each tile, (tiles,) or (3, tiles) by segment: factors,
+    or a bound on the change of a probability. None: the scene has nothing of it."""
+    act: Callable[[Shots, Scene], Shots] | None = None
+    """What it does to shots, once."""
+    turn: Callable[[dict[str, np.ndarray], Realisation], dict[str, np.ndarray]] | None = None
+    """What it does at random to parameters, before any shot is prepared."""
+    draw: Callable[[Shots, Scene, Realisation], Shots] | None = None
+    """What it does at random to shots, after all else but spectrum and detection."""
+    parameters: tuple[Parameter, ...] = ()
+    within: str = ""
+    """An effect without which there is nothing of this one."""
+    needs: tuple[str, ...] = ()
+    """Effects that this one is simulated with, however little they change by themselves."""
+
+    @property
+    def is_random(self) -> bool:
+        """Whether it is simulated by draws."""
+        return self.turn is not None or self.draw is not None

@@ -1,0 +1,28 @@
+"""Effects as flags: how a store says, point by point, what was simulated."""
+
+from typing import Any
+
+import numpy as np
+
+from sweep.model.effects.catalogue import NAMES
+
+
+def flags_of(kept: np.ndarray) -> np.ndarray:
+    """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
+    bits = np.uint32(1) << np.arange(len(kept), dtype=np.uint32)
+    return np.asarray((kept * bits[:, None]).sum(axis=0), np.uint32)
+
+
+def names_of(flags: int) -> tuple[str, ...]:
+    """Names of the effects that flags stand for."""
+    return tuple(name for k, name in enumerate(NAMES) if flags >> k & 1)
+
+
+def flag_attributes() -> dict[str, Any]:
+    """What the flags mean, in the words of the CF conventions."""
+    return {
+        "units": "1",
+        "long_name": "effects that were simulated",
+        "flag_masks": [1 << k for k in range(len(NAMES))],
+        "flag_meanings": " ".join(NAMES),
+    }

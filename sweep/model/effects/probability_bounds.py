@@ -1,0 +1,253 @@
+"""What effects' bounds on bins make of probabilities, whichever of the other effects are there.
+
+With x = ln a, a and the threshold b over sigma,
+
+    max_x  Q_1(e^{x + s}, b) - Q_1(e^x, b)  <=  s max g,
+    g = dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2}
+
+with g <= sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}, which has one maximum, at a (a - b) = 1/2; or the
+change from one end of the interval to the other. What is added to a magnitude counts by
+
+    dQ_1/da = b I_1(a b) e^{-(a^2 + b^2)/2} <= min(1/2, 0.22 b e^{-(a - b)^2 / 2}).
+
+Noise that the threshold does not follow changes the false alarms too, whose probability in a
+segment is P = 1 - (1 - p)^N, p = e^{-b^2/2}, with -dP/d ln b = N p (1 - p)^(N-1) b^2.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from sweep.model.effects.change import Change
+from sweep.model.effects.span import Span
+from sweep.model.marcum import marcum_q1_pair
+
+_HUGE = 1e12
+_WEAK, _STRONG, _DOWN, _UP, _ADDED, _FIELDS = range(6)
+_NEGLIGIBLE = 1e-12
+"""A change of a probability that needs no closer look."""
+
+
+def probability_changes(
+    bounds: Sequence[Change | np.ndarray], *, amplitude: Span, threshold: Span, fft_size: int
+) -> np.ndarray:
+    """Largest change of a probability by each effect, (effects, tiles), 0..1.
+
+    For a :class:`Change` the sum of the changes of pd in the three segments, which bounds that of
+    their product; or that of a false alarm in a segment, or its shift in bins, if larger.
+
+    Parameters
+    ----------
+    bounds : sequence of Change or array_like
+        Of scalars, (tiles,), or (3, tiles) by segment. An array is a bound on the change of a
+        probability itself, and is summed over the segments if it has them.
+    amplitude : Span
+        Magnitude of the detecting bin without any of the effects over sigma, (3, tiles).
+    threshold : Span
+        Threshold over sigma, (tiles,) or a scalar.
+    fft_size : int
+        N, of the bins that may raise a false alarm.
+    """
+    tiles = np.shape(amplitude.low)[1]
+    factors = [bound for bound in bounds if isinstance(bound, Change)]
+    table = np.empty((len(factors), _FIELDS, 3, tiles))
+    for entry, change in zip(table, factors, strict=True):
+        _fill(entry, change)
+    ends = np.empty((2, 2, 3, tiles))
+    ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
+        amplitude.low, amplitude.high, threshold.low, threshold.high,
+    )  # fmt: skip
+    found = iter(_changes(table, ends, float(fft_size)))
+    out = np.empty((len(bounds), tiles))
+    for row, bound in zip(out, bounds, strict=True):
+        if isinstance(bound, Change):
+            row[:] = np.maximum(next(found), np.max(np.atleast_2d(bound.shift), axis=0))
+        else:
+            value = np.asarray(bound, float)
+            row[:] = value.sum(axis=0) if value.ndim > 1 else value
+    return np.minimum(out, 1.0)
+
+
+def pd_change_within(
+    change: Change,
+    *,
+    amplitude: tuple[ArrayLike, ArrayLike],
+    threshold: tuple[ArrayLike, ArrayLike],
+) -> np.ndarray:
+    """Largest change of the probability of detection, starting anywhere within intervals, 0..1.
+
+    Parameters
+    ----------
+    change : Change
+        What the effect can change, (n,) or scalars.
+    amplitude, threshold : (array_like, array_like)
+        Least and largest magnitude and threshold, over sigma, without it.
+    """
+    ends = np.array(np.broadcast_arrays(*amplitude, *threshold), dtype=float)
+    entry = np.empty((_FIELDS, *ends.shape[1:]))
+    _fill(entry, change)
+    flat = _each_within(entry.reshape(_FIELDS, -1), ends.reshape(4, -1))
+    return np.asarray(flat.reshape(ends.shape[1:]))
+
+
+def _fill(entry: np.ndarray, change: Change) -> None:
+    """Least and largest factor on amplitude and threshold over sigma, and what is added."""
+    weak, strong = change.signal
+    quiet, loud = (1 / np.sqrt(value) for value in change.noise)
+    entry[_WEAK], entry[_STRONG] = np.multiply(weak, loud), np.multiply(strong, quiet)
+    entry[_DOWN] = 1.0 if change.threshold_follows else loud
+    entry[_UP] = 1.0 if change.threshold_follows else quiet
+    entry[_ADDED] = change.added
+    np.minimum(entry, _HUGE, out=entry)
+
+
+@njit(cache=True, error_model="numpy")
+def _each_within(entry, ends):
+    """Changes of pd from intervals of their own, (n,)."""
+    out = np.empty(ends.shape[1])
+    for i in range(out.size):
+        out[i] = _within(entry[:, i], ends[0, i], ends[1, i], ends[2, i], ends[3, i])
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _changes(table, ends, bins):
+    """Changes of pd, summed over segments, or of a segment's false alarms, (effects, tiles)."""
+    effects, _, segments, tiles = table.shape
+    out = np.zeros((effects, tiles))
+    for i in range(effects):
+        for t in range(tiles):
+            total, alarm = 0.0, 0.0
+            for s in range(segments):
+                own = table[i, :, s, t]
+                if not _does_anything(own):
+                    continue
+                low, high, lower, upper = _with_others(table, ends, i, s, t)
+                total += _within(own, low, high, lower, upper)
+                if own[_DOWN] != 1.0 or own[_UP] != 1.0:
+                    alarm = max(alarm, _alarm_change(own, lower, upper, bins))
+            out[i, t] = min(max(total, alarm), 1.0)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _does_anything(own):
+    return (
+        own[_WEAK] != 1.0
+        or own[_STRONG] != 1.0
+        or own[_DOWN] != 1.0
+        or own[_UP] != 1.0
+        or own[_ADDED] != 0.0
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _with_others(table, ends, i, s, t):
+    """Least and largest amplitude and threshold with any of the effects but one."""
+    low, high = ends[0, 0, s, t], ends[0, 1, s, t]
+    lower, upper = ends[1, 0, s, t], ends[1, 1, s, t]
+    added = 0.0
+    for j in range(table.shape[0]):
+        if j != i:
+            low *= min(table[j, _WEAK, s, t], 1.0)
+            high *= max(table[j, _STRONG, s, t], 1.0)
+            lower *= min(table[j, _DOWN, s, t], 1.0)
+            upper *= max(table[j, _UP, s, t], 1.0)
+            added += table[j, _ADDED, s, t]
+    return max(low - high * added, 0.0), high * (1.0 + added), lower, upper
+
+
+@njit(cache=True, error_model="numpy")
+def _within(own, low, high, lower, upper):
+    """Largest change of pd by one effect from anywhere within intervals."""
+    weak, strong, down, up, added = own
+    low, high = min(low, _HUGE), min(high, _HUGE)
+    if low == high and lower == upper and added == 0.0:
+        without = marcum_q1_pair(low, lower)[0]
+        most = marcum_q1_pair(min(high * strong, _HUGE), lower * down)[0]
+        least = marcum_q1_pair(low * weak, lower * up)[0]
+        return max(most - without, without - least)
+    more = min(high * added, _HUGE)
+    weak, strong, down, up = min(weak, 1.0), max(strong, 1.0), min(down, 1.0), max(up, 1.0)
+    below, above = max(low * weak - more, 0.0), min(high * strong + more, _HUGE)
+    smallest, biggest = lower * down, upper * up
+    step = math.inf if weak == 0.0 else max(math.log(strong), -math.log(weak))
+    turn = max(math.log(up), -math.log(down))
+    slopes = more * _steepest_addition(below, above, smallest, biggest)
+    if step > 0.0:
+        slopes += step * _steepest(below, above, smallest, biggest)
+    if turn > 0.0:
+        slopes += turn * _steepest_threshold(below, above, smallest, biggest)
+    if slopes <= _NEGLIGIBLE:
+        return slopes
+    most = marcum_q1_pair(above, smallest)[0]
+    ends = max(most - marcum_q1_pair(below, biggest)[0], 0.0)
+    return slopes if slopes < ends else ends
+
+
+@njit(cache=True, error_model="numpy")
+def _apart(low, high, smallest, biggest):
+    """Least distance between amplitudes and thresholds of a box."""
+    return max(low - biggest, smallest - high, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _steepest(low, high, smallest, biggest):
+    """Bound on dQ_1/d ln a over a box of amplitudes and thresholds."""
+    peak_low = 0.5 * (smallest + math.sqrt(smallest**2 + 2.0))
+    peak_high = 0.5 * (biggest + math.sqrt(biggest**2 + 2.0))
+    a = high if high < peak_low else max(low, peak_high)
+    a = min(a, peak_high * 1e6)
+    beyond = high < peak_low or low > peak_high
+    apart = max(smallest - a, a - biggest, 0.0) if beyond else 0.0
+    return math.sqrt(a * biggest / (2.0 * math.pi)) * math.exp(-0.5 * apart * apart)
+
+
+@njit(cache=True, error_model="numpy")
+def _steepest_addition(low, high, smallest, biggest):
+    """Bound on dQ_1/da over the box."""
+    apart = _apart(low, high, smallest, biggest)
+    return min(0.5, 0.22 * biggest * math.exp(-0.5 * apart * apart))
+
+
+@njit(cache=True, error_model="numpy")
+def _steepest_threshold(low, high, smallest, biggest):
+    """Bound on -dQ_1/d ln b = b^2 I_0(a b) e^{-(a^2 + b^2)/2} over the box.
+
+    I_0(z) e^{-z} is at most 1 and 1/sqrt(1 + 2 z): the one for a below b/2, the other above.
+    """
+    half = 0.5 * smallest
+    found = 0.0
+    if low < half:
+        apart = max(smallest - min(high, half), 0.0)
+        found = biggest**2 * math.exp(-0.5 * apart * apart)
+    if high >= half:
+        apart = _apart(low, high, smallest, biggest)
+        strong = math.exp(-0.5 * apart * apart) / math.sqrt(1.0 + smallest**2)
+        found = max(found, biggest**2 * strong)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _false_alarm(threshold, bins):
+    """Chance of a false alarm in a segment, every bin counted."""
+    bin_alarm = math.exp(-0.5 * threshold * threshold)
+    return -math.expm1(bins * math.log1p(-bin_alarm)) if bin_alarm < 1.0 else 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _alarm_change(own, lower, upper, bins):
+    """Largest change of a segment's chance of a false alarm from anywhere within thresholds."""
+    down, up = own[_DOWN], own[_UP]
+    if lower == upper:
+        without = _false_alarm(lower, bins)
+        most = _false_alarm(lower * down, bins) - without
+        return max(most, without - _false_alarm(upper * up, bins))
+    down, up = min(down, 1.0), max(up, 1.0)
+    least, largest = lower * down, upper * up
+    ends = _false_alarm(least, bins) - _false_alarm(largest, bins)
+    slope = largest**2 * min(bins * math.exp(-0.5 * least * least), 0.5)
+    return min(ends, slope * max(math.log(up), -math.log(down)))

@@ -1,0 +1,173 @@
+"""Spans: the least and the largest value of a quantity over the points of each tile of a grid.
+
+Interval arithmetic on arrays. Where both ends are the same, the arithmetic is that of plain
+numbers to the last bit; no end is rounded outwards. A quantity that enters a formula twice is
+taken for two: the result holds all values, and may be wider than it need be.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Union
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+Operand = Union["Span", float, int, np.ndarray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Span:
+    """Least and largest value, scalars or arrays that broadcast against each other's shapes."""
+
+    low: np.ndarray | float
+    high: np.ndarray | float
+
+    __array_ufunc__ = None  # an array times a span is a span, not an array of spans
+
+    @staticmethod
+    def of(value: Operand) -> "Span":
+        """A span that is one value; a span as it is."""
+        return value if isinstance(value, Span) else Span(value, value)
+
+    @staticmethod
+    def hull(*values: Operand) -> "Span":
+        """The least span that holds all of some."""
+        spans = [Span.of(value) for value in values]
+        low, high = spans[0].low, spans[0].high
+        for span in spans[1:]:
+            low, high = np.minimum(low, span.low), np.maximum(high, span.high)
+        return Span(low, high)
+
+    @property
+    def is_one(self) -> bool:
+        """Whether all tiles have one and the same value."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return bool(low.size and (low == low.flat[0]).all() and (high == low.flat[0]).all())
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """Largest magnitude."""
+        return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
+
+    def some(self, index: np.ndarray | slice) -> "Span":
+        """The spans of some tiles; one for all stays it."""
+        ends = (np.asarray(end)[index] if np.ndim(end) else end for end in (self.low, self.high))
+        return Span(*ends)
+
+    def holds(self, value: ArrayLike, rounding: float = 0.0) -> np.ndarray:
+        """Whether a value lies within, by tile; ``rounding`` is relative room."""
+        v = np.asarray(value, float)
+        room = rounding * np.abs(v)
+        return np.asarray((v >= self.low - room) & (v <= self.high + room))
+
+    def __add__(self, other: Operand) -> "Span":
+        o = Span.of(other)
+        return Span(self.low + o.low, self.high + o.high)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> "Span":
+        return Span(-self.high, -self.low)
+
+    def __sub__(self, other: Operand) -> "Span":
+        o = Span.of(other)
+        return Span(self.low - o.high, self.high - o.low)
+
+    def __rsub__(self, other: Operand) -> "Span":
+        o = Span.of(other)
+        return Span(o.low - self.high, o.high - self.low)
+
+    def __mul__(self, other: Operand) -> "Span":
+        o = Span.of(other)
+        if _never_negative(self.low) and _never_negative(o.low):
+            return Span(self.low * o.low, self.high * o.high)
+        return _extremes(self.low * o.low, self.low * o.high, self.high * o.low, self.high * o.high)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Operand) -> "Span":
+        """Infinite to both sides where the divisor's span holds 0 and is not 0 itself."""
+        o = Span.of(other)
+        if _positive(o.low):
+            if _never_negative(self.low):
+                return Span(self.low / o.high, self.high / o.low)
+            return _extremes(
+                self.low / o.low, self.low / o.high, self.high / o.low, self.high / o.high
+            )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = [np.divide(a, b) for a in (self.low, self.high) for b in (o.low, o.high)]
+            found = _extremes(*ends)
+        through = np.less_equal(o.low, 0) & np.greater_equal(o.high, 0)
+        return Span(np.where(through, -np.inf, found.low), np.where(through, np.inf, found.high))
+
+    def __rtruediv__(self, other: Operand) -> "Span":
+        return Span.of(other) / self
+
+    def __pow__(self, power: float) -> "Span":
+        """A number's power; a span that may be negative has whole ones only."""
+        if power < 0:
+            return 1.0 / self ** (-power)
+        if _never_negative(self.low):
+            return Span(self.low**power, self.high**power)
+        found = _extremes(self.low**power, self.high**power)
+        if power % 2:
+            return found
+        through = np.less_equal(self.low, 0) & np.greater_equal(self.high, 0)
+        return Span(np.where(through, 0.0, found.low), found.high)
+
+    def __abs__(self) -> "Span":
+        ends = _extremes(np.abs(self.low), np.abs(self.high))
+        through = np.less_equal(self.low, 0) & np.greater_equal(self.high, 0)
+        return Span(np.where(through, 0.0, ends.low), ends.high)
+
+    def sqrt(self) -> "Span":
+        """Square root of what is not negative."""
+        return Span(np.sqrt(self.low), np.sqrt(self.high))
+
+    def minimum(self, other: Operand) -> "Span":
+        """The smaller of two."""
+        o = Span.of(other)
+        return Span(np.minimum(self.low, o.low), np.minimum(self.high, o.high))
+
+    def maximum(self, other: Operand) -> "Span":
+        """The larger of two."""
+        o = Span.of(other)
+        return Span(np.maximum(self.low, o.low), np.maximum(self.high, o.high))
+
+
+def monotone(
+    function: Callable[..., np.ndarray],
+    *,
+    falling: Any = (),
+    **values: Operand,
+) -> Span:
+    """What a function takes on that rises with all of its arguments, but falls with some.
+
+    Parameters
+    ----------
+    function : callable
+        Of numbers or arrays by keyword.
+    falling : tuple of str
+        Arguments with which it falls.
+    **values
+        The arguments.
+    """
+    spans = {name: Span.of(value) for name, value in values.items()}
+    low = {name: s.high if name in falling else s.low for name, s in spans.items()}
+    high = {name: s.low if name in falling else s.high for name, s in spans.items()}
+    return Span(function(**low), function(**high))
+
+
+def _never_negative(value: np.ndarray | float) -> bool:
+    return value >= 0 if isinstance(value, float) else bool(np.asarray(value >= 0).all())
+
+
+def _positive(value: np.ndarray | float) -> bool:
+    return value > 0 if isinstance(value, float) else bool(np.asarray(value > 0).all())
+
+
+def _extremes(*values: np.ndarray | float) -> Span:
+    low = high = values[0]
+    for value in values[1:]:
+        low, high = np.minimum(low, value), np.maximum(high, value)
+    return Span(low, high)

@@ -1,0 +1,124 @@
+"""What a beam meets: a flat plane, or whatever rays have found; as one line or as beamlets."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from sweep.model import footprint, reflectance
+from sweep.model.constants import SPEED_OF_LIGHT
+
+
+class Footprints(NamedTuple):
+    """Where beamlets fall and what they send back, in rows that points share."""
+
+    row: np.ndarray
+    """(n,) int64: the row of each point."""
+    offset: np.ndarray
+    """(rows, beamlets): (R_b - R_0) / R_0."""
+    doppler: np.ndarray
+    """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
+    echo: np.ndarray
+    """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
+
+
+class Ground(Protocol):
+    """What n points' beams meet."""
+
+    def axis(self, size: int) -> Footprints:
+        """One line for each point, at the range and the velocity of the beam's axis."""
+
+    @property
+    def beamlets(self) -> Footprints:
+        """The whole footprint."""
+
+    @property
+    def beside(self) -> np.ndarray | None:
+        """Beamlets that lie on another surface than the axis, (rows, beamlets) bool; or None."""
+
+
+class Plane:
+    """A flat plane, for points of one category.
+
+    Parameters
+    ----------
+    p : mapping
+        Parameters as arrays, of :func:`sweep.model.preparation.categories`.
+    size : int
+        Points n.
+    """
+
+    beside = None
+
+    def __init__(self, p: Mapping[str, np.ndarray], size: int) -> None:
+        self._law = str(p["target.reflectance_law"])
+        self._number = int(p["footprint.beamlets"])
+        self._pattern = pattern(
+            str(p["footprint.phases"]), str(p["instrument.receiver.architecture"])
+        )
+        columns = np.broadcast_arrays(
+            p["target.grazing_angle"],
+            p["instrument.laser.beam_divergence"],
+            p["target.radial_velocity"],
+            p["target.transverse_velocity"],
+        )
+        self._columns, self._size = [np.atleast_1d(column) for column in columns], size
+
+    def axis(self, size: int) -> Footprints:
+        """One line for each point: a row for each distinct grazing angle."""
+        angles, row = np.unique(self._columns[0], return_inverse=True)
+        echo = reflectance.backscatter(self._law, np.sin(angles))[:, None]
+        nothing = np.zeros_like(echo)
+        return Footprints(_rows(row, size), nothing, nothing, echo)
+
+    @cached_property
+    def beamlets(self) -> Footprints:
+        """The whole footprint: a row for each distinct geometry."""
+        across = self._columns[3]
+        # The velocity along the beam spreads the lines only where one across it is looked at too.
+        columns = [*self._columns[:2], np.where(across == 0, 0.0, self._columns[2]), across]
+        shapes, row = np.unique(np.stack(columns), axis=1, return_inverse=True)
+        offset, cos_incidence, weights = footprint.plane_footprint(
+            grazing_angle=shapes[0],
+            beam_divergence=shapes[1],
+            number=self._number,
+            pattern=self._pattern,
+        )
+        echo = weights * reflectance.backscatter(self._law, cos_incidence) / (1 + offset) ** 2
+        closing = footprint.velocity_offsets(
+            radial=shapes[2], transverse=shapes[3], beam_divergence=shapes[1],
+            number=self._number, pattern=self._pattern,
+        )  # fmt: skip
+        doppler = np.where(weights > 0, 2 * closing / SPEED_OF_LIGHT, 0.0)
+        return Footprints(_rows(row, self._size), offset, doppler, echo)
+
+
+class Cast:
+    """Footprints that rays have found.
+
+    Parameters
+    ----------
+    footprints : Footprints
+        Of the n points.
+    beside : (rows, beamlets) bool ndarray, optional
+        Beamlets that lie on another surface than the beam's axis.
+    """
+
+    def __init__(self, footprints: Footprints, beside: np.ndarray | None = None) -> None:
+        self.beamlets, self.beside = footprints, beside
+
+    def axis(self, size: int) -> Footprints:
+        """One line for each point, with the echo of all its beamlets."""
+        whole = self.beamlets.echo.sum(axis=1)[:, None]
+        nothing = np.zeros_like(whole)
+        return Footprints(self.beamlets.row, nothing, nothing, whole)
+
+
+def pattern(phases: str, architecture: str) -> str:
+    """Arrangement of the beamlets: hexagonal where their powers add, else without symmetry."""
+    return "hexagonal" if phases == "incoherent" and architecture != "direct" else "sunflower"
+
+
+def _rows(row: np.ndarray, size: int) -> np.ndarray:
+    return np.broadcast_to(row.ravel(), size).astype(np.int64)

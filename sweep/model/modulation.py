@@ -1,0 +1,201 @@
+"""What befalls lines within a record: phase errors, and a frequency that is not quite known.
+
+Shots may carry phase errors that all lines of a segment share (:class:`PhaseError`), and a
+Gaussian width of their beat. The compiled code takes both as numbers: each line becomes a few
+lines (:mod:`sweep.model.effects.line_splitting`), each spectrum the mean over a few shifts
+(:func:`sweep.model.effects.line_width.gaussian_shifts`). They are worked out for a stretch of
+points at a time, so that what they take of memory does not grow with the number of points; shots
+without them are one stretch, and pay for nothing.
+
+Shifts are about the middle of the record: there, lines and images keep their phases.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sweep.model.effects.line_splitting import split_lines
+from sweep.model.effects.line_width import gaussian_shifts
+from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.preparation import Shots
+from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE
+
+POINTS = 256
+"""Points of a stretch."""
+
+
+class Stretch(NamedTuple):
+    """A run of points, and what compiled code has to know of them."""
+
+    part: slice
+    """Which points of the shots these m are."""
+    points: np.ndarray
+    """(14, m) :meth:`sweep.model.preparation.Shots.point_table`."""
+    row: np.ndarray
+    """(m,) int64: row in the footprints."""
+    scene: tuple
+    """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
+    many count (3, u), which of the u each point has (m,); shifts [bins of fs/L] and their weights
+    (m, k). Empty where there is none."""
+    lines: int
+    """Lines that one point may have at the most."""
+
+
+def stretches(shots: Shots) -> Iterator[Stretch]:
+    """Points in stretches, in their order; one at least."""
+    alike = _alike(shots)
+    plain = shots.gaussian_width is None and alike[0].size <= POINTS
+    step = max(shots.size, 1) if plain else POINTS
+    table, shared = shots.point_table(), _parts(shots, *alike) if plain else None
+    for first in range(0, max(shots.size, 1), step):
+        yield _stretch(shots, table, first, min(first + step, shots.size), shared)
+
+
+def single(shots: Shots, i: int) -> Stretch:
+    """Point ``i`` alone."""
+    return _stretch(shots, shots.point_table(), i, i + 1)
+
+
+def _alike(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Points of which no two have the same phase errors; which of these each point has."""
+    values = [
+        np.broadcast_to(np.asarray(one, float), shots.size)
+        for error in shots.phase_errors
+        for value in error.values.values()
+        for one in (value if isinstance(value, tuple) else (value,))
+    ]
+    if not values:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    varying = [v for v in values if v.size and (v != v[0]).any()]
+    if not varying:
+        return np.zeros(min(shots.size, 1), np.int64), np.zeros(shots.size, np.int64)
+    _, first, which = np.unique(np.stack(varying), axis=1, return_index=True, return_inverse=True)
+    return first, which.ravel()
+
+
+def _stretch(
+    shots: Shots, table: np.ndarray, first: int, last: int, shared: tuple | None = None
+) -> Stretch:
+    part, index = slice(first, last), np.arange(first, last)
+    parts = _parts(shots, index, np.arange(index.size)) if shared is None else shared
+    shifts = _shifts(shots, index)
+    beamlets = shots.offset.shape[1]
+    times = max(parts[0].shape[2], shifts[0].shape[1])
+    return Stretch(
+        part,
+        np.ascontiguousarray(table[:, part]),
+        shots.row[part],
+        (shots.footprint, parts, shifts),
+        max(beamlets, MOST_NODES) * times if times else beamlets,
+    )
+
+
+def choices(shots: Shots, *, every_bin: bool = False) -> tuple[bool, bool, bool, bool]:
+    """What compiled code is to do: add beamlets as powers, sum images, look at leakage.
+
+    The last is whether each bin of it is looked at by itself, where it could be an integral.
+    """
+    return shots.incoherent, shots.image, shots.leakage, every_bin
+
+
+def _parts(shots: Shots, index: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Places and weights of the lines that each line is split into, by segment and point.
+
+    Worked out for some points; ``which`` of these stands for each point of a stretch.
+    """
+    if not shots.phase_errors or not index.size:
+        return (*np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64))
+
+    def phase(x: np.ndarray, segment: int) -> np.ndarray:
+        return np.asarray(sum(error.of(segment, index, x) for error in shots.phase_errors))
+
+    splits = {
+        segment: split_lines(partial(phase, segment=segment))
+        for segment in map(int, np.flatnonzero(shots.segments))
+    }
+    most = max(split.offset.shape[1] for split in splits.values())
+    offset, re, im = np.zeros((3, 3, index.size, most))
+    number = np.zeros((3, index.size), np.int64)
+    for segment, split in splits.items():
+        lines = split.offset.shape[1]
+        offset[segment, :, :lines] = split.offset
+        re[segment, :, :lines], im[segment, :, :lines] = split.weight.real, split.weight.imag
+        number[segment] = split.number
+    return offset, re, im, number, which
+
+
+def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts over which |X|^2 is averaged, and their weights."""
+    if shots.gaussian_width is None:
+        return np.empty((0, 0)), np.empty((0, 0))
+    duration = np.broadcast_to(shots.record_duration, shots.size)[index]
+    shifts = gaussian_shifts(fwhm=shots.gaussian_width[index], duration=duration)
+    return shifts.offset, shifts.weight
+
+
+@njit(cache=True, error_model="numpy")
+def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
+    """Lines in rows DELTA .. after what befalls them, as far as that leaves them plain lines.
+
+    Amplitudes are split into parts, powers shifted; few lines stand for many before and after.
+
+    Parameters
+    ----------
+    segment, i, n : int
+        0 up, 1 Doppler, 2 down; place of the point in its stretch; number of lines.
+    fold : float
+        -1 where the lines are seen as their images, which conjugates their weights.
+    parts, shifts, power, kernel, room
+        As of :class:`Stretch` and :func:`sweep.model.segments.segment_spectrum`.
+
+    Returns
+    -------
+    int
+        Number of lines.
+    """
+    count = shifts[0].shape[1] if power else parts[0].shape[2]
+    if count == 0:
+        return n
+    fft_size, length = kernel[0]
+    bins = fold * fft_size / length
+    few = reduce_lines(n, power, kernel, room)
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    at, one, other = room[4], room[5], room[6]
+    lines = 0
+    if power:
+        for m in range(count):
+            share = shifts[1][i, m]
+            if share > 0.0:
+                apart = bins * shifts[0][i, m]
+                for j in range(few):
+                    delta[lines + j], re[lines + j] = at[j] + apart, one[j] * share
+                    im[lines + j] = 0.0
+                lines += few
+    else:
+        own = parts[4][i]
+        for m in range(parts[3][segment, own]):
+            apart = bins * parts[0][segment, own, m]
+            a, b = parts[1][segment, own, m], fold * parts[2][segment, own, m]
+            for j in range(few):
+                delta[lines + j] = at[j] + apart
+                re[lines + j] = one[j] * a - other[j] * b
+                im[lines + j] = one[j] * b + other[j] * a
+            lines += few
+    few = reduce_lines(lines, power, kernel, room)
+    for j in range(few):
+        delta[j], re[j], im[j] = at[j], one[j], other[j]
+    return few
+
+
+@njit(cache=True, error_model="numpy")
+def reduce_lines(n, power, kernel, room):
+    """Few lines that are equivalent to those in rows DELTA .., into rows 4 to 6; how many."""
+    fft_size, length = kernel[0]
+    band = np.pi * length / fft_size * (2.0 if power else 1.0)
+    return equivalent_lines(
+        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, band, kernel[3], room[4], room[5],
+        room[6], room[7:12],
+    )  # fmt: skip

@@ -1,0 +1,187 @@
+"""Random effects, draw by draw: each draw is a shot of its own, and what counts is their mean.
+
+Points times draws are laid out in a row, cut into stretches that memory holds, and each stretch
+is prepared as any other points are: random effects turn its parameters before, and change its
+shots after, all the others. Over the noise every draw has closed forms (PHYSICS section 6), whose
+mean over the draws converges far faster than a count of detections would.
+
+Every random number is addressed by point, draw and cause (:mod:`sweep.model.philox`), and sums run
+over a point's draws in their order: how draws are cut into stretches, and which points or effects
+are there besides, makes no difference to a single bit.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sweep.model.chain import SHARED, assembled, nodes
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.effect import Effect, Realisation, Scene
+from sweep.model.ground import Plane
+from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS
+from sweep.model.preparation import Parameters, Shots, categories
+from sweep.model.shot import statistics
+
+ROWS = 4096
+"""Draws that are prepared at once, of all points together."""
+BEAMLETS = 1 << 19
+"""Beamlets of all these draws, of some 100 bytes each."""
+
+_LOGARITHMS = np.array([name.startswith("log10_") for name in OUTPUTS])
+_WITHOUT_ECHO = ("range_error", "radial_velocity_error")
+"""What has no value in a draw that sends nothing back."""
+
+
+class Stretch(NamedTuple):
+    """Some draws of some points, (m,) each, a point's draws in their order."""
+
+    point: np.ndarray
+    """int64: which point."""
+    draw: np.ndarray
+    """int64: number of the draw."""
+    shots: Shots
+
+
+def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
+    """Those of the effects, by name, that are simulated by draws."""
+    return tuple(effect for effect in nodes(effects) if effect.is_random)
+
+
+def realise(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int,
+) -> Iterator[Stretch]:
+    """Shots of every draw of n points on a flat plane.
+
+    Parameters
+    ----------
+    parameters, effects
+        As of :func:`sweep.model.chain.prepare`.
+    keys : (n, 2) uint64
+        Random key of each point.
+    first_draw, draws : int
+        Number of the first draw, number of draws.
+    """
+    everything = DEFAULTS | dict(parameters)
+    # So that there are n points even where they differ in nothing.
+    everything["target.range"] = np.broadcast_to(everything["target.range"], len(keys))
+    for index, p in categories(everything, SHARED):
+        rows = min(ROWS, max(1, BEAMLETS // int(p["footprint.beamlets"])))
+        for start in range(0, index.size * draws, rows):
+            place = np.arange(start, min(start + rows, index.size * draws))
+            of_group, number = place // draws, first_draw + place % draws
+            point = index[of_group]
+            chosen = {path: a[of_group] if a.ndim else a for path, a in p.items()}
+            yield Stretch(point, number, _drawn(chosen, effects, Realisation(keys[point], number)))
+
+
+def _drawn(p: dict[str, np.ndarray], effects: Collection[str], realisation: Realisation) -> Shots:
+    """One draw of each of some points of one category."""
+    size, chosen = realisation.draw.size, random_effects(effects)
+    for effect in chosen:
+        if effect.turn is not None:
+            p = effect.turn(p, realisation)
+    scene = Scene(p, Plane(p, size))
+    shots = assembled(p, size, scene.ground, effects)
+    for effect in chosen:
+        if effect.draw is not None:
+            shots = effect.draw(shots, scene, realisation)
+    return shots
+
+
+def evaluate(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int,
+) -> dict[str, np.ndarray]:
+    """Statistics of n shots, means over draws of random effects.
+
+    Parameters
+    ----------
+    parameters, effects, keys, first_draw, draws
+        As of :func:`realise`.
+
+    Returns
+    -------
+    dict of (n,) ndarray
+        As of :meth:`Means.results`.
+    """
+    means = Means(len(keys))
+    for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
+        means.add(stretch.point, outputs_of(stretch.shots))
+    return means.results()
+
+
+def outputs_of(shots: Shots) -> dict[str, np.ndarray]:
+    """Outputs of each draw, (m,); where nothing is sent back, nan for what is then unknown."""
+    outputs = statistics(shots)
+    dark = shots.echo_power == 0
+    return outputs | {name: np.where(dark, np.nan, outputs[name]) for name in _WITHOUT_ECHO}
+
+
+def certain(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Standard errors where nothing is random: 0, but nan for what there is not."""
+    return {name: 0.0 * outputs[name.removesuffix("_error")] for name in ERROR_OUTPUTS}
+
+
+class Means:
+    """Means of the outputs over the draws of n points, added up draw after draw.
+
+    A draw in which an output is nan is no draw of that output. Logarithms are those of the mean.
+    """
+
+    def __init__(self, size: int) -> None:
+        shape = len(OUTPUTS), size
+        self._count = np.zeros(shape, np.int64)
+        self._mean = np.where(_LOGARITHMS[:, None], -np.inf, np.zeros(shape))
+        self._spread = np.zeros(shape)
+
+    def add(self, point: np.ndarray, outputs: Mapping[str, np.ndarray]) -> None:
+        """Adds draws, (m,) each, in the order of their numbers for each point."""
+        values = np.array([outputs[name] for name in OUTPUTS])
+        _add(point, values, _LOGARITHMS, self._count, self._mean, self._spread)
+
+    def results(self) -> dict[str, np.ndarray]:
+        """The means by the names of OUTPUTS, standard errors by those of ERROR_OUTPUTS, (n,)."""
+        n = self._count
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithm = self._mean + np.log10(self._spread / n)
+            error = np.sqrt(self._spread / (n * (n - 1.0)))
+        # The running maximum of logarithms that are all -inf has nothing to add to it.
+        logarithm = np.where(np.isneginf(self._mean), self._mean, logarithm)
+        mean = np.where(_LOGARITHMS[:, None], logarithm, self._mean)
+        means = dict(zip(OUTPUTS, np.where(n > 0, mean, np.nan), strict=True))
+        errors = dict(zip(OUTPUTS, error, strict=True))
+        return means | {name: errors[name.removesuffix("_error")] for name in ERROR_OUTPUTS}
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add(point, values, logarithms, count, mean, spread):
+    """Draws into running means and sums of squared deviations [Welford, Technometrics 4, 1962].
+
+    For logarithms instead the largest, and the sum of the numbers over its number.
+    """
+    for k in range(values.shape[0]):
+        for j in range(point.size):
+            i, x = point[j], values[k, j]
+            if np.isnan(x):
+                continue
+            count[k, i] += 1
+            if not logarithms[k]:
+                apart = x - mean[k, i]
+                mean[k, i] += apart / count[k, i]
+                spread[k, i] += apart * (x - mean[k, i])
+            elif x > mean[k, i]:
+                spread[k, i] = spread[k, i] * 10.0 ** (mean[k, i] - x) + 1.0
+                mean[k, i] = x
+            elif x > -np.inf:
+                spread[k, i] += 10.0 ** (x - mean[k, i])

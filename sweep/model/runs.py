@@ -1,0 +1,222 @@
+"""|X| of a run of bins around a segment's lines, and the detection in it.
+
+For unpadded spectra of cosine-sum windows, whose far field is smooth: bins near the lines take
+every line as it is, bins beside them few sources (:mod:`sweep.model.far_field`). Where leakage is
+left out nothing is looked at but what lines can lift to the threshold, and what it takes to be
+sure of the largest bin.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sweep.model import far_field
+from sweep.model.detection import mark
+from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
+from sweep.model.spectrum import set_tangents
+
+DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
+"""Rows of scratch that hold the lines."""
+
+SOURCES, IMAGES = 13, 16
+"""First of three rows each that hold the sources of lines and of images."""
+
+
+@njit(cache=True, error_model="numpy")
+def smooth(kernel):
+    """Whether spectra are smooth between lines: closed form of the window, no padding."""
+    return kernel[1][4].size == 0 and kernel[0][0] == kernel[0][1]
+
+
+@njit(cache=True, error_model="numpy")
+def reach_of(level, weights, envelope, reach):
+    """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
+    if not weights > 0.0:
+        return 1.0
+    low, high = 0, envelope.size - 1
+    if envelope[high] * weights > level:
+        return np.inf
+    while low < high:
+        middle = (low + high) // 2
+        if envelope[middle] * weights > level:
+            low = middle + 1
+        else:
+            high = middle
+    return reach[low]
+
+
+@njit(cache=True, error_model="numpy")
+def detect(origin, n, level, choices, kernel, room, exempt):
+    """Run of bins and detection of a segment's lines, whatever leaks beside them.
+
+    Parameters and results as of :func:`sweep.model.leakage.inspect`, without leakage; ``level`` is
+    the threshold. The run ends where lines and images stay below it, and below the largest bin.
+    """
+    half_size = kernel[0][0] // 2
+    power, image = choices[0], choices[1]
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
+    spread = lowest, highest
+    poles = len(kernel[1][2])
+    clearance = CLEARANCE + poles
+    total = math.sqrt(total) if power else total
+    afar = total if power else sum_afar(re, im, n, total, spread, poles)
+    centre = _seen_from(origin, spread, kernel[0][0])
+    needed = _lifted(level, total, afar, highest - lowest, centre, image, kernel)
+    while True:
+        beyond = needed
+        near, mirrored, fits = near_bins(
+            origin, lowest, highest, min(beyond, clearance), image, kernel
+        )
+        if not fits:
+            return 0, 0, 0, 0
+        sources = beyond > clearance or (image and not mirrored)
+        field = prepare_field(origin, n, spread, sources, choices, kernel, room)
+        low = max(near[0] - max(beyond - clearance, 0), 0)
+        high = min(near[1] + max(beyond - clearance, 0), half_size)
+        count = high - low + 1
+        magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
+        peak, exempted = mark(room[0], count, level, exempt)
+        if room[0, peak] >= level or count == half_size + 1:
+            return low, count, peak, exempted
+        most = room[0, peak]
+        needed = _lifted(most, total, afar, highest - lowest, centre, image, kernel)
+        if needed <= beyond:
+            return low, count, peak, exempted
+
+
+@njit(cache=True, error_model="numpy")
+def _lifted(level, total, afar, spread, centre, image, kernel):
+    """Bins beside the lines that they and their images may lift to a level."""
+    poles, half_size = len(kernel[1][2]), kernel[0][0] // 2
+    near = stays_below(level, total * kernel[2][0], spread, centre, image, kernel)
+    clearance = CLEARANCE + poles
+    if near > clearance:
+        far = stays_below(level, afar * kernel[2][0], spread, centre, image, kernel)
+        near = max(min(near, far), float(clearance))
+    return math.ceil(min(max(near, poles + 2.0), float(half_size)))
+
+
+@njit(cache=True, error_model="numpy")
+def stays_below(level, weight, spread, centre, image, kernel):
+    """Bins beyond which lines and images of a summed weight stay below a level.
+
+    The envelope is of sin(pi y) K(y): K itself falls to it within a bin.
+    """
+    _, envelope, reach = kernel[2]
+    crossing = reach_of(0.9 * level, weight, envelope, reach)
+    far = min(centre, kernel[0][0] // 2 - centre) - 0.5 * spread - 1.0
+    if image and far < 32.0 * crossing:  # else images add less than a tenth
+        crossing = reach_of(0.5 * level, weight, envelope, reach)
+    return crossing + 1.5
+
+
+@njit(cache=True, error_model="numpy")
+def sum_afar(re, im, n, total, spread, poles):
+    """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
+
+    By how much kernels may differ over the bundle, from the clearance on: the spread times their
+    derivative, (2 poles + 1) over the distance.
+    """
+    sum_re, sum_im = 0.0, 0.0
+    for b in range(n):
+        sum_re += re[b]
+        sum_im += im[b]
+    differ = (2 * poles + 1) * 0.5 * (spread[1] - spread[0]) / CLEARANCE
+    return min(total, math.hypot(sum_re, sum_im) + differ * total)
+
+
+@njit(cache=True, error_model="numpy")
+def _seen_from(origin, spread, fft_size):
+    """Bin in the middle of where a bundle of lines is seen, 0..N/2."""
+    centre = abs(origin + math.floor(0.5 * (spread[0] + spread[1]) + 0.5))
+    return fft_size - centre if centre > fft_size // 2 else centre
+
+
+@njit(cache=True, error_model="numpy")
+def near_bins(origin, lowest, highest, apart, image, kernel):
+    """First and last bin ``apart`` from a line; whether images are near; whether angles small."""
+    fft_size = kernel[0][0]
+    half_size = fft_size // 2
+    clearance = CLEARANCE + len(kernel[1][2])
+    low = origin + math.floor(lowest) - apart
+    high = origin + math.ceil(highest) + apart
+    # Lines beyond DC or Nyquist are seen as their images, which fold back into the band.
+    if low < 0:
+        high = max(high, -low)
+    if high > half_size:
+        low = min(low, fft_size - high)
+    low, high = max(low, 0), min(high, half_size)
+    below, above = low + origin + lowest, fft_size - high - origin - highest
+    mirrored = image and min(below, above) < clearance
+    farthest = max(high - origin - lowest, origin + highest - low)
+    if mirrored:
+        sum_, other = high + origin + highest, fft_size - low - origin - lowest
+        farthest = max(farthest, sum_ if below < above else other)
+    fits = (farthest + clearance) * math.pi < LARGEST_ANGLE * fft_size
+    return (low, high), mirrored, fits
+
+
+@njit(cache=True, error_model="numpy")
+def prepare_field(origin, n, spread, sources, choices, kernel, room):
+    """What the far field needs.
+
+    Bin that distances count from; number of sources of the lines and of their images; what the
+    window's first sample adds to every bin, real and imaginary. Without ``sources`` there are
+    none: all that matters is near.
+    """
+    power, image = choices[0], choices[1]
+    fft_size, poles, edge = kernel[0][0], len(kernel[1][2]), kernel[1][3]
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    centre = _seen_from(origin, spread, fft_size)
+    lines, images = 0, 0
+    if sources:
+        lines, images = far_field.far_sources(
+            delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
+            room[SOURCES:], room[5:11],
+        )  # fmt: skip
+    edge_re, edge_im = far_field.edge_field(re if power else im, n, edge, power), 0.0
+    if not image:  # else the imaginary parts of line and image cancel
+        images, edge_re = 0, 0.5 * edge_re
+        edge_im = 0.0 if power else -0.5 * far_field.edge_field(re, n, edge, False)
+    return centre, lines, images, edge_re, edge_im
+
+
+@njit(cache=True, error_model="numpy")
+def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room):
+    """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
+    coefficients, numerator, poles, _, _ = kernel[1]
+    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    centre, lines_used, images_used, edge_re, edge_im = field
+    re, im, t = room[0, :count], room[1, :count], room[2, :count]
+    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
+    re[:] = edge_re
+    im[:] = edge_im
+    set_tangents(low - centre, count, fft_size, kernel[4], t)
+    first, last = near[0] - low, near[1] - low + 1
+    for start, end in ((0, first), (last, count)):
+        if start < end:
+            at, part_re, part_im = t[start:end], re[start:end], im[start:end]
+            add_far_field(at, lines, lines_used, numerator, poles, power, part_re, part_im)
+            if mirrored:
+                add_far_field(at, images, images_used, numerator, poles, power, part_re, part_im)
+    if not mirrored:
+        add_far_field(t, images, images_used, numerator, poles, power, re, im)
+    delta, strength_re, strength_im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    first_bin, near_re, near_im = near[0] - origin, re[first:last], im[first:last]
+    add_near_field(
+        first_bin, delta, strength_re, strength_im, n, False, fft_size, coefficients, power,
+        room[5:7], near_re, near_im,
+    )  # fmt: skip
+    if mirrored:
+        for b in range(n):
+            room[7, b] = -delta[b]
+        first_bin = near[0] + origin - (fft_size if 2 * near[0] > half_size else 0)
+        add_near_field(
+            first_bin, room[7], strength_re, strength_im, n, True, fft_size, coefficients, power,
+            room[5:7], near_re, near_im,
+        )  # fmt: skip
+    for i in range(count):
+        square = re[i] if power else re[i] * re[i] + im[i] * im[i]
+        re[i] = math.sqrt(square if square > 0.0 else 0.0)

@@ -1,0 +1,152 @@
+"""What is wrong with the effects that a study asks for: their modes, and what they lack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.effect import Effect, Parameter
+from sweep.spec.axes import Axis
+from sweep.spec.effect_fields import OFF, ON
+from sweep.spec.fields import rules_of
+from sweep.spec.limits import Condition, has_point, place_on_grid
+from sweep.spec.mistakes import ABSENT, Finding
+from sweep.spec.sections import Effects
+from sweep.units import QuantityError
+
+SECTION = "effects"
+
+
+class Need(NamedTuple):
+    """A parameter that means nothing without another."""
+
+    path: str
+    asks: Condition
+    """Whether values of it need the other."""
+    other: str
+    """Parameter that must then be above 0."""
+
+
+NEEDS = (
+    Need("instrument.processing.bits", lambda bits: bits > 0, "instrument.processing.full_scale"),
+    Need(
+        "atmosphere.profile",
+        lambda profile: np.isin(profile, ("exponential", "layer")),
+        "atmosphere.extinction",
+    ),
+)
+
+
+def written_modes(written: Mapping[str, Any]) -> dict[str, str]:
+    """Mode of every effect by its name, of a spec as written; those unreadable are left out."""
+    section = written.get(SECTION)
+    modes = {}
+    for name, rule in rules_of(Effects, "").items():
+        default = Effects.model_fields[name].default
+        with suppress(QuantityError):
+            given = section.get(name, ABSENT) if isinstance(section, Mapping) else ABSENT
+            modes[name] = default if given is ABSENT else rule.read(given)
+    return modes
+
+
+def effect_findings(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
+) -> list[Finding]:
+    """Effects without those that they act within, and parameters without those that they need.
+
+    Parameters
+    ----------
+    values : mapping
+        SI values of the parameters off the axes, as far as they could be read.
+    axes : tuple of Axis
+        The axes.
+    modes : mapping
+        Mode of each effect by its name, as far as it could be read.
+    """
+    return [*_nesting_findings(modes), *_need_findings(values, axes, modes)]
+
+
+def _nesting_findings(modes: Mapping[str, str]) -> Iterator[Finding]:
+    """Effects that are on within others that are off."""
+    by_name = {effect.name: effect for effect in EFFECTS}
+    for effect in EFFECTS:
+        outer = effect.within
+        while outer and modes.get(effect.name) == ON:
+            if modes.get(outer) == OFF:
+                rule = f"acts within {outer}, which is off"
+                remedy = f"turn {outer} on, or leave {effect.name} out"
+                yield Finding((SECTION, effect.name), rule, remedy, ON)
+            outer = by_name[outer].within
+
+
+def _need_findings(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
+) -> Iterator[Finding]:
+    """Parameters of effects without others that they need."""
+    for path, asks, other in NEEDS:
+        owner = next(e for e in EFFECTS if any(p.path == path for p in e.parameters))
+        conditions: dict[str, Condition] = {path: asks, other: lambda value: value == 0}
+        if modes.get(owner.name, OFF) != OFF and has_point(conditions, values, axes):
+            rule = f"needs {other}, which is 0"
+            remedy = f"set {other}, or effects.{owner.name}: off"
+            yield Finding(place_on_grid(path, axes), rule, remedy, ABSENT)
+
+
+def without_draws(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
+) -> Iterator[Finding]:
+    """Random effects that a grid has and, without draws, can't simulate.
+
+    Parameters are those of :func:`effect_findings`.
+    """
+    for effect, parameter in _random_and_there(values, axes, modes):
+        yield Finding(
+            place_on_grid(parameter.path, axes),
+            "is simulated by draws, and the study has none",
+            f"set draws.number, or effects.{effect.name}: off",
+            ABSENT,
+        )
+
+
+def not_in_flights(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
+) -> Iterator[Finding]:
+    """Random effects that are asked for in a flight, where none of them is drawn yet.
+
+    Parameters are those of :func:`effect_findings`.
+    """
+    rule = "is not drawn in flights yet"
+    for effect in EFFECTS:
+        if effect.is_random and modes.get(effect.name) == ON:
+            instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
+            yield Finding((SECTION, effect.name), rule, f"leave it out{instead}", ON)
+    for effect, parameter in _random_and_there(values, axes, modes):
+        if parameter.path.startswith("target."):
+            continue  # a flight has no target, which is told where one is written
+        remedy = f"leave it out, or set effects.{effect.name}: off"
+        yield Finding(place_on_grid(parameter.path, axes), rule, remedy, ABSENT)
+
+
+def _random_and_there(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
+) -> Iterator[tuple[Effect, Parameter]]:
+    """Random effects that are not off, each with a parameter by which the scene has it."""
+    for effect in EFFECTS:
+        if not effect.is_random or modes.get(effect.name, OFF) == OFF:
+            continue
+        for parameter in effect.parameters:
+            if has_point({parameter.path: _is_there(parameter)}, values, axes):
+                yield effect, parameter
+
+
+def _is_there(parameter: Parameter) -> Condition:
+    """Whether values of a parameter bring its effect: all but its zero or `none`.
+
+    One that is something by default only says how an effect acts that another brings.
+    """
+    brings = parameter.default in (0, "none")
+    return lambda value: (value != parameter.default) & brings

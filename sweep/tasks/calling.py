@@ -1,0 +1,162 @@
+"""Which effects the points of a grid call for: planned tile by tile, told point by point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.effects.flags import flag_attributes, flags_of, names_of
+from sweep.tasks.study import ArrayLayout
+from sweep.tasks.tiles import Tiles
+
+if TYPE_CHECKING:
+    from sweep.model.effects.planning import Plan
+    from sweep.model.eyepoints import Eyepoints
+    from sweep.model.geometry.surfaces import Surface
+    from sweep.spec import Spec
+    from sweep.tasks.grid import Grid
+
+#: Arrays of a store that say what was simulated.
+EFFECTS, ERROR = "effects", "effects_error"
+
+#: Shots of a flight that are planned together.
+TILE_SHOTS = 256
+
+
+class Called(NamedTuple):
+    """What is simulated at some points, (n,) each."""
+
+    flags: np.ndarray
+    """uint32: bit k for the k-th effect of the catalogue."""
+    error: np.ndarray
+    """Largest change of a probability that all that is left out may make."""
+
+    def some(self, index: np.ndarray) -> Called:
+        """What is simulated at some of the points."""
+        return Called(self.flags[index], self.error[index])
+
+    def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
+        """Points that call for the same effects, and these."""
+        for flags in np.unique(self.flags):
+            yield np.flatnonzero(self.flags == flags), names_of(int(flags))
+
+
+class Calling:
+    """Plans of a grid's tiles.
+
+    Parameters
+    ----------
+    spec, grid
+        The study and its grid.
+    """
+
+    def __init__(self, spec: Spec, grid: Grid) -> None:
+        self._modes, self.tiles = spec.modes(), Tiles(grid)
+        self._known: dict[int, tuple[int, float]] = {}
+
+    def of_block(self, block: int) -> Called:
+        """What is simulated at the points of a block, in C order over it."""
+        tiles, place = self.tiles.of_block(block)
+        lacking = np.array([t for t in tiles.tolist() if t not in self._known], np.int64)
+        for chosen, plan in self.plans(lacking):
+            flags = flags_of(plan.kept)
+            for tile, flag, error in zip(lacking[chosen], flags, plan.error, strict=True):
+                self._known[int(tile)] = int(flag), float(error)
+        found = [self._known[t] for t in tiles.tolist()]
+        flags, errors = np.array([f for f, _ in found], np.uint32), np.array([e for _, e in found])
+        return Called(flags[place], errors[place])
+
+    def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
+        """Plans of some tiles: places among them, and the plan of these."""
+        from sweep.model.effects.block import Block
+        from sweep.model.effects.planning import plan
+
+        for alike in self.tiles.alike(tiles):
+            block = Block.of_plane(alike.parameters)
+            tolerance = float(np.ravel(block["accuracy.tolerance"].low)[0])
+            yield alike.tiles, plan(block, modes=self._modes, tolerance=tolerance)
+
+
+class ShotsPlan(NamedTuple):
+    """Plans of shots of a flight."""
+
+    shots: np.ndarray
+    """Places of the shots that see something."""
+    tile: np.ndarray
+    """Index of the tile of each of these."""
+    plan: Plan
+    """Of the tiles."""
+
+    def called(self, number: int) -> Called:
+        """What is simulated of that many shots; nothing where nothing is seen."""
+        called = Called(np.zeros(number, np.uint32), np.zeros(number))
+        called.flags[self.shots] = flags_of(self.plan.kept)[self.tile]
+        called.error[self.shots] = self.plan.error[self.tile]
+        return called
+
+
+def plan_shots(
+    eyepoints: Eyepoints,
+    parameters: Mapping[str, Any],
+    surfaces: Sequence[Surface],
+    *,
+    modes: Mapping[str, str],
+    tiles: np.ndarray,
+    rotating: bool,
+) -> ShotsPlan | None:
+    """Plans of shots of a flight; None where none of them sees anything.
+
+    Parameters
+    ----------
+    eyepoints, parameters, surfaces
+        As of :func:`sweep.model.eyepoints.seen_ground`, but that shots may see nothing.
+    modes
+        Mode of each effect.
+    tiles
+        Number of the tile of each shot, rising.
+    rotating
+        Whether any body turns.
+    """
+    from sweep.model.effects.block import Block
+    from sweep.model.effects.catalogue import DEFAULTS
+    from sweep.model.effects.planning import plan
+    from sweep.model.eyepoints import seen_ground
+
+    seen = np.flatnonzero(eyepoints.seen)
+    if not seen.size:
+        return None
+    starts = np.flatnonzero(np.diff(tiles[seen], prepend=-1))
+    shots, ground = seen_ground(eyepoints.some(seen), parameters, surfaces)
+    block = Block.of_cast(
+        DEFAULTS | dict(shots),
+        ground.beamlets,
+        ground.beside,
+        np.append(starts, seen.size),
+        rotating,
+    )
+    planned = plan(block, modes=modes, tolerance=float(parameters["accuracy.tolerance"]))
+    tile = np.searchsorted(starts, np.arange(seen.size), "right") - 1
+    return ShotsPlan(seen, tile, planned)
+
+
+def layouts(
+    shape: tuple[int, ...], chunks: tuple[int, ...], dims: tuple[str, ...]
+) -> list[ArrayLayout]:
+    """Arrays that say what was simulated at each point."""
+    comment = "sum over the three segments of what the effects left out may change of pd"
+    return [
+        ArrayLayout(
+            name=EFFECTS, shape=shape, chunks=chunks, dims=dims, dtype="uint32", fill=0,
+            attributes=flag_attributes(),
+        ),
+        ArrayLayout(
+            name=ERROR, shape=shape, chunks=chunks, dims=dims, dtype="float64", fill=float("nan"),
+            attributes={
+                "units": "1",
+                "long_name": "largest change of a probability by effects that were left out",
+                "comment": comment,
+            },
+        ),
+    ]  # fmt: skip

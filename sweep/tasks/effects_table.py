@@ -1,0 +1,225 @@
+"""Which effects a study calls for, where, how much they may change, and what they cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sweep.tasks.calling import Calling
+from sweep.tasks.evaluate import evaluate_points
+from sweep.tasks.grid import Grid
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+    from sweep.tasks.flight_study import FlightStudy
+
+#: Tiles that are looked at; of larger grids as many as these, spread over them.
+MOST_TILES = 4096
+
+#: Tiles on which an effect's cost is measured, points of each, and rounds of which the best counts.
+COST_TILES, COST_POINTS, ROUNDS = 4, 24, 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectRow:
+    """An effect in a study."""
+
+    name: str
+    about: str
+    mode: str
+    share: float  # of the points at which it is simulated
+    where: str  # the part of the study that holds these
+    bound: float  # largest change of a probability that it may make anywhere
+    at: str  # where that is
+    seconds_a_point: float  # what it costs where it is simulated; nan where it is not
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectsTable:
+    """All effects in a study."""
+
+    rows: tuple[EffectRow, ...]
+    tolerance: float
+    error: float  # largest sum of what is left out
+    looked_at: float  # share of the tiles
+
+    def warnings(self) -> Iterator[str]:
+        """What is forced off though it matters."""
+        for row in self.rows:
+            if row.mode == "off" and row.bound > self.tolerance:
+                yield (
+                    f"effects.{row.name} is off and may change a probability by up to "
+                    f"{row.bound:.2g} ({row.at}); the tolerance is {self.tolerance:g}: "
+                    "say auto to have it where it matters"
+                )
+
+
+def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
+    """Effects of a study of a grid, from the plans of its tiles.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    costs
+        Whether to measure what effects cost, in a second or so.
+    """
+    from sweep.model.effects.catalogue import EFFECTS
+
+    grid = Grid(spec)
+    calling = Calling(spec, grid)
+    number = calling.tiles.number
+    tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
+    kept, change = np.empty((2, len(EFFECTS), len(tiles)))
+    error = np.empty(len(tiles))
+    for chosen, plan in calling.plans(tiles):
+        kept[:, chosen], change[:, chosen], error[chosen] = plan.kept, plan.change, plan.error
+    points = np.array([_points(calling, tile) for tile in tiles.tolist()])
+    modes = spec.modes()
+    rows = []
+    for k, effect in enumerate(EFFECTS):
+        called = kept[k] > 0
+        most = int(change[k].argmax())
+        rows.append(
+            EffectRow(
+                name=effect.name,
+                about=effect.about,
+                mode=modes[effect.name],
+                share=float(points[called].sum() / points.sum()),
+                where=_region(spec, calling, tiles[called]) if called.any() else "",
+                bound=float(change[k, most]),
+                at=_region(spec, calling, tiles[most : most + 1]),
+                seconds_a_point=_cost(spec, calling, tiles[called], effect.name)
+                if costs and called.any()
+                else float("nan"),
+            )
+        )
+    return EffectsTable(
+        rows=tuple(rows),
+        tolerance=float(np.min([spec.accuracy.tolerance])),
+        error=float(error.max()),
+        looked_at=len(tiles) / number,
+    )
+
+
+def flight_effects_table(study: FlightStudy, shots: int) -> EffectsTable:
+    """Effects of a study of a scene, at the first place along its axes.
+
+    Parameters
+    ----------
+    study
+        The study.
+    shots
+        Shots of each scanner that are looked at, about, spread over the flight in whole cycles.
+    """
+    from sweep.model.effects.catalogue import EFFECTS
+    from sweep.scenes.eyepoint_arrays import from_arrays
+
+    kept, change, error, time_, weight = [], [], [], [], []
+    for eyepoints in study.eyepoint_studies():
+        index = eyepoints.spread(max(1, shots // eyepoints.shots_a_cycle))
+        seen = from_arrays(eyepoints.see(index), eyepoints.weight)
+        part = study.scanners[eyepoints.scanner].part(0)
+        planned = study.planned(part, seen, index // eyepoints.shots_a_cycle)
+        if planned is None:
+            continue
+        kept.append(planned.plan.kept)
+        change.append(planned.plan.change)
+        error.append(planned.plan.error)
+        first = np.searchsorted(planned.tile, np.arange(planned.tile[-1] + 1))
+        time_.append(seen.time[planned.shots][first])
+        weight.append(np.bincount(planned.tile))
+    if not kept:
+        return EffectsTable(
+            rows=(), tolerance=study.spec.accuracy.tolerance, error=0.0, looked_at=1
+        )
+    keep, changes = np.concatenate(kept, axis=1), np.concatenate(change, axis=1)
+    times, number = np.concatenate(time_), np.concatenate(weight)
+    modes = study.spec.modes()
+    rows = []
+    for k, effect in enumerate(EFFECTS):
+        called, most = keep[k], int(changes[k].argmax())
+        rows.append(
+            EffectRow(
+                name=effect.name,
+                about=effect.about,
+                mode=modes[effect.name],
+                share=float(number[called].sum() / number.sum()),
+                where=_times(times[called]) if called.any() else "",
+                bound=float(changes[k, most]),
+                at=f"time {times[most]:.4g} s",
+                seconds_a_point=float("nan"),
+            )
+        )
+    return EffectsTable(
+        rows=tuple(rows),
+        tolerance=float(study.spec.accuracy.tolerance),
+        error=float(np.concatenate(error).max()),
+        looked_at=float(number.sum() / max(1, sum(e.points for e in study.eyepoint_studies()))),
+    )
+
+
+def _times(times: np.ndarray) -> str:
+    low, high = times.min(), times.max()
+    return f"time {low:.4g} s" if low == high else f"time {low:.4g}..{high:.4g} s"
+
+
+def _points(calling: Calling, tile: int) -> int:
+    return int(np.prod([s.stop - s.start for s in calling.tiles.points(tile)]))
+
+
+def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
+    """The least box of the grid that holds some tiles, in the user's units."""
+    slices = [calling.tiles.points(tile) for tile in tiles.tolist()]
+    words = []
+    for k, axis in enumerate(spec.axes):
+        first, stop = min(s[k].start for s in slices), max(s[k].stop for s in slices)
+        for member in axis.members:
+            seen = list(dict.fromkeys(member.display[first:stop].tolist()))
+            unit = f" {member.units}" if member.units else ""
+            if isinstance(seen[0], str):
+                words.append(f"{member.name} {', '.join(seen)}")
+            elif len(seen) == 1:
+                words.append(f"{member.name} {seen[0]:g}{unit}")
+            else:
+                words.append(f"{member.name} {min(seen):g}..{max(seen):g}{unit}")
+    return ", ".join(words) or "the point"
+
+
+def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
+    """Time a point that an effect takes on one core [s], from points with it and without."""
+    chosen = tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]
+    spent = 0.0
+    total = 0
+    for tile in chosen.tolist():
+        numbers, names = _some_points(calling, tile)
+        best = {}
+        for effects in (names, tuple(n for n in names if n != name)):
+            best[effects] = min(_timed(spec, calling, numbers, effects) for _ in range(ROUNDS))
+        spent += best[names] - min(best.values())
+        total += len(numbers)
+    return spent / total
+
+
+def _some_points(calling: Calling, tile: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Numbers of some points of a tile, and the effects that it calls for."""
+    from sweep.model.effects.catalogue import NAMES
+
+    slices = calling.tiles.points(tile)
+    shape = tuple(s.stop - s.start for s in slices)
+    few = np.unique(np.linspace(0, int(np.prod(shape)) - 1, COST_POINTS).astype(np.int64))
+    at = [i + s.start for i, s in zip(np.unravel_index(few, shape), slices, strict=True)]
+    numbers = np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few
+    ((_, plan),) = calling.plans(np.array([tile]))
+    return numbers, tuple(n for n, kept in zip(NAMES, plan.kept[:, 0], strict=True) if kept)
+
+
+def _timed(spec: Spec, calling: Calling, numbers: np.ndarray, effects: tuple[str, ...]) -> float:
+    parameters = calling.tiles.grid.parameters_at(numbers)
+    begun = time.perf_counter()
+    evaluate_points(spec, parameters, len(numbers), effects)
+    return time.perf_counter() - begun

@@ -1,0 +1,369 @@
+"""Spectra of what shots carry only where an effect asks for it: images, leakage, phases, widths."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_leakage import CLOSED_FORMS, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD, held
+from test_leakage import drawn_bundles as bundles
+
+from sweep.model import draws, philox, returns, segments, spectra, truth
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.line_width import DEVIATION_OF_FWHM
+from sweep.model.groups import groups
+from sweep.model.lines import segment_lines
+from sweep.model.modulation import POINTS, stretches
+from sweep.model.preparation import PhaseError
+from sweep.model.shot import evaluate, find
+from sweep.model.window import samples, transform
+
+AGREEMENT = 1e-9
+"""Largest difference of |X| from the truth, relative to the peak of lines without the effect."""
+
+WINDOWS = ("hamming", "rectangular", "flattop", "kaiser(8.6)")
+PHASES = ("coherent", "incoherent")
+DRIFTING = "range_walk", "acceleration", "chirp_nonlinearity"
+DRIFTS = {
+    "target.acceleration": 300.0,
+    "instrument.chirp.quadratic_error": 1e5,
+    "instrument.chirp.sinusoidal_error": 3e4,
+    "instrument.chirp.error_periods": 3.0,
+    "instrument.laser.line_width": 2e4,
+}
+
+
+def prepared(parameters, *further, without=()):
+    effects = [name for name in (*CORE, *further) if name not in without]
+    ((_, shots),) = prepare(parameters | (DRIFTS if further else {}), effects)
+    return shots
+
+
+def scene(table_4_1, **changes):
+    """Small and quick; 7 beamlets a few bins wide."""
+    small = {
+        "fft_size": 4096, "sample_rate": 60e6, "beamlets": 7, "range": 1000.0,
+        "grazing_angle": 0.5, "radial_velocity": 150.0,
+    }  # fmt: skip
+    return table_4_1(**small | changes)
+
+
+# Images
+
+
+def plain_sum(shots, i, segment, bins):
+    """|X| of some bins with the folded lines' own kernels only: plain sums over the window."""
+    p = shots.point_table()[:, i].copy()
+    offset, doppler, amplitude, _ = (
+        part[shots.row[i]] if part.ndim == 2 else np.empty(0) for part in shots.footprint
+    )
+    delta, re, im = np.empty((3, offset.size))
+    origin = segment_lines(
+        (segments.SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]),
+        (p[4], p[5]), (p[6], shots.fft_size, shots.window.length, p[7]),
+        offset, doppler, amplitude, np.empty(0), delta, re, im,
+    )  # fmt: skip
+    total = np.zeros(len(bins), complex)
+    for b in range(offset.size):
+        y = (bins - origin - delta[b]) * shots.window.length / shots.fft_size
+        kernel = transform(shots.window, y) * (re[b] + 1j * im[b])
+        # C_b holds half of the turn pi y already, bins and origin the other
+        total += abs(kernel) ** 2 if shots.incoherent else kernel * np.exp(1j * np.pi * y)
+    return np.sqrt(total.real) if shots.incoherent else abs(total)
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("fft_size", [512, 801])
+def test_without_images_only_the_folded_lines_themselves_are_summed(
+    window, phases, fft_size, table_4_1
+):
+    for distance, velocity in ((1000.0, 150.0), (1500.0, 0.0), (0.3, 0.02), (1499.0, 100.0)):
+        shots = prepared(
+            scene(table_4_1, window=window, phases=phases, fft_size=fft_size, sample_rate=40e6,
+                  range=distance, radial_velocity=velocity, duration=15e-6),
+            without=("image",),
+        )  # fmt: skip
+        for segment in range(3):
+            bins, fast = spectra.segment_spectrum(shots, 0, segment)
+            slow = plain_sum(shots, 0, segment, bins)
+            assert np.abs(fast - slow).max() < 1e-11 * slow.max()
+        if distance < 1:  # beats next to DC: images are there, and were left out
+            both = find(replace(shots, image=True))[1, MAGNITUDE]
+            assert abs(both / find(shots)[1, MAGNITUDE] - 1) > 1e-3
+
+
+@pytest.mark.parametrize("fft_size", [64, 255, 512, 1023, 4099, 8192])
+def test_leakage_without_images_is_that_of_every_bin(table_4_1, fft_size):
+    """The spectrum is no longer even about DC and Nyquist, which the integral has to know."""
+    for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
+        shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
+        held(replace(shots, image=False))
+
+
+# Leakage
+
+
+def same_detections(shots):
+    """Largest relative change of a magnitude, and change of a pd, by leaving leakage out."""
+    whole = find(shots)
+    worst = np.zeros(2)
+    for every_bin in (False, True):
+        found = find(replace(shots, leakage=False), every_bin=every_bin)
+        assert not np.nan_to_num(found[:, LEAKAGE]).any()
+        for field in (FREQUENCY, EXEMPTED):
+            np.testing.assert_array_equal(found[:, field], whole[:, field])
+        with np.errstate(invalid="ignore"):
+            change = abs(found[:, MAGNITUDE] - whole[:, MAGNITUDE]) / whole[:, MAGNITUDE]
+        moved = abs(found[:, [PD, MISS]] - whole[:, [PD, MISS]])
+        worst = np.maximum(worst, [np.nanmax(change, initial=0.0), np.nanmax(moved)])
+    return worst
+
+
+@pytest.mark.parametrize("image", [True, False])
+@pytest.mark.parametrize("fft_size", [64, 255, 512, 1023, 4099, 8192])
+def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, image):
+    """Bundles wide and narrow, weak and strong, on DC and Nyquist and beyond."""
+    for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
+        shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
+        magnitude, pd = same_detections(replace(shots, image=image))
+        assert magnitude < 1e-11 and pd < 1e-12
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("window", (*CLOSED_FORMS, "kaiser(8.6)", "dpss(3)", "bartlett"))
+@pytest.mark.parametrize("fft_size, sample_rate", [(2**13, 600e6), (5000, 6e6)])
+def test_without_leakage_every_window_detects_the_same(
+    window, phases, fft_size, sample_rate, table_4_1
+):
+    """The second record is padded. Down to 1e-8 of the noise, and phases that cancel."""
+    rng = np.random.default_rng(5)
+    parameters = table_4_1(
+        window=window, phases=phases, fft_size=fft_size, sample_rate=sample_rate, beamlets=19,
+        tnr=4.0, leakage_floor=1e-12,
+    ) | {
+        "target.range": np.r_[0.3, 22484.4, 10 ** rng.uniform(0, 4, 58)],
+        "target.grazing_angle": np.radians(rng.uniform(1, 90, 60)),
+        "target.radial_velocity": rng.choice([0.0, 0.005, 232.5, -90.0, 150.0], 60),
+        "instrument.laser.power": 10 ** rng.uniform(-16, 1, 60),
+    }  # fmt: skip
+    magnitude, pd = same_detections(prepared(parameters))
+    assert magnitude < 1e-11 and pd < 1e-12
+
+
+def test_without_leakage_only_noise_raises_false_peaks(table_4_1):
+    """Where leaked signal all but surely crosses, draws without it have the alarms of noise."""
+    parameters = scene(table_4_1, range=20.0, tnr=7.0, fft_size=8192, power=30.0)
+    keys = philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
+    shares = {}
+    for name, effects in (("with", CORE), ("without", set(CORE) - {"leakage"})):
+        outputs = evaluate(parameters, effects)
+        counts = draws.draw(
+            parameters, outputs, keys=keys, first_draw=0, batch_sizes=[4000], method="noise",
+            effects=effects,
+        )  # fmt: skip
+        shares[name] = counts["n_false_alarm_up"][0, 0] / 4000, outputs["pfa_segment"][0]
+    assert shares["with"][0] > 0.5
+    found, expected = shares["without"]
+    assert abs(found - expected) < 5 * np.sqrt(expected * (1 - expected) / 4000)
+
+
+# Phase errors and widths
+
+
+def exact(shots, i, segment, shifts):
+    """|X| from time-domain records with their exact phases, averaged over shifts (bins, weights).
+
+    Records of beamlets add, or the powers of their spectra, lines' and images' apart: what is
+    left of random phases in the mean.
+    """
+    window, length = samples(shots.window.name, shots.window.length), shots.window.length
+    x, half = 2 * np.arange(length) / length - 1, shots.fft_size // 2 + 1
+    cycles = np.zeros(length)
+    for error in shots.phase_errors:
+        cycles = cycles + error.of(segment, np.array([i]), x)[0]
+    records = [
+        truth.analytic_record(shots, i, segment, b, range_walk=False)
+        for b in range(shots.offset.shape[1])
+    ]
+    total = np.zeros(half)
+    for shift, weight in zip(*shifts, strict=True):
+        turn = window * np.exp(2j * np.pi * (cycles + shift * x / 2))
+        for record in records if shots.incoherent else [sum(records)]:
+            spectrum = np.fft.fft(turn * record, shots.fft_size) / 2
+            line, image = spectrum[:half], spectrum[-np.arange(half)].conj() * shots.image
+            power = abs(line) ** 2 + abs(image) ** 2 if shots.incoherent else abs(line + image) ** 2
+            total += weight * power
+    return np.sqrt(total)
+
+
+def width_by_hermite(shots, i):
+    """Shifts [bins of fs/L] of a Gaussian line, by a rule of its own: Gauss and Hermite's."""
+    if shots.gaussian_width is None:
+        return np.zeros(1), np.ones(1)
+    place, weight = np.polynomial.hermite_e.hermegauss(61)
+    bins = shots.gaussian_width[i] * np.broadcast_to(shots.record_duration, shots.size)[i]
+    return DEVIATION_OF_FWHM * bins * place, weight / weight.sum()
+
+
+CASES = {
+    "one sign": {},
+    "folded": {"range": 9000.0, "radial_velocity": -400.0, "duration": 700e-6},
+    "at DC": {"range": 3.0, "radial_velocity": 0.0},
+    "padded": {"fft_size": 8000, "duration": 75e-6, "range": 500.0, "radial_velocity": 2.0},
+    "wide": {"beam_divergence": 5e-3, "beamlets": 19, "grazing_angle": 0.2, "range": 4000.0},
+}
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "effects", [DRIFTING[:1], DRIFTING, ("line_width",), (*DRIFTING[:1], "line_width")]
+)
+def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, phases, table_4_1):
+    parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
+    shots, plain = prepared(parameters, *effects), prepared(parameters)
+    for segment in range(3):
+        bins, fast = spectra.segment_spectrum(shots, 0, segment)
+        slow = exact(shots, 0, segment, width_by_hermite(shots, 0))
+        peak = spectra.segment_spectrum(plain, 0, segment)[1].max()
+        assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
+        assert np.abs(fast - slow).max() < AGREEMENT * peak
+
+
+def test_the_drift_of_the_truth_itself_is_that_of_range_walk(table_4_1):
+    """The truth takes it from the exact delay, and knows no phase error."""
+    for phases in PHASES:
+        parameters = scene(table_4_1, phases=phases, radial_velocity=-400.0, duration=70e-6)
+        shots = prepared(parameters, "range_walk")
+        for segment in range(3):
+            _, fast = spectra.segment_spectrum(shots, 0, segment)
+            slow = truth.spectrum(shots, 0, segment)
+            assert np.abs(fast - slow).max() < AGREEMENT * slow.max()
+            still = truth.spectrum(shots, 0, segment, range_walk=False)
+            moved = np.abs(fast - still).max() / still.max()
+            assert moved > 1e-3 if segment != 1 else moved < AGREEMENT
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("leakage", [True, False])
+@pytest.mark.parametrize("effects", [DRIFTING, ("line_width",), (*DRIFTING, "line_width")])
+def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, table_4_1):
+    """Peak, exempt bins and groups of 40 points against all bins of their spectra."""
+    rng = np.random.default_rng(6)
+    parameters = scene(table_4_1, phases=phases, tnr=4.0) | {
+        "target.range": 10 ** rng.uniform(0.5, 3.5, 40),
+        "instrument.laser.power": 10 ** rng.uniform(-6, 0, 40),
+        "accuracy.leakage_floor": 1e-12,
+    }
+    shots = prepared(parameters, *effects, without=() if leakage else ("leakage",))
+    found, listed = find(shots), groups(shots)
+    slow = find(shots, every_bin=True)
+    np.testing.assert_allclose(found[:, LEAKAGE], slow[:, LEAKAGE], rtol=1e-6, atol=1e-20)
+    above = 0
+    for i in range(40):
+        for segment in range(3):
+            bins, magnitude = spectra.segment_spectrum(shots, i, segment)
+            level = shots.threshold[i]
+            best = magnitude.argmax()
+            assert found[segment, MAGNITUDE, i] == pytest.approx(magnitude[best], rel=1e-9)
+            assert found[segment, FREQUENCY, i] == best * shots.sample_rate[i] / 4096
+            assert listed.bin[i, segment, 0] == best
+            neighbours = magnitude[np.clip([best - 1, best, best + 1], 0, bins[-1])]
+            inside = 0 < best < bins[-1]
+            if inside:
+                np.testing.assert_allclose(listed.neighbours[i, segment, 0], neighbours, rtol=1e-7)
+            crossing = magnitude >= level
+            crossing[best] = True
+            wide = np.convolve(crossing, np.ones(3), "same") > 0
+            assert found[segment, EXEMPTED, i] == wide.sum()
+            above += crossing.sum() > 1
+    assert above > 20
+
+
+@pytest.mark.parametrize("effects", [DRIFTING[:1], ("line_width",)])
+def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
+    """Detections in noise have the pd of the smeared line, not that of a pure one; 5 sigma."""
+    number = 20_000
+    effects = [*(name for name in CORE if name != "leakage"), *effects]
+    parameters = scene(
+        table_4_1, radial_velocity=-3e3, tnr=4.0, power=12.0, duration=70e-6,
+        phases="incoherent", grazing_angle=np.pi / 2,
+    ) | {"instrument.laser.line_width": 3e4, "target.range": np.array([300.0, 400.0])}  # fmt: skip
+    outputs = evaluate(parameters, effects)
+    keys = philox.point_keys(np.arange(2.0)[:, None], domain="tests", seed=2)
+    counts = draws.draw(
+        parameters, outputs, keys=keys, first_draw=0, batch_sizes=[number], method="noise",
+        effects=effects,
+    )  # fmt: skip
+    pd = outputs["pd_up"]
+    sigma = np.sqrt(pd * (1 - pd) / number)
+    assert (abs(counts["n_detected_up"][:, 0] / number - pd) < 5 * sigma).all()
+    assert (abs(evaluate(parameters)["pd_up"] - pd) > 10 * sigma).any()
+    ((_, shots),) = prepare(parameters, effects)
+    for method in returns.METHODS:
+        drawn = returns.draw_returns(
+            shots, groups(shots), keys=keys, draws=4000, method=method
+        ).group[..., 0]  # fmt: skip
+        seen = (drawn == 0).any(axis=-1).mean(axis=1)
+        # An up peak makes a return where there is a down peak, or a false one, to go with it.
+        assert (seen < pd + 5 * sigma * np.sqrt(number / 4000)).all() and (seen > 0).all()
+
+
+# What is not there, and company
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("window", ["hamming", "kaiser(8.6)"])
+def test_no_drift_and_no_width_are_what_is_without_them(window, phases, table_4_1):
+    shots = prepared(scene(table_4_1, window=window, phases=phases, leakage_floor=1e-12))
+    none = PhaseError(lambda x, sign, rate: np.outer(rate, x), {"rate": np.zeros(1)})
+    for still in (
+        replace(shots, phase_errors=(none,)),
+        replace(shots, gaussian_width=np.zeros(1)),
+        replace(shots, phase_errors=(none, none), gaussian_width=np.zeros(1)),
+    ):
+        a, b = find(shots), find(still)
+        np.testing.assert_allclose(a[:, MAGNITUDE], b[:, MAGNITUDE], rtol=1e-10)
+        np.testing.assert_allclose(a[:, LEAKAGE], b[:, LEAKAGE], rtol=2e-6, atol=1e-20)
+        np.testing.assert_array_equal(a[:, FREQUENCY], b[:, FREQUENCY])
+
+
+def test_what_points_lack_takes_no_memory_and_no_stretches(table_4_1):
+    parameters = scene(table_4_1) | {"target.range": np.linspace(10.0, 900.0, 3 * POINTS)}
+    (whole,) = stretches(prepared(parameters))
+    assert all(not array.size for part in whole.scene[1:] for array in part)
+    parts = list(stretches(prepared(parameters, "range_walk", "line_width")))
+    assert [stretch.row.size for stretch in parts] == 3 * [POINTS]
+    joined = np.concatenate([stretch.points for stretch in parts], axis=1)
+    assert np.array_equal(joined, whole.points)
+
+
+@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize("effects", [(), DRIFTING, ("line_width",), (*DRIFTING, "line_width")])
+def test_the_company_of_points_changes_no_bit(effects, phases, table_4_1):
+    """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
+    number = 2 * POINTS + 40
+    rng = np.random.default_rng(7)
+    parameters = scene(table_4_1, phases=phases, fft_size=512) | {
+        "target.range": 10 ** rng.uniform(0, 4, number),
+        "target.radial_velocity": rng.choice([0.0, 30.0, -400.0, 3e3], number),
+        "target.acceleration": rng.choice([0.0, 300.0, 3e4], number),
+        "instrument.chirp.quadratic_error": rng.choice([0.0, 1e5], number),
+        "instrument.chirp.sinusoidal_error": rng.choice([0.0, 1e5], number),
+        "instrument.laser.line_width": rng.choice([0.0, 1e3, 3e5], number),
+    }
+    for left_out in ((), ("image",), ("leakage",), ("image", "leakage")):
+        chosen = [name for name in (*CORE, *effects) if name not in left_out]
+
+        def found(index, chosen=chosen):
+            part = {k: v[index] if np.ndim(v) else v for k, v in parameters.items()}
+            ((_, shots),) = prepare(part, chosen)
+            return find(shots)
+
+        whole = found(np.arange(number))
+        some = rng.permutation(number)[: number // 2]
+        for index in (some, some[:1], np.array([number - 1])):
+            there = np.ascontiguousarray(whole[..., index])
+            assert there.tobytes() == np.ascontiguousarray(found(index)).tobytes()

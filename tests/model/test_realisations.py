@@ -1,0 +1,307 @@
+"""Draws of random effects: their bits, their means, and quadratures over what is random."""
+
+import numpy as np
+import pytest
+from scipy import special
+
+from sweep.model import philox, realisations
+from sweep.model.draws import simulate
+from sweep.model.effects import pointing_jitter, scintillation
+from sweep.model.effects.catalogue import CORE
+from sweep.model.marcum import marcum_q1
+from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS
+from sweep.model.realisations import evaluate, outputs_of, realise
+from sweep.model.shot import evaluate as evaluate_without
+
+DRAWS = 20_000
+RANDOM = ("pointing_jitter", "speckle", "scintillation")
+AIR = {
+    "atmosphere.turbulence": "uniform",
+    "atmosphere.structure_constant": 1e-14,
+    "atmosphere.scintillation_law": "log_normal",
+}
+ALL = (*CORE, *RANDOM)
+
+
+def keys(n, seed=5):
+    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
+
+
+def scene(table_4_1, **changes):
+    """Points of different FFTs in turbulent air, the beam unsteady over a rough surface."""
+    varied = {
+        "range": np.array([2000.0, 3000.0, 4000.0, 5000.0]),
+        "fft_size": np.array([4096, 8192, 4096, 4096]),
+        "beamlets": 7,
+        "phases": "incoherent",
+        "grazing_angle": 0.5,
+    }
+    rough = AIR | {"target.roughness": 1e-5, "target.pointing_jitter": 2e-5}
+    return table_4_1(**varied | changes) | rough
+
+
+def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
+    """Outputs of every draw by name, (n, draws)."""
+    names = {name: np.full((n, draws), np.nan) for name in OUTPUTS}
+    chosen = keys(n) if seeded is None else seeded
+    for point, draw, shots in realise(
+        parameters, effects, keys=chosen, first_draw=first_draw, draws=draws
+    ):
+        for name, values in outputs_of(shots).items():
+            names[name][point, draw - first_draw] = values
+    return names
+
+
+def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch):
+    whole = per_draw(scene(table_4_1), ALL, 4, 60)
+    means = evaluate(scene(table_4_1), ALL, keys=keys(4), draws=60)
+    assert np.unique(whole["snr_up"]).size == 240
+    late = per_draw(scene(table_4_1), ALL, 4, 20, first_draw=30)
+    alone = scene(table_4_1, range=np.array([5000.0]), fft_size=4096)
+    single = per_draw(alone, ALL, 1, 60, seeded=keys(4)[3:])
+    monkeypatch.setattr(realisations, "ROWS", 7)
+    pieces = per_draw(scene(table_4_1), ALL, 4, 60)
+    summed = evaluate(scene(table_4_1), ALL, keys=keys(4), draws=60)
+    for name in OUTPUTS:
+        np.testing.assert_array_equal(whole[name][:, 30:50], late[name], err_msg=name)
+        np.testing.assert_array_equal(whole[name][3:], single[name], err_msg=name)
+        np.testing.assert_array_equal(whole[name], pieces[name], err_msg=name)
+    for name, values in means.items():
+        np.testing.assert_array_equal(values, summed[name], err_msg=name)
+
+
+def test_wide_footprints_are_cut_into_shorter_stretches(table_4_1, monkeypatch):
+    monkeypatch.setattr(realisations, "BEAMLETS", 70)
+    sizes = [s.point.size for s in realise(scene(table_4_1), ALL, keys=keys(4), draws=25)]
+    assert max(sizes) == 10 and sum(sizes) == 100
+
+
+def drawn_shots(parameters, effects):
+    (stretch,) = realise(parameters, [*CORE, *effects], keys=keys(2), draws=50)
+    return stretch.shots
+
+
+def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1):
+    parameters = scene(table_4_1, range=np.array([2000.0, 5000.0]), fft_size=4096)
+    both = drawn_shots(parameters, ["speckle", "scintillation"])
+    speckled, twinkling = (drawn_shots(parameters, [e]) for e in ("speckle", "scintillation"))
+    np.testing.assert_array_equal(both.amplitude, speckled.amplitude)
+    np.testing.assert_array_equal(both.phase, speckled.phase)
+    np.testing.assert_array_equal(both.beat_scale, twinkling.beat_scale)
+    shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
+    np.testing.assert_array_equal(every.range, shaken.range)
+    # Beamlets are elsewhere, and the factors on them are what they were.
+    plain = drawn_shots(parameters, [])
+    np.testing.assert_allclose(
+        every.amplitude / shaken.amplitude[shaken.row],
+        speckled.amplitude / plain.amplitude[plain.row],
+        rtol=1e-12,
+    )
+    np.testing.assert_array_equal(every.phase, speckled.phase)
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_a_random_effect_that_does_nothing_leaves_every_count_as_it_is(method, table_4_1):
+    """Air without turbulence multiplies by exactly 1: not a number of the noise's has moved."""
+    parameters = scene(table_4_1) | {"atmosphere.structure_constant": 0.0}
+    parameters["instrument.processing.tnr"] = 5.0
+    chosen = {"keys": keys(4), "batch_sizes": [40, 70], "method": method}
+    still = simulate(parameters, CORE, **chosen)
+    drawn = simulate(parameters, [*CORE, "scintillation"], **chosen)
+    for name, values in still.items():
+        if values.ndim == 2:
+            np.testing.assert_array_equal(values, drawn[name], err_msg=name)
+        else:
+            np.testing.assert_allclose(values, drawn[name], rtol=1e-12, err_msg=name)
+    assert still["n_detected_up"].sum() > 0 and still["n_false_alarm_up"].sum() > 0
+    for name in ERROR_OUTPUTS:
+        assert (still[name] == 0).all()
+
+
+def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
+    parameters = scene(table_4_1)
+    drawn = per_draw(parameters, ALL, 4, 300)
+    means = evaluate(parameters, ALL, keys=keys(4), draws=300)
+    assert list(means) == [*OUTPUTS, *ERROR_OUTPUTS]
+    for name, values in drawn.items():
+        if not name.startswith("log10"):
+            np.testing.assert_allclose(means[name], values.mean(axis=1), rtol=1e-11, err_msg=name)
+    for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot"):
+        error = drawn[name].std(axis=1, ddof=1) / np.sqrt(300)
+        np.testing.assert_allclose(means[name + "_error"], error, rtol=1e-9)
+        alone = evaluate(parameters, ALL, keys=keys(4), draws=1)
+        assert np.isnan(alone[name + "_error"]).all()
+    np.testing.assert_allclose(drawn["pd_up"] * drawn["pd_down"], drawn["pd_shot"], rtol=1e-15)
+
+
+@pytest.mark.parametrize("tnr", [5.0, 60.0])
+def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_1):
+    """Close to a loud target, whose own shot noise twinkles with it."""
+    parameters = table_4_1(range=np.array([1.0, 2.0]), tnr=tnr, fft_size=4096, beamlets=7) | AIR
+    parameters |= {"atmosphere.structure_constant": 1e-8, "target.radial_velocity": 20.0}
+    effects = (*CORE, "scintillation")
+    drawn = per_draw(parameters, effects, 2, 200)
+    means = evaluate(parameters, effects, keys=keys(2), draws=200)
+    assert (np.ptp(drawn["log10_pfa_bin"], axis=1) > 1e-3).all()
+    for name in ("pfa_bin", "pfa_segment", "pfa_shot"):
+        logs = np.log(10) * drawn["log10_" + name]
+        exact = (special.logsumexp(logs, axis=1) - np.log(200)) / np.log(10)
+        np.testing.assert_allclose(means["log10_" + name], exact, rtol=1e-12, atol=1e-14)
+        assert np.isfinite(means["log10_" + name]).all()
+    assert (means["pfa_shot"] == 0).all() == (tnr == 60)
+
+
+def test_an_average_without_counted_bins_has_the_logarithm_of_zero():
+    means = realisations.Means(2)
+    values = {name: np.zeros(4) for name in OUTPUTS}
+    values["log10_pfa_shot"] = np.array([-np.inf, -np.inf, -np.inf, -3.0])
+    means.add(np.array([0, 0, 1, 1]), values)
+    found = means.results()["log10_pfa_shot"]
+    assert found[0] == -np.inf
+    assert found[1] == pytest.approx(np.log10(0.5e-3), rel=1e-12)
+
+
+def test_direct_detection_has_no_doppler_segment_in_any_draw(table_4_1):
+    parameters = table_4_1(architecture="direct", range=np.array([30.0]), beamlets=7) | AIR
+    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=20)
+    for name in ("pd_doppler", "miss_doppler", "snr_doppler", "pd_doppler_error"):
+        assert np.isnan(means[name]).all()
+    assert np.isfinite(means["pd_up_error"]).all()
+
+
+@pytest.mark.parametrize("law", ["log_normal", "gamma_gamma"])
+@pytest.mark.parametrize("architecture", ["homodyne", "direct"])
+def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, table_4_1):
+    """Power of mean 1 on the echo and its shot noise, and on the SNR its square if direct."""
+    parameters = scene(table_4_1, range=np.full(4, 3000.0), fft_size=4096) | AIR
+    parameters |= {
+        "atmosphere.scintillation_law": law,
+        "instrument.receiver.architecture": architecture,
+    }
+    effects = (*CORE, "scintillation")
+    stretches = list(realise(parameters, effects, keys=keys(4), draws=DRAWS))
+    (plain,) = realise(parameters, CORE, keys=keys(4), draws=1)
+    power = np.concatenate([s.shots.echo_power for s in stretches]) / plain.shots.echo_power[0]
+    legs = scintillation.both_ways(
+        scintillation.Turbulence(uniform=1e-14), wavelength=1550e-9, range=3000.0,
+        lidar_height=0.0, target_height=0.0, aperture=25e-3, beam_divergence=50e-6,
+    )  # fmt: skip
+    root = np.sqrt(power.size)
+    assert power.mean() == pytest.approx(1, abs=5 * power.std() / root)
+    square = (power - 1) ** 2
+    assert square.mean() == pytest.approx(scintillation.index(legs), abs=5 * square.std() / root)
+    for stretch in stretches[:2]:
+        shots, outputs = stretch.shots, outputs_of(stretch.shots)
+        share = shots.echo_power / plain.shots.echo_power[0]
+        quiet = plain.shots.noise_sources["signal_shot"][0]
+        np.testing.assert_allclose(shots.noise_sources["signal_shot"], share * quiet, rtol=1e-12)
+        by_light = 2 if architecture == "direct" else 1
+        signal = outputs["snr_up"] * shots.noise_variance
+        alone = evaluate_without(parameters, CORE)
+        np.testing.assert_allclose(
+            signal, share**by_light * alone["snr_up"][0] * alone["noise_variance"][0], rtol=1e-9
+        )
+
+
+def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
+    parameters = table_4_1(range=4000.0, beamlets=1, tnr=8.0, power=0.1) | AIR
+    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=100_000)
+    legs = scintillation.both_ways(
+        scintillation.Turbulence(uniform=1e-14), wavelength=1550e-9, range=4000.0,
+        lidar_height=0.0, target_height=0.0, aperture=25e-3, beam_divergence=50e-6,
+    )  # fmt: skip
+    variance = np.log1p(scintillation.index(legs))
+    x, weight = np.polynomial.hermite_e.hermegauss(100)
+    root = np.exp(0.5 * (np.sqrt(variance) * x - variance / 2))
+    plain = evaluate_without(parameters)
+    beta = 8.0 * np.sqrt(2 - np.pi / 2)
+    pd = {s: marcum_q1(np.sqrt(2 * plain[f"snr_{s}"]) * root, beta).q for s in ("up", "down")}
+    for name, values in {"up": pd["up"], "shot": pd["up"] * pd["down"]}.items():
+        exact = (weight * values).sum() / np.sqrt(2 * np.pi)
+        assert 0.05 < exact < 0.95
+        error = means[f"pd_{name}_error"][0]
+        assert abs(means[f"pd_{name}"][0] - exact) <= 5 * error
+        assert error < 0.002
+    product = means["pd_up"] * means["pd_down"]
+    assert (means["pd_shot"] > product + 20 * means["pd_shot_error"]).all()
+
+
+def by_vectors(distance, grazing, off):
+    """Range and grazing angle of jittered rays that are followed down to the plane z = 0."""
+    start = np.array([0.0, 0.0, distance * np.sin(grazing)])
+    aim = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])
+    up, aside = np.array([np.sin(grazing), 0.0, np.cos(grazing)]), np.array([0.0, 1.0, 0.0])
+    angle = np.hypot(*off.T)[:, None]
+    across = off[:, :1] * up + off[:, 1:] * aside
+    direction = aim * np.cos(angle) + across * np.sinc(angle / np.pi)
+    return -start[2] / direction[:, 2], np.arcsin(-direction[:, 2]), direction @ aim
+
+
+@pytest.mark.parametrize(
+    "changes, sigma",
+    [
+        ({"grazing_angle": 0.6, "phases": "incoherent", "beamlets": 7}, 4e-6),
+        ({"grazing_angle": 0.2, "reflectance_law": "lambert", "beamlets": 1, "power": 0.3}, 2e-6),
+        ({"grazing_angle": np.pi / 2, "beamlets": 1}, 3e-3),
+    ],
+)
+def test_the_mean_over_jitter_is_a_quadrature_over_both_angles(changes, sigma, table_4_1):
+    parameters = table_4_1(**{"range": 5000.0, "tnr": 8.0, "power": 0.15} | changes)
+    a, b = (v.ravel() for v in np.mgrid[-6:6.05:0.1, -6:6.05:0.1])
+    share = np.exp(-(a**2 + b**2) / 2) * 0.1**2 / (2 * np.pi)
+    off = sigma * np.stack([a, b], axis=1)
+    far, grazing, along = by_vectors(5000.0, parameters["target.grazing_angle"], off)
+    outputs = evaluate_without(
+        parameters
+        | {"target.range": far, "target.grazing_angle": grazing}
+        | {"target.radial_velocity": 150.0 * along}
+    )
+    means = evaluate(
+        parameters | {"target.pointing_jitter": sigma}, (*CORE, "pointing_jitter"),
+        keys=keys(1), draws=DRAWS,
+    )  # fmt: skip
+    for name in ("pd_up", "pd_down", "pd_shot"):
+        exact = (share * outputs[name]).sum()
+        assert 0.01 < exact < 0.99
+        error = means[name + "_error"][0]
+        assert 1e-5 < error < 0.004
+        assert abs(means[name][0] - exact) <= 5 * error
+
+
+def test_a_moving_instrument_sees_what_its_jitter_turns_into_the_beam(table_4_1):
+    """Towards the near side, tilting up by a takes a of the speed away: v_r' = v_r - a v."""
+    parameters = table_4_1(beamlets=1, radial_velocity=50.0, grazing_angle=0.5)
+    parameters |= {"target.pointing_jitter": 1e-4, "target.transverse_velocity": 80.0}
+    (stretch,) = realise(parameters, (*CORE, "pointing_jitter"), keys=keys(1), draws=2000)
+    upwards = np.arcsin(2000.0 * np.sin(0.5) / stretch.shots.range) - 0.5  # -a
+    found = stretch.shots.radial_velocity - 50.0
+    np.testing.assert_allclose(found, 80.0 * upwards, atol=3 * 130.0 * 1e-4**2 * 10)
+    assert found.std() == pytest.approx(80.0 * 1e-4, rel=5 / np.sqrt(4000))
+
+
+def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
+    """a > 0.02, of deviation 0.02: 15.9 % of draws; noise alone may still cross the threshold."""
+    parameters = table_4_1(grazing_angle=0.02, beamlets=1, range=50.0, tnr=3.0)
+    parameters |= {"target.pointing_jitter": 0.02}
+    effects = (*CORE, "pointing_jitter")
+    drawn = per_draw(parameters, effects, 1, 2000)
+    missed = drawn["snr_up"][0] == 0
+    assert missed.mean() == pytest.approx(0.1587, abs=5 * np.sqrt(0.1587 * 0.8413 / 2000))
+    noise = np.exp(-(4 - np.pi) / 4 * 9)
+    np.testing.assert_allclose(drawn["pd_up"][0, missed], noise, rtol=1e-9)
+    np.testing.assert_array_equal(np.isnan(drawn["range_error"][0]), missed)
+    means = evaluate(parameters, effects, keys=keys(1), draws=2000)
+    assert means["range_error"] == pytest.approx(drawn["range_error"][0, ~missed].mean(), rel=1e-9)
+    assert means["pd_up"] == pytest.approx(drawn["pd_up"].mean(), rel=1e-12)
+
+
+def test_a_steady_beam_is_the_shot_as_it_is(table_4_1):
+    parameters = table_4_1(range=np.array([2000.0, 4000.0]), grazing_angle=0.5, beamlets=7)
+    angles = pointing_jitter.angles(
+        pointing_jitter.Realisation(keys(2), np.zeros(2, np.int64)), np.array([0.0, 1.0])
+    )
+    assert (angles[0] == 0).all() and (angles[1] != 0).all()
+    still = evaluate(parameters, (*CORE, "pointing_jitter"), keys=keys(2), draws=3)
+    plain = evaluate_without(parameters)
+    for name in ("pd_up", "pd_doppler", "pd_shot", "snr_down"):
+        np.testing.assert_allclose(still[name], plain[name], rtol=1e-6)

@@ -1,0 +1,318 @@
+"""What effects bring into a spec: their parameters, their modes, and what these need."""
+
+import json
+
+import jsonschema
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from written_scenes import written as flight
+from written_specs import written
+
+import sweep.spec.effect_fields
+from sweep.model.effects.catalogue import EFFECTS, NAMES, PARAMETERS
+from sweep.model.effects.effect import Parameter
+from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored, json_schema
+from sweep.spec.axis_reading import read_axes
+from sweep.spec.effect_fields import with_modes, with_parameters
+from sweep.spec.fields import parameter_rules, rule_of
+from sweep.spec.instrument import Laser, Part
+from sweep.spec.limits import has_point
+from sweep.spec.reading import read_document
+from sweep.spec.rules import Numeric
+from sweep.spec.sections import Effects
+
+BROUGHT = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.path)
+RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jitter",
+          "atmosphere.turbulence": "scintillation"}  # fmt: skip
+"""Parameters that bring a random effect."""
+THERE = {"target.roughness": "1 um", "target.pointing_jitter": "1 urad",
+         "atmosphere.turbulence": "uniform"}  # fmt: skip
+NEEDED = {"instrument.processing.full_scale": "1 V", "atmosphere.extinction": "0.1 1/km",
+          "draws.number": 1}  # fmt: skip
+"""What parameters of effects need beside them."""
+
+
+def spec(changes=None, **sections):
+    return Spec.from_mapping(written(changes, **sections))
+
+
+def mistakes(kind, mapping):
+    try:
+        kind.from_mapping(mapping)
+    except SpecError as error:
+        return [str(mistake) for mistake in error.mistakes]
+    return []
+
+
+def values(parameter):
+    """Good values of a parameter as a user writes them, more than its default."""
+    return list(parameter.options) or [parameter.example]
+
+
+@pytest.fixture(scope="module")
+def validator():
+    return jsonschema.Draft202012Validator(json.loads(json.dumps(json_schema())))
+
+
+@BROUGHT
+def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
+    default = spec().parameters()[parameter.path]
+    assert default == parameter.default and type(default) is type(parameter.default)
+    for value in values(parameter):
+        mapping = written(NEEDED | {parameter.path: value})
+        validator.validate(mapping)
+        read = Spec.from_mapping(mapping)
+        assert parameter.path in read.identity()["parameters"]
+        assert Spec.from_stored(read.to_json()).parameters() == read.parameters()
+    rule = parameter_rules()[parameter.path]
+    assert rule.read(rule.written(parameter.default)) == parameter.default
+    assert spec({parameter.path: rule.written(parameter.default)}).id == spec().id
+
+
+@BROUGHT
+def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
+    written_values = values(parameter)
+    mapping = written(NEEDED, axes={parameter.path: written_values})
+    validator.validate(mapping)
+    (axis,) = Spec.from_mapping(mapping).axes
+    rule = parameter_rules()[parameter.path]
+    assert list(axis.members[0].values) == [rule.read(value) for value in written_values]
+    coordinate = Spec.from_mapping(mapping).coordinate_value(axis.name, written_values[-1])
+    assert coordinate == axis.members[0].display[-1]
+
+
+@BROUGHT
+def test_a_parameter_of_an_effect_is_described_in_the_schema(parameter):
+    section, name = parameter.path.rsplit(".", 2)[-2:]
+    described = json_schema()["$defs"][section.capitalize()]["properties"][name]
+    assert described["description"].startswith(parameter.about)
+    assert parameter_rules()[parameter.path].read(described["default"]) == parameter.default
+    if parameter.options:
+        assert described["enum"] == list(parameter.options)
+    else:
+        assert described["examples"] == [parameter.example]
+
+
+@BROUGHT
+def test_a_flight_has_the_parameters_that_are_not_its_targets(parameter):
+    is_targets = parameter.path.startswith("target.")
+    assert (parameter.path in SceneSpec.from_mapping(flight()).parameters()) is not is_targets
+    if is_targets:
+        (mistake,) = mistakes(SceneSpec, flight(axes={parameter.path: values(parameter)}))
+        assert "is given by the scene" in mistake
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data):
+    parameter = data.draw(st.sampled_from([p for p in PARAMETERS if not p.options]))
+    value = data.draw(st.floats(1e-300, 1e300, allow_nan=False))
+    rule = parameter_rules()[parameter.path]
+    assert isinstance(rule, Numeric)
+    if rule.si_unit != "dB" and rule.first_outside(np.array([value])) is None:
+        assert rule.read(rule.written(value)) == value
+
+
+def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
+    """Both decorators read the catalogue: what is added there is in the sections."""
+    new = Parameter(path="instrument.laser.colours", about="Colours", default=2, whole=True,
+                    example="3", at_least="1")  # fmt: skip
+    monkeypatch.setattr(sweep.spec.effect_fields, "PARAMETERS", (new,))
+    monkeypatch.setattr(sweep.spec.effect_fields, "EFFECTS", EFFECTS[:1])
+
+    class Bare(Part):
+        """A section."""
+
+    Lamp = with_parameters("instrument.laser")(Bare)
+    assert Lamp.model_validate({}).colours == 2 and Lamp.model_validate({"colours": 3}).colours == 3
+    assert Lamp.__doc__ == "A section." and Lamp.__name__ == "Bare"
+    assert Lamp.__module__ == __name__
+    assert set(with_modes(Bare).model_fields) == {EFFECTS[0].name}
+    assert not with_parameters("instrument")(Bare).model_fields
+    with pytest.raises(TypeError, match="has colours already"):
+        with_parameters("instrument.laser")(Lamp)
+
+
+def test_a_section_keeps_its_name_and_words():
+    assert (Laser.__name__, Laser.__module__) == ("Laser", "sweep.spec.instrument")
+    assert Laser.__doc__ == "Transmitter: wavelength, power and beam."
+    assert next(iter(Laser.model_fields)) == "wavelength"
+
+
+# Modes
+
+
+def test_every_effect_is_simulated_where_the_scene_calls_for_it_by_default():
+    for study in (spec(), SceneSpec.from_mapping(flight())):
+        assert study.modes() == dict.fromkeys(NAMES, "auto")
+        assert study.identity()["effects"] == study.modes()
+    for effect in EFFECTS:
+        about = rule_of(Effects.model_fields[effect.name]).about
+        assert about[0].isupper() and about[1:] == effect.about[1:]
+
+
+@pytest.mark.parametrize(
+    ("text", "mode"),
+    [("on", "on"), ("off", "off"), ("true", "on"), ("False", "off"), ("'on'", "on"),
+     ("yes", "on"), ("auto", "auto")],
+)  # fmt: skip
+def test_a_mode_is_read_from_yaml_with_or_without_quotes(text, mode, tmp_path, validator):
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump(written()) + f"effects: {{leakage: {text}}}\n")
+    document = read_document(path)
+    validator.validate(document.value)
+    study = Spec.from_document(document, tmp_path)
+    assert study.modes()["leakage"] == mode
+    assert Spec.from_stored(study.to_json()).modes() == study.modes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+def test_a_mode_is_part_of_the_identity(name, kind):
+    base = {Spec: written, SceneSpec: flight}[kind]
+    plain, off = (kind.from_mapping(m) for m in (base(), base({f"effects.{name}": "off"})))
+    assert plain.id != off.id
+    assert difference(plain, off) == [f"effects.{name}: auto -> off"]
+    assert kind.from_mapping(base({f"effects.{name}": False})).id == off.id
+
+
+@pytest.mark.parametrize("effect", [e for e in EFFECTS if e.within], ids=lambda e: e.name)
+def test_an_effect_is_on_only_within_one_that_is_not_off(effect):
+    on, off = f"effects.{effect.name}", f"effects.{effect.within}"
+    (mistake,) = mistakes(Spec, written({on: True, off: False}))
+    assert mistake.startswith(f"{on}: acts within {effect.within}, which is off")
+    assert f"turn {effect.within} on" in mistake
+    for changes in ({on: "auto", off: "off"}, {on: "on"}, {on: "off", off: "on"}):
+        assert not mistakes(Spec, written(changes))
+
+
+def test_a_mode_that_cannot_be_read_is_reported_alone():
+    (mistake,) = mistakes(
+        Spec, written({"effects.footprint": "of", "effects.doppler_spread": "on"})
+    )
+    assert mistake.startswith("effects.footprint: ")
+    (mistake,) = mistakes(Spec, written({"effects.speckle": "of", "target.roughness": "1 um"}))
+    assert mistake.startswith("effects.speckle: ")
+
+
+def test_a_stored_study_without_effects_reads_as_one_that_leaves_all_to_the_scene():
+    mapping = spec().to_yaml_mapping()
+    del mapping["effects"], mapping["atmosphere"], mapping["accuracy"]["tolerance"]
+    old = from_stored(json.dumps(mapping))
+    assert old.id == spec().id
+
+
+# What effects need
+
+
+def test_the_random_effects_are_those_looked_at_here():
+    assert set(RANDOM.values()) == {effect.name for effect in EFFECTS if effect.is_random}
+
+
+@pytest.mark.parametrize("path", RANDOM)
+def test_a_random_effect_needs_draws_or_is_off(path):
+    there, name = {path: THERE[path]}, RANDOM[path]
+    (mistake,) = mistakes(Spec, written(there))
+    assert mistake.startswith(f"{path}: is simulated by draws")
+    assert mistake.endswith(f"set draws.number, or effects.{name}: off")
+    default = parameter_rules()[path].written(parameter_rules()[path].read(THERE[path]))
+    (mistake,) = mistakes(Spec, written(axes={path: [default]}))
+    assert mistake.startswith(f"axes.{path}: is simulated by draws")
+    assert not mistakes(Spec, written(there | {"draws.number": 1}))
+    assert not mistakes(Spec, written(there | {f"effects.{name}": "off"}))
+
+
+def test_what_only_says_how_a_random_effect_acts_asks_for_no_draws():
+    how = {"atmosphere.structure_constant": "1e-15 m^(-2/3)",
+           "atmosphere.scintillation_law": "log_normal"}  # fmt: skip
+    assert not mistakes(Spec, written(how))
+
+
+@pytest.mark.parametrize("name", RANDOM.values())
+def test_a_random_effect_is_not_asked_of_a_flight(name):
+    (mistake,) = mistakes(SceneSpec, flight({f"effects.{name}": "on"}))
+    assert mistake.startswith(f"effects.{name}: is not drawn in flights yet")
+    assert ("platform.jitter" in mistake) is (name == "pointing_jitter")
+    assert not mistakes(SceneSpec, flight({f"effects.{name}": "off"}))
+
+
+def test_turbulence_over_a_flight_is_refused_unless_it_is_left_out():
+    turbulent = {"atmosphere.turbulence": "hufnagel_valley"}
+    (mistake,) = mistakes(SceneSpec, flight(turbulent))
+    assert mistake.startswith("atmosphere.turbulence: is not drawn in flights yet")
+    assert not mistakes(SceneSpec, flight(turbulent | {"effects.scintillation": "off"}))
+    (mistake,) = mistakes(SceneSpec, flight({"target": {"roughness": "1 um"}}))
+    assert mistake.startswith("target: is no field")
+
+
+BITS, FULL_SCALE = "instrument.processing.bits", "instrument.processing.full_scale"
+PROFILE, EXTINCTION = "atmosphere.profile", "atmosphere.extinction"
+
+
+@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+def test_a_parameter_needs_the_one_without_which_it_means_nothing(kind):
+    base = {Spec: written, SceneSpec: flight}[kind]
+    (mistake,) = mistakes(kind, base({BITS: 12}))
+    assert mistake.startswith(f"{BITS}: needs {FULL_SCALE}, which is 0; set {FULL_SCALE}")
+    assert not mistakes(kind, base({BITS: 12, FULL_SCALE: "1 V"}))
+    assert not mistakes(kind, base({BITS: 12, "effects.quantisation": "off"}))
+    for profile in ("exponential", "layer"):
+        (mistake,) = mistakes(kind, base({PROFILE: profile}))
+        assert mistake.startswith(f"{PROFILE}: needs {EXTINCTION}, which is 0")
+        assert not mistakes(kind, base({PROFILE: profile, EXTINCTION: "0.1 1/km"}))
+
+
+def test_a_need_is_held_against_the_points_of_the_grid_and_no_others():
+    scales = ["0 V", "1 V"]
+    (mistake,) = mistakes(Spec, written({BITS: 12}, axes={FULL_SCALE: scales}))
+    assert mistake.startswith(f"{BITS}: ")
+    (mistake,) = mistakes(Spec, written(axes={BITS: [0, 12], FULL_SCALE: scales}))
+    assert mistake.startswith(f"axes.{BITS}: ")
+    together = {"zip": {BITS: [0, 12], FULL_SCALE: scales}}
+    assert not mistakes(Spec, written(axes={"adc": together}))
+    crossed = {"zip": {BITS: [12, 0], FULL_SCALE: scales}}
+    (mistake,) = mistakes(Spec, written(axes={"adc": crossed}))
+    assert mistake.startswith("axes.adc: ")
+
+
+def test_a_point_asked_for_later_is_held_to_the_same_needs():
+    with pytest.raises(SpecError, match=f"needs {FULL_SCALE}"):
+        spec().parameters_at({"bits": 12})
+    at = spec().parameters_at({"bits": 12, "full_scale": "1 V", "roughness": "1 um"})
+    assert at["target.roughness"] == 1e-6
+
+
+counts = st.lists(st.integers(0, 3), min_size=2, max_size=2, unique=True)
+
+
+@settings(deadline=None)
+@given(counts, counts, st.booleans(), st.integers(0, 3), st.integers(0, 3))
+def test_a_grid_has_a_point_just_when_one_of_its_points_meets_all_conditions(a, b, zipped, x, y):
+    one, two = "instrument.receiver.apd_gain", "instrument.receiver.excess_noise_factor"
+    three = "instrument.processing.tnr"
+    a, b = [value + 1 for value in a], [value + 1 for value in b]
+    axes, _ = read_axes({"both": {"zip": {one: a, two: b}}} if zipped else {one: a, two: b})
+    conditions = {one: lambda v: v > x, two: lambda v: v < y, three: lambda v: v == 1}
+    points = zip(a, b, strict=True) if zipped else [(i, j) for i in a for j in b]
+    expected = any(i > x and j < y for i, j in points)
+    assert has_point(conditions, {three: 1.0}, axes) == expected
+    assert not has_point(conditions, {three: 2.0}, axes)
+    assert not has_point(conditions, {}, axes)
+
+
+# Decibels beside a plain unit
+
+
+def test_an_axis_in_decibels_per_hertz_is_shown_in_them():
+    path = "instrument.laser.relative_intensity_noise"
+    steps = {"step": ["-160 dB/Hz", "-140 dB/Hz", "10 dB/Hz"]}
+    study = spec(axes={path: steps})
+    member = study.axes[0].members[0]
+    assert member.values.tolist() == [1e-16, 1e-15, 1e-14] and member.units == "dB/Hz"
+    assert study.coordinate_value("relative_intensity_noise", "-150 dB/Hz") == -150
+    assert study.coordinate_value("relative_intensity_noise", "1e-15 1/Hz") == -150
+    mixed = spec(axes={path: ["-160 dB/Hz", "0 1/Hz"]}).axes[0].members[0]
+    assert mixed.display.tolist() == [1e-16, 0] and mixed.units == "1/Hz"

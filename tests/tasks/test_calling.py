@@ -1,0 +1,113 @@
+"""Plans of grids and flights: the same however a study is cut up, and true to the tolerance."""
+
+import numpy as np
+import pytest
+from small import small
+
+from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.effects.flags import flag_attributes, flags_of, names_of
+from sweep.tasks.calling import Calling
+from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.tiles import TILE_POINTS, Tiles, tile_shape
+
+PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
+WIDE = {
+    "instrument.laser.power": ["1 W", "3 W"],
+    "target.range": {"linear": ["10 m", "9 km"], "number": 90},
+    "target.grazing_angle": {"linear": ["2 deg", "90 deg"], "number": 45},
+}
+FORCED = {effect.name: "on" for effect in EFFECTS if not effect.is_random}
+
+
+def whole(spec, name):
+    """An array of a study over its whole grid."""
+    study = GridStudy(spec)
+    out = None
+    for block in range(study.n_blocks):
+        values = study.evaluate(block)[name]
+        out = np.empty(study.grid.shape, values.dtype) if out is None else out
+        out[study.grid.block(block)] = values
+    return out
+
+
+def test_tiles_are_alike_on_all_sides_and_hold_no_two_words():
+    assert tile_shape((10000, 90), (False, False)) == (32, 32)
+    assert tile_shape((10000, 7), (False, False)) == (146, 7)
+    assert tile_shape((3, 10000), (True, False)) == (1, TILE_POINTS)
+    assert tile_shape((), ()) == ()
+
+
+def test_every_point_lies_in_one_tile_whose_spans_hold_its_parameters():
+    axes = {"instrument.processing.window": ["hann", "hamming"], **WIDE}
+    grid = Grid(small(axes=axes, storage={"block_points": 977}))
+    tiles = Tiles(grid)
+    for block in range(0, grid.n_blocks, 7):
+        numbers, place = tiles.of_block(block)
+        points = grid.parameters(block)
+        assert place.size == grid.block_size(block)
+        for alike in tiles.alike(numbers):
+            within = np.flatnonzero(np.isin(place, alike.tiles))
+            at = np.searchsorted(alike.tiles, place[within])
+            window = alike.parameters["instrument.processing.window"]
+            assert set(points["instrument.processing.window"][within]) == {window}
+            for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
+                span, values = alike.parameters[path], points[path][within]
+                assert (span.low[at] <= values).all() and (values <= span.high[at]).all()
+
+
+def test_flags_and_names_are_each_other():
+    kept = np.zeros((len(NAMES), 3), bool)
+    kept[[0, 3], 0] = kept[-1, 1] = True
+    flags = flags_of(kept)
+    assert names_of(int(flags[0])) == (NAMES[0], NAMES[3])
+    assert names_of(int(flags[1])) == (NAMES[-1],)
+    assert names_of(int(flags[2])) == ()
+    meanings = flag_attributes()["flag_meanings"].split()
+    assert [m for m, mask in zip(meanings, flag_attributes()["flag_masks"], strict=True)
+            if flags[0] & mask] == [NAMES[0], NAMES[3]]  # fmt: skip
+
+
+def test_what_is_simulated_does_not_depend_on_blocks():
+    """Bit for bit: plans are those of tiles, and a point's result depends on its effects alone."""
+    few, many = (small(axes=WIDE, storage={"block_points": n}) for n in (333, 65536))
+    for name in ("effects", "effects_error", "pd_up", "pd_shot", "p_leakage_up", "snr_down"):
+        assert whole(few, name).tobytes() == whole(many, name).tobytes(), name
+
+
+@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
+def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(tolerance, phases):
+    footprint = {"beamlets": 9, "phases": phases}
+    called = small(axes=WIDE, footprint=footprint, accuracy={"tolerance": tolerance})
+    every = small(axes=WIDE, footprint=footprint, effects=FORCED, accuracy={"tolerance": 0})
+    for name in PROBABILITIES:
+        assert np.abs(whole(called, name) - whole(every, name)).max() <= tolerance, name
+    error = whole(called, "effects_error")
+    assert 0 < error.max() <= tolerance
+    assert np.count_nonzero(whole(called, "effects") != whole(every, "effects")) > 0
+
+
+def test_less_is_simulated_the_larger_the_tolerance():
+    counts = [
+        np.bitwise_count(whole(small(axes=WIDE, accuracy={"tolerance": t}), "effects")).sum()
+        for t in (1e-5, 1e-3, 1e-1)
+    ]
+    assert counts[0] > counts[1] > counts[2]
+
+
+def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
+    spec = small(axes=WIDE, effects={"leakage": "on", "image": "off"})
+    flags = whole(spec, "effects")
+    assert (flags >> NAMES.index("leakage") & 1).all()
+    assert not (flags >> NAMES.index("image") & 1).any()
+
+
+def test_a_plan_is_made_once_for_a_tile(monkeypatch):
+    spec = small(axes=WIDE, storage={"block_points": 100})
+    calling, planned = Calling(spec, Grid(spec)), []
+    plans = calling.plans
+    monkeypatch.setattr(calling, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
+    for block in range(Grid(spec).n_blocks):
+        calling.of_block(block)
+    assert sorted(planned) == list(range(calling.tiles.number))

@@ -1,0 +1,41 @@
+"""Points with random effects: alone or together, and refused where nothing is drawn."""
+
+import numpy as np
+import pytest
+from small import small
+
+from sweep.model.effects.catalogue import CORE
+from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.tasks.evaluate import evaluate_points, select
+from sweep.tasks.grid import Grid
+
+RANDOM = (*CORE, "speckle", "pointing_jitter")
+
+
+def points(**draws):
+    spec = small(draws=draws, axes={"target.range": {"linear": ["1 km", "9 km"], "number": 5}})
+    grid = Grid(spec)
+    rough = {"target.roughness": 1e-5, "target.pointing_jitter": 1e-5}
+    return spec, grid.parameters(0) | rough, grid.block_size(0)
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+@pytest.mark.parametrize("effects", [CORE, RANDOM])
+def test_points_are_evaluated_alone_as_they_are_together(effects, method):
+    spec, parameters, count = points(number=40, batch=25, method=method)
+    together = evaluate_points(spec, parameters, count, effects)
+    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS}
+    random = together["pd_up_error"] > 0
+    assert random.any() if effects == RANDOM else not random.any()
+    for i in range(count):
+        alone = evaluate_points(spec, select(parameters, np.array([i])), 1, effects)
+        for name, values in alone.items():
+            assert values.shape == ((1, 2) if name in DRAW_OUTPUTS else (1,))
+            np.testing.assert_array_equal(values[0], together[name][i], err_msg=name)
+
+
+def test_random_effects_are_refused_in_a_study_without_draws():
+    spec, parameters, count = points(number=0)
+    with pytest.raises(ValueError, match="speckle: simulated by draws"):
+        evaluate_points(spec, parameters, count, (*CORE, "speckle"))
+    assert set(evaluate_points(spec, parameters, count, CORE)) == set(OUTPUTS)
