@@ -87,11 +87,11 @@ def run(
     from sweep.spec import load
     from sweep.tasks import driver
 
-    study = load(spec)
-    warn_before(study)
+    study, path = load(spec), store or _default_store(spec)
+    warn_before(study, path)
     outcome = driver.run(
         study,
-        store=store or _default_store(spec),
+        store=path,
         workers=workers,
         scheduler=scheduler,
         overwrite=overwrite,

@@ -157,17 +157,7 @@ def scene_plan(study: SceneSpec, store: Path, workers: int | None) -> Iterator[t
 
 def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
     """Print which effects a study calls for, where, and what they cost; warn of what is off."""
-    from sweep.spec import SceneSpec
-
-    if isinstance(study, SceneSpec):
-        from sweep.tasks.effects_table import flight_effects_table
-        from sweep.tasks.flight_study import FlightStudy
-
-        table = flight_effects_table(FlightStudy(study, store.absolute()), LOOKED_AT)
-    else:
-        from sweep.tasks.effects_table import effects_table
-
-        table = effects_table(study)
+    table = _effects(study, store, costs=True)
     there = [row for row in table.rows if row.bound > 0 or row.share > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
     _print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
@@ -181,15 +171,21 @@ def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
     warn(table)
 
 
-def warn_before(study: Spec | SceneSpec) -> None:
-    """Before a run over a grid: which effects are forced off though they matter."""
+def warn_before(study: Spec | SceneSpec, store: Path) -> None:
+    """Before a run: which effects are forced off though they matter."""
+    if "off" in study.modes().values():
+        warn(_effects(study, store, costs=False))
+
+
+def _effects(study: Spec | SceneSpec, store: Path, *, costs: bool) -> EffectsTable:
     from sweep.spec import SceneSpec
+    from sweep.tasks.effects_table import effects_table, flight_effects_table
 
-    if isinstance(study, SceneSpec) or "off" not in study.modes().values():
-        return
-    from sweep.tasks.effects_table import effects_table
+    if isinstance(study, SceneSpec):
+        from sweep.tasks.flight_study import FlightStudy
 
-    warn(effects_table(study, costs=False))
+        return flight_effects_table(FlightStudy(study, store.absolute()), LOOKED_AT)
+    return effects_table(study, costs=costs)
 
 
 def warn(table: EffectsTable) -> None:

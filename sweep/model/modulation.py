@@ -157,7 +157,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
         Number of lines.
     """
     count = shifts[0].shape[1] if power else parts[0].shape[2]
-    if count == 0:
+    if count == 0 or (not power and _is_whole(segment, i, parts)):
         return n
     fft_size, length = kernel[0]
     bins = fold * fft_size / length
@@ -188,6 +188,14 @@ def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
     for j in range(few):
         delta[j], re[j], im[j] = at[j], one[j], other[j]
     return few
+
+
+@njit(cache=True, error_model="numpy")
+def _is_whole(segment, i, parts):
+    """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
+    own = parts[4][i]
+    whole = parts[3][segment, own] == 1 and parts[0][segment, own, 0] == 0.0
+    return whole and parts[1][segment, own, 0] == 1.0 and parts[2][segment, own, 0] == 0.0
 
 
 @njit(cache=True, error_model="numpy")

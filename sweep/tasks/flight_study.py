@@ -184,7 +184,7 @@ class FlightStudy:
         reader = self._reader(part.scanner)
         shots, eyepoints = reader.shots(first, stop)
         results = shots | reader.cycles(*stretches.cycle_range(part))
-        called = self._called(part, first, stop)
+        called = self.called(block)
         results |= {"effects": called.flags, "effects_error": called.error}
         results |= self.look(part, shots, eyepoints, called, first=first)
         depth = len(part.axes)
@@ -203,15 +203,16 @@ class FlightStudy:
             shots, eyepoints = self._reader(part.scanner).shots(0, stretches.shots_a_cycle)
             self.look(part, shots, eyepoints, self.call(part, eyepoints), first=0)
 
-    def _called(self, part: Part, first: int, stop: int) -> Called:
-        """What is simulated of some shots, whatever the block: whole tiles are looked at."""
-        stretches = self.scanners[part.scanner]
-        begin, total = first // TILE_SHOTS * TILE_SHOTS, stretches.total_cycles
-        end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total * stretches.shots_a_cycle)
+    def called(self, block: int) -> Called:
+        """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
+        stretches, part = self._part(block)
+        first, stop = stretches.shot_range(part)
+        total = stretches.total_cycles * stretches.shots_a_cycle
+        begin = first // TILE_SHOTS * TILE_SHOTS
+        end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total)
         _, around = self._reader(part.scanner).shots(begin, end)
         called = self.call(part, around, first=begin)
-        own = slice(first - begin, stop - begin)
-        return Called(called.flags[own], called.error[own])
+        return called.some(np.arange(first - begin, stop - begin))
 
     def call(self, part: Part, eyepoints: Eyepoints, *, first: int = 0) -> Called:
         """What is simulated of shots, the first of this number."""

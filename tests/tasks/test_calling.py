@@ -79,18 +79,20 @@ def test_what_is_simulated_does_not_depend_on_blocks():
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(tolerance, phases):
     footprint = {"beamlets": 9, "phases": phases}
-    called = small(axes=WIDE, footprint=footprint, accuracy={"tolerance": tolerance})
-    every = small(axes=WIDE, footprint=footprint, effects=FORCED, accuracy={"tolerance": 0})
+    sections = {"axes": WIDE, "footprint": footprint, "storage": {"block_points": 65536}}
+    called = GridStudy(small(**sections, accuracy={"tolerance": tolerance})).evaluate(0)
+    every = GridStudy(small(**sections, effects=FORCED, accuracy={"tolerance": 0})).evaluate(0)
     for name in PROBABILITIES:
-        assert np.abs(whole(called, name) - whole(every, name)).max() <= tolerance, name
-    error = whole(called, "effects_error")
-    assert 0 < error.max() <= tolerance
-    assert np.count_nonzero(whole(called, "effects") != whole(every, "effects")) > 0
+        assert np.abs(called[name] - every[name]).max() <= tolerance, name
+    assert 0 < called["effects_error"].max() <= tolerance
+    assert (called["effects"] != every["effects"]).any()
 
 
 def test_less_is_simulated_the_larger_the_tolerance():
     counts = [
-        np.bitwise_count(whole(small(axes=WIDE, accuracy={"tolerance": t}), "effects")).sum()
+        np.bitwise_count(
+            GridStudy(small(axes=WIDE, accuracy={"tolerance": t})).calling.of_block(0).flags
+        ).sum()
         for t in (1e-5, 1e-3, 1e-1)
     ]
     assert counts[0] > counts[1] > counts[2]

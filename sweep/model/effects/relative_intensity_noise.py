@@ -47,7 +47,7 @@ def current_variance(
     local_oscillator_power : array_like
         Power [W] on the detector; 0 for direct detection.
     apd_gain, responsivity, electrical_bandwidth : array_like
-        As for :func:`sweep.model.noise.current_variances`.
+        As for :func:`sweep.model.noise.shot_noise`.
     """
     current = (
         np.asarray(apd_gain, float)

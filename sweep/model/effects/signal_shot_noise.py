@@ -1,6 +1,6 @@
 """Signal shot noise: the echo's own light, which close by rivals the local oscillator's.
 
-What it does is in :func:`sweep.model.noise.current_variances`: 2 q M^2 F Re P B_e of the whole
+What it does is in :func:`sweep.model.noise.shot_noise`: 2 q M^2 F Re P B_e of the whole
 echo, which makes the rise of false alarms below some 5 m that [T 4.2] reports. Here is what
 leaving it out can change: of the echo on the axis, or of the whole footprint's.
 """

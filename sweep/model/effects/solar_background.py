@@ -1,7 +1,7 @@
 """Solar background: sunlight scattered into the receiver, as shot noise.
 
 What it does is in :func:`sweep.model.noise.solar_power` and
-:func:`sweep.model.noise.current_variances`; here is what leaving it out can change.
+:func:`sweep.model.noise.shot_noise`; here is what leaving it out can change.
 """
 
 from collections.abc import Mapping

@@ -1,0 +1,101 @@
+"""What a scene does not call for is not computed: nodes of the chain and calls are counted."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from small import small
+
+from sweep.model import footprint, modulation
+from sweep.model.chain import nodes, prepare
+from sweep.model.effects import atmosphere, turbulence
+from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.effects.flags import names_of
+from sweep.tasks.grid_study import GridStudy
+
+AIR = {"extinction", "backscatter", "scintillation"}
+MOON = {"instrument.laser.power": ["1 W", "3 W"], "target.range": {"linear": ["1 km", "5 km"],
+        "number": 40}, "target.grazing_angle": ["30 deg", "60 deg"]}  # fmt: skip
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """How often effects act and some of their inner functions run, by name."""
+    counted = Counter()
+
+    def watch(owner, name, label):
+        plain = getattr(owner, name)
+
+        def counting(*arguments, **keywords):
+            counted[label] += 1
+            return plain(*arguments, **keywords)
+
+        # effects are frozen: what is compared is their functions, not they themselves
+        object.__setattr__(owner, name, counting) if owner in EFFECTS else monkeypatch.setattr(
+            owner, name, counting
+        )
+        return plain
+
+    acts = [(effect, watch(effect, "act", effect.name)) for effect in EFFECTS if effect.act]
+    watch(footprint, "plane_footprint", "plane_footprint")
+    watch(atmosphere, "optical_depth", "optical_depth")
+    watch(turbulence, "rytov_variance", "rytov_variance")
+    watch(modulation, "split_lines", "split_lines")
+    yield counted
+    for effect, plain in acts:
+        object.__setattr__(effect, "act", plain)
+
+
+def evaluated(spec):
+    """Effects that any point of a study calls for, by computing all of it."""
+    study = GridStudy(spec)
+    flags = [study.evaluate(block)["effects"].ravel() for block in range(study.n_blocks)]
+    return {name for flag in np.unique(np.concatenate(flags)) for name in names_of(int(flag))}
+
+
+def test_over_the_moon_there_is_no_air(calls):
+    called = evaluated(small(axes=MOON))
+    assert "doppler" in called and not AIR & called
+    assert calls["doppler"] > 0 and not any(calls[name] for name in AIR)
+    assert calls["optical_depth"] == calls["rytov_variance"] == 0
+
+
+def test_over_mars_there_is(calls):
+    called = evaluated(small(axes=MOON, atmosphere={"profile": "mars_storm"}))
+    assert "extinction" in called and "scintillation" not in called
+    assert calls["extinction"] > 0 and calls["optical_depth"] > 0 and calls["rytov_variance"] == 0
+
+
+def test_a_hovering_lidar_sees_no_doppler_shift(calls):
+    still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
+    called = evaluated(small(axes=MOON, target=still))
+    assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
+    assert calls["doppler"] == calls["range_walk"] == calls["split_lines"] == 0
+
+
+def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):
+    near = {"range": "20 m", "grazing_angle": "90 deg", "reflectance": 0.02}
+    spec = small(axes={"target.range": {"linear": ["15 m", "25 m"], "number": 40}}, target=near,
+                 footprint={"beamlets": 109})  # fmt: skip
+    called = evaluated(spec)
+    assert "footprint" not in called and calls["plane_footprint"] == 0
+    ((_, one),) = prepare(spec.parameters(), called)
+    ((_, every),) = prepare(spec.parameters(), {*called, "footprint"})
+    assert one.offset.shape == (1, 1) and every.offset.shape == (1, 109)
+
+
+def test_nodes_of_a_chain_are_its_effects_and_no_more():
+    assert nodes(()) == ()
+    assert [node.name for node in nodes({"leakage", "footprint"})] == ["footprint", "leakage"]
+    assert tuple(node.name for node in nodes(NAMES)) == NAMES
+    with pytest.raises(ValueError, match="no effect wind: choose from footprint"):
+        nodes({"wind"})
+
+
+def test_bare_shots_hold_nothing_of_any_effect():
+    spec = small(axes={})
+    ((_, bare),) = prepare(spec.parameters(), ())
+    assert bare.offset.shape == (1, 1) and bare.phase.size == 0 and bare.beta == 0.0
+    assert bare.phase_errors == () and bare.gaussian_width is None
+    assert not bare.image and not bare.leakage and bare.incoherent
+    assert set(bare.noise_sources) == {"local_oscillator_shot", "detector", "amplifier"}
