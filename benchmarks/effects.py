@@ -1,6 +1,6 @@
 """All effects on against those that are called for: what it changes, what it saves.
 
-Run with `make effects`, some twenty minutes: every experiment in the repository, whole, with each
+Run with `make effects`, some ten minutes: every experiment in the repository, whole, with each
 effect forced on, and with effects on demand at three tolerances. All in one process, one variant
 of an experiment after the other; quote the ratios. Writes docs/effects_table.md.
 """
@@ -32,7 +32,8 @@ Written by `make effects`. For each experiment, whole: the time with every effec
 computed with the scene's own parameters; and with effects simulated only where they are called for,
 at three tolerances: how many times faster that is, planning included, and the largest change of any
 probability of detection anywhere, which has to stay below the tolerance. `planning` is its share of
-the time at the tightest.
+that time at the tightest tolerance; it takes some milliseconds a block at the least, which is what
+shows where all blocks together take less than a second.
 
 """
 

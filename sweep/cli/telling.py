@@ -201,7 +201,7 @@ def _effect_cells(row: EffectRow) -> list[str]:
         f"{100 * row.share:.3g} %",
         f"{1e6 * cost:.2g} us" if cost == cost else "-",
         f"{row.bound:.2g}",
-        row.where or f"nowhere; most at {row.at}",
+        "everywhere" if row.share == 1 else row.where or f"nowhere; most at {row.at}",
     ]
 
 

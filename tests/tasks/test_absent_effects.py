@@ -88,6 +88,7 @@ def test_nodes_of_a_chain_are_its_effects_and_no_more():
     assert nodes(()) == ()
     assert [node.name for node in nodes({"leakage", "footprint"})] == ["footprint", "leakage"]
     assert tuple(node.name for node in nodes(NAMES)) == NAMES
+    assert nodes({"doppler_spread", "footprint_phase"}) == ()  # there is no footprint
     with pytest.raises(ValueError, match="no effect wind: choose from footprint"):
         nodes({"wind"})
 

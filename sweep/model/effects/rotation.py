@@ -16,21 +16,6 @@ if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
 
-def equivalent_velocity(
-    *, rate: np.ndarray, instrument: np.ndarray, pivot: np.ndarray
-) -> np.ndarray:
-    """Velocity of the instrument that would do what the rotation does [m/s], (n, 3).
-
-    Parameters
-    ----------
-    rate : (n, 3) ndarray
-        Angular velocity of the body, omega [rad/s].
-    instrument, pivot : (n, 3) ndarray
-        O and X [m]; X is the point whose velocity is called the body's.
-    """
-    return np.asarray(-np.cross(rate, np.asarray(instrument) - np.asarray(pivot)))
-
-
 def bound(block: "Block") -> np.ndarray | None:
     """Whether anything turns: what it does to velocities is in the scene, and not left out."""
     return np.ones(block.size) if block.rotating else None
