@@ -17,7 +17,7 @@ SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 
 
 def nodes(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Effects by name in the order in which they act, but those within one that is not there.
+    """Effects by name in the order in which they act.
 
     Raises
     ------
@@ -26,8 +26,7 @@ def nodes(effects: Collection[str]) -> tuple[Effect, ...]:
     """
     if unknown := sorted(set(effects) - set(NAMES)):
         raise ValueError(f"no effect {', '.join(unknown)}: choose from {', '.join(NAMES)}")
-    there = {"", *effects}
-    return tuple(e for e in EFFECTS if e.name in effects and e.within in there)
+    return tuple(effect for effect in EFFECTS if effect.name in effects)
 
 
 def prepare(

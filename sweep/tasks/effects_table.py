@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -70,40 +71,28 @@ def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
     """
     from sweep.model.effects.catalogue import EFFECTS
 
-    grid = Grid(spec)
-    calling = Calling(spec, grid)
+    calling = Calling(spec, Grid(spec))
     number = calling.tiles.number
     tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
-    kept, change = np.empty((2, len(EFFECTS), len(tiles)))
-    error = np.empty(len(tiles))
+    kept = np.empty((len(EFFECTS), len(tiles)), bool)
+    change, error = np.empty(kept.shape), np.empty(len(tiles))
     for chosen, plan in calling.plans(tiles):
         kept[:, chosen], change[:, chosen], error[chosen] = plan.kept, plan.change, plan.error
-    points = np.array([_points(calling, tile) for tile in tiles.tolist()])
-    modes = spec.modes()
-    rows = []
-    for k, effect in enumerate(EFFECTS):
-        called = kept[k] > 0
-        most = int(change[k].argmax())
-        rows.append(
-            EffectRow(
-                name=effect.name,
-                about=effect.about,
-                mode=modes[effect.name],
-                share=float(points[called].sum() / points.sum()),
-                where=_region(spec, calling, tiles[called]) if called.any() else "",
-                bound=float(change[k, most]),
-                at=_region(spec, calling, tiles[most : most + 1]),
-                seconds_a_point=_cost(spec, calling, tiles[called], effect.name)
-                if costs and called.any()
-                else float("nan"),
-            )
-        )
+
+    def cost(name: str, called: np.ndarray) -> float:
+        return _cost(spec, calling, tiles[called], name) if costs else math.nan
+
     return EffectsTable(
-        rows=tuple(rows),
-        tolerance=float(np.min([spec.accuracy.tolerance])),
+        rows=_rows(
+            spec.modes(), kept, change,
+            weight=np.array([_points(calling, tile) for tile in tiles.tolist()]),
+            where=lambda some: _region(spec, calling, tiles[some]),
+            cost=cost,
+        ),
+        tolerance=float(spec.accuracy.tolerance),
         error=float(error.max()),
         looked_at=len(tiles) / number,
-    )
+    )  # fmt: skip
 
 
 def flight_effects_table(study: FlightStudy, shots: int) -> EffectsTable:
@@ -116,50 +105,63 @@ def flight_effects_table(study: FlightStudy, shots: int) -> EffectsTable:
     shots
         Shots of each scanner that are looked at, about, spread over the flight in whole cycles.
     """
-    from sweep.model.effects.catalogue import EFFECTS
     from sweep.scenes.eyepoint_arrays import from_arrays
 
-    kept, change, error, time_, weight = [], [], [], [], []
+    plans, times, weights, total = [], [], [], 0
     for eyepoints in study.eyepoint_studies():
         index = eyepoints.spread(max(1, shots // eyepoints.shots_a_cycle))
         seen = from_arrays(eyepoints.see(index), eyepoints.weight)
         part = study.scanners[eyepoints.scanner].part(0)
         planned = study.planned(part, seen, index // eyepoints.shots_a_cycle)
-        if planned is None:
-            continue
-        kept.append(planned.plan.kept)
-        change.append(planned.plan.change)
-        error.append(planned.plan.error)
-        first = np.searchsorted(planned.tile, np.arange(planned.tile[-1] + 1))
-        time_.append(seen.time[planned.shots][first])
-        weight.append(np.bincount(planned.tile))
-    if not kept:
-        return EffectsTable(
-            rows=(), tolerance=study.spec.accuracy.tolerance, error=0.0, looked_at=1
-        )
-    keep, changes = np.concatenate(kept, axis=1), np.concatenate(change, axis=1)
-    times, number = np.concatenate(time_), np.concatenate(weight)
-    modes = study.spec.modes()
-    rows = []
-    for k, effect in enumerate(EFFECTS):
-        called, most = keep[k], int(changes[k].argmax())
-        rows.append(
-            EffectRow(
-                name=effect.name,
-                about=effect.about,
-                mode=modes[effect.name],
-                share=float(number[called].sum() / number.sum()),
-                where=_times(times[called]) if called.any() else "",
-                bound=float(changes[k, most]),
-                at=f"time {times[most]:.4g} s",
-                seconds_a_point=float("nan"),
-            )
-        )
+        total += eyepoints.points
+        if planned is not None:
+            plans.append(planned.plan)
+            first = np.searchsorted(planned.tile, np.arange(planned.tile[-1] + 1))
+            times.append(seen.time[planned.shots][first])
+            weights.append(np.bincount(planned.tile))
+    tolerance = float(study.spec.accuracy.tolerance)
+    if not plans:
+        return EffectsTable(rows=(), tolerance=tolerance, error=0.0, looked_at=1.0)
+    time_, weight = np.concatenate(times), np.concatenate(weights)
     return EffectsTable(
-        rows=tuple(rows),
-        tolerance=float(study.spec.accuracy.tolerance),
-        error=float(np.concatenate(error).max()),
-        looked_at=float(number.sum() / max(1, sum(e.points for e in study.eyepoint_studies()))),
+        rows=_rows(
+            study.spec.modes(),
+            np.concatenate([plan.kept for plan in plans], axis=1),
+            np.concatenate([plan.change for plan in plans], axis=1),
+            weight=weight,
+            where=lambda some: _times(time_[some]),
+            cost=lambda name, called: math.nan,
+        ),
+        tolerance=tolerance,
+        error=max(float(plan.error.max()) for plan in plans),
+        looked_at=float(weight.sum() / total),
+    )
+
+
+def _rows(
+    modes: Mapping[str, str],
+    kept: np.ndarray,
+    change: np.ndarray,
+    *,
+    weight: np.ndarray,
+    where: Callable[[np.ndarray], str],
+    cost: Callable[[str, np.ndarray], float],
+) -> tuple[EffectRow, ...]:
+    """A row for each effect, from what is kept and changed in tiles of so many points each."""
+    from sweep.model.effects.catalogue import EFFECTS
+
+    return tuple(
+        EffectRow(
+            name=effect.name,
+            about=effect.about,
+            mode=modes[effect.name],
+            share=float(weight[called].sum() / weight.sum()),
+            where=where(called) if called.any() else "",
+            bound=float(changes.max()),
+            at=where(np.arange(changes.size) == changes.argmax()),
+            seconds_a_point=cost(effect.name, called) if called.any() else math.nan,
+        )
+        for effect, called, changes in zip(EFFECTS, kept, change, strict=True)
     )
 
 

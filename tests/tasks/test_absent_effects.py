@@ -88,9 +88,17 @@ def test_nodes_of_a_chain_are_its_effects_and_no_more():
     assert nodes(()) == ()
     assert [node.name for node in nodes({"leakage", "footprint"})] == ["footprint", "leakage"]
     assert tuple(node.name for node in nodes(NAMES)) == NAMES
-    assert nodes({"doppler_spread", "footprint_phase"}) == ()  # there is no footprint
     with pytest.raises(ValueError, match="no effect wind: choose from footprint"):
         nodes({"wind"})
+
+
+def test_what_spreads_beamlets_does_nothing_where_there_are_none():
+    spec = small(axes={}, target={"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.1,
+                                  "transverse_velocity": "100 m/s"})  # fmt: skip
+    ((_, alone),) = prepare(spec.parameters(), {"doppler_spread", "several_returns"})
+    ((_, both),) = prepare(spec.parameters(), {"footprint", "doppler_spread"})
+    assert alone.doppler.shape == (1, 1) and not alone.doppler.any()
+    assert both.doppler.shape == (1, 9) and both.doppler.any()
 
 
 def test_bare_shots_hold_nothing_of_any_effect():

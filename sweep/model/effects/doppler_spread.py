@@ -37,8 +37,9 @@ def bound(block: "Block") -> Change | None:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """Beamlets at their own radial velocities."""
-    return replace(shots, doppler=scene.ground.beamlets.doppler)
+    """Beamlets at their own radial velocities, where there are beamlets."""
+    doppler = scene.ground.beamlets.doppler
+    return replace(shots, doppler=doppler) if shots.doppler.shape == doppler.shape else shots
 
 
 EFFECT = Effect(

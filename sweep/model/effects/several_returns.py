@@ -51,10 +51,11 @@ def bound(block: "Block") -> Change | None:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """Beamlets on other surfaces than the axis's at ranges of their own."""
-    if scene.ground.beside is None:
+    """Beamlets on other surfaces than the axis's at ranges of their own, where there are any."""
+    offset = scene.ground.beamlets.offset
+    if scene.ground.beside is None or shots.offset.shape != offset.shape:
         return shots
-    return replace(shots, offset=scene.ground.beamlets.offset)
+    return replace(shots, offset=offset)
 
 
 EFFECT = Effect(

@@ -1,0 +1,79 @@
+"""Footprints on a plane with a velocity across the beam, and effects of the air in the chain."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from sweep.model import chain, shot, spectra, truth
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.solar_background import sunlight
+from sweep.model.footprint import beamlets, velocity_offsets
+
+STORM = {"atmosphere.profile": "mars_storm"}
+
+
+def test_velocities_of_beamlets_by_vectors():
+    """The instrument moves with v_r along the axis and v_t across it, towards the near side."""
+    (across, along), _ = beamlets(37)
+    divergence, radial, transverse = 0.2, 40.0, -70.0
+    found = velocity_offsets(
+        radial=np.array([radial]), transverse=np.array([transverse]),
+        beam_divergence=np.array([divergence]), number=37,
+    )[0]  # fmt: skip
+    rays = np.stack([across * divergence / 4, along * divergence / 4, np.ones(37)])
+    rays /= np.linalg.norm(rays, axis=0)
+    velocity = np.array([0.0, transverse, radial])
+    assert found == pytest.approx(velocity @ rays - radial, abs=1e-11)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_doppler_spread_against_the_truth(table_4_1, phases):
+    """100 m/s across and 50 urad: 1.4 bins, in the Doppler segment too."""
+    moving = {"target.transverse_velocity": 100.0}
+    parameters = table_4_1(phases=phases, beamlets=19, fft_size=2**14, grazing_angle=1.0) | moving
+    ((_, shots),) = chain.prepare(parameters, (*CORE, "doppler_spread"))
+    spread = 2 / 1550e-9 * np.ptp(shots.doppler * SPEED_OF_LIGHT / 2) * 2**14 / 600e6
+    assert spread == pytest.approx(2 / 1550e-9 * 100 * 1.4 * 50e-6 * 2**14 / 600e6, rel=0.1)
+    for segment in range(3):
+        exact = truth.spectrum(shots, 0, segment, range_walk=False)
+        bins, fast = spectra.segment_spectrum(shots, 0, segment)
+        assert np.abs(fast - exact[bins]).max() < 1e-9 * exact.max()
+
+
+def test_a_velocity_across_lowers_the_peak_of_a_wide_beam(table_4_1):
+    wide = table_4_1(beam_divergence=1e-3, phases="incoherent", range=2000.0)
+    still = shot.evaluate(wide)["snr_doppler"]
+    moving = shot.evaluate(wide | {"target.transverse_velocity": 100.0})["snr_doppler"]
+    assert moving < 0.3 * still
+
+
+@pytest.mark.parametrize("grazing", [0.2, 1.2])
+def test_air_dims_the_echo_by_the_integral_over_the_path(table_4_1, grazing):
+    """tau = integral of 5/11 km exp(-h/11 km) along a slant path of 5 km; SNR falls by T^2."""
+    parameters = table_4_1(range=5000.0, grazing_angle=grazing)
+    names = [name for name in CORE if name != "signal_shot_noise"]
+    clear = shot.evaluate(parameters, names)
+    dusty = shot.evaluate(parameters | STORM, (*names, "extinction"))
+    depth, _ = quad(lambda s: 5 / 11e3 * np.exp(-s * np.sin(grazing) / 11e3), 0, 5000.0)
+    assert dusty["snr_up"] / clear["snr_up"] == pytest.approx(np.exp(-2 * depth), rel=1e-6)
+    level = {"atmosphere.path": "level", "atmosphere.target_height": 100.0}
+    along = shot.evaluate(parameters | STORM | level, (*names, "extinction"))
+    expected = np.exp(-2 * 5000.0 * 5 / 11e3 * np.exp(-100 / 11e3))
+    assert along["snr_up"] / clear["snr_up"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_all_sunlight_together_is_the_solar_constant():
+    """1361 W/m^2 at the Earth's distance, and a quarter of it at twice that, lit from 30 deg."""
+    one = {"distance": 149597870700.0, "elevation": np.pi / 2}
+
+    def total(**place):
+        return quad(lambda x: sunlight(wavelength=x, **place), 1e-8, 1e-4, limit=500,
+                    points=[5e-7, 2e-6, 1e-5])[0]  # fmt: skip
+
+    assert total(**one) == pytest.approx(1361.0, rel=1e-3)
+    away = {"distance": 2 * one["distance"], "elevation": np.pi / 6}
+    assert total(**away) == pytest.approx(1361.0 / 8, rel=1e-3)
+    assert sunlight(wavelength=1.55e-6, distance=0.0, elevation=1.0) == 0.0
+    # the sun shines through its least opaque wavelengths there, a fifth brighter than a black body
+    assert 0.2 < sunlight(wavelength=1.55e-6, **one) * 1e-9 < 0.27
