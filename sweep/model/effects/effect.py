@@ -86,7 +86,7 @@ class Effect:
     """What it does at random to shots, after all else but spectrum and detection."""
     parameters: tuple[Parameter, ...] = ()
     within: str = ""
-    """An effect that this one is part of: kept wherever this is, and where that is off, so is this."""
+    """An effect that this is part of: kept wherever this is; where it is off, so is this."""
     needs: tuple[str, ...] = ()
     """Effects that this one is simulated with, however little they change by themselves."""
 
