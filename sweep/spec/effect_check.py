@@ -22,21 +22,39 @@ SECTION = "effects"
 
 
 class Need(NamedTuple):
-    """A parameter that means nothing without another."""
+    """A parameter that means nothing beside some values of another."""
 
     path: str
     asks: Condition
     """Whether values of it need the other."""
     other: str
-    """Parameter that must then be above 0."""
+    """Parameter that must then have another value."""
+    lacks: Condition
+    """Whether values of that one will not do."""
+    rule: str
+    remedy: str
+
+
+def _above_zero(path: str, asks: Condition, other: str) -> Need:
+    return Need(path, asks, other, lambda v: v == 0, f"needs {other}, which is 0", f"set {other}")
 
 
 NEEDS = (
-    Need("instrument.processing.bits", lambda bits: bits > 0, "instrument.processing.full_scale"),
-    Need(
+    _above_zero(
+        "instrument.processing.bits", lambda bits: bits > 0, "instrument.processing.full_scale"
+    ),
+    _above_zero(
         "atmosphere.profile",
         lambda profile: np.isin(profile, ("exponential", "layer")),
         "atmosphere.extinction",
+    ),
+    Need(
+        "target.roughness",
+        lambda roughness: roughness > 0,
+        "instrument.receiver.architecture",
+        lambda architecture: architecture == "direct",
+        "makes speckle, of which direct detection averages over an unknown number",
+        "take a coherent receiver",
     ),
 )
 
@@ -87,13 +105,12 @@ def _need_findings(
     values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
 ) -> Iterator[Finding]:
     """Parameters of effects without others that they need."""
-    for path, asks, other in NEEDS:
-        owner = next(e for e in EFFECTS if any(p.path == path for p in e.parameters))
-        conditions: dict[str, Condition] = {path: asks, other: lambda value: value == 0}
+    for need in NEEDS:
+        owner = next(e for e in EFFECTS if any(p.path == need.path for p in e.parameters))
+        conditions = {need.path: need.asks, need.other: need.lacks}
         if modes.get(owner.name, OFF) != OFF and has_point(conditions, values, axes):
-            rule = f"needs {other}, which is 0"
-            remedy = f"set {other}, or effects.{owner.name}: off"
-            yield Finding(place_on_grid(path, axes), rule, remedy, ABSENT)
+            remedy = f"{need.remedy}, or effects.{owner.name}: off"
+            yield Finding(place_on_grid(need.path, axes), need.rule, remedy, ABSENT)
 
 
 def without_draws(

@@ -248,6 +248,19 @@ def test_turbulence_over_a_flight_is_refused_unless_it_is_left_out():
     assert mistake.startswith("target: is no field")
 
 
+@pytest.mark.parametrize("on_axis", [False, True])
+def test_speckle_is_refused_for_direct_detection(on_axis):
+    receiver = {"instrument.receiver.architecture": "direct"}
+    changes = {"target.roughness": "10 um", "draws.number": 10}
+    if on_axis:
+        changes["axes"] = {"instrument.receiver.architecture": ["homodyne", "direct"]}
+    else:
+        changes |= receiver
+    with pytest.raises(SpecError, match="makes speckle, of which direct detection averages"):
+        spec(changes)
+    assert spec(changes | {"effects.speckle": "off"}).modes()["speckle"] == "off"
+
+
 BITS, FULL_SCALE = "instrument.processing.bits", "instrument.processing.full_scale"
 PROFILE, EXTINCTION = "atmosphere.profile", "atmosphere.extinction"
 
