@@ -113,7 +113,7 @@ EVERY = {
 def other_value(path):
     """A good value of a parameter that is not the one of the base study."""
     special = {
-        "instrument.receiver.architecture": "direct",
+        "instrument.receiver.architecture": "heterodyne",
         "instrument.processing.window": "hann",
         "instrument.processing.bins_counted": "all",
         "target.reflectance_law": "thesis",
