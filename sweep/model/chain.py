@@ -10,7 +10,8 @@ import numpy as np
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, PARAMETERS
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.ground import Cast, Ground, Plane
-from sweep.model.preparation import Parameters, Shots, as_arrays, bare, categories
+from sweep.model.preparation import Parameters, Shots, as_arrays, bare
+from sweep.model.sampling import sampled_categories
 
 SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 """Numbers of effects that points must share to be prepared together."""
@@ -42,7 +43,7 @@ def prepare(
     effects : collection of str
         Names of the effects that are simulated.
     """
-    for index, p in categories(DEFAULTS | dict(parameters), SHARED):
+    for index, p in sampled_categories(DEFAULTS | dict(parameters), effects, SHARED):
         yield index, assembled(p, index.size, Plane(p, index.size), effects)
 
 

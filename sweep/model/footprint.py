@@ -17,6 +17,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from sweep.model.quadrature import gaussian_rule
+
+PATTERNS = ("hexagonal", "sunflower", "line", "square")
+
 REACH = 3.0
 """Radius of the pattern before the mapping, in standard deviations: 98.9 % of the power."""
 
@@ -33,18 +37,22 @@ def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.nd
     number : int
         Beamlets, at least 1; [T 3.3.1] uses 109, a full hexagonal lattice in a circle.
     pattern : str
-        ``hexagonal`` or ``sunflower``.
+        One of :data:`PATTERNS`. A square has the whole root of as many on each side.
 
     Returns
     -------
     offsets : (2, number) ndarray
-        Angles off the axis in units of the beam's standard deviation (Theta/4). Their weighted
-        mean is 0 and, from three beamlets on, their covariance the identity.
+        Angles off the axis in units of the beam's standard deviation (Theta/4), across the
+        plane's slope and along it. Their weighted mean is 0 and, from three beamlets on, their
+        covariance the identity; but that those of a line all lie one deviation to the same side,
+        which has the mean square of both sides.
     weights : (number,) ndarray
         Power fractions; they sum to 1.
     """
     if number == 1:
         return np.zeros((2, 1)), np.ones(1)
+    if pattern in ("line", "square"):
+        return _product(pattern, number)
     if number == 2:
         return np.array([[0.0, 0.0], [-1.0, 1.0]]), np.array([0.5, 0.5])
     offsets = _PATTERNS[pattern](number)
@@ -76,6 +84,16 @@ def _sunflower(number: int) -> np.ndarray:
     k = np.arange(number) + 0.5
     radius, angle = REACH * np.sqrt(k / number), k * math.pi * (3 - math.sqrt(5))
     return np.array([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def _product(pattern: str, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets and weights of a Gaussian's rules along the slope, and across it."""
+    if pattern == "line":
+        along, weights = gaussian_rule(number)
+        return np.array([np.ones(number), along]), weights
+    nodes, weights = gaussian_rule(max(math.isqrt(number), 2))
+    across, along = (v.ravel() for v in np.meshgrid(nodes, nodes))
+    return np.array([across, along]), np.outer(weights, weights).ravel()
 
 
 _PATTERNS = {"hexagonal": _hexagonal, "sunflower": _sunflower}

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -54,9 +54,7 @@ class Plane:
     def __init__(self, p: Mapping[str, np.ndarray], size: int) -> None:
         self._law = str(p["target.reflectance_law"])
         self._number = int(p["footprint.beamlets"])
-        self._pattern = pattern(
-            str(p["footprint.phases"]), str(p["instrument.receiver.architecture"])
-        )
+        self._pattern = pattern(p)
         columns = np.broadcast_arrays(
             p["target.grazing_angle"],
             p["instrument.laser.beam_divergence"],
@@ -115,9 +113,18 @@ class Cast:
         return Footprints(self.beamlets.row, nothing, nothing, whole)
 
 
-def pattern(phases: str, architecture: str) -> str:
-    """Arrangement of the beamlets: hexagonal where their powers add, else without symmetry."""
-    return "hexagonal" if phases == "incoherent" and architecture != "direct" else "sunflower"
+def powers_add(p: Mapping[str, Any]) -> bool:
+    """Whether the beamlets of points of one category add as powers."""
+    incoherent = str(p["footprint.phases"]) == "incoherent"
+    return incoherent and str(p["instrument.receiver.architecture"]) != "direct"
+
+
+def pattern(p: Mapping[str, Any]) -> str:
+    """Arrangement of the beamlets: as chosen, or hexagonal where powers add, else unsymmetric."""
+    chosen = str(p["footprint.pattern"])
+    if chosen != "auto":
+        return chosen
+    return "hexagonal" if powers_add(p) else "sunflower"
 
 
 def _rows(row: np.ndarray, size: int) -> np.ndarray:

@@ -59,6 +59,7 @@ OUTPUTS: dict[str, Output] = {
     "snr_up": _snr("up-chirp"),
     "snr_down": _snr("down-chirp"),
     "snr_doppler": _snr("Doppler segment", NO_DOPPLER),
+    "beamlets": Output("1", "number of beamlets that were simulated"),
     "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
     "range_error": Output(
         "m", "reported less true range, without noise", "peak bins of the three segments resolved"

@@ -63,6 +63,7 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
         "snr_up": snr[0],
         "snr_down": snr[2],
         "snr_doppler": snr[1],
+        "beamlets": np.full(shots.size, float(shots.offset.shape[1])),
         "noise_variance": shots.noise_variance,
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,

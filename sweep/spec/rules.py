@@ -90,6 +90,8 @@ class Numeric(Rule):
         Bounds, as a user would write them.
     whole : bool
         Whether only whole numbers will do.
+    words : tuple of (str, int)
+        Words that stand for numbers, whatever the bounds; not along axes.
     """
 
     si_unit: str = ""
@@ -98,6 +100,7 @@ class Numeric(Rule):
     at_least: str | None = None
     at_most: str | None = None
     whole: bool = False
+    words: tuple[tuple[str, int], ...] = ()
 
     @property
     def units(self) -> str:
@@ -112,6 +115,8 @@ class Numeric(Rule):
 
     def read(self, written: object) -> float | int:
         """SI value of what the user wrote, within the bounds."""
+        if isinstance(written, str) and written in dict(self.words):
+            return dict(self.words)[written]
         number, unit = self.exact(written)
         if self.whole and number.denominator != 1:
             raise QuantityError("must be a whole number", f"write e.g. {self.example}")
@@ -140,6 +145,9 @@ class Numeric(Rule):
         if self.si_unit:
             number = 10.0 * math.log10(value) if self.si_unit == DECIBEL else float(value)
             return f"{repr(number).removesuffix('.0')} {self.si_unit}"
+        for word, number in self.words:
+            if value == number:
+                return word
         return int(value) if self.whole else float(value)
 
     def schema(self) -> dict[str, Any]:
@@ -155,6 +163,9 @@ class Numeric(Rule):
             {"type": "integer" if self.whole else "number"} | self._numeric_bounds(),
             {"type": "string", "pattern": r"^\s*[-+.0-9][-+.0-9eE^*_ ]*%?\s*$"},
         ]
+        kinds += (
+            [{"type": "string", "enum": [word for word, _ in self.words]}] if self.words else []
+        )
         return common | {"anyOf": kinds}
 
     def _numeric_bounds(self) -> dict[str, float]:

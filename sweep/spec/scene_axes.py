@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from sweep.model.ground import pattern as pattern_of
+from sweep.model.sampling import PATTERN
 from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.spec.axes import Axis
 from sweep.spec.mistakes import ABSENT, Finding, Location
 
 ARCHITECTURE = "instrument.receiver.architecture"
+OF_PLANES = ("line", "square")
+"""Patterns of beamlets that stand for a plane's slope."""
 DIVERGENCE = "instrument.laser.beam_divergence"
 STORED = frozenset(
     name
@@ -33,22 +37,27 @@ def why_not(path: str) -> tuple[str, str]:
     return next((why for start, why in _REASONS.items() if path.startswith(start)), ("", ""))
 
 
-def beamlet_pattern(phases: str, architecture: str) -> str:
-    """Arrangement of the beamlets: hexagonal where their powers add, else without symmetry."""
-    return "hexagonal" if phases == "incoherent" and architecture != "direct" else "sunflower"
+def beamlet_pattern(chosen: str, phases: str, architecture: str) -> str:
+    """Arrangement of the beamlets, as :func:`sweep.model.ground.pattern` has it."""
+    words = {PATTERN: chosen, "footprint.phases": phases, ARCHITECTURE: architecture}
+    return pattern_of(words)
 
 
 def parameter_findings(
-    pattern: str, phases: str, path: str, values: Iterable[Any], location: Location
+    footprint: tuple[str, str],
+    architecture: str,
+    path: str,
+    values: Iterable[Any],
+    location: Location,
 ) -> list[Finding]:
     """What is wrong with a parameter taking several values on one geometry.
 
     Parameters
     ----------
-    pattern : str
-        Arrangement of the study's beamlets.
-    phases : str
-        How they add.
+    footprint : (str, str)
+        The study's ``footprint.pattern`` and ``footprint.phases``.
+    architecture : str
+        Its receiver's.
     path : str
         Dotted path of the parameter.
     values : iterable
@@ -59,7 +68,8 @@ def parameter_findings(
     rule, remedy = why_not(path)
     if rule:
         return [Finding(location, rule, remedy, ABSENT)]
-    if path == ARCHITECTURE and {beamlet_pattern(phases, str(v)) for v in values} != {pattern}:
+    taken = {beamlet_pattern(*footprint, str(v)) for v in (architecture, *values)}
+    if path == ARCHITECTURE and len(taken) > 1:
         rule = "moves the beamlets between direct detection and the others"
         return [Finding(location, rule, f"{_OTHER}, or take coherent phases", ABSENT)]
     return []
@@ -67,13 +77,17 @@ def parameter_findings(
 
 def axis_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[Finding]:
     """Axes of what can not vary on one geometry."""
-    phases = str(_at(written, "footprint.phases", "incoherent"))
-    pattern = beamlet_pattern(phases, str(_at(written, ARCHITECTURE, "homodyne")))
+    chosen, phases = _at(written, PATTERN, "auto"), _at(written, "footprint.phases", "incoherent")
+    architecture = str(_at(written, ARCHITECTURE, "homodyne"))
     findings = []
+    if chosen in OF_PLANES:
+        rule = "stands for a plane alone, and the ground of a scene is none"
+        findings.append(Finding(("footprint", "pattern"), rule, "take hexagonal", str(chosen)))
     for axis in axes:
         for member in axis.members:
             at: Location = ("axes", axis.name if axis.zipped else member.path)
-            findings += parameter_findings(pattern, phases, member.path, member.values, at)
+            footprint = str(chosen), str(phases)
+            findings += parameter_findings(footprint, architecture, member.path, member.values, at)
         if axis.zipped and axis.name in STORED:
             rule = "bears the name of something stored"
             findings.append(Finding(("axes", axis.name), rule, "take a word such as 'cut'", ABSENT))

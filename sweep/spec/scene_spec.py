@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import Field, PrivateAttr
 
 from sweep.model import VERSION
+from sweep.model.sampling import BEAMLETS, PATTERN, THESIS
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
 from sweep.spec.effect_check import not_in_flights, written_modes
@@ -21,7 +22,13 @@ from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
 from sweep.spec.motion import Platform
 from sweep.spec.reading import Document, plain
 from sweep.spec.scanners import AnyScanner, shots_a_cycle
-from sweep.spec.scene_axes import axis_findings, beamlet_pattern, parameter_findings, why_not
+from sweep.spec.scene_axes import (
+    ARCHITECTURE,
+    axis_findings,
+    beamlet_pattern,
+    parameter_findings,
+    why_not,
+)
 from sweep.spec.scene_check import scene_findings
 from sweep.spec.scene_figure_check import scene_figure_findings
 from sweep.spec.scene_figures import SceneFigure
@@ -108,7 +115,7 @@ class SceneSpec(Study):
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
         """What is wrong with a parameter taking a value without the geometry changing."""
-        return parameter_findings(self.pattern, self.footprint.phases, path, [value], location)
+        return parameter_findings(*self._arrangement, path, [value], location)
 
     @property
     def base(self) -> Path:
@@ -127,7 +134,10 @@ class SceneSpec(Study):
             for section in SECTIONS
             for path, value in values_of(getattr(self, section), section).items()
         }
-        return parameters | {"target.solar_irradiance": self.scene.solar_irradiance}
+        return parameters | {
+            "target.solar_irradiance": self.scene.solar_irradiance,
+            BEAMLETS: self.footprint.beamlets or THESIS,
+        }
 
     def surfaces(self) -> tuple[Surface, ...]:
         """What surface numbers mean; no file is looked at."""
@@ -174,7 +184,14 @@ class SceneSpec(Study):
     @property
     def pattern(self) -> str:
         """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
-        return beamlet_pattern(self.footprint.phases, self.instrument.receiver.architecture)
+        footprint, architecture = self._arrangement
+        return beamlet_pattern(*footprint, architecture)
+
+    @property
+    def _arrangement(self) -> tuple[tuple[str, str], str]:
+        """What arranges the beamlets: pattern and phases of the footprint, architecture."""
+        words = {path: str(value) for path, value in self.parameters().items()}
+        return (words[PATTERN], words["footprint.phases"]), words[ARCHITECTURE]
 
     def pointing_jitter(self) -> PointingJitter | None:
         """Random turns of the beams; None where there are none."""
@@ -197,7 +214,7 @@ class SceneSpec(Study):
         seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
         return seen | {
             "model": VERSION,
-            "beamlets": self.footprint.beamlets,
+            "beamlets": self.parameters()[BEAMLETS],
             "pattern": self.pattern,
             "beam_divergence": self.instrument.laser.beam_divergence,
             "seed": self.seed if self.platform.jitter else 0,

@@ -62,7 +62,18 @@ class Target(Part):
 class Footprint(Part):
     """The spot on the target, as a sum of beamlets."""
 
-    beamlets: Annotated[int, count("Number of beamlets", "109", at_most="100000")] = 109
+    beamlets: Annotated[
+        int,
+        Numeric(
+            about="Number of beamlets; auto: as many as accuracy.tolerance needs where powers add "
+            "over a plane, else 109",
+            example="109",
+            at_least="1",
+            at_most="100000",
+            whole=True,
+            words=(("auto", 0),),
+        ),
+    ] = 0
     phases: Annotated[
         str,
         Choice(

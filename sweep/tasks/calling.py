@@ -72,10 +72,15 @@ class Calling:
         """Plans of some tiles: places among them, and the plan of these."""
         from sweep.model.effects.block import Block
         from sweep.model.effects.planning import plan
+        from sweep.model.sampling import BEAMLETS, effects_tolerance
 
         for alike in self.tiles.alike(tiles):
             block = Block.of_plane(alike.parameters)
-            tolerance = float(np.ravel(block["accuracy.tolerance"].low)[0])
+            tolerance = effects_tolerance(
+                block.words,
+                block.whole(BEAMLETS),
+                float(np.ravel(block["accuracy.tolerance"].low)[0]),
+            )
             yield alike.tiles, plan(block, modes=self._modes, tolerance=tolerance)
 
 

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sweep.model import ground, sampling
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.line_spread import NOT_AWAY, Line, Moments
@@ -34,7 +35,7 @@ class Block(TileLink):
         super().__init__(parameters)
         self.size, self.geometry = size, geometry
         self._at_rest = at_rest
-        self.number = self.whole("footprint.beamlets")
+        self.number, self._pattern = _beamlets(self)
         self.coherent = self.word("footprint.phases") == "coherent"
         self.segment_exists = (True, self.architecture != "direct", True)
         self.adds_amplitudes = self.coherent or self.architecture == "direct"
@@ -60,8 +61,7 @@ class Block(TileLink):
         sizes = {end.size for end in ends if isinstance(end, np.ndarray) and end.ndim} - {1}
         if len(sizes) > 1:
             raise ValueError(f"spans over different numbers of tiles: {sizes}")
-        number = TileLink(parameters).whole("footprint.beamlets")
-        geometry = tile_geometry.plane(parameters, number)
+        geometry = tile_geometry.plane(parameters, *_beamlets(TileLink(parameters)))
         return cls(parameters, max(sizes, default=1), geometry)
 
     @classmethod
@@ -99,6 +99,11 @@ class Block(TileLink):
         amplitudes = str(spans[RECEIVER + "architecture"])
         geometry = tile_geometry.cast(footprints, beside, edges, amplitudes)
         return cls(spans, edges.size - 1, replace(geometry, rotating=rotating))
+
+    @property
+    def reach(self) -> float:
+        """Farthest beamlet from the axis in the beam's standard deviations."""
+        return line_spread.reach_of(self.number, self._pattern)
 
     def at_rest(self) -> "Block":
         """The same tiles without the Doppler effect."""
@@ -219,6 +224,12 @@ class Block(TileLink):
         """Bins by which ranges and velocities put the lines off the axis's, (3, tiles)."""
         pairs = zip(self.range_spread, self.velocity_spread, strict=True)
         return Moments(*(np.add(one, two) for one, two in pairs))
+
+
+def _beamlets(link: TileLink) -> tuple[int, str]:
+    """Beamlets and their pattern; the most there may be where they follow from the tolerance."""
+    number, words = link.whole(sampling.BEAMLETS), link.words
+    return (number, ground.pattern(words)) if number else sampling.finest(words)
 
 
 def _finite(moments: Moments) -> list[np.ndarray]:

@@ -13,9 +13,10 @@ import numpy as np
 
 from sweep.model.effects import footprint_phase
 from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.line_spread import NO_SPREAD, spread_change
 from sweep.model.effects.span import Span
+from sweep.model.footprint import PATTERNS
 from sweep.model.preparation import Shots, relative_amplitude
 
 if TYPE_CHECKING:
@@ -66,4 +67,14 @@ EFFECT = Effect(
     stage="lines",
     bound=bound,
     act=act,
+    parameters=(
+        Parameter(
+            path="footprint.pattern",
+            about="Arrangement of the beamlets; auto: as many as the tolerance needs lie in a line "
+            "along the slope, a given number in a hexagonal lattice where their powers add, else "
+            "in a sunflower",
+            default="auto",
+            options=("auto", *PATTERNS),
+        ),
+    ),
 )

@@ -30,7 +30,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Realisation
 from sweep.model.effects.span import Span
-from sweep.model.footprint import beamlets as pattern_of
 from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair
 
 if TYPE_CHECKING:
@@ -116,7 +115,8 @@ def turned_change(
     fft_size: ArrayLike,
     bandwidths: tuple[ArrayLike, ArrayLike],
     signal_shot_share: ArrayLike,
-    beamlets: int,
+    reach: float,
+    single: bool,
     coherent: bool,
     direct: bool = False,
     speed_across: ArrayLike = 0.0,
@@ -157,8 +157,10 @@ def turned_change(
         Poles of detector and amplifier [Hz].
     signal_shot_share : array_like
         Share of the echo's own shot noise in the noise variance, 0..1.
-    beamlets : int
-        Their number.
+    reach : float
+        Farthest beamlet from the axis in the beam's standard deviations.
+    single : bool
+        Whether there is but one beamlet.
     coherent : bool
         Whether beamlets add as amplitudes.
     direct : bool
@@ -174,11 +176,11 @@ def turned_change(
     """
     off = np.asarray(sigma, float) * math.sqrt(2 * math.log(1 / RARE))
     aimed, record = np.asarray(grazing_angle, float), np.asarray(record, float)
-    reach = np.hypot(*pattern_of(beamlets)[0]).max() * np.asarray(beam_divergence, float) / 4
-    sure = aimed - reach > off  # no beamlet passes over the horizon
-    lowest = np.where(sure, aimed - reach, 1.0)
+    rim = reach * np.asarray(beam_divergence, float) / 4
+    sure = aimed - rim > off  # no beamlet passes over the horizon
+    lowest = np.where(sure, aimed - rim, 1.0)
     lower, higher = lowest - np.where(sure, off, 0.0), np.minimum(lowest + off, math.pi / 2)
-    highest = np.minimum(lowest + 2 * reach, math.pi / 2)
+    highest = np.minimum(lowest + 2 * rim, math.pi / 2)
     per_metre = np.asarray(chirp_rate, float) * 2 / SPEED_OF_LIGHT
     slope = per_metre * np.asarray(range, float) * np.sin(aimed)
     doppler = np.abs(radial_velocity) * off**2 / 2 + np.asarray(speed_across, float) * off
@@ -196,7 +198,7 @@ def turned_change(
     low = (weak * transfer * np.maximum(1 - moved, kept_after)) ** power * least / most
     with np.errstate(divide="ignore"):
         high = (strong / transfer * np.minimum(1 + moved, 1 / kept)) ** power * most / least
-    known = sure & (not coherent or beamlets == 1)
+    known = sure & (not coherent or single)
     share = np.asarray(signal_shot_share, float)
     loudest = np.where(sure, 1 + share * (strong - 1), np.where(share > 0, np.inf, 1.0))
     return Change(
@@ -235,7 +237,8 @@ def bound(block: "Block") -> Change | None:
             block["instrument.receiver.amplifier_bandwidth"].low,
         ),
         signal_shot_share=own / (1 + own),
-        beamlets=block.number,
+        reach=block.reach,
+        single=block.number == 1,
         coherent=block.adds_amplitudes or block.has("target.roughness"),
         direct=block.architecture == "direct",
         speed_across=block["target.transverse_velocity"].magnitude,

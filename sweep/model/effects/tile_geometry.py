@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import ground, reflectance
+from sweep.model import reflectance
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.line_spread import (
     Moments,
@@ -49,11 +49,10 @@ class Geometry:
     """Whether any surface belongs to a body that turns."""
 
 
-def plane(p: Mapping[str, Span | str], number: int) -> Geometry:
-    """Tiles of points on a flat plane: ``number`` beamlets."""
+def plane(p: Mapping[str, Span | str], number: int, pattern: str) -> Geometry:
+    """Tiles of points on a flat plane: ``number`` beamlets in a pattern."""
     law = str(p["target.reflectance_law"])
     architecture = str(p[RECEIVER + "architecture"])
-    pattern = ground.pattern(str(p["footprint.phases"]), architecture)
     angle, divergence, along, across = (
         _number(p, path)
         for path in (

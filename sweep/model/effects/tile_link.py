@@ -40,6 +40,11 @@ class TileLink:
         """A parameter that is a word."""
         return str(self._parameters[path])
 
+    @property
+    def words(self) -> dict[str, str]:
+        """Parameters that are words."""
+        return {path: v for path, v in self._parameters.items() if isinstance(v, str)}
+
     def whole(self, path: str) -> int:
         """A parameter that is a number shared by all points.
 

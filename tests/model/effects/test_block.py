@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sweep.model.chain import prepare, prepare_cast
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.block import Block
+from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.footprint_phase import phase_reach
 from sweep.model.ground import Cast, Footprints
 from sweep.model.shot import find
@@ -163,7 +164,7 @@ def test_shots_of_a_flight_are_tiled_by_stretches(table_4_1):
     echo = rng.random((shots, beamlets)) / beamlets
     beside = rng.random((shots, beamlets)) < 0.2
     footprints = Footprints(np.arange(shots), offset, doppler, echo)
-    parameters = table_4_1(
+    parameters = DEFAULTS | table_4_1(
         range=rng.uniform(100, 200, shots), radial_velocity=rng.normal(0, 10, shots), beamlets=7
     )
     edges = np.array([0, 4, 5, 20, 30])

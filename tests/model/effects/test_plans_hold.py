@@ -25,6 +25,7 @@ KINDS = (
     {"architecture": "direct", "range": np.linspace(1, 30, POINTS), "power": 1e-2},
     {"architecture": "heterodyne", "phases": "coherent"},
     {"range": np.geomspace(0.3, 8.0, POINTS), "grazing_angle": 1.2},
+    {"beamlets": 0},
 )
 ROUNDING = 1e-8
 STILL = {"doppler": "off"}
@@ -35,6 +36,15 @@ def some_of(rng, name):
     """Any of the other effects, with what they need, but for those within this one."""
     chosen = {n for n in CORE if n != name and WITHIN[n] != name and rng.random() < 0.6}
     return {n for n in chosen if not WITHIN[n] or WITHIN[n] in chosen} | {WITHIN[name]} - {""}
+
+
+def counted(parameters, seed):
+    """Some number of beamlets where it is left open, one for all points: plans hold for any."""
+    if parameters["footprint.beamlets"] > 0:
+        return parameters
+    return parameters | {
+        "footprint.beamlets": [2, 5, 33, 163][seed % 4], "footprint.pattern": "line",
+    }  # fmt: skip
 
 
 def changed(on, off):
@@ -53,7 +63,7 @@ def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1,
             **{"beamlets": 7} | KINDS[kind],
         )  # fmt: skip
         block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
-        inner = inner if tiles else parameters
+        inner = counted(inner if tiles else parameters, seed)
         moving, still = (plan(block, modes, 1.0, CHOICE).change for modes in ({}, STILL))
         for name in CORE:
             others = some_of(rng, name)
@@ -83,11 +93,11 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
             table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
         )
         for tiles in (False, True):
-            block = point_block(parameters)
-            inner = parameters
+            block, inner = point_block(parameters), parameters
             if tiles:
                 block, inner = tile_block(parameters, seed)
             made = plan(block, {}, tolerance, CHOICE)
+            inner = counted(inner, seed)
             truth = shot.evaluate(inner)
             assert (made.error <= tolerance).all()
             for column in np.unique(made.kept, axis=1).T:

@@ -1,0 +1,150 @@
+"""How finely a footprint on a plane is sampled: as many beamlets as the accuracy asked for needs.
+
+``footprint.beamlets`` 0 leaves their number to ``accuracy.tolerance``. Where powers add, the
+largest bin's magnitude r is then within a share of itself such that pd is within a quarter of the
+tolerance: with b the threshold over sigma,
+
+    |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
+
+in each of three segments. The rest of the tolerance is the effects' (:mod:`.effects.planning`).
+Where amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
+what [T] takes, 109, is then taken.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from sweep.model import detection, ground, quadrature
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.line_spread import (
+    plane_range_moments,
+    plane_velocity_moments,
+    range_to_bins,
+    velocity_to_bins,
+)
+from sweep.model.effects.lobes import lobe
+from sweep.model.preparation import (
+    CHIRP,
+    LASER,
+    PROCESSING,
+    Parameters,
+    categories,
+    doppler_ratio,
+)
+from sweep.model.window import canonical_name
+
+BEAMLETS = "footprint.beamlets"
+PATTERN = "footprint.pattern"
+
+THESIS = 109
+"""Beamlets of [T 3.3.1]."""
+
+SHARE = 0.25
+"""Of the tolerance on pd, for the sampling of the footprint."""
+
+FINEST = int(quadrature.COUNTS[-1])
+
+_SEGMENTS = 3
+_SQUARE_SIDE = 64
+"""Beamlets on a side of a square at the most."""
+
+
+def sampled_categories(
+    parameters: Parameters, effects: Collection[str], further: Collection[str] = ()
+) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Points by category, their beamlets counted where that is left to the tolerance.
+
+    Parameters
+    ----------
+    parameters, further
+        As of :func:`sweep.model.preparation.categories`, whose result this is like.
+    effects : collection of str
+        Names of the effects that are simulated; without a footprint one beamlet is all.
+    """
+    for index, p in categories(parameters, further):
+        if int(p[BEAMLETS]) > 0:
+            yield index, p
+            continue
+        number, pattern = np.asarray(1), np.asarray("line")
+        if "footprint" in effects:
+            number, pattern = (
+                beamlets_needed(p, index.size) if _is_open(p) else map(np.asarray, finest(p))
+            )
+        for some, q in categories(p | {BEAMLETS: number, PATTERN: pattern}, further):
+            yield index[some], q
+
+
+def finest(words: Mapping[str, Any]) -> tuple[int, str]:
+    """Most beamlets that points with these words may be given, and their pattern."""
+    return (FINEST, "line") if _is_open(words) else (THESIS, ground.pattern(words))
+
+
+def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:
+    """What is left of a tolerance for the effects that are left out."""
+    return tolerance * (1 - SHARE if number == 0 and _is_open(words) else 1)
+
+
+def _is_open(words: Mapping[str, Any]) -> bool:
+    """Whether there is a number of beamlets that is enough."""
+    return ground.powers_add(words) and str(words[PATTERN]) not in ("hexagonal", "sunflower")
+
+
+def beamlets_needed(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Number of beamlets, and their pattern, of points whose powers add, (n,) each."""
+    along, across = _spreads(p, size)
+    number, _ = quadrature.nodes_needed(_window(p), along, allowed_power_error(p, size))
+    # Across the slope all that a line of beamlets does not show is how the squares vary.
+    missed = 0.5 * lobe(_window(p), 1024, 1024).curvature * 2 * across**2
+    square = (missed > allowed_power_error(p, size)) | (str(p[PATTERN]) == "square")
+    side = np.minimum(number, _SQUARE_SIDE)
+    return np.where(square, side * side, number), np.where(square, "square", "line")
+
+
+def allowed_power_error(p: Mapping[str, np.ndarray], size: int) -> np.ndarray:
+    """What the largest bin's power may be off by, over that power, (n,)."""
+    tolerance = np.asarray(p["accuracy.tolerance"], float)
+    b = detection.threshold(tnr=p[PROCESSING + "tnr"], bin_deviation=np.asarray(1.0))
+    a = 0.5 * (b + np.sqrt(b * b + 2))
+    steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
+    allowed: np.ndarray = 2 * SHARE * tolerance / (_SEGMENTS * steepest) + np.zeros(size)
+    return allowed
+
+
+def _spreads(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation of the lines' places along the slope, and their mean across it [bins of fs/L]."""
+    sigma = np.asarray(p[LASER + "beam_divergence"], float) / 4
+    bins = p[PROCESSING + "sample_rate"] / p["record"]
+    rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
+    shape: dict[str, Any] = {
+        "grazing_angle": p["target.grazing_angle"],
+        "beam_divergence": p[LASER + "beam_divergence"],
+        "number": FINEST,
+        "pattern": "line",
+    }
+    # Beyond the horizon the moments have no bound: there the plain one has to do.
+    rms = plane_range_moments(**shape).rms
+    rms = np.where(np.isfinite(rms), rms, sigma / np.tan(p["target.grazing_angle"]))
+    speed = np.asarray(p["target.transverse_velocity"], float)
+    velocity = plane_velocity_moments(
+        across=speed, along=np.where(speed != 0, p["target.radial_velocity"], 0.0), **shape
+    ).rms
+    per_range = range_to_bins(
+        range=p["target.range"],
+        beta=doppler_ratio(np.asarray(p["target.radial_velocity"])),
+        chirp_rate=rate,
+        bin_width=bins,
+    )
+    per_speed = velocity_to_bins(
+        range=p["target.range"],
+        carrier=SPEED_OF_LIGHT / p[LASER + "wavelength"] + p[CHIRP + "bandwidth"],
+        chirp_rate=rate,
+        bin_width=bins,
+    )
+    nothing = np.zeros(size)
+    return per_range * rms + per_speed * velocity + nothing, per_range * sigma**2 / 2 + nothing
+
+
+def _window(p: Mapping[str, np.ndarray]) -> str:
+    return canonical_name(str(p[PROCESSING + "window"]))

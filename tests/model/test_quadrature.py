@@ -1,0 +1,79 @@
+"""Few nodes for the mean over a Gaussian: moments, and power over bins against the continuum."""
+
+import numpy as np
+import pytest
+
+from sweep.model.quadrature import COUNTS, gaussian_rule, nodes_needed
+from sweep.model.window import samples
+
+LENGTH = 128
+WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop", "kaiser(8.6)")
+
+
+@pytest.mark.parametrize("number", COUNTS.tolist())
+def test_rules_have_the_gaussians_mean_and_variance(number):
+    nodes, weights = gaussian_rule(number)
+    assert nodes.shape == weights.shape == (number,)
+    assert weights.sum() == pytest.approx(1, abs=1e-14)
+    assert abs((weights * nodes).sum()) < 1e-14
+    assert (weights * nodes**2).sum() == pytest.approx(1, abs=1e-13)
+
+
+@pytest.mark.parametrize("number", [2, 3, 7, 15])
+def test_gauss_and_hermites_rule_is_exact_for_polynomials(number):
+    """E x^(2k) = (2k - 1)!!, exact up to degree 2 number - 1."""
+    nodes, weights = gaussian_rule(number)
+    for k in range(1, number):
+        moment = np.prod(np.arange(1.0, 2 * k, 2))
+        assert (weights * nodes ** (2 * k)).sum() == pytest.approx(moment, rel=1e-11)
+
+
+def power_of_bins(window, offset, deviation, rule):
+    """Mean of |W|^2 over a spread of lines, by the window's autocorrelation; rule or continuum."""
+    w = samples(window, LENGTH)
+    lag = np.arange(-LENGTH + 1, LENGTH)
+    r = np.correlate(w, w, "full")
+    turn = 2 * np.pi * deviation * lag / LENGTH
+    if rule is None:
+        mean = np.exp(-(turn**2) / 2)
+    else:
+        nodes, weights = rule
+        mean = (weights * np.exp(1j * turn[:, None] * nodes)).sum(axis=1).real
+    bins = np.arange(-20, 21) + offset
+    return (r * mean * np.cos(2 * np.pi * bins[:, None] * lag / LENGTH)).sum(axis=1) / w.sum() ** 2
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_power_is_within_the_tolerance_of_the_continuum_wherever_lines_lie(window):
+    counts = []
+    for deviation in np.geomspace(2e-3, 12.0, 25):
+        for tolerance in (1e-1, 1e-3, 1e-6):
+            number, error = nodes_needed(window, np.array([deviation]), np.array([tolerance]))
+            assert error[0] <= tolerance
+            counts.append(number[0])
+            for offset in (0.0, 0.3, 0.5):
+                exact = power_of_bins(window, offset, deviation, None)
+                found = power_of_bins(window, offset, deviation, gaussian_rule(int(number[0])))
+                assert abs(found - exact).max() <= tolerance * exact.max() + 1e-13
+    assert min(counts) == 2 and max(counts) > 100
+
+
+@pytest.mark.parametrize("number", [22, 109, 1234])
+def test_even_steps_are_exact_but_for_their_reach_and_where_they_alias(number):
+    nodes, weights = gaussian_rule(number)
+    turn = np.linspace(0, 2 * np.pi / (nodes[1] - nodes[0]) - 7, 2000)
+    mean = np.array([(weights * np.cos(t * nodes)).sum() for t in turn])
+    assert abs(mean - np.exp(-(turn**2) / 2)).max() < 1e-10
+
+
+def test_narrow_spreads_need_few_nodes_and_more_accuracy_costs_few_more():
+    tolerance = np.array([1e-1, 1e-3, 1e-6])
+    number, _ = nodes_needed("hamming", np.full(3, 0.25), tolerance)
+    assert (number <= [3, 5, 7]).all()
+    wide, _ = nodes_needed("hamming", np.full(3, 5.0), tolerance)
+    assert wide[2] <= 1.5 * wide[0] + 1
+
+
+def test_spreads_beyond_what_is_provided_for_take_the_most_and_say_so():
+    number, error = nodes_needed("hamming", np.array([1e4, np.inf]), np.array([1e-3, 1e-3]))
+    assert number.tolist() == [COUNTS[-1]] * 2 and error.tolist() == [1.0, 1.0]

@@ -1,0 +1,113 @@
+"""Beamlets by tolerance: the promise on pd and magnitudes, and what they are where it is open."""
+
+import numpy as np
+import pytest
+
+from sweep.model import sampling, shot
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import CORE, DEFAULTS
+
+NUMBER = 400
+FINE = {"footprint.beamlets": 8192, "footprint.pattern": "line"}
+AUTO = {"footprint.beamlets": 0}
+PDS = ("pd_up", "pd_down", "pd_doppler", "pd_shot")
+SNRS = ("snr_up", "snr_down", "snr_doppler")
+
+
+def scenes(table_4_1, seed, **fixed):
+    """Slanted planes near and far, narrow and wide beams, at rest and moving across."""
+    rng = np.random.default_rng((55, seed))
+    values = {
+        "range": 10 ** rng.uniform(0.5, 4, NUMBER),
+        "grazing_angle": np.radians(10 ** rng.uniform(0.2, 1.954, NUMBER)),
+        "beam_divergence": 10 ** rng.uniform(-5, -3, NUMBER),
+        "power": 10 ** rng.uniform(-2, 1, NUMBER),
+        "phases": "incoherent",
+        "fft_size": 2**12,
+    }
+    across = rng.normal(0, 50, NUMBER) * (rng.random(NUMBER) < 0.5)
+    table = table_4_1(**values | fixed)
+    return DEFAULTS | table | {"target.transverse_velocity": across}
+
+
+@pytest.mark.parametrize("window", ["hamming", "rectangular"])
+@pytest.mark.parametrize("law", ["thesis", "lambert"])
+def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, window, law):
+    parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)
+    exact = shot.evaluate(parameters | FINE)
+    for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
+        for name in PDS:
+            assert abs(found[name] - exact[name]).max() <= sampling.SHARE * tolerance, name
+        for name in SNRS:
+            assert abs(np.sqrt(found[name] / exact[name]) - 1).max() <= tolerance, name
+        assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9
+
+
+def test_wide_beams_at_normal_incidence_take_a_square(table_4_1):
+    """Their ranges rise with the angle's square, on both axes alike."""
+    parameters = scenes(
+        table_4_1, 2, grazing_angle=np.pi / 2, beam_divergence=0.05, window="hann",
+        reflectance_law="lambert",
+    ) | {"target.transverse_velocity": 0.0}  # fmt: skip
+    side = 61
+    exact = shot.evaluate(
+        parameters | {"footprint.beamlets": side * side, "footprint.pattern": "square"}
+    )
+    found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": 1e-3})
+    far = parameters["target.range"] > 1000
+    assert (np.sqrt(found["beamlets"][far]) % 1 == 0).all()
+    for name in PDS:
+        assert abs(found[name] - exact[name]).max() <= 1e-3
+
+
+def test_a_lattice_of_many_beamlets_agrees_with_the_line(table_4_1):
+    """An arrangement of its own: two-dimensional, of 20,000 beamlets, for narrow spreads."""
+    parameters = scenes(table_4_1, 3, beam_divergence=5e-5)
+    some = {path: v[:40] if np.ndim(v) else v for path, v in parameters.items()}
+    lattice = shot.evaluate(some | {"footprint.beamlets": 20_000, "footprint.pattern": "hexagonal"})
+    found = shot.evaluate(some | AUTO | {"accuracy.tolerance": 1e-6})
+    for name in PDS:
+        # the lattice ends at three deviations of the beam: its fourth moment is 5 % short
+        assert abs(found[name] - lattice[name]).max() <= 2e-3
+
+
+def test_points_stay_what_they_are_whatever_points_are_beside_them(table_4_1):
+    parameters = scenes(table_4_1, 4) | AUTO | {"accuracy.tolerance": 1e-3}
+    whole = shot.evaluate(parameters)
+    for chosen in (slice(0, 7), slice(7, None)):
+        part = {path: v[chosen] if np.ndim(v) else v for path, v in parameters.items()}
+        for name, values in shot.evaluate(part).items():
+            assert np.array_equal(values, whole[name][chosen], equal_nan=True), name
+
+
+@pytest.mark.parametrize(
+    "changes", [{"phases": "coherent"}, {"architecture": "direct"}, {}], ids=str
+)
+def test_where_no_number_is_enough_it_is_the_thesiss(table_4_1, changes):
+    """Amplitudes over a smooth plane, and patterns chosen by hand."""
+    parameters = table_4_1(**{"phases": "incoherent"} | changes) | AUTO
+    by_hand = {} if changes else {"footprint.pattern": "hexagonal"}
+    ((_, shots),) = prepare(parameters | {"accuracy.tolerance": 1e-3} | by_hand)
+    assert shots.offset.shape[1] == 109
+
+
+def test_without_a_footprint_there_is_one_beamlet(table_4_1):
+    parameters = table_4_1(phases="incoherent") | AUTO | {"accuracy.tolerance": 1e-3}
+    ((_, shots),) = prepare(parameters, [name for name in CORE if name != "footprint"])
+    assert shots.offset.shape[1] == 1
+
+
+def test_numbers_given_by_hand_are_kept(table_4_1):
+    for pattern, number in (("line", 5), ("square", 9), ("sunflower", 33), ("hexagonal", 7)):
+        parameters = table_4_1(beamlets=number, phases="incoherent")
+        ((_, shots),) = prepare(parameters | {"footprint.pattern": pattern})
+        assert shots.offset.shape[1] == number
+
+
+def test_tolerance_0_takes_what_errs_least(table_4_1):
+    parameters = scenes(table_4_1, 5) | AUTO
+    exact = shot.evaluate(parameters | FINE)
+    found = shot.evaluate(parameters | {"accuracy.tolerance": 0.0})
+    for name in PDS:
+        assert abs(found[name] - exact[name]).max() <= 1e-7
