@@ -111,19 +111,30 @@ class Numeric(Rule):
         """Exact number and unit of what the user wrote, bounds apart."""
         if self.si_unit:
             return read_quantity(written, si_unit=self.si_unit, example=self.example)
-        return read_number(written)
+        if isinstance(written, str) and written in dict(self.words):
+            raise QuantityError(
+                "is one value for a whole study, no point of an axis", "leave it out"
+            )
+        try:
+            return read_number(written)
+        except QuantityError as error:
+            if not self.words:
+                raise
+            words = " or ".join(word for word, _ in self.words)
+            raise QuantityError(f"must be a number or {words}", error.suggestion) from None
 
     def read(self, written: object) -> float | int:
         """SI value of what the user wrote, within the bounds."""
-        if isinstance(written, str) and written in dict(self.words):
-            return dict(self.words)[written]
+        known = dict(self.words)
+        if isinstance(written, str) and written in known:
+            return known[written]
         number, unit = self.exact(written)
         if self.whole and number.denominator != 1:
             raise QuantityError("must be a whole number", f"write e.g. {self.example}")
         value = unit.to_si(number)
         broken = self.first_outside(np.array([value]))
         if broken is not None:
-            raise QuantityError(broken[1])
+            raise QuantityError(broken[1], f"or write {', '.join(known)}" if known else "")
         return int(number) if self.whole else value
 
     def first_outside(self, values: np.ndarray) -> tuple[int, str] | None:

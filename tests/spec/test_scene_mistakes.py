@@ -76,6 +76,7 @@ FIELDS = [
      "as many different angles"),
     ("scanners.s", {"kind": "corners", "angle": "1 deg", "rate": "10 s"}, "unit like Hz"),
     ("footprint.beamlets", 0, "must be at least 1"),
+    ("footprint.pattern", "line", "stands for a plane alone"),
     ("draws.number", 0, "must be at least 1"),
     ("draws.batch", 3, "is no field; the fields here are number, method, returns"),
     ("draws.returns", 0, "must be at least 1"),

@@ -58,7 +58,9 @@ FIELDS = [
     ("target.grazing_angle", 15, "write e.g. '15 deg'"),
     ("target.range", ..., "write e.g. 'range: 2 km', or put it on an axis"),
     ("target.radial_velocity", "2e6 m/s", "must be at most 1000 km/s"),
-    ("footprint.beamlets", 0, "must be at least 1"),
+    ("footprint.beamlets", 0, "must be at least 1 (you wrote 0); or write auto"),
+    ("footprint.beamlets", "atuo", "must be a number or auto (you wrote 'atuo')"),
+    ("footprint.pattern", "grid", "must be one of auto, hexagonal"),
     ("footprint.phases", "random", "must be one of coherent, incoherent"),
     ("accuracy.leakage_floor", 0, "must be greater than 0"),
     ("accuracy.tolerance", -1, "must be at least 0"),
@@ -163,6 +165,8 @@ AXES = [
       "instrument.laser.power": ["1 W"]}, "power", "bears the name of a coordinate"),
     ({"range": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}}}, "range",
      "bears the name of a coordinate"),
+    ({"footprint.beamlets": ["auto", 9]}, "footprint.beamlets[0]",
+     "is one value for a whole study, no point of an axis (you wrote 'auto'); leave it out"),
 ]  # fmt: skip
 
 
