@@ -48,7 +48,7 @@ TABLE_4_1 = {
     "target.solar_irradiance": 0.0,
     "footprint.beamlets": 109,
     "footprint.phases": "coherent",
-    "accuracy.tolerance": 1e-3,
+    "accuracy.tolerance": 0.0,
     "accuracy.leakage_floor": 0.1,
 }
 """The instrument of [T] Table 4.1 with the target that PHYSICS section 3 reads into its figures."""

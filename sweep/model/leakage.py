@@ -3,7 +3,8 @@
 Bins within a run around the lines are evaluated one by one: all that may cross the threshold, and
 as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
 chances that leaked signal adds are summed as an integral (:mod:`sweep.model.far_field`), to better
-than 1e-6 of the leakage.
+than 1e-6 of the leakage; or left out, where the window's envelope says that they come to no more
+than the accuracy asked for.
 """
 
 import math
@@ -30,6 +31,7 @@ from sweep.model.runs import (
     magnitudes,
     near_bins,
     prepare_field,
+    seen_from,
     stays_below,
     sum_afar,
 )
@@ -50,8 +52,8 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     origin, n : int
         Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
         ``power`` |C_b|^2 and nothing; they become strengths.
-    noise : (float, float)
-        sigma per quadrature; threshold.
+    noise : (float, float, float)
+        sigma per quadrature; threshold; chance of leakage that may be left out.
     choices, kernel
         As of :func:`sweep.model.segments.segment_spectrum`.
     room : (ROOM, width) float64
@@ -80,8 +82,21 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     spread = lowest, highest
     poles = len(kernel[1][2])
     total = math.sqrt(total) if power else sum_afar(re, im, n, total, spread, poles)
-    field = prepare_field(origin, n, spread, True, choices, kernel, room)
-    reach = _least_reach(total, highest - lowest, noise, field[0], image, kernel)
+    centre = seen_from(origin, spread, kernel[0][0])
+    crossing = stays_below(noise[1], total * kernel[2][0], highest - lowest, centre, image, kernel)
+    clearance = CLEARANCE + poles
+    reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
+    alone = _all_beyond(total, float(clearance + reach), noise, image, kernel) <= noise[2]
+    sources = not alone or reach > 0 or (image and not mirrored)
+    field = prepare_field(origin, n, spread, sources, choices, kernel, room)
+    if alone:
+        low, high = max(near[0] - reach, 0), min(near[1] + reach, half_size)
+        count = high - low + 1
+        magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
+        peak, exempted = mark(room[0], count, noise[1], exempt)
+        _chances(count, noise, kernel, room, exempt, series)
+        return low, count, peak, exempted, any_crossing(room[4], 0, count)
+    reach = _least_reach(total, highest - lowest, noise, crossing, kernel)
     while True:
         low, high = near[0] - reach, near[1] + reach
         low = 0 if low <= reach + APRON else low
@@ -98,14 +113,54 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
 
 
 @njit(cache=True, error_model="numpy")
-def _least_reach(total, spread, noise, centre, image, kernel):
+def _all_beyond(total, first, noise, image, kernel):
+    """Bound on the chance that any bin ``first`` or more bins from the lines adds to leakage.
+
+    With x = a^2/2, y = b^2/2 and z = a b a bin's own is at most
+
+        x dQ_1/dx = x y e^{-y} g,    g = I_1(z) / (z/2) <= e^{z^2/8}, 2 e^z / sqrt(2 pi z^3)
+
+    (and no less than at shorter distances); bins count by steps of a factor of four. Images are
+    no nearer than the lines.
+    """
+    sigma, level, allowed = noise
+    half_size = kernel[0][0] // 2
+    window_sum, envelope, reach = kernel[2]
+    weight = total * window_sum / sigma * (2.0 if image else 1.0)
+    b = level / sigma
+    y = 0.5 * b * b
+    bound, distance = 0.0, first
+    while distance < half_size and bound <= allowed:
+        place = np.searchsorted(reach, max(distance - 1.5, 0.0), "right") - 1
+        a = weight * envelope[max(place, 0)]
+        z = a * b
+        if z > 2.0 * y:
+            return np.inf
+        growth = z * z / 8.0
+        if z > 1.0:
+            growth = min(growth, z + math.log(2.0 / math.sqrt(2.0 * math.pi * z * z * z)))
+        after = min(4.0 * distance, float(half_size))
+        bound += 2.0 * (after - distance) * 0.5 * a * a * y * math.exp(growth - y)
+        distance = after
+    return bound / -math.expm1(-y)
+
+
+@njit(cache=True, error_model="numpy")
+def _chances(count, noise, kernel, room, exempt, series):
+    """Added chances of a run of bins, into row 4."""
+    sigma, level, _ = noise
+    _half_squares(room[0, :count], exempt, 0.5 / (sigma * sigma), room[3])
+    added_crossings(room[3], count, level / sigma, series, room[4])
+
+
+@njit(cache=True, error_model="numpy")
+def _least_reach(total, spread, noise, crossing, kernel):
     """Bins beyond the near ones that the run has to take in: see the module."""
-    sigma, level = noise
+    sigma, level, _ = noise
     window_sum, envelope, reach = kernel[2]
     half_size = kernel[0][0] // 2
     clearance = CLEARANCE + len(kernel[1][2])
     weight = total * window_sum
-    crossing = stays_below(level, weight, spread, centre, image, kernel)
     at = np.searchsorted(reach, float(clearance))
     beside = envelope[min(at, envelope.size - 1)] * weight / sigma
     gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
@@ -116,12 +171,11 @@ def _least_reach(total, spread, noise, centre, image, kernel):
 @njit(cache=True, error_model="numpy")
 def _leakage(low, count, peak, field, noise, choices, kernel, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
-    sigma, level = noise
+    sigma, level, _ = noise
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
     beta, scale = level / sigma, 0.5 / (sigma * sigma)
-    magnitude, x, chance = room[0], room[3], room[4]
-    _half_squares(magnitude[:count], exempt, scale, x)
-    added_crossings(x, count, beta, series, chance)
+    magnitude, chance = room[0], room[4]
+    _chances(count, noise, kernel, room, exempt, series)
     below, above = low > 0, low + count - 1 < half_size
     some = any_crossing(chance, APRON if below else 0, count - APRON if above else count)
     if not below and not above:

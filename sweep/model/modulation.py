@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
     part: slice
     """Which points of the shots these m are."""
     points: np.ndarray
-    """(14, m) :meth:`sweep.model.preparation.Shots.point_table`."""
+    """(15, m) :meth:`sweep.model.preparation.Shots.point_table`."""
     row: np.ndarray
     """(m,) int64: row in the footprints."""
     scene: tuple

@@ -34,6 +34,10 @@ UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
 
+LEAKAGE_SHARE = 0.02
+"""Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
+
+
 class PhaseError(NamedTuple):
     """A deterministic phase error over the record, common to the lines of a footprint."""
 
@@ -76,6 +80,8 @@ class Shots:
     detector_bandwidth: np.ndarray
     amplifier_bandwidth: np.ndarray
     leakage_floor: np.ndarray
+    leakage_tolerance: np.ndarray
+    """Chance of leakage, of all bins far from the lines, that need not be looked for."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -183,12 +189,12 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Columns of :func:`sweep.model.segments.evaluate_segments`, (14, n)."""
+        """Columns of :func:`sweep.model.segments.evaluate_segments`, (15, n)."""
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.leakage_floor,
-            self.line_deviation,
+            self.line_deviation, self.leakage_tolerance,
         )  # fmt: skip
         return np.array(np.broadcast_arrays(*columns), dtype=float)
 
@@ -286,6 +292,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=p["accuracy.leakage_floor"],
+        leakage_tolerance=LEAKAGE_SHARE * np.asarray(p["accuracy.tolerance"]),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
         noise_scale=per_ampere,

@@ -62,7 +62,7 @@ def detect(origin, n, level, choices, kernel, room, exempt):
     clearance = CLEARANCE + poles
     total = math.sqrt(total) if power else total
     afar = total if power else sum_afar(re, im, n, total, spread, poles)
-    centre = _seen_from(origin, spread, kernel[0][0])
+    centre = seen_from(origin, spread, kernel[0][0])
     needed = _lifted(level, total, afar, highest - lowest, centre, image, kernel)
     while True:
         beyond = needed
@@ -128,7 +128,7 @@ def sum_afar(re, im, n, total, spread, poles):
 
 
 @njit(cache=True, error_model="numpy")
-def _seen_from(origin, spread, fft_size):
+def seen_from(origin, spread, fft_size):
     """Bin in the middle of where a bundle of lines is seen, 0..N/2."""
     centre = abs(origin + math.floor(0.5 * (spread[0] + spread[1]) + 0.5))
     return fft_size - centre if centre > fft_size // 2 else centre
@@ -169,7 +169,7 @@ def prepare_field(origin, n, spread, sources, choices, kernel, room):
     power, image = choices[0], choices[1]
     fft_size, poles, edge = kernel[0][0], len(kernel[1][2]), kernel[1][3]
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    centre = _seen_from(origin, spread, fft_size)
+    centre = seen_from(origin, spread, fft_size)
     lines, images = 0, 0
     if sources:
         lines, images = far_field.far_sources(

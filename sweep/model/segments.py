@@ -34,7 +34,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     ----------
     segment : int
         0 up, 1 Doppler, 2 down.
-    p : (14,) float64
+    p : (15,) float64
         The point's column of :meth:`sweep.model.preparation.Shots.point_table`.
     scene, at : tuple, (int, int)
         Footprint, parts and shifts of :class:`sweep.model.modulation.Stretch`; the point's row in
@@ -184,7 +184,7 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
         chance = 0.0
         if leakage:
             low, count, peak, exempted, chance = inspect(
-                origin, n, (p[10], p[11]), choices, kernel, room, exempt, series
+                origin, n, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
             )
         else:
             low, count, peak, exempted = detect(origin, n, p[11], choices, kernel, room, exempt)

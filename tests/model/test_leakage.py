@@ -1,5 +1,7 @@
 """Leakage summed as an integral against every bin looked at by itself, hard cases first."""
 
+from dataclasses import replace
+
 import mpmath
 import numpy as np
 import pytest
@@ -45,6 +47,29 @@ def held(shots):
     assert error[MAGNITUDE] < 1e-9 and error[PD] < 1e-7
     assert error[FREQUENCY] == 0 and error[EXEMPTED] == 0
     return slow[:, LEAKAGE]
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("window", CLOSED_FORMS)
+@pytest.mark.parametrize("allowed", [1e-1, 1e-3, 1e-6])
+def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
+    table_4_1, window, phases, allowed
+):
+    generator = np.random.default_rng(13)
+    parameters = table_4_1(
+        window=window, phases=phases, fft_size=2**14, beamlets=19,
+        tnr=generator.uniform(2.0, 12.0, 300), range=10 ** generator.uniform(0.5, 4.0, 300),
+        grazing_angle=np.radians(generator.uniform(2.0, 90.0, 300)),
+        power=10 ** generator.uniform(-5.0, 1.0, 300),
+    )  # fmt: skip
+    ((_, shots),) = prepare(parameters)
+    whole = find(shots)
+    some = find(replace(shots, leakage_tolerance=np.asarray(allowed)))
+    missed = whole[:, LEAKAGE] - some[:, LEAKAGE]
+    assert (missed <= allowed).all() and (missed >= -1e-6 * whole[:, LEAKAGE]).all()
+    others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
+    np.testing.assert_allclose(some[:, others], whole[:, others], rtol=1e-9, atol=1e-300)
+    assert (missed > 0).any()
 
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
