@@ -11,7 +11,7 @@ from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, PARAME
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.ground import Cast, Ground, Plane
 from sweep.model.preparation import Parameters, Shots, as_arrays, bare
-from sweep.model.sampling import sampled_categories
+from sweep.model.resolution import resolved_categories
 
 SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 """Numbers of effects that points must share to be prepared together."""
@@ -43,7 +43,7 @@ def prepare(
     effects : collection of str
         Names of the effects that are simulated.
     """
-    for index, p in sampled_categories(DEFAULTS | dict(parameters), effects, SHARED):
+    for index, p in resolved_categories(DEFAULTS | dict(parameters), effects, SHARED):
         yield index, assembled(p, index.size, Plane(p, index.size), effects)
 
 

@@ -14,13 +14,13 @@ from numba import njit
 
 from sweep.model.elementary import fma
 
-AMPLITUDE_TOLERANCE = 1e-13
-"""Error of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
+AMPLITUDE_TOLERANCES = (1e-13, 1e-11, 1e-9, 1e-7, 1e-5)
+"""Errors of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
 
-POWER_TOLERANCE = 1e-18
-"""The same of powers: its root is what a null of |X| shows."""
+POWER_TOLERANCES = (1e-18, 1e-15, 1e-12, 1e-9, 1e-6)
+"""The same of powers: the root of the first is what a null of |X| shows."""
 
-MOST_NODES = 64
+MOST_NODES = 128
 """Equivalent lines at the most; wider bundles are left as they are."""
 
 
@@ -35,9 +35,16 @@ def _bessel_bound(z: float, order: int) -> float:
 
 
 @lru_cache(maxsize=2)
-def node_limits(tolerance: float) -> np.ndarray:
-    """Largest pi h that J equivalent lines serve to a tolerance, (MOST_NODES + 1,), from J = 1."""
-    limits = np.zeros(MOST_NODES + 1)
+def node_limits(tolerances: tuple[float, ...]) -> np.ndarray:
+    """Largest pi h that J equivalent lines serve to each tolerance, from J = 1.
+
+    (tolerances, MOST_NODES + 1), with the tolerances themselves at J = 0.
+    """
+    return np.array([_node_limits(tolerance) for tolerance in tolerances])
+
+
+def _node_limits(tolerance: float) -> np.ndarray:
+    limits = np.full(MOST_NODES + 1, tolerance)
     for nodes in range(1, MOST_NODES + 1):
         low, high = 0.0, 400.0
         for _ in range(80):
@@ -50,7 +57,9 @@ def node_limits(tolerance: float) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, work):
+def equivalent_lines(
+    delta, re, im, n, band, tolerance, most, limits, out_delta, out_re, out_im, work
+):  # fmt: skip
     """Few lines with the same spectrum as n lines: Chebyshev moments put onto Chebyshev nodes.
 
     Parameters
@@ -59,7 +68,12 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
         Positions [bins from a common origin] and complex weights.
     band : float
         Half bandwidth of the kernel in radians per bin: pi r for amplitudes, 2 pi r for powers.
-    limits : (m,) float64
+    tolerance : float
+        Error allowed, relative to the sum of the weights' magnitudes; the least of those of
+        ``limits`` is taken where it is smaller than all.
+    most : int
+        Equivalent lines at the most; where more are needed the lines stay as they are.
+    limits : (levels, m) float64
         :func:`node_limits`.
     out_delta, out_re, out_im : (>= max(n, MOST_NODES),) float64
         The equivalent lines.
@@ -76,9 +90,13 @@ def equivalent_lines(delta, re, im, n, band, limits, out_delta, out_re, out_im, 
         low = min(low, delta[b])
         high = max(high, delta[b])
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    level = limits.shape[0] - 1
+    while level > 0 and limits[level, 0] > tolerance:
+        level -= 1
     nodes = 1
-    while nodes < limits.size and limits[nodes] < band * half:
+    while nodes < limits.shape[1] and limits[level, nodes] < band * half:
         nodes += 1
+    nodes = nodes if nodes <= most else n
     return put_on_nodes(
         delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work
     )  # fmt: skip

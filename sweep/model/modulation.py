@@ -10,6 +10,7 @@ without them are one stretch, and pay for nothing.
 Shifts are about the middle of the record: there, lines and images keep their phases.
 """
 
+import math
 from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
@@ -26,6 +27,9 @@ from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE
 POINTS = 256
 """Points of a stretch."""
 
+SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
+"""To which lines are split, relative to all of them in phase: the last that a point allows."""
+
 
 class Stretch(NamedTuple):
     """A run of points, and what compiled code has to know of them."""
@@ -33,7 +37,7 @@ class Stretch(NamedTuple):
     part: slice
     """Which points of the shots these m are."""
     points: np.ndarray
-    """(15, m) :meth:`sweep.model.preparation.Shots.point_table`."""
+    """(16, m) :meth:`sweep.model.preparation.Shots.point_table`."""
     row: np.ndarray
     """(m,) int64: row in the footprints."""
     scene: tuple
@@ -47,9 +51,9 @@ class Stretch(NamedTuple):
 def stretches(shots: Shots) -> Iterator[Stretch]:
     """Points in stretches, in their order; one at least."""
     alike = _alike(shots)
-    plain = shots.gaussian_width is None and alike[0].size <= POINTS
+    plain = shots.gaussian_width is None and alike.point.size <= POINTS
     step = max(shots.size, 1) if plain else POINTS
-    table, shared = shots.point_table(), _parts(shots, *alike) if plain else None
+    table, shared = shots.point_table(), _parts(shots, alike) if plain else None
     for first in range(0, max(shots.size, 1), step):
         yield _stretch(shots, table, first, min(first + step, shots.size), shared)
 
@@ -59,7 +63,18 @@ def single(shots: Shots, i: int) -> Stretch:
     return _stretch(shots, shots.point_table(), i, i + 1)
 
 
-def _alike(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+class Alike(NamedTuple):
+    """Points that stand for all those with the same phase errors, as exactly to be split."""
+
+    point: np.ndarray
+    """(u,) int64: the points."""
+    which: np.ndarray
+    """(m,) int64: which of these stands for each point."""
+    level: np.ndarray
+    """(u,) int64: place in :data:`SPLIT_TOLERANCES`."""
+
+
+def _alike(shots: Shots) -> Alike:
     """Points of which no two have the same phase errors; which of these each point has."""
     values = [
         np.broadcast_to(np.asarray(one, float), shots.size)
@@ -68,19 +83,33 @@ def _alike(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
         for one in (value if isinstance(value, tuple) else (value,))
     ]
     if not values:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    varying = [v for v in values if v.size and (v != v[0]).any()]
+        return Alike(*np.empty((3, 0), np.int64))
+    levels = _levels(shots)
+    varying = [v for v in (levels, *values) if v.size and (v != v[0]).any()]
     if not varying:
-        return np.zeros(min(shots.size, 1), np.int64), np.zeros(shots.size, np.int64)
+        one = np.zeros(min(shots.size, 1), np.int64)
+        return Alike(one, np.zeros(shots.size, np.int64), levels[one])
     _, first, which = np.unique(np.stack(varying), axis=1, return_index=True, return_inverse=True)
-    return first, which.ravel()
+    return Alike(first, which.ravel(), levels[first])
+
+
+def _levels(shots: Shots) -> np.ndarray:
+    """How exactly each point's lines are to be split: a place in :data:`SPLIT_TOLERANCES`, (n,)."""
+    amplitudes = shots.amplitude.sum(axis=1)[shots.row]
+    whole = 0.5 * shots.beat_scale * amplitudes * shots.window.sum
+    error = shots.line_tolerance * shots.bin_deviation / 3
+    relative = np.where(whole > 0, error / np.where(whole > 0, whole, 1.0), np.inf)
+    found = np.searchsorted(SPLIT_TOLERANCES, relative + np.zeros(shots.size), "right") - 1
+    return np.asarray(np.maximum(found, 0))
 
 
 def _stretch(
     shots: Shots, table: np.ndarray, first: int, last: int, shared: tuple | None = None
 ) -> Stretch:
     part, index = slice(first, last), np.arange(first, last)
-    parts = _parts(shots, index, np.arange(index.size)) if shared is None else shared
+    parts = shared
+    if parts is None:
+        parts = _parts(shots, Alike(index, np.arange(index.size), _levels(shots)[part]))
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
     times = max(parts[0].shape[2], shifts[0].shape[1])
@@ -101,30 +130,31 @@ def choices(shots: Shots, *, every_bin: bool = False) -> tuple[bool, bool, bool,
     return shots.incoherent, shots.image, shots.leakage, every_bin
 
 
-def _parts(shots: Shots, index: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Places and weights of the lines that each line is split into, by segment and point.
-
-    Worked out for some points; ``which`` of these stands for each point of a stretch.
-    """
-    if not shots.phase_errors or not index.size:
+def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
+    """Places and weights of the lines that each line is split into, by segment and point."""
+    if not shots.phase_errors or not alike.point.size:
         return (*np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64))
 
-    def phase(x: np.ndarray, segment: int) -> np.ndarray:
+    def phase(x: np.ndarray, segment: int, index: np.ndarray) -> np.ndarray:
         return np.asarray(sum(error.of(segment, index, x) for error in shots.phase_errors))
 
-    splits = {
-        segment: split_lines(partial(phase, segment=segment))
-        for segment in map(int, np.flatnonzero(shots.segments))
-    }
-    most = max(split.offset.shape[1] for split in splits.values())
-    offset, re, im = np.zeros((3, 3, index.size, most))
-    number = np.zeros((3, index.size), np.int64)
-    for segment, split in splits.items():
+    splits = []
+    for level in np.unique(alike.level):
+        some = np.flatnonzero(alike.level == level)
+        for segment in map(int, np.flatnonzero(shots.segments)):
+            of_these = partial(phase, segment=segment, index=alike.point[some])
+            split = split_lines(of_these, tolerance=SPLIT_TOLERANCES[level])
+            splits.append((segment, some, split))
+    most = max(split.offset.shape[1] for _, _, split in splits)
+    offset, re, im = np.zeros((3, 3, alike.point.size, most))
+    number = np.zeros((3, alike.point.size), np.int64)
+    for segment, some, split in splits:
         lines = split.offset.shape[1]
-        offset[segment, :, :lines] = split.offset
-        re[segment, :, :lines], im[segment, :, :lines] = split.weight.real, split.weight.imag
-        number[segment] = split.number
-    return offset, re, im, number, which
+        offset[segment, some, :lines] = split.offset
+        re[segment, some, :lines] = split.weight.real
+        im[segment, some, :lines] = split.weight.imag
+        number[segment, some] = split.number
+    return offset, re, im, number, alike.which
 
 
 def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +167,7 @@ def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, error_model="numpy")
-def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
+def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
     """Lines in rows DELTA .. after what befalls them, as far as that leaves them plain lines.
 
     Amplitudes are split into parts, powers shifted; few lines stand for many before and after.
@@ -148,6 +178,8 @@ def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
         0 up, 1 Doppler, 2 down; place of the point in its stretch; number of lines.
     fold : float
         -1 where the lines are seen as their images, which conjugates their weights.
+    allowed : float
+        As of :func:`reduce_lines`.
     parts, shifts, power, kernel, room
         As of :class:`Stretch` and :func:`sweep.model.segments.segment_spectrum`.
 
@@ -161,7 +193,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
         return n
     fft_size, length = kernel[0]
     bins = fold * fft_size / length
-    few = reduce_lines(n, power, kernel, room)
+    few = reduce_lines(n, power, allowed, n - 1, kernel, room)
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     at, one, other = room[4], room[5], room[6]
     lines = 0
@@ -184,10 +216,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, kernel, room):
                 re[lines + j] = one[j] * a - other[j] * b
                 im[lines + j] = one[j] * b + other[j] * a
             lines += few
-    few = reduce_lines(lines, power, kernel, room)
-    for j in range(few):
-        delta[j], re[j], im[j] = at[j], one[j], other[j]
-    return few
+    return take_few(lines, power, allowed, lines - 1, kernel, room)
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,11 +228,39 @@ def _is_whole(segment, i, parts):
 
 
 @njit(cache=True, error_model="numpy")
-def reduce_lines(n, power, kernel, room):
-    """Few lines that are equivalent to those in rows DELTA .., into rows 4 to 6; how many."""
+def reduce_lines(n, power, allowed, most, kernel, room):
+    """Few lines that are equivalent to those in rows DELTA .., into rows 4 to 6; how many.
+
+    ``allowed`` is the error of a bin, of its power for ``power``; above ``most`` lines nothing is
+    gained, and they stay as they are.
+    """
     fft_size, length = kernel[0]
     band = np.pi * length / fft_size * (2.0 if power else 1.0)
+    tolerance = 0.0
+    if allowed > 0.0:
+        peak = kernel[2][0] * kernel[2][0] if power else kernel[2][0]
+        tolerance = allowed / max(peak * _total(n, power, room), 1e-300)
     return equivalent_lines(
-        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, band, kernel[3], room[4], room[5],
-        room[6], room[7:12],
+        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, band, tolerance, most, kernel[3],
+        room[4], room[5], room[6], room[7:12],
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _total(n, power, room):
+    """Sum of the magnitudes of the weights of n lines."""
+    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
+    total = 0.0
+    for j in range(n):
+        total += re[j] if power else math.sqrt(re[j] * re[j] + im[j] * im[j])
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def take_few(n, power, allowed, most, kernel, room):
+    """Puts equivalent lines in the place of n lines; how many there are then."""
+    few = reduce_lines(n, power, allowed, most, kernel, room)
+    for j in range(few):
+        room[DELTA, j], room[STRENGTH_RE, j] = room[4, j], room[5, j]
+        room[STRENGTH_IM, j] = room[6, j]
+    return few

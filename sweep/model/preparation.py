@@ -17,7 +17,7 @@ import numpy as np
 
 from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.equivalent import AMPLITUDE_TOLERANCE, POWER_TOLERANCE, node_limits
+from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 from sweep.model.ground import Ground
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
@@ -36,6 +36,10 @@ UNSEEN = frozenset({"signal_shot"})
 
 LEAKAGE_SHARE = 0.02
 """Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
+
+
+LINE_SHARE = 0.1
+"""The same, for errors of bins over sigma: pd changes by half as much in each segment."""
 
 
 class PhaseError(NamedTuple):
@@ -82,6 +86,8 @@ class Shots:
     leakage_floor: np.ndarray
     leakage_tolerance: np.ndarray
     """Chance of leakage, of all bins far from the lines, that need not be looked for."""
+    line_tolerance: np.ndarray
+    """Error of a bin by taking few lines for many, over sigma."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -189,12 +195,12 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Columns of :func:`sweep.model.segments.evaluate_segments`, (15, n)."""
+        """Columns of :func:`sweep.model.segments.evaluate_segments`, (16, n)."""
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.leakage_floor,
-            self.line_deviation, self.leakage_tolerance,
+            self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
         return np.array(np.broadcast_arrays(*columns), dtype=float)
 
@@ -205,7 +211,7 @@ class Shots:
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach),
-            node_limits(POWER_TOLERANCE if self.incoherent else AMPLITUDE_TOLERANCE),
+            node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
             tangents(self.fft_size),
         )
 
@@ -293,6 +299,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=p["accuracy.leakage_floor"],
         leakage_tolerance=LEAKAGE_SHARE * np.asarray(p["accuracy.tolerance"]),
+        line_tolerance=LINE_SHARE * np.asarray(p["accuracy.tolerance"]),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
         noise_scale=per_ampere,

@@ -22,7 +22,7 @@ from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane
 from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.sampling import sampled_categories
+from sweep.model.resolution import resolved_categories
 from sweep.model.shot import statistics
 
 ROWS = 4096
@@ -72,7 +72,7 @@ def realise(
     everything = DEFAULTS | dict(parameters)
     # So that there are n points even where they differ in nothing.
     everything["target.range"] = np.broadcast_to(everything["target.range"], len(keys))
-    for index, p in sampled_categories(everything, effects, SHARED):
+    for index, p in resolved_categories(everything, effects, SHARED):
         rows = min(ROWS, max(1, BEAMLETS // int(p["footprint.beamlets"])))
         for start in range(0, index.size * draws, rows):
             place = np.arange(start, min(start + rows, index.size * draws))

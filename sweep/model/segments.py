@@ -13,7 +13,7 @@ from sweep.model.far_field import MOST_POINTS
 from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.modulation import modulate, reduce_lines
+from sweep.model.modulation import modulate, reduce_lines, take_few
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
@@ -34,7 +34,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     ----------
     segment : int
         0 up, 1 Doppler, 2 down.
-    p : (15,) float64
+    p : (16,) float64
         The point's column of :meth:`sweep.model.preparation.Shots.point_table`.
     scene, at : tuple, (int, int)
         Footprint, parts and shifts of :class:`sweep.model.modulation.Stretch`; the point's row in
@@ -56,7 +56,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     """
     power, image = choices[0], choices[1]
     origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
-    few = reduce_lines(n, power, kernel, room)
+    few = reduce_lines(n, power, allowed(p, power), n - 1, kernel, room)
     _, parts, shifts = scene
     reach = _extent(segment, at[1], fold, few, parts, shifts, power, kernel, room)
     low, high = _bins_above(level, reach, origin, kernel)
@@ -73,6 +73,16 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
             break
         low, high = min(low, first), max(high, last)
     return low, high - low + 1
+
+
+@njit(cache=True, error_model="numpy")
+def allowed(p, power):
+    """Error of a bin, or of its power, that one step of taking few lines for many may make.
+
+    There are three such steps at the most. Powers are those of bins of half a sigma or more.
+    """
+    error = p[15] * p[10] / 3.0
+    return error * p[10] if power else error
 
 
 @njit(cache=True, error_model="numpy")
@@ -94,7 +104,9 @@ def _lines_of(segment, p, scene, at, power, kernel, room):
     n, fold = offset.size, 1.0
     if parts[0].size or shifts[0].size:
         fold = folding(which, chirp, record)
-        n = modulate(segment, at[1], n, fold, parts, shifts, power, kernel, room)
+        n = modulate(
+            segment, at[1], n, fold, parts, shifts, power, allowed(p, power), kernel, room
+        )  # fmt: skip
     return origin, n, fold
 
 
@@ -181,6 +193,7 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
     several = scene[1][0].size if power else scene[2][0].size
     if smooth(kernel) and not every_bin and not several:
         origin, n, _ = _lines_of(segment, p, scene, at, power, kernel, room)
+        n = take_few(n, power, allowed(p, power), n // 2, kernel, room) if p[15] > 0.0 else n
         chance = 0.0
         if leakage:
             low, count, peak, exempted, chance = inspect(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import Field, PrivateAttr
 
 from sweep.model import VERSION
-from sweep.model.sampling import BEAMLETS, PATTERN, THESIS
+from sweep.model.resolution import BEAMLETS, PATTERN, THESIS
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
 from sweep.spec.effect_check import not_in_flights, written_modes

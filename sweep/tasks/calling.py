@@ -72,7 +72,7 @@ class Calling:
         """Plans of some tiles: places among them, and the plan of these."""
         from sweep.model.effects.block import Block
         from sweep.model.effects.planning import plan
-        from sweep.model.sampling import BEAMLETS, effects_tolerance
+        from sweep.model.resolution import BEAMLETS, effects_tolerance
 
         for alike in self.tiles.alike(tiles):
             block = Block.of_plane(alike.parameters)

@@ -9,7 +9,7 @@ from scipy.constants import c as speed_of_light
 
 from sweep.model.chain import prepare
 from sweep.model.equivalent import (
-    AMPLITUDE_TOLERANCE,
+    AMPLITUDE_TOLERANCES,
     MOST_NODES,
     equivalent_lines,
     node_limits,
@@ -138,20 +138,22 @@ def test_far_sidelobes_of_a_line_keep_their_digits(name):
 # Few lines for many
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 3e-9, 1e-5])
 @pytest.mark.parametrize("centre", [0.0, -0.31, 0.49])
-def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre):
-    """Sum of C e^{i u delta} for |u| <= pi, to the promised 1e-13 of the summed amplitudes."""
+def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, tolerance):
+    """Sum of C e^{i u delta} for |u| <= pi, to what is allowed of the summed amplitudes."""
     rng = np.random.default_rng(43)
-    limits, work = node_limits(AMPLITUDE_TOLERANCE), np.empty((5, 128))
+    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
     u = np.linspace(-np.pi, np.pi, 41)[:, None]
-    allowed = 1e-13 + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
+    allowed = max(tolerance, 1e-13) + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
     for spread in 10 ** np.linspace(-16, 2, 500):
         delta, weights = bundle(rng, 109, spread)
         delta += centre
         few, re, im = np.empty(128), np.empty(128), np.empty(128)
         n = equivalent_lines(
-            delta, weights.real.copy(), weights.imag.copy(), 109, np.pi, limits, few, re, im, work
-        )
+            delta, weights.real.copy(), weights.imag.copy(), 109, np.pi, tolerance, 108, limits,
+            few, re, im, work,
+        )  # fmt: skip
         assert n <= 109
         many_sum = np.exp(1j * u * (delta - centre)) @ weights
         few_sum = np.exp(1j * u * (few[:n] - centre)) @ (re[:n] + 1j * im[:n])
@@ -159,21 +161,35 @@ def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre
 
 
 def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
-    limits, work = node_limits(AMPLITUDE_TOLERANCE), np.empty((5, 128))
+    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
     few, re, im = np.empty(128), np.empty(128), np.empty(128)
     counts = []
     for spread in (0.0, 0.1, 1.0, 5.0, 200.0):
         delta = np.linspace(-spread, spread, 109)
         counts.append(
             equivalent_lines(
-                delta, np.ones(109), np.zeros(109), 109, np.pi, limits, few, re, im, work
+                delta, np.ones(109), np.zeros(109), 109, np.pi, 0.0, 108, limits, few, re, im, work
             )
         )
     assert counts[0] == 1
     assert counts[1] <= 10
     assert counts == sorted(counts)
     assert counts[-1] == 109 and np.array_equal(few[:109], delta)
-    assert limits.size == MOST_NODES + 1
+    assert limits.shape == (len(AMPLITUDE_TOLERANCES), MOST_NODES + 1)
+
+
+def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most():
+    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
+    few, re, im = np.empty(128), np.empty(128), np.empty(128)
+
+    def number(tolerance, most):
+        line = np.linspace(-1, 1, 109), np.ones(109), np.zeros(109)
+        return equivalent_lines(*line, 109, np.pi, tolerance, most, limits, few, re, im, work)
+
+    counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1.0)]
+    assert counts[0] == counts[1] and counts[-1] == counts[-2]
+    assert (np.diff(counts[1:-1]) < 0).all()
+    assert number(1e-9, counts[3]) == counts[3] and number(1e-9, counts[3] - 1) == 109
 
 
 # Lines

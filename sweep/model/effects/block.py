@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sweep.model import ground, sampling
+from sweep.model import ground, resolution
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.line_spread import NOT_AWAY, Line, Moments
@@ -228,8 +228,8 @@ class Block(TileLink):
 
 def _beamlets(link: TileLink) -> tuple[int, str]:
     """Beamlets and their pattern; the most there may be where they follow from the tolerance."""
-    number, words = link.whole(sampling.BEAMLETS), link.words
-    return (number, ground.pattern(words)) if number else sampling.finest(words)
+    number, words = link.whole(resolution.BEAMLETS), link.words
+    return (number, ground.pattern(words)) if number else resolution.finest(words)
 
 
 def _finite(moments: Moments) -> list[np.ndarray]:

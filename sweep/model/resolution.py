@@ -6,7 +6,7 @@ tolerance: with b the threshold over sigma,
 
     |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
 
-in each of three segments. The rest of the tolerance is the effects' (:mod:`.effects.planning`).
+in each of three segments. Most of the rest is the effects' (:mod:`.effects.planning`).
 Where amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
 what [T] takes, 109, is then taken.
 """
@@ -42,7 +42,10 @@ THESIS = 109
 """Beamlets of [T 3.3.1]."""
 
 SHARE = 0.25
-"""Of the tolerance on pd, for the sampling of the footprint."""
+"""Of the tolerance on pd, for the number of beamlets."""
+
+EFFECTS_SHARE = 0.8
+"""For effects that are left out, if beamlets are given; the rest is that of lines and leakage."""
 
 FINEST = int(quadrature.COUNTS[-1])
 
@@ -51,7 +54,7 @@ _SQUARE_SIDE = 64
 """Beamlets on a side of a square at the most."""
 
 
-def sampled_categories(
+def resolved_categories(
     parameters: Parameters, effects: Collection[str], further: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Points by category, their beamlets counted where that is left to the tolerance.
@@ -83,7 +86,7 @@ def finest(words: Mapping[str, Any]) -> tuple[int, str]:
 
 def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:
     """What is left of a tolerance for the effects that are left out."""
-    return tolerance * (1 - SHARE if number == 0 and _is_open(words) else 1)
+    return tolerance * (EFFECTS_SHARE - (SHARE if number == 0 and _is_open(words) else 0.0))
 
 
 def _is_open(words: Mapping[str, Any]) -> bool:

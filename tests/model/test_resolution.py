@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sweep.model import sampling, shot
+from sweep.model import resolution, shot
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 
@@ -38,7 +38,7 @@ def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, wi
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
         found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         for name in PDS:
-            assert abs(found[name] - exact[name]).max() <= sampling.SHARE * tolerance, name
+            assert abs(found[name] - exact[name]).max() <= resolution.SHARE * tolerance, name
         for name in SNRS:
             assert abs(np.sqrt(found[name] / exact[name]) - 1).max() <= tolerance, name
         assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9

@@ -1,0 +1,71 @@
+"""Few lines for many, to the accuracy asked for: bins against those of the strictest tolerance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import CORE, DEFAULTS
+from sweep.model.modulation import stretches
+from sweep.model.shot import find
+
+POINTS = 200
+PD, MAGNITUDE = 0, 2
+
+
+def some_shots(table_4_1, phases, effects, seed):
+    """From the target on the doorstep to the far one, where phases cancel and where they do not."""
+    rng = np.random.default_rng((81, seed))
+    parameters = DEFAULTS | table_4_1(
+        phases=phases, fft_size=2**13, window=str(rng.choice(["hamming", "blackman"])),
+        range=10 ** rng.uniform(0.5, 4, POINTS), power=10 ** rng.uniform(-3, 1, POINTS),
+        grazing_angle=np.radians(rng.uniform(2, 90, POINTS)),
+        radial_velocity=rng.choice([5.0, 150.0], POINTS), beam_divergence=1e-4,
+    )  # fmt: skip
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("effects", [CORE, (*CORE, "range_walk")], ids=["plain", "range walk"])
+def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, phases, effects):
+    changed = 0
+    for seed in range(3):
+        shots = some_shots(table_4_1, phases, effects, seed)
+        exact = find(shots)
+        for tolerance in (1e-1, 1e-3, 1e-6):
+            found = find(replace(shots, line_tolerance=np.asarray(tolerance)))
+            apart = abs(found[:, MAGNITUDE] - exact[:, MAGNITUDE]) / shots.bin_deviation
+            rounding = 1e-11 * exact[:, MAGNITUDE] / shots.bin_deviation
+            assert (apart <= tolerance + rounding).all()
+            assert abs(found[:, PD] - exact[:, PD]).max() <= 0.5 * tolerance + 1e-9
+            changed += (apart > 10 * rounding).sum()
+    assert changed > 100
+
+
+def test_a_looser_tolerance_splits_lines_into_fewer_and_points_stay_their_own(table_4_1):
+    shots = some_shots(table_4_1, "coherent", (*CORE, "range_walk"), 5)
+    loose = replace(shots, line_tolerance=np.asarray(1e-2))
+    numbers = [next(stretches(s)).scene[1][3].max() for s in (shots, loose)]
+    fewest = next(stretches(loose)).scene[1][3][0].min()
+    assert fewest < numbers[0] and numbers[1] <= numbers[0]
+    whole = find(loose)
+    for part in (slice(0, 3), slice(3, None)):
+        ((_, alone),) = prepare(
+            {path: v[part] if np.ndim(v) else v for path, v in _parameters(table_4_1).items()},
+            (*CORE, "range_walk"),
+        )
+        ((_, both),) = prepare(_parameters(table_4_1), (*CORE, "range_walk"))
+        one = find(replace(alone, line_tolerance=np.asarray(1e-2)))
+        other = find(replace(both, line_tolerance=np.asarray(1e-2)))
+        np.testing.assert_array_equal(one, other[..., part])
+    assert np.isfinite(whole[:, PD]).all()
+
+
+def _parameters(table_4_1):
+    rng = np.random.default_rng(9)
+    return DEFAULTS | table_4_1(
+        phases="coherent", fft_size=2**12, range=10 ** rng.uniform(0.5, 4, 8), power=1e-2,
+        grazing_angle=np.radians(rng.uniform(2, 90, 8)), radial_velocity=150.0,
+    )  # fmt: skip
