@@ -37,7 +37,7 @@ class Change(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """What drawing an effect can change of mean probabilities, from whatever the others make."""
+    """What an effect can change of (mean) probabilities, from whatever the others make."""
 
     change: Callable[[Span, Span], np.ndarray]
     """Bound on it, (3, tiles), from spans of magnitude (3, tiles) and threshold over sigma."""

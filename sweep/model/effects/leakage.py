@@ -3,10 +3,17 @@
 It changes no detecting bin, and so no detection probability; it is what ``p_leakage`` holds. It
 acts on the detection: without it no bin beside the groups need be looked at. By the union bound
 
-    p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E(k), b),
+    p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E_k, b),
 
-with A the magnitude of all lines in phase, E the envelope of the window's sidelobes and b the
-threshold, all over sigma.
+over the bins that may leak, with A the magnitude of all lines together, E_k the largest |W| at
+the distances that lines may have from bin k, and b the threshold, all over sigma. Not among them
+are the detecting bin and those that surely reach the threshold, and all their neighbours; so A is
+in the main lobe at most what leaves the bin before k below the threshold. Bins amid lines that add
+as powers have what Parseval's theorem gives them together.
+
+Amplitudes may cancel. With S their sum and all lines within e bins of the axis's, bins have
+|S| |W| to A e max |W'|: either the largest is next to the axis's line, or S is so small that this
+leaves it open, and then every bin may leak, none with more than that makes of it.
 """
 
 import math
@@ -16,10 +23,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 
+from sweep.model.effects.change import Mean
 from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.line_spread import Line
+from sweep.model.effects.sidelobes import CELLS, LEVELS, sidelobes
+from sweep.model.effects.span import Span
 from sweep.model.marcum import excess_crossing
 from sweep.model.preparation import Shots
 
@@ -27,103 +35,178 @@ if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
 
-_STEPS = 40
+_STEPS = 24
+_ROUNDING = 1e-6
+"""Bins by which a line's place may be off."""
 _NEGLIGIBLE = 1e-14
 """Chance that needs no closer look."""
 _HIGHER = 1.25
 """How much more leaks, at the most, with a higher threshold than one of 2 sigma or more: only bins
 that reach the threshold, whose chance to cross then rises from 0.468 to 0.556."""
+_STAR = 1.3
+"""How much more than in proportion to a^2 <= b^2 the chance to cross may fall, at the most."""
 
 
-def bound(block: "Block") -> np.ndarray:
-    """Bound on the chance that leaked signal raises an extra group, (3, tiles)."""
-    lines, spread = block.lines, block.spread
-    uphill = np.exp(np.minimum(lines.tilt * np.asarray(spread.extreme), 50.0))
-    peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)
-    ratio = np.maximum(block.echo_ratio.high, 1.0)
-    whole = ratio if block.architecture == "direct" else np.sqrt(ratio)
-    powers = not block.adds_amplitudes
-    lower, upper = block.threshold.low, block.threshold.high
-    found = probability_bound(
-        lines,
-        amplitude=peak * whole * (1.0 if powers else block.gain.high),
-        threshold=lower,
-        extreme=spread.extreme,
-        fft_size=block.fft_size,
-        powers=powers,
-    )
-    if not block.segment_exists[1]:
-        found[1] = 0.0
-    one = np.equal(lower, upper)
-    return np.asarray(np.where(one, found, np.where(np.greater(lower, 2), _HIGHER * found, 1.0)))
+def bound(block: "Block") -> Mean:
+    """Bound on the chance that leaked signal raises an extra group."""
+
+    def change(amplitude: Span, threshold: Span) -> np.ndarray:
+        return probability_bound(block, amplitude=amplitude, threshold=threshold)
+
+    return Mean(change)
 
 
-def probability_bound(
-    line: Line,
-    *,
-    amplitude: ArrayLike,
-    threshold: ArrayLike,
-    extreme: ArrayLike,
-    fft_size: int,
-    powers: bool,
-) -> np.ndarray:
-    """Bound on the chance that leaked signal raises an extra group in a segment, 0..1.
+def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np.ndarray:
+    """Bound on the chance that leaked signal raises an extra group in a segment, (3, tiles), 0..1.
 
     Parameters
     ----------
-    line : Line
-        Of the axis.
-    amplitude, threshold : array_like
-        Magnitude of all lines in phase, or as powers, and the threshold, over sigma.
-    extreme : array_like
-        Bins from the axis's line to the furthest.
-    fft_size : int
-        N; there are N/2 bins.
-    powers : bool
-        Whether lines, and images, add as powers: then the largest bin is nearest to lines that
-        lie close, and it and its neighbours, less than a bin from them, cannot leak.
+    block : Block
+        The tiles.
+    amplitude : Span
+        Magnitude of the detecting bin over sigma, (3, tiles), whatever the effects make of it.
+    threshold : Span
+        Threshold over sigma, likewise.
     """
-    steps = _steps(fft_size)
+    lines, extreme = block.lines, np.asarray(block.spread.extreme, float)
+    powers = not block.adds_amplitudes
+    uphill = np.exp(np.minimum(lines.tilt * extreme, 50.0))
+    peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)
+    ratio = np.maximum(block.echo_ratio.high, 1.0)
+    whole = ratio if block.architecture == "direct" else np.sqrt(ratio)
+    image = lines.lobe.tail(lines.edge - extreme)
+    apart = 0.0 if powers else np.minimum(math.sqrt(lines.lobe.curvature) * extreme, 2.0)
     columns = np.broadcast_arrays(
-        *(np.asarray(v, float) for v in (amplitude, threshold, extreme)), line.edge
-    )
-    a, b, e, edge = (np.array(v) for v in columns)
-    image = line.lobe.tail(edge - e)
-    envelope, bins = line.lobe.tail(steps[:-1]), np.diff(steps)
-    flat = np.stack([v.ravel() for v in (a, b, e, image)])
-    total = _union(flat, envelope, bins, fft_size / 2, powers)
-    return np.asarray(total.reshape(a.shape))
+        peak * whole * (1.0 if powers else block.gain.high), np.asarray(amplitude.low),
+        np.asarray(threshold.low), np.asarray(threshold.high), extreme, lines.bin_offset_least,
+        lines.bin_offset, image, apart,
+    )  # fmt: skip
+    shape = block.window
+    table = sidelobes(shape.name, shape.length)
+    steps = _steps(table.lowest.size / CELLS * block.fft_size / shape.length, block.fft_size)
+    found = _union(
+        np.stack([c.ravel() for c in columns]), (table.highest, table.lowest),
+        (np.diff(steps), lines.lobe.tail(steps[:-1])),
+        (shape.length / block.fft_size, block.fft_size / 2, shape.equivalent_noise_bandwidth),
+        powers,
+    ).reshape(columns[0].shape)  # fmt: skip
+    if not block.segment_exists[1]:
+        found[1] = 0.0
+    higher = np.divide(threshold.high, threshold.low) ** 4
+    higher = np.where(np.greater(threshold.low, 2), np.minimum(higher, _HIGHER), higher)
+    return np.asarray(np.minimum(higher * found, 1.0))
 
 
 @lru_cache(maxsize=32)
-def _steps(fft_size: int) -> np.ndarray:
-    """Distances [bins] between which the sidelobes are taken to be even."""
-    return np.unique(np.r_[0.0, np.geomspace(0.75, fft_size / 2 + 1, _STEPS)])
+def _steps(first: float, fft_size: int) -> np.ndarray:
+    """Distances [bins] from the table's end on, between which sidelobes are taken to be even."""
+    return np.geomspace(first, max(fft_size / 2, first) + 1, _STEPS)
 
 
 @njit(cache=True, error_model="numpy")
-def _union(columns, envelope, bins, half, powers):
-    """Sum of the chances of all bins, step of distance by step, (n,)."""
+def _union(columns, table, far, sizes, powers):
+    """Largest sum of the chances of all bins that may leak, (n,)."""
     out = np.empty(columns.shape[1])
     for i in range(out.size):
-        a, b, extreme, aside = columns[:, i]
-        close = powers and extreme < 0.125
+        column = columns[:, i]
+        a, b = column[0], column[2]
+        first, second, limit, sure = _starts(column, table, sizes[0])
         total = 0.0
-        if not close:
-            inside = min(2.0 * extreme + 1.0, half)
-            total = inside * excess_crossing(min(2.0 * a, b), b)
-        for j in range(1 if close else 0, bins.size):
-            beside = envelope[j]
-            both = math.hypot(beside, aside) if powers else beside + aside
-            # to either side; steps need not begin on a bin
-            number = 2.0 * bins[j] + (2.0 if j < 2 else 0.0)
-            chance = excess_crossing(min(a * both, b), b)
-            if chance * half < _NEGLIGIBLE or total > 1.0:
-                total += 2.0 * half * chance  # sidelobes fall, so does the chance
-                break
-            total += number * chance
+        if limit < a:
+            total = _sum(a, first, second, column, table, far, sizes, powers)
+        if not sure:
+            other = _sum(min(a, limit), 0.0, 1.0, column, table, far, sizes, powers)
+            total = max(total, other)
         out[i] = min(total / -math.expm1(-0.5 * b * b), 1.0)
     return out
+
+
+@njit(cache=True, error_model="numpy")
+def _starts(column, table, ratio):
+    """First bins that may leak on either side, from the nearest (0) up and from the next (1) up.
+
+    Returns
+    -------
+    first, second : float
+    limit : float
+        The sum of all lines below which any bin may be the largest.
+    sure : bool
+        Whether the sum is above it.
+    """
+    a, peak, _, b, extreme, least, most, image, apart = column
+    beyond, lowest = table[0][LEVELS], table[1]
+    other = a * (image + apart)
+    sum_ = max(peak - other, 0.0) / _read(beyond, (least - extreme) * ratio)
+    near = _read(lowest, (most + extreme) * ratio)
+    first, second = 2.0, 2.0
+    gap = near - _read(beyond, (1.0 - most - extreme) * ratio)
+    if gap < 0.1 and sum_ * gap <= 2.0 * other:
+        first = 1.0
+        gap = near - _read(beyond, (1.0 + least - extreme) * ratio)
+    limit = 2.0 * other / gap if gap > 0.0 else math.inf
+    # the furthest that bins are sure to reach the threshold
+    weakest = (b + other) / sum_
+    reach = np.searchsorted(-lowest, -weakest, "right") / CELLS / ratio - extreme
+    if reach > most:
+        first = max(first, math.floor(reach - most) + 2.0)
+        second = max(second, math.floor(reach + least) + 2.0)
+    return first, second, limit, sum_ > limit
+
+
+@njit(cache=True, error_model="numpy")
+def _sum(whole, first, second, column, table, far, sizes, powers):
+    """Sum of the chances of the bins from the first two on, of lines that add up to ``whole``."""
+    a, _, b, upper, extreme, least, most, image, apart = column
+    ratio, half, noise_bandwidth = sizes
+    stride = max(int(1.0 / ratio), 1)
+    width = (most - least + 2.0 * extreme + stride - 1.0) * ratio + 2.0 * _ROUNDING
+    level = min(math.ceil(math.log2(math.floor(CELLS * min(width, 1.0)) + 2.0)) - 1, LEVELS)
+    row, lowest = table[0][level], table[1]
+    total = 0.0
+    for side in range(2):
+        start = second if side else first
+        # bins of this side lie at k + nearest or further from the nearest line
+        nearest, furthest = (-most, -least) if side else (least, most)
+        nearest -= extreme
+        inside = min(max(math.ceil(-nearest) - start, 0.0), half + 1.0)
+        total += _inside(inside, a, b, image, noise_bandwidth / ratio, powers)
+        k = start + inside
+        j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
+        while j < row.size and total <= 1.0 and k <= half:
+            # where the bin before reaches the threshold this one does not leak
+            before = max(k + stride - 2.0 + furthest, most) + extreme
+            least_before = _read(lowest, before * ratio)
+            most_whole = min(whole, (upper + a * (image + apart)) / max(least_before, 1e-300))
+            beside = min(most_whole * row[j] + apart * a, a * row[j])
+            beside = math.hypot(beside, a * image) if powers else beside + a * image
+            total += stride * excess_crossing(min(beside, b), b)
+            k += stride
+            j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
+    for j in range(far[0].size):
+        both = math.hypot(far[1][j], image) if powers else far[1][j] + image
+        chance = excess_crossing(min(a * both, b), b)
+        if chance * half < _NEGLIGIBLE or total > 1.0:
+            total += 2.0 * half * chance
+            break
+        total += (2.0 * far[0][j] + 2.0) * chance
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _inside(number, a, b, image, energy, powers):
+    """Sum of the chances of so many bins within the spread of lines."""
+    if number <= 0.0:
+        return 0.0
+    at = min(a * (math.hypot(1.0, image) if powers else 1.0 + image), b)
+    if powers:
+        number = min(number, max(_STAR * (energy + 2.0 * image * image) * (a / at) ** 2, 1.0))
+    return number * excess_crossing(at, b)
+
+
+@njit(cache=True, error_model="numpy")
+def _read(table, place):
+    j = int(CELLS * max(place, 0.0))
+    return table[j] if j < table.size else table[-1]
 
 
 def act(shots: Shots, scene: Scene) -> Shots:

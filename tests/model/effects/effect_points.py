@@ -3,8 +3,10 @@
 import numpy as np
 
 from sweep.model.chain import prepare
+from sweep.model.effects import leakage
 from sweep.model.effects.block import Block
-from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
+from sweep.model.effects.change import Change, within_changes
 from sweep.model.effects.span import Span
 from sweep.model.shot import find
 
@@ -101,6 +103,16 @@ def found(parameters, effects):
 def magnitudes(parameters, effects):
     """Largest bin's |X| of each segment, (3, n)."""
     return found(parameters, effects)[:, 2]
+
+
+def leakage_bound(block):
+    """Bound on what leaks, (3, tiles), whichever of the core's effects are there."""
+    asked = (effect.bound(block) for effect in EFFECTS if effect.name in CORE)
+    changes = [bound for bound in asked if isinstance(bound, Change)]
+    amplitude, threshold = within_changes(
+        changes, amplitude=block.amplitude, threshold=block.threshold
+    )
+    return leakage.bound(block).change(amplitude, threshold)
 
 
 ROUNDING = 1e-9

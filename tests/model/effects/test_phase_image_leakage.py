@@ -2,9 +2,19 @@
 
 import numpy as np
 import pytest
-from effect_points import CLOSED, found, held, magnitudes, point_block, scene, shots_of, tile_block
+from effect_points import (
+    CLOSED,
+    found,
+    held,
+    leakage_bound,
+    magnitudes,
+    point_block,
+    scene,
+    shots_of,
+    tile_block,
+)  # fmt: skip
 
-from sweep.model.effects import footprint_phase, image, leakage
+from sweep.model.effects import footprint_phase, image
 from sweep.model.effects.change import pd_change
 from sweep.model.shot import find
 from sweep.model.spectra import segment_spectrum
@@ -130,10 +140,41 @@ def test_leakage_is_no_more_than_bound_and_nothing_without(table_4_1, tiles):
         seen, silent = (found(inner, e) for e in (effects, effects - {"leakage"}))
         np.testing.assert_allclose(seen[:, :5], silent[:, :5], 1e-9, 1e-300)
         assert not silent[:, 5].any()
-        most = leakage.bound(block)
+        most = leakage_bound(block)
         assert (seen[:, 5] <= most + 1e-12).all()
         bounds.append(most.ravel())
         truths.append(seen[:, 5].ravel())
     bounds, truths = np.concatenate(bounds), np.concatenate(truths)
     assert (truths > 1e-6).sum() > 100 and (bounds < 1e-3).sum() > 100
     assert (bounds[truths < 1e-12] < 0.1).sum() > 100
+
+
+FLAT = {
+    "range": np.linspace(100, 300, 40), "grazing_angle": np.pi / 2,
+    "beam_divergence": 10 ** np.linspace(-6, -4.5, 40),
+}  # fmt: skip
+"""Footprints so flat that their beamlets cannot cancel."""
+LINES = (
+    {"beamlets": 1},
+    {"beamlets": 1, "phases": "coherent"},
+    {"beamlets": 19},
+    {"beamlets": 19, "phases": "coherent"} | FLAT,
+)
+
+
+@pytest.mark.parametrize("window", ["hamming", "hann", "blackman", "kaiser(8.6)"])
+@pytest.mark.parametrize("lines", LINES, ids=["line", "coherent line", "powers", "amplitudes"])
+def test_the_bound_on_leakage_is_near_what_leaks(table_4_1, window, lines):
+    ratios = []
+    for seed in range(10):
+        power = 10 ** np.random.default_rng((4, seed)).uniform(-7, 1, 40)
+        parameters = scene(
+            table_4_1, 40, seed, fft_size=2**13, window=window, power=power, across=0.0, **lines
+        )
+        phased = {"footprint_phase"} if lines.get("phases") else set()
+        leaks = found(parameters, {"footprint", "doppler", "image", "leakage"} | phased)[:, 5]
+        most = leakage_bound(point_block(parameters))
+        noticed = (leaks > 1e-9) & (leaks < 0.5)
+        ratios.append(most[noticed] / leaks[noticed])
+    ratios = np.concatenate(ratios)
+    assert ratios.size > 200 and ratios.min() >= 1 and np.median(ratios) <= 30
