@@ -68,7 +68,7 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     threshold : Span
         Threshold over sigma, likewise.
     """
-    lines, extreme = block.lines, np.asarray(block.spread.extreme, float)
+    lines, extreme = block.lines, np.fmin(block.spread.extreme, block.fft_size)
     powers = not block.adds_amplitudes
     uphill = np.exp(np.minimum(lines.tilt * extreme, 50.0))
     peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)

@@ -41,7 +41,7 @@ def sidelobes(name: str, length: int) -> Sidelobes:
     reach = min(REACH, length // 2 - 1)
     value = _magnitudes(shape, reach) / shape.sum
     cells = np.lib.stride_tricks.sliding_window_view(value, _SAMPLES + 1)[::_SAMPLES]
-    beyond = shape.envelope[max(np.searchsorted(shape.reach, reach, "right") - 1, 0)]
+    beyond = shape.envelope[max(int(np.searchsorted(shape.reach, reach, "right")) - 1, 0)]
     own = np.r_[(1 + _CREST) * cells.max(axis=1), np.full(2**LEVELS, beyond)]
     rows = [own]
     for level in range(LEVELS):

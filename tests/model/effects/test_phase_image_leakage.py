@@ -178,3 +178,18 @@ def test_the_bound_on_leakage_is_near_what_leaks(table_4_1, window, lines):
         ratios.append(most[noticed] / leaks[noticed])
     ratios = np.concatenate(ratios)
     assert ratios.size > 200 and ratios.min() >= 1 and np.median(ratios) <= 30
+
+
+@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
+def test_lines_spread_over_all_bins_and_beyond_may_leak_in_any(table_4_1, phases):
+    parameters = scene(
+        table_4_1, 30, 2, grazing_angle=np.geomspace(1e-4, 1e-2, 30), beam_divergence=2e-3,
+        beamlets=7, phases=phases, power=np.geomspace(1e-2, 1e12, 30), fft_size=2**12, range=50.0,
+    )  # fmt: skip
+    block = point_block(parameters)
+    with np.errstate(all="ignore"):  # other effects' bounds on infinite spreads
+        most = leakage_bound(block)
+    assert not np.isfinite(block.ranges.extreme[0]) and ((most >= 0) & (most <= 1)).all()
+    phased = {"footprint_phase"} if phases == "coherent" else set()
+    leaks = found(parameters, {"footprint", "doppler", "image", "leakage"} | phased)[:, 5]
+    assert (np.nan_to_num(leaks) <= most * (1 + 1e-9) + 1e-12).all() and np.nanmax(leaks) > 1e-3
