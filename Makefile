@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all bench effects lock forget-kernels clean
+.PHONY: demo test test-all stability bench effects lock forget-kernels clean
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
@@ -25,6 +25,9 @@ test: $(READY) forget-kernels
 
 test-all: $(READY) forget-kernels
 	$(BIN)/pytest -n auto --dist worksteal -m ''
+
+stability: $(READY)
+	$(BIN)/python tests/stability/stability_table.py
 
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py

@@ -61,10 +61,10 @@ def fraction_of_cycle(x):
 
 @njit(inline="always")
 def product_fraction(high, low, x):
-    """Fraction of (high + low) * x cycles, right to about 1e-16 however many cycles there are.
+    """Fraction of (high + low) * x cycles, right to about 1e-16 up to 1e15 cycles.
 
     The rounding error of high * x is recovered by a fused multiply-add, so what remains is
-    low * x rounded once.
+    low * x rounded once: beyond, 1e-32 of all cycles.
     """
     product = high * x
     rest = fma(high, x, -product) + low * x

@@ -1,0 +1,94 @@
+"""Registry of what is numerically hard: each case, what it is held against and how close it comes.
+
+A family is a module of cases. A case is a function that returns the worst error it finds; its
+decorator says what is hard about it, against what the error is taken, what is allowed, and where
+float64's own limit lies. `test_stability.py` holds every case to what it allows, and
+`stability_table.py` writes docs/stability.md from the same registry.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+EPS = sys.float_info.epsilon
+"""Distance from 1 to the next float64; half of it is the error of one rounding."""
+
+MODULES = (
+    "hard_marcum", "hard_chances", "hard_beats", "hard_sidelobes", "hard_geometry",
+)  # fmt: skip
+"""Families in the order in which the page shows them."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case.
+
+    Parameters
+    ----------
+    hard : str
+        What is hard about it.
+    reference : str
+        What it is held against.
+    measure : str
+        What the error is an error of.
+    allowed : float
+        Largest error with which the case is met.
+    limit : float
+        Error that float64 alone can make, estimated as `because` says.
+    slow : bool
+        Longer than the fast suite allows.
+    needs : Path or None
+        File with reference values, without which the case cannot be looked at.
+    find : callable
+        Gives the worst error.
+    """
+
+    hard: str
+    reference: str
+    measure: str
+    allowed: float
+    limit: float
+    because: str
+    slow: bool
+    needs: Path | None
+    find: Callable[[], float]
+
+
+@dataclass
+class Family:
+    """Cases about one part of the model."""
+
+    title: str
+    about: str
+    cases: list[Case] = field(default_factory=list)
+
+    def case(
+        self,
+        hard: str,
+        *,
+        reference: str,
+        measure: str,
+        allowed: float,
+        limit: float,
+        because: str,
+        slow: bool = False,
+        needs: Path | None = None,
+    ) -> Callable[[Callable[[], float]], Callable[[], float]]:
+        """Decorator that registers a function that returns its worst error."""
+
+        def register(find: Callable[[], float]) -> Callable[[], float]:
+            self.cases.append(
+                Case(hard, reference, measure, allowed, limit, because, slow, needs, find)
+            )
+            return find
+
+        return register
+
+
+def families() -> list[Family]:
+    """Every family with its cases."""
+    return [importlib.import_module(name).FAMILY for name in MODULES]

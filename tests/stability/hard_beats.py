@@ -1,0 +1,292 @@
+"""Beats where signs, images and folds meet, and what three peaks say."""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+from cases import EPS, Family
+from exact_spectrum import magnitudes, peak
+from table_shots import shots, velocity_for
+
+from sweep.model import spectra, truth
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.preparation import Shots
+from sweep.model.waveform import beat_frequency, resolve
+from sweep.model.window import COSINE_SUMS
+
+SIZE, RATE = 4096, 600e6
+NYQUIST = RATE / 2
+
+FAMILY = Family(
+    "Beats",
+    "Magnitudes of bins at and beside lines, to DC and to Nyquist, 4096 samples, against the exact "
+    "delay's phase and the window's transform in 40 digits; range and velocity are taken as exact. "
+    "A beat at bin nu before it is folded is known to nu eps / 2 bins, and next to a line |X| "
+    "changes by about pi/2 of the peak a bin; where a line meets its image, its phase counts as "
+    "well, in which S tau^2 / 2 is rounded; the closed form adds some roundings of the peak. (The "
+    "rounding of R alone, not counted here, turns the optical phase at 2 km by 1e-6 rad.)",
+)
+WINDOWS = ("rectangular", "hann", "hamming", "flattop")
+
+
+def of_the_peak(frequency: float, allowed: float, cycles: float = 0.0) -> dict[str, Any]:
+    """What the cases share, given their largest beat [Hz] and, where it counts, S tau^2 / 2."""
+    place = frequency / RATE * SIZE * np.pi / 2
+    phase = f"; chirp phase of {cycles:.0f} cycles" if cycles else ""
+    return {
+        "reference": "exact delay and transform, 40 digits",
+        "measure": "abs(X), of the peak",
+        "allowed": allowed,
+        "limit": (place + 4 * np.pi * cycles + 4) * EPS / 2,
+        "because": f"beats to {frequency:.1e} Hz{phase}, rounded",
+    }
+
+
+def looked_at(one: Shots, segment: int) -> list[int]:
+    """Bins about the line, at both ends of the spectrum and in between."""
+    _, found = spectra.segment_spectrum(one, 0, segment)
+    centre, half = int(np.argmax(found)), one.fft_size // 2
+    near = range(centre - 8, centre + 9)
+    return sorted({k for k in (0, 1, 2, *near, half - 1, half, 77, 1234) if 0 <= k <= half})
+
+
+def departure(one: Shots) -> float:
+    """Largest error of the fast path's bins over the peak, all segments."""
+    worst = 0.0
+    for segment in np.flatnonzero(one.segments):
+        bins = looked_at(one, int(segment))
+        _, found = spectra.segment_spectrum(one, 0, int(segment))
+        with mp.workdps(40):
+            exact = magnitudes(one, 0, int(segment), bins)
+            errors = [abs(mp.mpf(float(found[k])) - x) for k, x in zip(bins, exact, strict=True)]
+            worst = max(worst, float(max(errors)) / peak(one, 0, int(segment)))
+    return worst
+
+
+def on_frequency(
+    frequencies: Iterable[float], segments: Iterable[int] = (0, 1, 2), **changes: Any
+) -> Iterator[Shots]:
+    """Shots whose velocity puts a segment's beat on a frequency, in several windows."""
+    for number, frequency in enumerate(frequencies):
+        for segment in segments:
+            v = velocity_for(frequency, segment, range=3210.0)
+            window = WINDOWS[(number + segment) % len(WINDOWS)]
+            scene = {"range": 3210.0, "radial_velocity": v, "window": window, "fft_size": SIZE}
+            yield shots(**scene | changes)
+
+
+@FAMILY.case("each segment's beat at DC", **of_the_peak(1e8, 2e-12, 459))
+def at_dc() -> float:
+    return max(departure(one) for one in on_frequency([0.0] * 4))
+
+
+@FAMILY.case("beats 1e-18 to 1e-6 bins off DC", **of_the_peak(1e8, 2e-13))
+def beside_dc() -> float:
+    return max(
+        departure(
+            shots(radial_velocity=bins * RATE / SIZE * 1550e-9 / 2, window=window, fft_size=SIZE)
+        )
+        for bins in (1e-18, -1e-12, 1e-6)
+        for window in WINDOWS
+    )
+
+
+@FAMILY.case("each segment's beat at Nyquist, of either sign", **of_the_peak(4e8, 2e-12, 459))
+def at_nyquist() -> float:
+    return max(departure(one) for one in on_frequency([NYQUIST, -NYQUIST]))
+
+
+@FAMILY.case(
+    "beats folded onto DC, Nyquist and between, up to 4 GHz", **of_the_peak(4e9, 5e-11, 459)
+)
+def folded() -> float:
+    frequencies = [RATE, 1.5 * RATE, -2 * RATE, 3.9e9, -3.3e9 - 12345.678]
+    return max(departure(one) for one in on_frequency(frequencies, segments=(1, 2)))
+
+
+@FAMILY.case("10 km/s, closing and receding", **of_the_peak(1.3e10, 3e-11))
+def ten_kilometres_a_second() -> float:
+    return max(
+        departure(shots(radial_velocity=v, window=window, fft_size=SIZE))
+        for v in (1e4, -1e4)
+        for window in WINDOWS
+    )
+
+
+@FAMILY.case("Doppler and range beat equal, closing and receding", **of_the_peak(8e7, 1e-12, 178))
+def equal_beats() -> float:
+    range_beat = 2e12 * 2 * 2000.0 / SPEED_OF_LIGHT
+    return max(
+        departure(
+            shots(radial_velocity=sense * range_beat * 1550e-9 / 2, window=window, fft_size=SIZE)
+        )
+        for sense in (1, -1)
+        for window in WINDOWS
+    )
+
+
+@FAMILY.case("zero velocity: the Doppler line on DC and on its image", **of_the_peak(3e7, 2e-13))
+def at_rest() -> float:
+    return max(
+        departure(shots(radial_velocity=0.0, window=window, fft_size=SIZE, **scene))
+        for window in WINDOWS
+        for scene in ({}, {"acquisition_delay": 1e-5}, {"range": 2000.0000003})
+    )
+
+
+@FAMILY.case("receding faster than the range beat", **of_the_peak(3e8, 5e-13))
+def receding() -> float:
+    return max(
+        departure(shots(radial_velocity=v, window="hann", fft_size=SIZE, range=r))
+        for v in (-0.001, -50.0, -150.0)
+        for r in (1.0, 500.0)
+    )
+
+
+def tones(bins: float, **changes: Any) -> Iterator[Shots]:
+    """Shots whose Doppler line lies on a place of the spectrum, every cosine sum."""
+    for window in COSINE_SUMS:
+        v = velocity_for(bins * RATE / SIZE, 1)
+        yield shots(radial_velocity=v, window=window, fft_size=SIZE, **changes)
+
+
+@FAMILY.case("tones exactly on bins: nulls beside them", **of_the_peak(1.5e8, 3e-13))
+def on_bins() -> float:
+    return max(departure(one) for bins in (1.0, 777.0, 1024.0) for one in tones(bins))
+
+
+@FAMILY.case("tones half-way between bins", **of_the_peak(3e8, 5e-13))
+def between_bins() -> float:
+    return max(departure(one) for bins in (0.5, 777.5, 2047.5) for one in tones(bins))
+
+
+@FAMILY.case(
+    "19 beamlets over 20 bins, as amplitudes",
+    reference="exact delay and transform, 40 digits",
+    measure="abs(X), of the peak",
+    allowed=1e-8,
+    limit=4 * np.pi / 1550e-9 * 75.0 * EPS / 2,
+    because="ranges of up to 75 m about the beam's centre, rounded, as optical phase",
+)
+def amplitudes_of_many() -> float:
+    return departure(shots(**spread(), phases="coherent"))
+
+
+@FAMILY.case("19 beamlets over 20 bins, as powers", **of_the_peak(1e8, 1e-13))
+def powers_of_many() -> float:
+    return departure(shots(**spread(), phases="incoherent"))
+
+
+def spread() -> dict[str, Any]:
+    """A footprint of 19 beamlets that spreads over bins, its Doppler line next to DC."""
+    return {
+        "beamlets": 19, "fft_size": SIZE, "window": "hann", "range": 3000.0,
+        "grazing_angle": 0.01, "beam_divergence": 1e-3, "radial_velocity": 0.2,
+    }  # fmt: skip
+
+
+@FAMILY.case(
+    "every window, closed form or table, at DC, on a bin, half-way and folded",
+    reference="time-domain record and its FFT",
+    measure="abs(X), of the peak",
+    allowed=1e-11,
+    limit=2 * np.pi * 3456 * EPS / 2,
+    because="phases f t of the record of up to 3456 cycles, rounded",
+)
+def time_domain() -> float:
+    tables = ("kaiser(8.6)", "chebwin(100)", "dpss(3)", "gaussian(600)", "tukey(0.3)", "bohman")
+    worst = 0.0
+    for window in (*COSINE_SUMS, *tables):
+        for bins in (0.0, 0.5, 300.0, 511.5, 3456.789):
+            v = velocity_for(bins * RATE / 1024, 1)
+            one = shots(radial_velocity=v, window=window, fft_size=1024)
+            for segment in range(3):
+                _, found = spectra.segment_spectrum(one, 0, segment)
+                exact = truth.spectrum(one, 0, segment, range_walk=False)
+                worst = max(worst, float(np.abs(found - exact).max()) / peak(one, 0, segment))
+    return worst
+
+
+@FAMILY.case(
+    "what the time-domain record itself holds",
+    reference="exact delay and transform, 40 digits",
+    measure="abs(X), of the peak",
+    allowed=1e-12,
+    limit=2 * np.pi * 1144 * EPS / 2,
+    because="phases f t of up to 1144 cycles, rounded sample by sample",
+)
+def floor_of_the_truth() -> float:
+    worst = 0.0
+    for window in ("rectangular", "hann"):
+        one = shots(window=window, fft_size=SIZE)
+        for segment in range(3):
+            bins = looked_at(one, segment)
+            record = truth.spectrum(one, 0, segment, range_walk=False)
+            with mp.workdps(40):
+                exact = magnitudes(one, 0, segment, bins)
+                errors = [abs(record[k] - x) for k, x in zip(bins, exact, strict=True)]
+            worst = max(worst, float(max(errors)) / peak(one, 0, segment))
+    return worst
+
+
+RANGES = (1e-3, 1.0, 2e3, 1e6)
+BANDWIDTH, DURATION = 1e9, 500e-6
+
+
+def readings(*velocities: float) -> Iterator[tuple[float, float, float]]:
+    """Errors of range [m] and velocity [m/s] read from exact beats, and the largest beat [Hz].
+
+    Not where a receding target's three unsigned beats are in the order of a closing one's.
+    """
+    carrier = SPEED_OF_LIGHT / 1550e-9
+    for r, v in itertools.product(RANGES, velocities):
+        if v < 0 and r <= -v * DURATION:
+            continue
+        up, doppler, down = (
+            np.abs(
+                beat_frequency(
+                    sign,
+                    carrier=np.float64(carrier + BANDWIDTH * (sign < 0)),
+                    chirp_rate=np.float64(BANDWIDTH / DURATION),
+                    range=np.float64(r),
+                    radial_velocity=np.float64(v),
+                )
+            )
+            for sign in (1, 0, -1)
+        )
+        found = resolve(
+            up=up, doppler=doppler, down=down, carrier=np.float64(carrier),
+            bandwidth=np.float64(BANDWIDTH), duration=np.float64(DURATION),
+            sample_rate=np.float64(1e12), bin_width=np.float64(4577.6),
+        )  # fmt: skip
+        error = abs(float(found.range) - r), abs(float(found.radial_velocity) - v)
+        yield *error, max(float(beat) for beat in (up, doppler, down))
+
+
+@FAMILY.case(
+    "ranges from 1 mm to 1e6 m out of three beats, up to 10 km/s",
+    reference="the range that was put in",
+    measure="range, over the rounding of the largest beat",
+    allowed=6.0,
+    limit=4.0,
+    because="differences of beats of up to 2.7e10 Hz, each the sum of two, rounded",
+)
+def range_out_of_beats() -> float:
+    metres = SPEED_OF_LIGHT / 2 * DURATION / BANDWIDTH
+    found = readings(0.0, 1e-3, 150.0, -150.0, 1e4, -1e4)
+    return max(error / (largest * EPS / 2 * metres) for error, _, largest in found)
+
+
+@FAMILY.case(
+    "velocities from 1 um/s to 10 km/s out of three beats, to 1e6 m",
+    reference="the velocity that was put in",
+    measure="velocity, over the rounding of the largest beat",
+    allowed=6.0,
+    limit=4.0,
+    because="sums and differences of beats, each the sum of two, rounded",
+)
+def velocity_out_of_beats() -> float:
+    found = readings(1e-6, -1e-3, 150.0, -150.0, 1e4)
+    return max(error / (largest * EPS / 2 * 1550e-9 / 2) for _, error, largest in found)

@@ -1,0 +1,254 @@
+"""Sidelobes far below the peak, of every window, and what they do to the detection."""
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+from cases import EPS, Family
+from exact_spectrum import magnitudes, transform
+from hard_marcum import mixture
+from table_shots import shots
+
+from sweep.model import modulation
+from sweep.model.segments import inspect_segment, workspace
+from sweep.model.shot import find
+from sweep.model.spectrum import bin_magnitudes, tangents
+from sweep.model.window import COSINE_SUMS, samples, window
+
+FAMILY = Family(
+    "Sidelobes",
+    "The window's transform W beside its line, image left out. Cosine sums of m terms fall as the "
+    "distance's power 1 to 2m - 1, out of terms that are larger by as much: their relative error "
+    "shows whether digits cancel. Windows without a closed form come from a table, and are held to "
+    "the peak.",
+)
+SIZES = (2**10, 2**14, 2**17, 2**20, 2**24)
+OFFSETS = (0.4061, -0.49999, 0.5)
+PEAK = {
+    "measure": "abs(X), of the peak",
+    "reference": "sum over all samples, exactly rounded",
+}
+
+
+def kernel(name: str, size: int, delta: float, bins: Iterable[int]) -> Iterator[float]:
+    """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
+    w, table = window(name, size), tangents(size)
+    shape = (w.coefficients, w.numerator, w.poles, w.edge, w.table)
+    out, scratch, work = np.empty(1), np.empty(1), np.empty((3, 1))
+    line = np.array([delta]), np.ones(1), np.zeros(1), 1
+    for k in bins:
+        bin_magnitudes(k, k, 0, *line, (size, size), shape, False, table, out, scratch, work, False)
+        yield float(out[0])
+
+
+def far(size: int) -> list[int]:
+    """Bins from beside the main lobe of any window to well before Nyquist."""
+    return [9, 10, 17, 40, 123, size // 16, size // 4, size // 3]
+
+
+def relative_error(name: str) -> float:
+    """Worst error of far sidelobes, relative to themselves."""
+    worst = 0.0
+    with mp.workdps(100):
+        for size in SIZES:
+            for delta in OFFSETS:
+                bins = far(size)
+                for k, found in zip(bins, kernel(name, size, delta, bins), strict=True):
+                    exact = abs(transform(name, size, k - mp.mpf(delta)))
+                    worst = max(worst, float(abs(found / exact - 1)))
+    return worst
+
+
+def condition(name: str) -> float:
+    """Largest ratio of the terms' magnitudes to what they add up to, over those bins."""
+    w, largest = window(name, 2**14), 1.0
+    for delta in OFFSETS:
+        square = np.tan(np.pi * (np.array(far(2**14)) - delta) / 2**14) ** 2
+        terms = [c * square**i for i, c in enumerate(w.numerator)]
+        largest = max(largest, float((sum(map(np.abs, terms)) / np.abs(sum(terms))).max()))
+    return largest
+
+
+def closed_forms() -> None:
+    """A case for each window in closed form."""
+    for name in COSINE_SUMS:
+        times = condition(name)
+        FAMILY.case(
+            f"{name}, 2^10 to 2^24 points, bins to N/3",
+            reference="sum of the terms, 100 digits",
+            measure="abs(W), of itself",
+            allowed=2e-15 + 4 * EPS * times,
+            limit=4 * EPS * times,
+            because=f"four roundings of terms {times:.0f} times their sum",
+        )(lambda name=name: relative_error(name))
+
+
+closed_forms()
+
+
+@FAMILY.case(
+    "the last bins before Nyquist, 2^10 to 2^24 points, where Hann's sidelobes go through zero",
+    reference="sum of the terms, 100 digits",
+    measure="abs(W), of itself over N",
+    allowed=4 * EPS,
+    limit=EPS,
+    because="a place of N/2 bins, rounded, a bin from where W is 0",
+)
+def last_bins() -> float:
+    worst = 0.0
+    with mp.workdps(100):
+        for name in COSINE_SUMS:
+            for size in (2**10, 2**17, 2**24):
+                bins = [size // 2 - 3, size // 2 - 1]
+                for k, found in zip(bins, kernel(name, size, 0.4061, bins), strict=True):
+                    exact = abs(transform(name, size, k - mp.mpf(0.4061)))
+                    worst = max(worst, float(abs(found / exact - 1)) / size)
+    return worst
+
+
+@FAMILY.case(
+    "main lobes and nulls of all closed forms, lines 1e-9 of a bin off their bin",
+    reference="sum of the terms, 100 digits",
+    measure="abs(W), of the peak",
+    allowed=2e-15,
+    limit=4 * EPS,
+    because="four roundings of the peak",
+)
+def main_lobes() -> float:
+    worst, bins = 0.0, [*range(9), 511, 512]
+    with mp.workdps(100):
+        for name in COSINE_SUMS:
+            for delta in (0.0, 1e-300, 1e-9, 0.25, 0.5):
+                unit = window(name, 1024).sum
+                for k, found in zip(bins, kernel(name, 1024, delta, bins), strict=True):
+                    exact = abs(transform(name, 1024, k - mp.mpf(delta)))
+                    worst = max(worst, float(abs(found - exact)) / unit)
+    return worst
+
+
+def by_samples(name: str, size: int, delta: float, k: int) -> float:
+    """|W| by the plain sum: phases of whole cycles taken off exactly, sums rounded once."""
+    w, n = samples(name, size), np.arange(size)
+    turns = (n * k % size) / size - n * (delta / size)
+    real, imaginary = w * np.cos(2 * np.pi * turns), w * np.sin(2 * np.pi * turns)
+    return math.hypot(math.fsum(real), math.fsum(imaginary))
+
+
+def tabulated_error(names: Iterable[str], sizes: Iterable[int], bins: Iterable[int]) -> float:
+    """Worst error of windows without a closed form, over the peak."""
+    worst = 0.0
+    for name in names:
+        for size in sizes:
+            for delta in (0.4061, 0.5, 1e-9):
+                chosen = [*bins, size // 3, size // 2]
+                for k, found in zip(chosen, kernel(name, size, delta, chosen), strict=True):
+                    exact = by_samples(name, size, delta, k)
+                    worst = max(worst, abs(found - exact) / window(name, size).sum)
+    return worst
+
+
+TAPERED = ("kaiser(14)", "chebwin(100)", "dpss(3)", "bohman", "parzen", "barthann")
+
+
+@FAMILY.case(
+    "tabulated windows that end near zero, 2^8 to 2^14 points",
+    allowed=1e-13, limit=EPS, because="one rounding of the peak", **PEAK,
+)  # fmt: skip
+def tapered() -> float:
+    return tabulated_error(TAPERED, (2**8, 2**11, 2**14), (0, 1, 2, 7, 33))
+
+
+@FAMILY.case(
+    "tabulated windows that end near zero, 2^18 to 2^20 points",
+    allowed=3e-13, limit=EPS, because="one rounding of the peak", slow=True, **PEAK,
+)  # fmt: skip
+def tapered_long() -> float:
+    return tabulated_error(TAPERED[:2], (2**18, 2**20), (1, 33))
+
+
+@FAMILY.case(
+    "tabulated windows with a step at their ends",
+    allowed=2e-11, limit=EPS, because="one rounding; the table's polynomial is of degree 9", **PEAK,
+)  # fmt: skip
+def stepped() -> float:
+    return tabulated_error(
+        ("gaussian(300)", "kaiser(1)", "tukey(0.05)"), (2**10,), (0, 1, 2, 7, 33)
+    )
+
+
+def strong(**changes: Any) -> dict[str, Any]:
+    """A line so far above the noise that bins across the whole spectrum cross the threshold."""
+    return {
+        "fft_size": 4096,
+        "range": 300.0,
+        "power": 1e3,
+        "tnr": 5.0,
+        "effects": LEAKING,
+    } | changes
+
+
+LEAKING = ("footprint", "footprint_phase", "doppler", "leakage")
+
+
+@FAMILY.case(
+    "sidelobes as few sources, where detection and leakage look at them",
+    reference="exact delay and transform, 40 digits",
+    measure="abs(X), of itself",
+    allowed=1e-9,
+    limit=2e-11,
+    because="the line's place, rounded at bin 1400, against its distance from the nearest bin",
+)
+def few_sources() -> float:
+    worst = 0.0
+    for name in ("hann", "hamming", "blackman", "rectangular"):
+        one = shots(**strong(window=name))
+        point = modulation.single(one, 0)
+        room, exempt, series = workspace(point.lines, one.fft_size)
+        low, count, *_ = inspect_segment(
+            0, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0),
+            modulation.choices(one), one.kernel(), room, exempt, series,
+        )  # fmt: skip
+        found = room[0, :count]
+        chosen = np.unique(np.geomspace(1, count, 25).astype(int)) - 1
+        with mp.workdps(40):
+            exact = magnitudes(one, 0, 0, [low + int(k) for k in chosen], image=False)
+            errors = [abs(float(found[k]) / x - 1) for k, x in zip(chosen, exact, strict=True)]
+        worst = max(worst, float(max(errors)))
+    return worst
+
+
+@FAMILY.case(
+    "leakage of 1000 bins, from 1e-12 to 1, many of each far below it",
+    reference="every bin in 30 digits, chances as mixtures of chi-square tails",
+    measure="leakage",
+    allowed=1e-6,
+    limit=1e-10,
+    because="magnitudes to 1e-11, times threshold over noise; the integral is meant to 1e-6",
+)
+def leakage() -> float:
+    worst = 0.0
+    for name, r in (("hann", 100.0), ("hamming", 1500.0)):
+        one = shots(LEAKING, window=name, fft_size=2048, range=r)
+        found = find(one)[0]
+        worst = max(worst, abs(found[5, 0] / exact_leakage(one, int(found[4, 0])) - 1))
+    return worst
+
+
+def exact_leakage(one: Any, exempted: int) -> float:
+    """Chance that a bin of the up segment but those about the peak crosses, over noise alone."""
+    sigma, level = float(one.bin_deviation[0]), float(one.threshold[0])
+    with mp.workdps(30):
+        bins = magnitudes(one, 0, 0, range(one.fft_size // 2 + 1), image=False)
+        crossing = [k for k, x in enumerate(bins) if x >= min(level, max(bins))]
+        exempt = {k + j for k in crossing for j in (-1, 0, 1)}
+        assert len(exempt) == exempted
+        beta = mp.mpf(level) / sigma
+        below = -mp.expm1(-(beta**2) / 2)
+        logs = [
+            mp.log1p(-mixture(x / sigma, beta) / below)
+            for k, x in enumerate(bins)
+            if k not in exempt
+        ]
+        return float(-mp.expm1(mp.fsum(logs)))

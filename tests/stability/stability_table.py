@@ -1,0 +1,72 @@
+"""Writes docs/stability.md, every hard case and the worst error found: `make stability`."""
+
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+from cases import Case, Family, families
+
+PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
+HEAD = """# Numerical stability, case by case
+
+Written by `make stability` from the cases in `tests/stability`, which the tests hold to the same
+figures (`make test` all but the longest, `make test-all` those too). Each case is named for what is
+hard about it and held against a reference of higher precision or of another kind. `worst` is the
+largest error found, as an error of what `error in` says, `allowed` what the tests allow. `float64`
+estimates what double precision alone must be expected to cost there, for the reason that follows:
+an error of that size is as good as any computation in doubles from the same numbers.
+"""
+COLUMNS = (
+    "case", "against", "error in", "worst", "allowed", "float64", "because of",
+)  # fmt: skip
+
+
+def figure(value: float) -> str:
+    """An error to two digits."""
+    return f"{value:.1e}" if value else "0"
+
+
+def row(case: Case) -> str:
+    """A case's row of the table."""
+    begun = time.perf_counter()
+    worst = case.find()
+    took = time.perf_counter() - begun
+    met = "" if worst <= case.allowed else "  MISSED"
+    print(
+        f"{took:7.2f} s  {figure(worst):>8} of {figure(case.allowed)}: {case.hard}{met}", flush=True
+    )
+    cells = (
+        case.hard, case.reference, case.measure, figure(worst), figure(case.allowed),
+        figure(case.limit), case.because,
+    )  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def section(family: Family) -> str:
+    """A family's part of the page."""
+    print(family.title, flush=True)
+    head = ["| " + " | ".join(COLUMNS) + " |", "|" + " --- |" * len(COLUMNS)]
+    return "\n".join(
+        [
+            f"## {family.title}",
+            "",
+            textwrap.fill(family.about, 100),
+            "",
+            *head,
+            *map(row, family.cases),
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    """The whole page; of the families named alone, nothing is written."""
+    chosen = [f for f in families() if not sys.argv[1:] or f.title in sys.argv[1:]]
+    sections = [section(family) for family in chosen]
+    if not sys.argv[1:]:
+        PAGE.write_text(HEAD + "\n" + "\n".join(sections), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
