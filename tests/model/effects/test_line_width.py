@@ -154,6 +154,24 @@ def test_the_density_is_the_transform_of_the_lags():
         assert found == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.parametrize("laser_width", [0.015 * RATE, 0.017 * RATE, RATE, 1e5 * RATE])
+@pytest.mark.parametrize("delay", [0.3, 20, 1000])
+def test_a_line_about_as_wide_as_the_band_leaves_noise_of_its_own_power(laser_width, delay):
+    """Either side of where lags are taken one by one, and far beyond: never more than there is."""
+    y, lags = np.array([0.0, 0.5, 7.3, -100.0]), np.arange(LENGTH)
+    g = 2 * np.pi * laser_width / RATE
+    expected = by_lags("hann", y, np.exp(-g * np.minimum(lags, delay)))
+    found, pedestal = lorentzian_power("hann", y, laser_width, delay / RATE)
+    kinks = g / (10 * delay**2) if g < 0.1 else 0.0
+    assert np.abs(found - expected).max() < (1e-6 + kinks) * found.max()
+    even = 1 + 2 * np.exp(-g) / -np.expm1(-g)  # the sum over all lags, without a window
+    assert pedestal.max() <= window("hann", LENGTH).energy * even * (1 + 1e-6)
+    change = line_width.lorentzian_bound(
+        line_width=laser_width, delay=delay / RATE, duration=DURATION, sample_rate=RATE, cnr=10.0
+    )
+    assert 10.0 * pedestal.max() / window("hann", LENGTH).energy <= change.noise[1] - 1
+
+
 def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_energy():
     length = 4096
     laser = {"line_width": np.array([1e3]), "delay": np.array([40 / RATE])}
