@@ -97,9 +97,7 @@ class Unit:
             Where the value exceeds what a float holds.
         """
         try:
-            if self.decibel:
-                return float(10.0 ** (float(value) / 10.0))
-            return float(self.factor * value + self.offset)
+            return float(_ratio(value) if self.decibel else self.factor * value + self.offset)
         except OverflowError:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
 
@@ -293,6 +291,14 @@ def _power(factor: Fraction, exponent: Fraction) -> Fraction:
         context.prec = 50  # rounded once more, so that the root of a cube is exact
         root = +root
     return Fraction(root) ** exponent.numerator
+
+
+def _ratio(decibels: Fraction) -> Fraction:
+    """Power ratio of so many decibels, to 50 digits; of more than a float can hold, 1e400."""
+    with localcontext() as context:
+        context.prec = 50
+        exponent = Decimal(decibels.numerator) / decibels.denominator / 10
+        return Fraction(Decimal(10) ** max(min(exponent, Decimal(400)), Decimal(-400)))
 
 
 def _near_miss(name: str, si_unit: str, example: str) -> str:

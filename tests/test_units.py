@@ -90,6 +90,18 @@ def test_a_written_quantity_gives_exactly_its_si_value(written, si_unit, value):
     assert si(written, si_unit) == value
 
 
+@pytest.mark.parametrize("text", ["3", "-2", "0.1", "29.9", "-155.3", "3000", "-3200", "1e-9"])
+def test_decibels_are_rounded_once(text):
+    with mpmath.workdps(60):
+        assert si(f"{text} dB", "dB") == float(mpmath.mpf(10) ** (mpmath.mpf(text) / 10))
+
+
+def test_decibels_beyond_a_float_are_refused_and_far_below_it_nothing():
+    with pytest.raises(QuantityError, match="a float holds"):
+        si("1e300 dB", "dB")
+    assert si("-1e300 dB", "dB") == 0.0
+
+
 def test_three_decibels_are_a_power_ratio_and_no_amplitude_ratio():
     assert si("3 dB", "dB") == pytest.approx(1.99526231496888, rel=1e-14)
 
