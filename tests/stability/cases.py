@@ -19,6 +19,7 @@ EPS = sys.float_info.epsilon
 
 MODULES = (
     "hard_marcum", "hard_chances", "hard_beats", "hard_sidelobes", "hard_geometry",
+    "hard_radiometry", "hard_sizes", "hard_units", "hard_meshes", "hard_statistics",
 )  # fmt: skip
 """Families in the order in which the page shows them."""
 

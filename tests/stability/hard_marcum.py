@@ -103,9 +103,7 @@ def no_signal() -> float:
 
 @FAMILY.case("upper tail: 1e-300 and what lies about it", reference=INTEGRAL, **ROUNDED)
 def upper_tail() -> float:
-    return worst(
-        [(a, a + d) for a in (0.5, 5.0, 100.0, 1e8) for d in (9.0, 37.0, 37.5)], integrated
-    )
+    return worst([(a, a + d) for a in (0.5, 5.0, 100.0, 1e8) for d in (9.0, 37.5)], integrated)
 
 
 @FAMILY.case("lower tail: 1e-300 and what lies about it", reference=INTEGRAL, **ROUNDED)

@@ -220,7 +220,7 @@ def few_sources() -> float:
 
 
 @FAMILY.case(
-    "leakage of 1000 bins, from 1e-12 to 1, many of each far below it",
+    "leakage of 600 bins, from 1e-12 to 1, many of each far below it",
     reference="every bin in 30 digits, chances as mixtures of chi-square tails",
     measure="leakage",
     allowed=1e-6,
@@ -230,7 +230,7 @@ def few_sources() -> float:
 def leakage() -> float:
     worst = 0.0
     for name, r in (("hann", 100.0), ("hamming", 1500.0)):
-        one = shots(LEAKING, window=name, fft_size=2048, range=r)
+        one = shots(LEAKING, window=name, fft_size=1280, range=r)
         found = find(one)[0]
         worst = max(worst, abs(found[5, 0] / exact_leakage(one, int(found[4, 0])) - 1))
     return worst

@@ -29,6 +29,8 @@ def figure(value: float) -> str:
 
 def row(case: Case) -> str:
     """A case's row of the table."""
+    if case.needs and not case.needs.exists():
+        sys.exit(f"the page would lack a figure without {case.needs}")
     begun = time.perf_counter()
     worst = case.find()
     took = time.perf_counter() - begun

@@ -87,7 +87,8 @@ class Caster:
     embree : bool
         Start single rays from Embree's guess. Without it (the reference) every ray walks the
         float64 hierarchy, and results are the same bit for bit on any machine; with it, rays
-        that pass a silhouette within float32's resolution may see the surface behind.
+        that pass a silhouette within float32's resolution may see the surface behind, and so may
+        all where two surfaces are nearer to each other than that, 1e-7 of the range.
 
     Raises
     ------

@@ -1,0 +1,256 @@
+"""Means, variances and tallies of few, equal, nearly equal and vanishing numbers."""
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+from cases import EPS, Family
+from table_shots import parameters
+
+from sweep.model.draws import simulate
+from sweep.model.effects.catalogue import CORE
+from sweep.model.navigation_tally import Tally, merge
+from sweep.model.outputs import OUTPUTS
+from sweep.model.realisations import Means
+
+FAMILY = Family(
+    "Statistics",
+    "Running means and sums of squared deviations, draw by draw [Welford]. A variance of n numbers "
+    "whose mean is kappa times their deviation is known to kappa eps at the best from a mean that "
+    "is a float. Deviations are squared: where they are below 1e-154 their standard error is 0. "
+    "Tallies are merged as sums of parts.",
+)
+SETS = {
+    "one": [0.3],
+    "two": [0.25, 0.75],
+    "never": [0.0] * 1000,
+    "always": [1.0] * 1000,
+    "once": [0.0] * 999 + [1.0],
+    "spread": list(np.random.default_rng(1).uniform(size=1000)),
+    "tiny": list(1e-140 * np.random.default_rng(2).uniform(size=1000)),
+    "huge": list(1e150 * np.random.default_rng(3).normal(size=1000)),
+}
+
+
+def summed(values: Sequence[float], pieces: int = 7) -> dict[str, float]:
+    """Results of :class:`Means` for draws of every output, added in pieces."""
+    means = Means(1)
+    for part in np.array_split(np.asarray(values, float), pieces):
+        outputs = dict.fromkeys(OUTPUTS, part)
+        means.add(np.zeros(part.size, np.int64), outputs)
+    return {name: float(value[0]) for name, value in means.results().items()}
+
+
+def exactly(values: Sequence[float]) -> tuple[Fraction, Fraction]:
+    """Mean and squared standard error of it, in fractions."""
+    exact = [Fraction(float(x)) for x in values]
+    mean = sum(exact) / len(exact)
+    square = sum((x - mean) ** 2 for x in exact)
+    return mean, square / (len(exact) * max(len(exact) - 1, 1))
+
+
+def moment_errors(values: Sequence[float]) -> tuple[float, float]:
+    """Relative error of the mean, over the mean magnitude, and of the standard error."""
+    found, (mean, square) = summed(values), exactly(values)
+    size = float(sum(map(abs, map(Fraction, map(float, values)))) / len(values)) or 1.0
+    of_mean = abs(float(Fraction(found["pd_up"]) - mean)) / size
+    with mp.workdps(40):
+        error = mp.sqrt(mp.mpf(square.numerator) / square.denominator)
+        if len(values) == 1:
+            return of_mean, 0.0 if math.isnan(found["pd_up_error"]) else math.inf
+        if not error:
+            return of_mean, abs(found["pd_up_error"])
+        return of_mean, float(abs(found["pd_up_error"] / error - 1))
+
+
+@FAMILY.case(
+    "one draw, two, no success, all successes, one in a thousand, 1e-140, 1e150",
+    reference="fractions",
+    measure="mean, and its standard error (of one draw: nan)",
+    allowed=2e-14,
+    limit=1000**0.5 * EPS,
+    because="a thousand steps, rounded",
+)
+def means() -> float:
+    return max(max(moment_errors(values)) for values in SETS.values())
+
+
+def near(kappa: float, number: int = 1000) -> list[float]:
+    """Numbers about 1 with a deviation of 1 / kappa."""
+    return list(1.0 + np.random.default_rng(4).normal(size=number) / kappa)
+
+
+@FAMILY.case(
+    "variances of numbers equal to 3, 8, 12 and 14 digits",
+    reference="fractions",
+    measure="standard error, over kappa eps + 1000 eps",
+    allowed=1.0,
+    limit=1.0,
+    because="the mean, rounded, against the deviation",
+)
+def near_equal() -> float:
+    return max(
+        moment_errors(near(10.0**digits))[1] / ((10.0**digits + 1000) * EPS)
+        for digits in (3, 8, 12, 14)
+    )
+
+
+@FAMILY.case(
+    "numbers equal but for their last bit, 1000 of them",
+    reference="fractions",
+    measure="standard error",
+    allowed=1.0,
+    limit=1.0,
+    because="deviations of half a step about a mean that is a float",
+)
+def last_bit() -> float:
+    values = [np.nextafter(1.0, 2.0) if k % 2 else 1.0 for k in range(1000)]
+    return moment_errors(values)[1]
+
+
+@FAMILY.case(
+    "a million equal numbers, of 1/3, 0.1 and 1e-300",
+    reference="the number, and no deviation",
+    measure="mean; standard error in units of the number",
+    allowed=0.0,
+    limit=0.0,
+    because="nothing is rounded",
+)
+def equal_numbers() -> float:
+    worst = 0.0
+    for value in (1 / 3, 0.1, 1e-300):
+        found = summed(np.full(10**6, value), 3)
+        worst = max(worst, abs(found["pd_up"] / value - 1), found["pd_up_error"] / value)
+    return worst
+
+
+@FAMILY.case(
+    "probabilities of 1 to 1000 steps of 5e-324",
+    reference="fractions",
+    measure="mean, in steps of 5e-324",
+    allowed=100.0,
+    limit=50.0,
+    because="a hundred means, each rounded to whole steps",
+)
+def denormal_means() -> float:
+    step = 5e-324
+    values = step * np.random.default_rng(5).integers(1, 1000, 100)
+    found, (mean, _) = summed(values), exactly(values)
+    return float(abs(Fraction(found["pd_up"]) - mean) / Fraction(step))
+
+
+LOGARITHMS = {
+    "far below": [-1e5, -1e5 + 1, -2e5],
+    "wide": [-3000.0, -0.1, -400.0, -20.0],
+    "none": [-math.inf] * 5,
+    "some": [-math.inf, -310.5, -math.inf, -310.25, -np.inf],
+    "equal": [-10.0 / 3] * 1000,
+    "many": list(-np.random.default_rng(6).uniform(0, 700, 1000)),
+}
+
+
+@FAMILY.case(
+    "log10 of means of chances from 1 to 1e-200000, some of them 0",
+    reference="sum of powers, 60 digits",
+    measure="logarithm (as a chance where it is near 0)",
+    allowed=1e-13,
+    limit=1000**0.5 * EPS,
+    because="a thousand additions, rounded",
+)
+def logarithms() -> float:
+    worst = 0.0
+    with mp.workdps(60):
+        for values in LOGARITHMS.values():
+            found = summed(values)["log10_pfa_bin"]
+            powers = [mp.mpf(10) ** mp.mpf(float(x)) for x in values if x > -math.inf]
+            if not powers:
+                worst = max(worst, 0.0 if found == -math.inf else math.inf)
+                continue
+            exact = mp.log10(mp.fsum(powers) / len(values))
+            worst = max(worst, float(abs(found - exact) / max(1, abs(exact))))
+    return worst
+
+
+def counts(method: str, number: int, **changes: Any) -> dict[str, np.ndarray]:
+    """Detections and false alarms of so many draws."""
+    return simulate(
+        parameters(fft_size=1024, **changes), CORE, keys=np.array([[7, 11]], np.uint64),
+        batch_sizes=[number], method=method,
+    )  # fmt: skip
+
+
+@FAMILY.case(
+    "one draw and a thousand, of which all succeed, or none does",
+    reference="the number of draws; none",
+    measure="draws counted wrongly",
+    allowed=0.0,
+    limit=0.0,
+    because="counts are whole",
+)
+def all_or_none() -> float:
+    wrong = 0
+    for method in ("probabilities", "noise"):
+        for number in (1, 1000):
+            bright = counts(method, number, power=1e3, range=100.0, tnr=20.0)
+            dark = counts(method, number, reflectance=0.0, tnr=40.0)
+            wrong += int(number - bright["n_detected_shot"].sum() + dark["n_detected_shot"].sum())
+            wrong += int(bright["n_false_alarm_shot"].sum() + dark["n_false_alarm_shot"].sum())
+    return float(wrong)
+
+
+def tally_of(errors: np.ndarray) -> Tally:
+    """Tally of errors (n, m), one by one."""
+    return merge([one_error(error) for error in errors])
+
+
+def one_error(error: np.ndarray) -> Tally:
+    one, size = np.array(1), error.size
+    return Tally(one, one, error, np.zeros((size, size)), np.zeros((size, size)))
+
+
+@FAMILY.case(
+    "tallies of single errors about a bias 1e6 times their deviation, merged one by one",
+    reference="fractions",
+    measure="covariance, over kappa eps + 1000 eps",
+    allowed=1.0,
+    limit=1.0,
+    because="the mean, rounded, against the deviation",
+)
+def tallies() -> float:
+    worst = 0.0
+    for kappa in (1.0, 1e3, 1e6):
+        errors = 1.0 + np.random.default_rng(8).normal(size=(500, 2)) / kappa
+        found = tally_of(errors).covariance
+        exact = [[Fraction(float(x)) for x in column] for column in errors.T]
+        mean = [sum(column) / 500 for column in exact]
+        for i in range(2):
+            square = sum((x - mean[i]) ** 2 for x in exact[i]) / 499
+            apart = abs(float(Fraction(float(found[i, i])) / square - 1))
+            worst = max(worst, apart / ((kappa + 1000) * EPS))
+    return worst
+
+
+@FAMILY.case(
+    "tallies without a solution, with one, and of both",
+    reference="nan, the error itself, no covariance",
+    measure="what differs",
+    allowed=0.0,
+    limit=0.0,
+    because="nothing is rounded",
+)
+def empty_tallies() -> float:
+    zero = np.zeros(2)
+    nothing = Tally(np.array(3), np.array(0), zero, np.zeros((2, 2)), np.zeros((2, 2)))
+    alone = one_error(np.array([0.1, -3.0]))
+    both = nothing + alone
+    same: Callable[..., bool] = np.array_equal
+    return float(
+        (not np.isnan(nothing.bias).all())
+        + (not np.isnan(alone.covariance).all())
+        + (not same(both.bias, alone.bias))
+        + (float(both.availability) != 0.25)
+        + (not same(alone.rmse, np.abs(alone.bias)))
+    )
