@@ -1,4 +1,5 @@
-"""Rules that join several fields: a chirp longer than its echo's delay, samples to transform.
+"""Rules that join several fields: a chirp longer than its echo's delay, samples to transform,
+no more electrons than photons.
 
 They are held against the whole grid of a study, by its extremes.
 """
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from sweep.spec.axes import Axis
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding, Location
@@ -21,6 +22,8 @@ RANGE = "target.range"
 DURATION = "instrument.chirp.duration"
 DELAY = "instrument.processing.acquisition_delay"
 SAMPLE_RATE = "instrument.processing.sample_rate"
+RESPONSIVITY = "instrument.receiver.responsivity"
+WAVELENGTH = "instrument.laser.wavelength"
 
 Condition = Callable[[np.ndarray], np.ndarray]
 """What holds or does not for each of several values."""
@@ -94,6 +97,24 @@ def grid_findings(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[Fin
         The axes.
     """
     known = set(values) | {member.path for axis in axes for member in axis.members}
+    findings = _time_findings(values, axes, known)
+    if {RESPONSIVITY, WAVELENGTH} <= known:
+        per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
+        spare = _smallest_sum({WAVELENGTH: per_metre, RESPONSIVITY: -1.0}, values, axes)
+        if spare < 0:
+            rule = (
+                "must not exceed that of one electron a photon, q lambda / (h c), over the whole "
+                f"grid, and does so by {-spare:.3g} A/W at its worst"
+            )
+            remedy = "lower it; the gain of an avalanche is 'apd_gain'"
+            findings += [Finding(place_on_grid(RESPONSIVITY, axes), rule, remedy, ABSENT)]
+    return findings
+
+
+def _time_findings(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], known: set[str]
+) -> list[Finding]:
+    """What is wrong with the chirp's duration, of the parameters that are known."""
     if not {DURATION, DELAY} <= known:
         return []
     location = place_on_grid(DURATION, axes)

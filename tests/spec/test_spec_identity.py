@@ -123,6 +123,7 @@ def other_value(path):
         "instrument.processing.sample_rate": "601 MHz",
         "instrument.chirp.duration": "501 us",
         "instrument.receiver.mixing_efficiency": 0.3,
+        "instrument.receiver.responsivity": "1 A/W",
         "instrument.telescope.optical_efficiency": 0.3,
         "instrument.receiver.modulation_index": 0.3,
         "target.reflectance": 0.3,

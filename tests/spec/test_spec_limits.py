@@ -43,6 +43,23 @@ def test_a_record_of_fewer_than_two_samples_is_refused():
     assert "2 samples" in refused({RATE: "4 kHz", DELAY: "1 us"})
 
 
+def test_a_responsivity_of_more_than_one_electron_a_photon_is_refused():
+    """q lambda / (h c) is 0.8065544 A/W a micrometre: 1.2501593 A/W at 1550 nm."""
+    path, wavelength = "instrument.receiver.responsivity", "instrument.laser.wavelength"
+    Spec.from_mapping(written({path: "1.25015 A/W"}))
+    Spec.from_mapping(written(axes={wavelength: ["1.5 um", "2 um"]}))
+    for changes, axes, place, over in (
+        ({path: "1.25017 A/W"}, {}, path, "1.07e-05 A/W"),
+        ({}, {wavelength: ["1 um", "2 um"]}, path, "0.293 A/W"),
+        ({}, {path: ["1 A/W", "2 A/W"]}, f"axes.{path}", "0.75 A/W"),
+    ):
+        with pytest.raises(SpecError) as caught:
+            Spec.from_mapping(written(changes, axes=axes))
+        (mistake,) = caught.value.mistakes
+        assert mistake.path == place
+        assert over in mistake.rule and "apd_gain" in mistake.suggestion
+
+
 def test_extremes_of_plain_axes_are_combined():
     assert not refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["420 us", "500 us"]})
     assert refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["390 us", "500 us"]})
