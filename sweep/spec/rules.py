@@ -128,13 +128,21 @@ class Numeric(Rule):
         known = dict(self.words)
         if isinstance(written, str) and written in known:
             return known[written]
+        try:
+            return self._read(written)
+        except QuantityError as error:
+            words = "".join(f" or '{word}'" for word in known)
+            remedy = error.suggestion or f"write e.g. '{self.example}'{words}"
+            raise QuantityError(error.rule, remedy) from None
+
+    def _read(self, written: object) -> float | int:
         number, unit = self.exact(written)
         if self.whole and number.denominator != 1:
-            raise QuantityError("must be a whole number", f"write e.g. {self.example}")
+            raise QuantityError("must be a whole number")
         value = unit.to_si(number)
         broken = self.first_outside(np.array([value]))
         if broken is not None:
-            raise QuantityError(broken[1], f"or write {', '.join(known)}" if known else "")
+            raise QuantityError(broken[1])
         return int(number) if self.whole else value
 
     def first_outside(self, values: np.ndarray) -> tuple[int, str] | None:

@@ -5,6 +5,8 @@ import yaml
 from written_specs import written
 
 from sweep.spec import Spec, SpecError, load
+from sweep.spec.fields import parameter_rules
+from sweep.spec.rules import Numeric
 
 
 def mistakes_of(mapping):
@@ -58,7 +60,7 @@ FIELDS = [
     ("target.grazing_angle", 15, "write e.g. '15 deg'"),
     ("target.range", ..., "write e.g. 'range: 2 km', or put it on an axis"),
     ("target.radial_velocity", "2e6 m/s", "must be at most 1000 km/s"),
-    ("footprint.beamlets", 0, "must be at least 1 (you wrote 0); or write auto"),
+    ("footprint.beamlets", 0, "must be at least 1 (you wrote 0); write e.g. '109' or 'auto'"),
     ("footprint.beamlets", "atuo", "must be a number or auto (you wrote 'atuo')"),
     ("footprint.pattern", "grid", "must be one of auto, hexagonal"),
     ("footprint.phases", "random", "must be one of coherent, incoherent"),
@@ -94,6 +96,8 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
     (mistake,) = mistakes_of(written({path: value}))
     assert mistake.path == path
     assert words in str(mistake)
+    if isinstance(parameter_rules().get(path), Numeric):
+        assert mistake.suggestion
 
 
 AXES = [
