@@ -1,6 +1,6 @@
 """Shots of the instrument of Table 4.1, any of its parameters changed by name."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,27 @@ from sweep.spec import Spec
 ROOT = Path(__file__).parents[2]
 
 
-@cache
-def _table_4_1() -> dict[str, Any]:
+def study(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A spec of one shot as it is written, with values changed by their dotted path."""
     target = {"range": "2 km", "grazing_angle": "90 deg", "reflectance": 0.1}
-    written = {
+    written: dict[str, Any] = {
         "title": "Table 4.1",
-        "instrument": "experiments/instruments/table_4_1.yaml",
+        "instrument": {"file": "experiments/instruments/table_4_1.yaml"},
         "target": target | {"radial_velocity": "150 m/s", "reflectance_law": "thesis"},
         "footprint": {"beamlets": 1, "phases": "coherent"},
     }
-    return DEFAULTS | Spec.from_mapping(written, base=ROOT).parameters_at({})
+    for path, value in changes.items():
+        *sections, name = path.split(".")
+        part = written
+        for section in sections:
+            part = part.setdefault(section, {})
+        part[name] = value
+    return written
+
+
+@cache
+def _table_4_1() -> dict[str, Any]:
+    return DEFAULTS | Spec.from_mapping(study({}), base=ROOT).parameters_at({})
 
 
 def parameters(**changes: Any) -> dict[str, Any]:
