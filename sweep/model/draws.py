@@ -5,7 +5,8 @@ the probability of a false alarm (noise and leakage together). ``noise`` adds co
 noise to the bins that hold signal and looks; over the other bins, which hold noise alone, the
 largest magnitude is drawn exactly from its order statistic. Both take the bins' noise as
 independent, as the closed forms do. Where effects are random, each draw has a spectrum and
-probabilities of its own (:mod:`sweep.model.realisations`), and its noise with them.
+probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling`, which also says
+when to stop.
 
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
@@ -23,9 +24,7 @@ from sweep.model.effects.catalogue import CORE
 from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.realisations import Means, certain, outputs_of, random_effects, realise
 from sweep.model.segments import inspect_bins, workspace
-from sweep.model.shot import evaluate
 
 METHODS = ("probabilities", "noise")
 
@@ -94,72 +93,27 @@ def draw(
     dict of (n, batches) int64 ndarray
         By the names of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
-    ends, counts = _batches(len(keys), first_draw, batch_sizes, method)
+    ends = first_draw + np.cumsum([0, *batch_sizes])
+    counts = no_counts(len(keys), len(batch_sizes), method)
     if method == "probabilities":
-        _count_by_chance(_all_draws(np.arange(len(keys)), keys, ends), ends, outputs, counts)
+        count_by_chance(_all_draws(np.arange(len(keys)), keys, ends), ends, outputs, counts)
     else:
         for index, shots in prepare(parameters, effects):
-            _count_in_noise(_all_draws(index, keys[index], ends), ends, shots, counts)
+            count_in_noise(_all_draws(index, keys[index], ends), ends, shots, counts)
     return dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
-def simulate(
-    parameters: Parameters,
-    effects: Collection[str],
-    *,
-    keys: np.ndarray,
-    first_draw: int = 0,
-    batch_sizes: Sequence[int],
-    method: str,
-) -> dict[str, np.ndarray]:
-    """Outputs, their errors, and counts over batches of draws, with all effects.
+def no_counts(points: int, batches: int, method: str) -> np.ndarray:
+    """Counts of 0, (names, points, batches), in the order of DRAW_OUTPUTS.
 
-    Parameters
-    ----------
-    parameters, effects
-        As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
-        are means over the same draws that are counted.
-    keys, first_draw, batch_sizes, method
-        As of :func:`draw`.
-
-    Returns
-    -------
-    dict of ndarray
-        (n,) by the names of OUTPUTS and ERROR_OUTPUTS, (n, batches) int64 by those of
-        DRAW_OUTPUTS of :mod:`sweep.model.outputs`.
+    Raises
+    ------
+    ValueError
+        There is no way to draw of that name.
     """
-    n = len(keys)
-    if not random_effects(effects):
-        values = evaluate(parameters, effects)
-        outputs = {name: np.broadcast_to(value, (n,)) for name, value in values.items()}
-        counts = draw(
-            parameters, outputs, keys=keys, first_draw=first_draw, batch_sizes=batch_sizes,
-            method=method, effects=effects,
-        )  # fmt: skip
-        return outputs | certain(outputs) | counts
-    ends, tallies = _batches(n, first_draw, batch_sizes, method)
-    means = Means(n)
-    for point, number, shots in realise(
-        parameters, effects, keys=keys, first_draw=first_draw, draws=sum(batch_sizes)
-    ):
-        found = outputs_of(shots)
-        means.add(point, found)
-        rows = Rows(point, keys[point], number, number + 1)
-        if method == "probabilities":
-            _count_by_chance(rows, ends, found, tallies)
-        else:
-            _count_in_noise(rows, ends, shots, tallies)
-    return means.results() | dict(zip(DRAW_OUTPUTS, tallies, strict=True))
-
-
-def _batches(
-    points: int, first_draw: int, sizes: Sequence[int], method: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of draws between batches, (batches + 1,); counts of 0, (names, points, batches)."""
     if method not in METHODS:
         raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
-    counts = np.zeros((len(DRAW_OUTPUTS), points, len(sizes)), np.int64)
-    return first_draw + np.cumsum([0, *sizes]), counts
+    return np.zeros((len(DRAW_OUTPUTS), points, batches), np.int64)
 
 
 def _all_draws(point: np.ndarray, keys: np.ndarray, ends: np.ndarray) -> Rows:
@@ -167,13 +121,30 @@ def _all_draws(point: np.ndarray, keys: np.ndarray, ends: np.ndarray) -> Rows:
     return Rows(point, keys, np.full(point.size, ends[0]), np.full(point.size, ends[-1]))
 
 
-def _count_by_chance(
+def count_by_chance(
     rows: Rows, ends: np.ndarray, outputs: Mapping[str, np.ndarray], counts: np.ndarray
 ) -> None:
+    """Add the draws of some rows, held against their outputs, to the counts.
+
+    Parameters
+    ----------
+    rows : Rows
+        Draws within the batches.
+    ends : (batches + 1,) ndarray
+        Numbers of draws between batches.
+    outputs : mapping
+        Of each row.
+    counts : (names, points, batches) ndarray
+        As of :func:`no_counts`.
+    """
     _draw_probabilities(rows, ends, *_chances(outputs), _DETECTION, _FALSE_ALARM, counts)
 
 
-def _count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
+def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
+    """Add the draws of some rows, in the noise of their shots, to the counts.
+
+    Parameters are those of :func:`count_by_chance`.
+    """
     for stretch in stretches(shots):
         _draw_noise(
             Rows(*(column[stretch.part] for column in rows)), ends, stretch.points, stretch.row,

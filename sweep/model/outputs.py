@@ -12,6 +12,8 @@ class Output:
     units: str
     long_name: str
     comment: str = ""
+    whole: bool = False
+    """Whether it is counted: an integer."""
 
 
 def _pd(segment: str, comment: str = "") -> Output:
@@ -71,7 +73,7 @@ OUTPUTS: dict[str, Output] = {
 
 
 def _count(what: str) -> Output:
-    return Output("1", f"number of draws with {what}")
+    return Output("1", f"number of draws with {what}", whole=True)
 
 
 DRAW_OUTPUTS: dict[str, Output] = {
@@ -98,3 +100,29 @@ ERROR_OUTPUTS: dict[str, Output] = {
     "pd_shot_error": _error("shot"),
 }
 """Floats, one a point, of studies with draws; each of the output that it is named after."""
+
+PROMISED = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
+"""Outputs of which the accuracy is promised."""
+
+
+def _half_width(segment: str, comment: str = "") -> Output:
+    text = (
+        "pd plus and minus this holds the true one with the confidence promised: of the mean over "
+        "draws where random effects are simulated; of the share of draws with a detection where "
+        "noise alone is drawn; 0 where pd is exact"
+    )
+    name = f"half-width of the interval of the probability of detection, {segment}"
+    return Output("1", name, "; ".join(filter(None, (text, comment))))
+
+
+ACCURACY_OUTPUTS: dict[str, Output] = {
+    "n_draws": Output("1", "number of draws", whole=True),
+    "pd_up_half_width": _half_width("up-chirp"),
+    "pd_down_half_width": _half_width("down-chirp"),
+    "pd_doppler_half_width": _half_width("Doppler segment", NO_DOPPLER),
+    "pd_shot_half_width": _half_width("shot"),
+    "accuracy_missed": Output(
+        "1", "largest half-width less the tolerance", "0 where the tolerance is met"
+    ),
+}
+"""What draws have come to, point by point."""

@@ -10,7 +10,7 @@ over a point's draws in their order: how draws are cut into stretches, and which
 are there besides, makes no difference to a single bit.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,8 @@ ROWS = 4096
 BEAMLETS = 1 << 19
 """Beamlets of all these draws, of some 100 bytes each."""
 
-_LOGARITHMS = np.array([name.startswith("log10_") for name in OUTPUTS])
+_NAMES = list(OUTPUTS)
+_LOGARITHMS = np.array([name.startswith("log10_") for name in _NAMES])
 _WITHOUT_ECHO = ("range_error", "radial_velocity_error")
 """What has no value in a draw that sends nothing back."""
 
@@ -150,6 +151,19 @@ class Means:
         """Adds draws, (m,) each, in the order of their numbers for each point."""
         values = np.array([outputs[name] for name in OUTPUTS])
         _add(point, values, _LOGARITHMS, self._count, self._mean, self._spread)
+
+    def moments(
+        self, names: Sequence[str], points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means, variances of a single draw and numbers of draws, (names, points) each.
+
+        Of outputs other than logarithms, nan where there is nothing of one; the variance is
+        unbiased, and nan with a single draw.
+        """
+        rows = np.ix_([_NAMES.index(name) for name in names], points)
+        n = self._count[rows]
+        with np.errstate(invalid="ignore"):
+            return np.where(n > 0, self._mean[rows], np.nan), self._spread[rows] / (n - 1.0), n
 
     def results(self) -> dict[str, np.ndarray]:
         """The means by the names of OUTPUTS, standard errors by those of ERROR_OUTPUTS, (n,)."""

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from sweep.model import philox
-from sweep.model.draws import draw, simulate
+from sweep.model.draws import draw
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.model.realisations import outputs_of, realise
+from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate
 
 DRAWS = 40_000

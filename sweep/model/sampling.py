@@ -1,0 +1,235 @@
+"""Points sampled by draws: a fixed number of them, or as many as it takes to keep a promise.
+
+What is promised is how far pd may be off, each segment's and the shot's, with some confidence. What
+draws tell of pd depends on what is random. Where effects are, pd is the mean over draws of the
+conditional probabilities that each draw has over its noise. Where noise alone is and is drawn, it
+is the share of draws with a detection. Where noise alone is and draws are held against known
+probabilities, pd is exact, and the counts sample it.
+
+Drawing until the promise is kept goes in rounds over all points that are still open. Who looks
+stops sooner, on the average, where the draws happen to vary little, and that costs coverage and
+adds bias: :func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping.py``
+measures them. Looks come at the same numbers of draws for every point, and what a point has drawn
+depends on nothing but its own draws: other points, blocks and workers change no bit of it.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_counts
+from sweep.model.intervals import COUNTED, bounded_mean, half_width
+from sweep.model.outputs import DRAW_OUTPUTS, PROMISED
+from sweep.model.preparation import Parameters
+from sweep.model.realisations import Means, certain, outputs_of, random_effects, realise
+from sweep.model.shot import evaluate
+
+GROWTH = 1.25
+"""Draws at a look over those at the one before; the last round's surplus is half of that, about."""
+PIECE = 1 << 16
+"""Draws of a point that are taken at once."""
+
+_COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
+
+
+class Promise(NamedTuple):
+    """How far pd may be off; scalars or one a point."""
+
+    tolerance: ArrayLike = 1e-3
+    confidence: ArrayLike = 0.95
+    interval: str = "clopper_pearson"
+    """Of counted shares, one of :data:`sweep.model.intervals.COUNTED`."""
+
+    def of(self, points: np.ndarray, size: int) -> "Promise":
+        """The promise made of some of `size` points."""
+        arrays = (np.broadcast_to(a, (size,))[points] for a in (self.tolerance, self.confidence))
+        return Promise(*arrays, self.interval)
+
+
+def looks(batch: int, limit: int) -> Iterator[int]:
+    """Numbers of draws, rising to `limit`, after which half-widths are looked at.
+
+    After each of the first batches, then after a quarter as many again, in whole batches.
+    """
+    batches = 1
+    while batches * batch < limit:
+        yield batches * batch
+        batches = max(batches + 1, int(batches * GROWTH))
+    yield limit
+
+
+def simulate(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    batch_sizes: Sequence[int],
+    method: str,
+    promise: Promise = Promise(),  # noqa: B008  # a tuple
+) -> dict[str, np.ndarray]:
+    """Outputs, their errors, and counts over batches of draws, with all effects.
+
+    Parameters
+    ----------
+    parameters, effects
+        As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
+        are means over the same draws that are counted.
+    keys, first_draw, batch_sizes, method
+        As of :func:`sweep.model.draws.draw`.
+    promise : Promise
+        What half-widths are held against.
+
+    Returns
+    -------
+    dict of ndarray
+        (n,) by the names of OUTPUTS, ERROR_OUTPUTS and ACCURACY_OUTPUTS, (n, batches) int64 by
+        those of DRAW_OUTPUTS of :mod:`sweep.model.outputs`.
+    """
+    sample = Sample(parameters, effects, keys=keys, method=method)
+    counts = sample.take(np.arange(len(keys)), first_draw, batch_sizes)
+    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
+
+
+def simulate_until(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    batch: int,
+    limit: int,
+    method: str,
+    promise: Promise,
+) -> dict[str, np.ndarray]:
+    """Outputs, their errors, and counts, of as many draws of each point as keep a promise.
+
+    Parameters
+    ----------
+    parameters, effects, keys, method, promise
+        As of :func:`simulate`.
+    batch : int
+        Draws of which a look comes after a whole number.
+    limit : int
+        Draws of a point at most, where the promise may still be broken.
+
+    Returns
+    -------
+    dict of (n,) ndarray
+        As of :func:`simulate`, with all draws in one count.
+    """
+    sample = Sample(parameters, effects, keys=keys, method=method)
+    unsettled, first = np.arange(len(keys)), 0
+    for last in looks(batch, limit):
+        for start in range(first, last, PIECE):
+            sample.take(unsettled, start, [min(PIECE, last - start)])
+        unsettled = unsettled[sample.missed(unsettled, promise) > 0]
+        first = last
+        if not unsettled.size:
+            break
+    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
+
+
+class Sample:
+    """What has been drawn of n points so far, added up.
+
+    Parameters
+    ----------
+    parameters, effects, keys, method
+        As of :func:`simulate`.
+    """
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str
+    ) -> None:
+        self._parameters, self._effects = parameters, effects
+        self._keys, self._method = keys, method
+        self.counts = no_counts(len(keys), 1, method)[..., 0]
+        self.number = np.zeros(len(keys), np.int64)
+        self._means = Means(len(keys)) if random_effects(effects) else None
+        if self._means is None:
+            values = evaluate(parameters, effects)
+            self._outputs = {name: np.broadcast_to(v, (len(keys),)) for name, v in values.items()}
+
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
+        """Draw some of the points, from draw `first` on.
+
+        Returns
+        -------
+        (names, points, batches) int64 ndarray
+            Counts of these draws, in the order of DRAW_OUTPUTS.
+        """
+        if self._means is None:
+            found = draw(
+                self._some(points), {name: v[points] for name, v in self._outputs.items()},
+                keys=self._keys[points], first_draw=first, batch_sizes=batch_sizes,
+                method=self._method, effects=self._effects,
+            )  # fmt: skip
+            counts = np.stack(list(found.values()))
+        else:
+            counts = self._realised(self._means, points, first, batch_sizes)
+        self.counts[:, points] += counts.sum(axis=-1)
+        self.number[points] += sum(batch_sizes)
+        return counts
+
+    def _realised(
+        self, means: Means, points: np.ndarray, first: int, batch_sizes: Sequence[int]
+    ) -> np.ndarray:
+        """Draws of random effects: added to the means, and counted."""
+        keys, ends = self._keys[points], first + np.cumsum([0, *batch_sizes])
+        counts = no_counts(len(points), len(batch_sizes), self._method)
+        for point, number, shots in realise(
+            self._some(points), self._effects, keys=keys, first_draw=first, draws=ends[-1] - first
+        ):
+            found = outputs_of(shots)
+            means.add(points[point], found)
+            rows = Rows(point, keys[point], number, number + 1)
+            if self._method == "probabilities":
+                count_by_chance(rows, ends, found, counts)
+            else:
+                count_in_noise(rows, ends, shots, counts)
+        return counts
+
+    def _some(self, points: np.ndarray) -> Parameters:
+        """Parameters of some of the points."""
+        return {path: v[points] if np.ndim(v) else v for path, v in self._parameters.items()}
+
+    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """How far pd of some points may be off with the promised confidence, (4, points).
+
+        By the names of PROMISED; nan for what there is not.
+        """
+        confidence, n = promise.of(points, self.number.size).confidence, self.number[points]
+        if self._means is not None:
+            mean, variance, number = self._means.moments(PROMISED, points)
+            interval = bounded_mean(
+                mean=mean, variance=variance, number=np.maximum(number, 1), confidence=confidence
+            )
+            return half_width(mean, interval)
+        exact = np.stack([0.0 * self._outputs[name][points] for name in PROMISED])
+        if self._method == "probabilities":
+            return exact
+        successes = self.counts[_COUNT_OF][:, points]
+        interval = COUNTED[promise.interval](successes=successes, trials=n, confidence=confidence)
+        return exact + half_width(successes / n, interval)
+
+    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
+        widths = self.half_widths(points, promise)
+        over = widths - promise.of(points, self.number.size).tolerance
+        return np.fmax.reduce(over, axis=0, initial=0.0)
+
+    def results(self, promise: Promise) -> dict[str, np.ndarray]:
+        """Outputs, their errors and their accuracy, (n,) each."""
+        points = np.arange(self.number.size)
+        widths = dict(zip(PROMISED, self.half_widths(points, promise), strict=True))
+        if self._means is None:
+            outputs = self._outputs | certain(self._outputs)
+        else:
+            outputs = self._means.results()
+        return outputs | {
+            "n_draws": self.number,
+            **{f"{name}_half_width": width for name, width in widths.items()},
+            "accuracy_missed": self.missed(points, promise),
+        }
