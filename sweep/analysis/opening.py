@@ -12,7 +12,6 @@ from typing import Any
 import xarray as xr
 
 BATCH = "batch"
-BATCH_DRAWS = "batch_draws"
 NOT_COUNTED = -1
 """What a count holds where its block is not computed."""
 
@@ -35,7 +34,7 @@ def open(path: str | Path) -> xr.Dataset:
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
     written in, and every variable has its units and what it is. Arrays are read when they are
     needed. What is not computed yet is nan; -1 for counts of draws, which are summed over their
-    batches; their number is `n_draws`.
+    batches, and for their number `n_draws`.
 
     Parameters
     ----------
@@ -111,10 +110,7 @@ def _near(path: Path) -> str:
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:
-    """Counts of draws summed over their batches, and their number `n_draws`.
-
-    A count is -1 where any of its batches is.
-    """
+    """Counts of draws summed over their batches; -1 where any of these is."""
     counts = {name: array for name, array in dataset.data_vars.items() if BATCH in array.dims}
     sums = {
         name: array.sum(BATCH, keep_attrs=True).where(
@@ -122,9 +118,7 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
         )
         for name, array in counts.items()
     }
-    number = dataset[BATCH_DRAWS].sum(BATCH)
-    number.attrs = {"units": "1", "long_name": "number of draws of each point"}
-    return dataset.drop_dims(BATCH).assign(sums).assign(n_draws=number)
+    return dataset.drop_dims(BATCH).assign(sums)
 
 
 def progress(path: Path, points: int, blocks: int) -> dict[str, Any]:

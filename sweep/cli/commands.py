@@ -7,7 +7,14 @@ from typing import Any
 
 import click
 
-from sweep.cli.telling import conclude, grid_plan, scene_plan, tell_effects, warn_before
+from sweep.cli.telling import (
+    conclude,
+    grid_plan,
+    scene_plan,
+    tell_accuracy,
+    tell_effects,
+    warn_before,
+)
 
 MISTAKE = 2
 
@@ -158,7 +165,7 @@ def plan(spec: Path, workers: int | None) -> None:
 @main.command()
 @STORE
 def status(store: Path) -> None:
-    """Say how far STORE is, also while it runs somewhere else."""
+    """Say how far STORE is, also while it runs somewhere else, and how well it knows what it drew."""
     from sweep.tasks.progress import duration
     from sweep.tasks.status import status as read
 
@@ -176,6 +183,8 @@ def status(store: Path) -> None:
         click.echo(f"not running; sweep resume {store}  goes on.")
     for block, failure in sorted(s.failures.items()):
         click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
+    if s.blocks_done:
+        tell_accuracy(store)
 
 
 @main.command()

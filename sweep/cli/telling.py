@@ -11,6 +11,7 @@ import click
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.accuracy_table import AccuracyRow
     from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.session import Outcome
 
@@ -26,6 +27,7 @@ def conclude(outcome: Outcome, store: Path) -> None:
 
     if outcome.blocks_done:
         _print_summary(store)
+        tell_accuracy(store)
     for scanner, rays in outcome.rays.items():
         told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")
@@ -75,6 +77,31 @@ def _grid_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
             for row in rows
         ],
     )
+
+
+def tell_accuracy(store: Path) -> None:
+    """Print how well what is drawn is known, where anything is."""
+    from sweep.tasks.accuracy_table import accuracy_table
+
+    if rows := accuracy_table(store):
+        _print_table(
+            "Half-widths of what is drawn",
+            ["", "met", "worst", "missed by", "draws", "needed", "at"],
+            [_accuracy_cells(row) for row in rows],
+            "at",
+        )
+
+
+def _accuracy_cells(row: AccuracyRow) -> list[str]:
+    return [
+        row.name,
+        f"{row.met:,} of {row.points:,}",
+        f"{row.half_width:.3g}",
+        f"{row.missed:.2g}",
+        f"{row.draws:,}",
+        f"{row.needed:,.0f}" if row.needed < float("inf") else "-",
+        row.where,
+    ]
 
 
 def _scene_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
@@ -129,7 +156,8 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
     yield "chunks", f"{p.chunks:,} files"
     yield "bytes", f"{_bytes(p.bytes)} before compression"
     yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
-    yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
+    bound = "at most about" if study.draws.adaptive else "about"
+    yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {_bytes(p.worker_memory)} a worker"
 
 

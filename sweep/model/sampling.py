@@ -13,8 +13,8 @@ measures them. Looks come at the same numbers of draws for every point, and what
 depends on nothing but its own draws: other points, blocks and workers change no bit of it.
 """
 
-from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +46,16 @@ class Promise(NamedTuple):
         """The promise made of some of `size` points."""
         arrays = (np.broadcast_to(a, (size,))[points] for a in (self.tolerance, self.confidence))
         return Promise(*arrays, self.interval)
+
+
+class Drawn(Protocol):
+    """Points that can be drawn on."""
+
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> object:
+        """Draw some of the points, from draw `first` on."""
+
+    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """By how much a promise is broken of some of the points; 0 where it is kept."""
 
 
 def looks(batch: int, limit: int) -> Iterator[int]:
@@ -120,15 +130,19 @@ def simulate_until(
         As of :func:`simulate`, with all draws in one count.
     """
     sample = Sample(parameters, effects, keys=keys, method=method)
-    unsettled, first = np.arange(len(keys)), 0
-    for last in looks(batch, limit):
-        for start in range(first, last, PIECE):
-            sample.take(unsettled, start, [min(PIECE, last - start)])
-        unsettled = unsettled[sample.missed(unsettled, promise) > 0]
-        first = last
-        if not unsettled.size:
-            break
+    settle(sample, np.arange(len(keys)), looks(batch, limit), promise)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
+
+
+def settle(sample: Drawn, points: np.ndarray, ends: Iterable[int], promise: Promise) -> None:
+    """Draw points until the promise is kept of each, or numbers of draws to look at end."""
+    first = 0
+    for last in ends:
+        for start in range(first, last, PIECE):
+            sample.take(points, start, [min(PIECE, last - start)])
+        points, first = points[sample.missed(points, promise) > 0], last
+        if not points.size:
+            return
 
 
 class Sample:

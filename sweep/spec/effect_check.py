@@ -124,7 +124,8 @@ def without_draws(
         yield Finding(
             place_on_grid(parameter.path, axes),
             "is simulated by draws, and the study has none",
-            f"set draws.number, or effects.{effect.name}: off",
+            "set draws.limit to draw until accuracy.tolerance is met, draws.number to draw so many "
+            f"times, or effects.{effect.name}: off",
             ABSENT,
         )
 

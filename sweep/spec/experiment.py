@@ -22,7 +22,6 @@ from sweep.spec.mistakes import Finding
 from sweep.spec.sections import Draws, Storage, Target
 from sweep.spec.study import Study
 
-
 class Spec(Study):
     """A study of a flat target over a grid of parameters, every value read and checked.
 
@@ -47,12 +46,15 @@ class Spec(Study):
         base: Path | None,
         axes_are_whole: bool,
     ) -> list[Finding]:
-        """Figures of what the study lacks, and random effects without draws."""
+        """Figures of what the study lacks, random effects without draws, draws without an end."""
         findings = figure_findings(written, axes) if axes_are_whole else []
         with suppress(ValidationError):
-            if not Draws.model_validate(written.get("draws", {})).number:
+            draws = Draws.model_validate(written.get("draws", {}))
+            if not draws.any:
                 values = readable(written, axes)
                 findings += without_draws(values, axes, written_modes(written))
+            if draws.number and draws.adaptive:
+                findings.append(_two_numbers(draws))
         return findings
 
     def parameters(self) -> dict[str, float | int | str]:
@@ -78,3 +80,10 @@ class Spec(Study):
             "seed": self.seed,
             "storage": values_of(self.storage, ""),
         }
+
+
+def _two_numbers(draws: Draws) -> Finding:
+    """A fixed number of draws beside a limit."""
+    rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to draw"
+    remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many times"
+    return Finding(("draws", "limit"), rule, remedy, draws.limit)

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.spec.axes import Axis
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure
@@ -28,8 +28,7 @@ def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[
     axes : tuple of Axis
         The study's axes.
     """
-    draws = written.get("draws")
-    with_draws = isinstance(draws, Mapping) and draws.get("number", 0) not in (0, "0")
+    with_draws = _has_draws(written.get("draws"))
     findings: list[Finding] = []
     stems: set[str] = set()
     for i, figure in _readable(written.get("figures")):
@@ -40,6 +39,12 @@ def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[
             findings.append(Finding(("figures", i), rule, "give it a name", ABSENT))
         stems.add(figure.stem)
     return findings
+
+
+def _has_draws(draws: object) -> bool:
+    """Whether a section of draws, as written, asks for any."""
+    asked = ("number", "limit") if isinstance(draws, Mapping) else ()
+    return any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
 
 
 def _readable(written: object) -> Iterator[tuple[int, Figure]]:
@@ -73,7 +78,7 @@ def _coordinate_findings(figure: Figure, axes: tuple[Axis, ...], index: int) -> 
 def _variable_findings(figure: Figure, with_draws: bool, index: int) -> list[Finding]:
     """A variable that the study does not store."""
     variable = getattr(figure, "variable", None)
-    drawn = DRAW_OUTPUTS | ERROR_OUTPUTS
+    drawn = DRAW_OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS
     if variable is None or variable in OUTPUTS or (with_draws and variable in drawn):
         return []
     location: Location = ("figures", index, "variable")
@@ -82,7 +87,7 @@ def _variable_findings(figure: Figure, with_draws: bool, index: int) -> list[Fin
             Finding(
                 location,
                 "is found over draws, and this study has none",
-                "set draws: {number: ...}",
+                "set draws: {number: ...} or {limit: ...}",
                 variable,
             )
         ]

@@ -86,7 +86,7 @@ class Numeric(Rule):
         for a pure number.
     example : str
         A good value.
-    above, at_least, at_most : str, optional
+    above, at_least, below, at_most : str, optional
         Bounds, as a user would write them.
     whole : bool
         Whether only whole numbers will do.
@@ -98,6 +98,7 @@ class Numeric(Rule):
     example: str
     above: str | None = None
     at_least: str | None = None
+    below: str | None = None
     at_most: str | None = None
     whole: bool = False
     words: tuple[tuple[str, int], ...] = ()
@@ -150,6 +151,7 @@ class Numeric(Rule):
         for written, words, is_outside in (
             (self.above, "must be greater than", np.less_equal),
             (self.at_least, "must be at least", np.less),
+            (self.below, "must be less than", np.greater_equal),
             (self.at_most, "must be at most", np.greater),
         ):
             if written is None:
@@ -173,6 +175,7 @@ class Numeric(Rule):
         """JSON Schema: text with a unit, or a number."""
         bounds = [f"greater than {self.above}"] if self.above is not None else []
         bounds += [f"at least {self.at_least}"] if self.at_least is not None else []
+        bounds += [f"less than {self.below}"] if self.below is not None else []
         bounds += [f"at most {self.at_most}"] if self.at_most is not None else []
         description = f"{self.about}; {', '.join(bounds)}" if bounds else self.about
         common: dict[str, Any] = {"description": description, "examples": [self.example]}
@@ -189,7 +192,12 @@ class Numeric(Rule):
 
     def _numeric_bounds(self) -> dict[str, float]:
         """Bounds of a pure number in JSON Schema's words."""
-        words = {"exclusiveMinimum": self.above, "minimum": self.at_least, "maximum": self.at_most}
+        words = {
+            "exclusiveMinimum": self.above,
+            "minimum": self.at_least,
+            "exclusiveMaximum": self.below,
+            "maximum": self.at_most,
+        }
         return {word: _bound(self, text) for word, text in words.items() if text is not None}
 
 

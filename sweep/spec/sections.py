@@ -2,6 +2,7 @@
 
 from typing import Annotated
 
+from sweep.model.intervals import COUNTED
 from sweep.model.reflectance import LAWS
 from sweep.spec.effect_fields import with_modes, with_parameters
 from sweep.spec.instrument import Part
@@ -99,13 +100,23 @@ class Accuracy(Part):
     tolerance: Annotated[
         float,
         Numeric(
-            about="Largest change of a probability that effects left out may make, all together; "
-            "0 simulates all that the scene has",
+            about="How far a probability may be off: by effects left out, all together, "
+            "and where it is drawn by the half-width of its interval; 0 simulates all that the "
+            "scene has",
             example="1e-3",
             at_least="0",
             at_most="1",
         ),
     ] = 1e-3
+    confidence: Annotated[
+        float,
+        Numeric(
+            about="Confidence of the intervals of probabilities of detection that a grid draws",
+            example="0.95",
+            above="0",
+            below="1",
+        ),
+    ] = 0.95
     leakage_floor: Annotated[
         float,
         Numeric(
@@ -127,6 +138,16 @@ class Draws(Part):
             "Draws a point; 0 computes probabilities alone", "10000", at_least="0", at_most="1e12"
         ),
     ] = 0
+    limit: Annotated[
+        int,
+        count(
+            "Draws of a point at most, where it draws until accuracy.tolerance is met; 0 draws "
+            "draws.number instead",
+            "1e5",
+            at_least="0",
+            at_most="1e12",
+        ),
+    ] = 0
     batch: Annotated[int, count("Draws that are counted together", "100", at_most="1e9")] = 100
     method: Annotated[
         str,
@@ -135,6 +156,24 @@ class Draws(Part):
             options=("probabilities", "noise"),
         ),
     ] = "probabilities"
+    interval: Annotated[
+        str,
+        Choice(
+            about="Interval of the share of draws with a detection, where noise alone is drawn: "
+            "at least as sure as promised everywhere, or on the average",
+            options=tuple(COUNTED),
+        ),
+    ] = "clopper_pearson"
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is drawn."""
+        return self.number > 0 or self.adaptive
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether each point is drawn until its accuracy is met."""
+        return self.limit > 0
 
 
 class Storage(Part):

@@ -41,7 +41,7 @@ def evaluate_block(spec: Spec, grid: Grid, block: int, called: Called) -> Result
     -------
     dict of ndarray
         Each output of the model with the block's extent as its shape, and what was simulated;
-        counts of draws with a last dimension over batches, where the study draws.
+        counts of draws with a last dimension over batches, where the study draws a fixed number.
     """
     extent, parameters = grid.extent(block), grid.parameters(block)
     order = grid.geometry_order(block)
@@ -61,7 +61,7 @@ def evaluate_points(
     count: int,
     effects: Collection[str],
 ) -> Results:
-    """Results of points, (count,) each; counts of draws (count, batches).
+    """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def evaluate_points(
     ValueError
         An effect is random and the study has no draws.
     """
-    if spec.draws.number:
+    if spec.draws.any:
         return _drawn(spec, parameters, count, effects)
     from sweep.model.realisations import random_effects
     from sweep.model.shot import evaluate
@@ -102,7 +102,7 @@ def _step(spec: Spec) -> int:
 
 
 def batch_sizes(spec: Spec) -> list[int]:
-    """Draws in each batch; the last one holds what is left, none where none is drawn."""
+    """Draws in each batch of a fixed number; the last one holds what is left."""
     number, batch = spec.draws.number, spec.draws.batch
     return [min(batch, number - first) for first in range(0, number, batch)]
 
@@ -110,28 +110,39 @@ def batch_sizes(spec: Spec) -> list[int]:
 def _drawn(
     spec: Spec, parameters: Mapping[str, Value], count: int, effects: Collection[str]
 ) -> Results:
-    from sweep.model.draws import simulate
     from sweep.model.philox import point_keys
+    from sweep.model.sampling import Promise, simulate, simulate_until
 
     # The same draws however closely they are looked at.
     physical = {path: v for path, v in parameters.items() if not path.startswith("accuracy.")}
+    keys = point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed)
+    draws, tolerance = spec.draws, parameters["accuracy.tolerance"]
+    promise = Promise(tolerance, parameters["accuracy.confidence"], draws.interval)  # type: ignore[arg-type]
+    if draws.adaptive:
+        return simulate_until(
+            parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit,
+            method=draws.method, promise=promise,
+        )  # fmt: skip
     return simulate(
-        parameters,
-        effects,
-        keys=point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed),
-        batch_sizes=batch_sizes(spec),
-        method=spec.draws.method,
-    )
+        parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), method=draws.method,
+        promise=promise,
+    )  # fmt: skip
+
+
+def with_few_draws(spec: Spec, most: int) -> Spec:
+    """The same study with so many draws at the most, where it has any."""
+    fewer = {"number": min(spec.draws.number, most), "limit": min(spec.draws.limit, most)}
+    return spec.model_copy(update={"draws": spec.draws.model_copy(update=fewer)})
 
 
 def compile_kernels(spec: Spec, grid: Grid) -> None:
     """Compile what the model compiles, once, before workers get blocks and find it on disk.
 
-    One point with every effect that may be called for, and one with none.
+    One draw of a point with every effect that may be called for, and one with none.
     """
     from sweep.model.effects.catalogue import EFFECTS as ALL
 
-    modes, draws = spec.modes(), spec.draws.number > 0
-    may_be = [e.name for e in ALL if modes[e.name] != "off" and (draws or not e.is_random)]
+    modes, once = spec.modes(), with_few_draws(spec, 1)
+    may_be = [e.name for e in ALL if modes[e.name] != "off" and (once.draws.any or not e.is_random)]
     for effects in (may_be, ()):
-        evaluate_points(spec, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)
+        evaluate_points(once, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)

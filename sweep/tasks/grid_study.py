@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 #: Dimension of the batches of draws.
 BATCH = "batch"
 
-#: Fill of counts; a number of detections is never negative.
+#: Fill of counts; a number of draws or detections is never negative.
 NO_COUNT = -1
 
 
 def output_names(spec: Spec) -> list[str]:
     """Names of the arrays that blocks write, sorted."""
-    from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+    from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 
-    drawn = (*ERROR_OUTPUTS, *DRAW_OUTPUTS) if spec.draws.number else ()
+    drawn = (*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS) if spec.draws.any else ()
     return sorted([*OUTPUTS, *drawn, EFFECTS, ERROR])
 
 
@@ -72,7 +72,7 @@ class GridStudy:
     def attributes(self) -> dict[str, Any]:
         """Title, question, spec and the blocks' shape."""
         coordinates = [member.name for axis in self.spec.axes for member in axis.members]
-        coordinates += ["batch_draws"] if self.spec.draws.number else []
+        coordinates += ["batch_draws"] if batch_sizes(self.spec) else []
         return {
             "kind": "grid",
             "title": self.spec.title,
@@ -90,33 +90,43 @@ class GridStudy:
     def arrays(self) -> list[ArrayLayout]:
         """Coordinates, the sizes of batches, and an array for each output."""
         arrays = coordinates(self.spec.axes)
-        if self.spec.draws.number:
-            arrays.append(_batches(np.array(batch_sizes(self.spec), dtype=np.int64)))
+        if sizes := batch_sizes(self.spec):
+            arrays.append(_batches(np.array(sizes, dtype=np.int64)))
         arrays += layouts(self.grid.shape, self.grid.block_shape, self.grid.dims)
         return arrays + [self._output(n) for n in self._names if n not in (EFFECTS, ERROR)]
 
     def _output(self, name: str) -> ArrayLayout:
-        from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+        from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 
-        counted = name in DRAW_OUTPUTS
-        output = (OUTPUTS | ERROR_OUTPUTS | DRAW_OUTPUTS)[name]
-        batches = (len(batch_sizes(self.spec)),) if counted else ()
+        output = (OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS)[name]
+        batches = (len(batch_sizes(self.spec)),) if self._in_batches(name) else ()
+        promise = self._promise() if name in ACCURACY_OUTPUTS and not output.whole else {}
         return ArrayLayout(
             name=name,
             shape=self.grid.shape + batches,
             chunks=self.grid.block_shape + batches,
-            dims=self.grid.dims + ((BATCH,) if counted else ()),
-            dtype="int64" if counted else "float64",
-            fill=NO_COUNT if counted else float("nan"),
-            attributes=described(output.units, output.long_name, output.comment),
+            dims=self.grid.dims + ((BATCH,) if batches else ()),
+            dtype="int64" if output.whole else "float64",
+            fill=NO_COUNT if output.whole else float("nan"),
+            attributes=described(output.units, output.long_name, output.comment) | promise,
         )
+
+    def _in_batches(self, name: str) -> bool:
+        """Whether an output has a dimension over batches of draws."""
+        from sweep.model.outputs import DRAW_OUTPUTS
+
+        return name in DRAW_OUTPUTS and not self.spec.draws.adaptive
+
+    def _promise(self) -> dict[str, float]:
+        """Tolerance and confidence that half-widths are held against, but for those on axes."""
+        promised = {f"accuracy.{name}": name for name in ("tolerance", "confidence")}
+        off_axes = self.spec.parameters_off_axes()
+        return {n: float(off_axes[path]) for path, n in promised.items() if path in off_axes}
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """The block's chunk of every output."""
-        from sweep.model.outputs import DRAW_OUTPUTS
-
         position = self.grid.position(block)
-        return {name: position + ((0,) if name in DRAW_OUTPUTS else ()) for name in self._names}
+        return {name: position + ((0,) if self._in_batches(name) else ()) for name in self._names}
 
     def evaluate(self, block: int) -> Results:
         """Outputs of a block."""

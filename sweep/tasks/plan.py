@@ -11,7 +11,13 @@ import psutil
 
 from sweep.tasks import cluster
 from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_points, select
+from sweep.tasks.evaluate import (
+    batch_sizes,
+    compile_kernels,
+    evaluate_points,
+    select,
+    with_few_draws,
+)
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import output_names
 
@@ -21,6 +27,9 @@ if TYPE_CHECKING:
 #: Time that measuring may take [s], and places of the grid that it looks at.
 MEASURING = 1.0
 PLACES = 16
+
+#: Draws of a point while measuring, at the most.
+FEW_DRAWS = 1000
 
 #: What a worker takes to start [s], and to write a chunk [s].
 START = 3.0
@@ -75,7 +84,8 @@ def point_bytes(spec: Spec, names: list[str]) -> int:
     from sweep.model.outputs import DRAW_OUTPUTS
 
     counted = sum(name in DRAW_OUTPUTS for name in names)
-    return 8 * (len(names) - counted + counted * len(batch_sizes(spec)))
+    batches = len(batch_sizes(spec)) or 1
+    return 8 * (len(names) - counted + counted * batches)
 
 
 def worker_memory(spec: Spec, grid: Grid, names: list[str]) -> int:
@@ -89,25 +99,34 @@ def worker_memory(spec: Spec, grid: Grid, names: list[str]) -> int:
 def measured(spec: Spec, grid: Grid) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
-    Whole sets of points that share a geometry are taken, so that sharing shows as it will.
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will. Where
+    points are drawn until their accuracy is met, those that are not after `FEW_DRAWS` are taken to
+    reach their limit.
     """
     compile_kernels(spec, grid)
     calling = Calling(spec, grid)
     points, begun = 0, time.perf_counter()
     rows = 1
     while time.perf_counter() - begun < MEASURING / 2:
-        points = 0
+        points, left_out = 0, 0.0
         round_begun = time.perf_counter()
         for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
-            points += _evaluate_some(spec, calling, int(block), rows)
+            more, seconds = _evaluate_some(spec, calling, int(block), rows)
+            points, left_out = points + more, left_out + seconds
         taken = time.perf_counter() - round_begun
         if points >= grid.points or taken > MEASURING / 4:
             break
         rows *= 4
-    return taken / points
+    return (taken + left_out) / points
 
 
-def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> int:
+def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple[int, float]:
+    """Number of points evaluated, and the time [s] that draws left out of them would take.
+
+    Points are drawn `FEW_DRAWS` times at most; those that have not come to their end would go on.
+    """
+    few, left_out = with_few_draws(spec, FEW_DRAWS), 0.0
+    most, drawn = (max(s.draws.number, s.draws.limit) for s in (spec, few))
     grid, sharing = calling.tiles.grid, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
@@ -116,5 +135,9 @@ def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> int:
     chosen = sets[few].ravel()
     parameters = grid.parameters(block)
     for members, effects in calling.of_block(block).some(chosen).groups():
-        evaluate_points(spec, select(parameters, chosen[members]), len(members), effects)
-    return len(chosen)
+        begun = time.perf_counter()
+        found = evaluate_points(few, select(parameters, chosen[members]), len(members), effects)
+        if most > drawn:
+            unsettled = float(np.mean(found["n_draws"] == drawn))
+            left_out += unsettled * (most / drawn - 1) * (time.perf_counter() - begun)
+    return len(chosen), left_out

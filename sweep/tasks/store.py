@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 JOURNAL = ".sweep"
 
 #: Version of the layout of stores.
-LAYOUT = 2
+LAYOUT = 3
 
 WRITTEN_WHOLE: ArrayConfigLike = {
     "write_empty_chunks": True

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import version
 
 #: Distributions whose version can change a result or how it is stored.
-DISTRIBUTIONS = ("numba", "numpy", "sweep", "zarr")
+DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
 @cache

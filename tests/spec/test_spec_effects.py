@@ -217,11 +217,13 @@ def test_a_random_effect_needs_draws_or_is_off(path):
     there, name = {path: THERE[path]}, RANDOM[path]
     (mistake,) = mistakes(Spec, written(there))
     assert mistake.startswith(f"{path}: is simulated by draws")
-    assert mistake.endswith(f"set draws.number, or effects.{name}: off")
+    assert "set draws.limit to draw until accuracy.tolerance is met, draws.number" in mistake
+    assert mistake.endswith(f"or effects.{name}: off")
     default = parameter_rules()[path].written(parameter_rules()[path].read(THERE[path]))
     (mistake,) = mistakes(Spec, written(axes={path: [default]}))
     assert mistake.startswith(f"axes.{path}: is simulated by draws")
     assert not mistakes(Spec, written(there | {"draws.number": 1}))
+    assert not mistakes(Spec, written(there | {"draws.limit": 1}))
     assert not mistakes(Spec, written(there | {f"effects.{name}": "off"}))
 
 

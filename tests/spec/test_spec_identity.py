@@ -130,6 +130,7 @@ def other_value(path):
         "instrument.processing.acquisition_delay": "1 us",
         "accuracy.leakage_floor": 0.2,
         "accuracy.tolerance": 0.2,
+        "accuracy.confidence": 0.9,
         "instrument.processing.bits": 12,
         "instrument.receiver.field_of_view": "1 mrad",
         "target.pointing_jitter": "1 mrad",
@@ -155,7 +156,7 @@ def test_every_parameter_is_part_of_the_id(path):
 
 @pytest.mark.parametrize(
     "changes", [{"seed": 1}, {"draws.number": 5}, {"draws.batch": 5}, {"draws.method": "noise"},
-                {"storage.block_points": 5}]
+                {"draws.limit": 5}, {"draws.interval": "wilson"}, {"storage.block_points": 5}]
 )  # fmt: skip
 def test_draws_seed_and_blocks_are_part_of_the_id(changes):
     assert spec(changes).id != spec().id

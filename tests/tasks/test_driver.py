@@ -12,6 +12,7 @@ import xarray as xr
 from distributed import Client, LocalCluster
 from small import STUDY, copied, deadly, evaluated, failing, logged, quiet, receipts, small, tree
 
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
 from sweep.tasks import session, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
@@ -77,6 +78,44 @@ def test_counts_of_draws_do_not_depend_on_blocks_workers_or_axes(tmp_path):
     np.testing.assert_array_equal(
         xr.open_zarr(one_watt.store).n_detected_up.values, expected.n_detected_up.values[0]
     )
+
+
+ADAPTIVE = {
+    "draws": {"limit": 60, "batch": 20},
+    "accuracy": {"tolerance": 0.09, "confidence": 0.9},
+    "target": STUDY["target"] | {"roughness": "10 um"},
+    "footprint": {"beamlets": 1},
+}
+"""Drawn until pd is known within 0.09, but 60 times at most."""
+
+
+def test_what_is_drawn_to_an_accuracy_does_not_depend_on_blocks_workers_or_axes(tmp_path):
+    plain = quiet(small(**ADAPTIVE), tmp_path / "plain.zarr")
+    threads = quiet(small(**ADAPTIVE), tmp_path / "t.zarr", workers=2, processes=False)
+    assert tree(plain.store) == tree(threads.store)
+    expected = xr.open_zarr(plain.store)
+    numbers = expected.n_draws.values
+    assert set(np.unique(numbers)) == {40, 60} and "batch" not in expected.dims
+    assert ((expected.accuracy_missed > 0).values <= (numbers == 60)).all()
+    whole = quiet(small(**ADAPTIVE, storage={"block_points": 1000}), tmp_path / "whole.zarr")
+    axes = {path: values for path, values in STUDY["axes"].items() if "power" not in path}
+    one_watt = quiet(small(**ADAPTIVE, axes=axes), tmp_path / "one_watt.zarr")
+    again, at_one_watt = xr.open_zarr(whole.store), xr.open_zarr(one_watt.store)
+    for name, values in expected.data_vars.items():
+        assert again[name].values.tobytes() == values.values.tobytes(), name
+    for name in (*ACCURACY_OUTPUTS, *DRAW_OUTPUTS):
+        np.testing.assert_array_equal(at_one_watt[name].values, expected[name].values[0])
+
+
+def test_what_is_drawn_to_an_accuracy_is_resumed_to_the_same_bytes(tmp_path):
+    undisturbed = quiet(small(**ADAPTIVE), tmp_path / "undisturbed.zarr")
+    progress = StopAfter(40)
+    outcome = run(
+        small(**ADAPTIVE), store=tmp_path / "cut.zarr", scheduler="none", progress=progress
+    )
+    assert outcome.stopped == "interrupted" and 0 < outcome.points_done < 72
+    assert resume(outcome.store, scheduler="none", progress=False).complete
+    assert tree(outcome.store) == tree(undisturbed.store)
 
 
 def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from small import small
 
 from sweep.model.effects.catalogue import CORE
-from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid
 
@@ -21,16 +21,18 @@ def points(**draws):
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 @pytest.mark.parametrize("effects", [CORE, RANDOM])
-def test_points_are_evaluated_alone_as_they_are_together(effects, method):
-    spec, parameters, count = points(number=40, batch=25, method=method)
+@pytest.mark.parametrize("much", [{"number": 40, "batch": 25}, {"limit": 40, "batch": 15}])
+def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
+    spec, parameters, count = points(**much, method=method)
     together = evaluate_points(spec, parameters, count, effects)
-    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS}
+    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
         alone = evaluate_points(spec, select(parameters, np.array([i])), 1, effects)
         for name, values in alone.items():
-            assert values.shape == ((1, 2) if name in DRAW_OUTPUTS else (1,))
+            in_batches = name in DRAW_OUTPUTS and "number" in much
+            assert values.shape == ((1, 2) if in_batches else (1,))
             np.testing.assert_array_equal(values[0], together[name][i], err_msg=name)
 
 
