@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability bench effects lock forget-kernels clean
+.PHONY: demo test test-all stability bench effects stopping lock forget-kernels clean
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
@@ -34,6 +34,9 @@ bench: $(READY)
 
 effects: $(READY)
 	$(BIN)/python benchmarks/effects.py
+
+stopping: $(READY)
+	$(BIN)/python benchmarks/stopping.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete

@@ -25,6 +25,7 @@ from sweep.tasks.studies import study_of
 ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "effects_table.md"
 TOLERANCES = (1e-1, 1e-2, 1e-3)
+DRAWS = 1000
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 HEAD = """# Effects on demand, and all of them on
 
@@ -51,6 +52,8 @@ def variant(path: Path, tolerance: float | None) -> Spec | SceneSpec:
     written = read_document(path).value
     kind = SceneSpec if "scene" in written else Spec
     drawn = kind is Spec and "draws" in written
+    if drawn:  # a tolerance also says how often; here all variants share their draws
+        written["draws"] = {"number": DRAWS}
     every = {e.name: "on" for e in EFFECTS if drawn or not e.is_random}
     written["effects"] = every if tolerance is None else {}
     written["accuracy"] = dict(written.get("accuracy", {}), tolerance=tolerance or 0.0)

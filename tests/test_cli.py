@@ -195,6 +195,56 @@ def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
 
 
+DRAWN = """\
+draws: {limit: 60, batch: 20, method: noise}
+accuracy: {tolerance: 0.1}
+"""
+
+
+def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here):
+    import numpy as np
+    import xarray as xr
+
+    from sweep.tasks.accuracy_table import accuracy_table
+
+    (here / "drawn.yaml").write_text(STUDY + DRAWN)
+    run = sweep("run", "drawn.yaml", "--scheduler", "none")
+    told = sweep("status", "results/drawn.zarr")
+    store = xr.open_zarr(here / "results" / "drawn.zarr")
+    rows = {row.name: row for row in accuracy_table(here / "results" / "drawn.zarr")}
+    assert list(rows) == ["pd_up", "pd_doppler", "pd_down", "pd_shot"]
+    for name, row in rows.items():
+        widths = store[f"{name}_half_width"]
+        assert (row.points, row.met) == (80, int((widths <= 0.1).sum()))
+        assert row.half_width == widths.max() and row.missed == row.half_width - 0.1
+        assert row.draws == 60 and row.needed == -(-60 * (row.half_width / 0.1) ** 2 // 1)
+        worst = np.argwhere(widths.values == float(widths.max()))[0]
+        assert row.where.startswith(f"range {float(store.range[worst[0]]):.4g} m, power ")
+        for result in (run, told):
+            assert f"{row.met} of 80" in result.stdout and f"{row.needed:,.0f}" in result.stdout
+    assert 0 < rows["pd_shot"].met < 80
+    assert store.accuracy_missed.max() == max(row.missed for row in rows.values())
+    promised = store.pd_shot_half_width.attrs
+    assert (promised["tolerance"], promised["confidence"]) == (0.1, 0.95)
+
+
+def test_a_run_without_draws_tells_of_none(here):
+    assert "Half-widths" not in sweep("run", "small.yaml", "--scheduler", "none").stdout
+    assert "Half-widths" not in sweep("status", "results/small.zarr").stdout
+
+
+def test_a_plan_of_very_many_draws_takes_seconds_and_counts_them_all(here):
+    many = STUDY.replace("reflectance: 0.01}", "reflectance: 0.01, roughness: 1 um}")
+    begun = time.monotonic()
+    (here / "many.yaml").write_text(many + "draws: {limit: 1e9}\naccuracy: {tolerance: 1e-6}\n")
+    result = sweep("plan", "many.yaml", "--workers", "1")
+    assert time.monotonic() - begun < 60
+    lines = dict(line.strip().split("  ", 1) for line in result.stdout.splitlines()[:7])
+    # A draw takes 0.1 us at the least.
+    assert float(lines["time a point"].split()[0]) > 1e9 * 0.1
+    assert lines["time"].startswith("at most about")
+
+
 def test_plan_of_ten_million_points_takes_seconds(here):
     text = STUDY.replace("number: 40", "number: 100000").replace(
         "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100}"

@@ -7,7 +7,7 @@ import pytest
 
 import sweep
 from sweep.analysis.figures import draw
-from sweep.model.outputs import OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.reading import read_document
 
@@ -48,7 +48,8 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)
-    assert set(dataset.data_vars) == {*OUTPUTS, "effects", "effects_error"}
+    drawn = {*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS} if spec.draws.any else set()
+    assert set(dataset.data_vars) == {*OUTPUTS, *drawn, "effects", "effects_error"}
     for name, variable in dataset.data_vars.items():
         assert np.isfinite(variable).all(), name
     for name in OUTPUTS:
@@ -94,7 +95,7 @@ def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
 def test_the_published_study_is_there():
     assert {path.stem for path in GRIDS} >= {
         "aperture", "beam_divergence", "fft_size", "quickstart", "range_angle",
-        "single_shot_2000m", "single_shot_45deg", "threshold", "transmit_power",
+        "single_shot_2000m", "single_shot_45deg", "speckled_target", "threshold", "transmit_power",
     }  # fmt: skip
     assert {path.stem for path in SCENES} >= {
         "forest_scan", "morpheus_three_beam", "square_high_descent", "square_low_descent",

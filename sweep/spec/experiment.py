@@ -22,6 +22,7 @@ from sweep.spec.mistakes import Finding
 from sweep.spec.sections import Draws, Storage, Target
 from sweep.spec.study import Study
 
+
 class Spec(Study):
     """A study of a flat target over a grid of parameters, every value read and checked.
 

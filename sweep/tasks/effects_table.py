@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import evaluate_points
 from sweep.tasks.grid import Grid
+from sweep.tasks.timing import timed
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -21,8 +20,9 @@ if TYPE_CHECKING:
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
 MOST_TILES = 4096
 
-#: Tiles on which an effect's cost is measured, points of each, and rounds of which the best counts.
-COST_TILES, COST_POINTS, ROUNDS = 4, 24, 3
+#: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds of which
+#: the best counts.
+COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS = 4, 24, 20, 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +222,4 @@ def _some_points(calling: Calling, tile: int) -> tuple[np.ndarray, tuple[str, ..
 
 def _timed(spec: Spec, calling: Calling, numbers: np.ndarray, effects: tuple[str, ...]) -> float:
     parameters = calling.tiles.grid.parameters_at(numbers)
-    begun = time.perf_counter()
-    evaluate_points(spec, parameters, len(numbers), effects)
-    return time.perf_counter() - begun
+    return sum(timed(spec, parameters, len(numbers), effects, most_draws=COST_DRAWS))

@@ -11,15 +11,10 @@ import psutil
 
 from sweep.tasks import cluster
 from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import (
-    batch_sizes,
-    compile_kernels,
-    evaluate_points,
-    select,
-    with_few_draws,
-)
+from sweep.tasks.evaluate import batch_sizes, compile_kernels, select
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import output_names
+from sweep.tasks.timing import timed
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -28,8 +23,8 @@ if TYPE_CHECKING:
 MEASURING = 1.0
 PLACES = 16
 
-#: Draws of a point while measuring, at the most.
-FEW_DRAWS = 1000
+#: Draws of a point while measuring.
+MOST_DRAWS = 1000
 
 #: What a worker takes to start [s], and to write a chunk [s].
 START = 3.0
@@ -100,7 +95,7 @@ def measured(spec: Spec, grid: Grid) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
     Whole sets of points that share a geometry are taken, so that sharing shows as it will. Where
-    points are drawn until their accuracy is met, those that are not after `FEW_DRAWS` are taken to
+    points are drawn until their accuracy is met, those that are not after few draws are taken to
     reach their limit.
     """
     compile_kernels(spec, grid)
@@ -121,12 +116,8 @@ def measured(spec: Spec, grid: Grid) -> float:
 
 
 def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple[int, float]:
-    """Number of points evaluated, and the time [s] that draws left out of them would take.
-
-    Points are drawn `FEW_DRAWS` times at most; those that have not come to their end would go on.
-    """
-    few, left_out = with_few_draws(spec, FEW_DRAWS), 0.0
-    most, drawn = (max(s.draws.number, s.draws.limit) for s in (spec, few))
+    """Number of points evaluated, and the time [s] that draws left out of them would take."""
+    left_out = 0.0
     grid, sharing = calling.tiles.grid, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
@@ -135,9 +126,6 @@ def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple
     chosen = sets[few].ravel()
     parameters = grid.parameters(block)
     for members, effects in calling.of_block(block).some(chosen).groups():
-        begun = time.perf_counter()
-        found = evaluate_points(few, select(parameters, chosen[members]), len(members), effects)
-        if most > drawn:
-            unsettled = float(np.mean(found["n_draws"] == drawn))
-            left_out += unsettled * (most / drawn - 1) * (time.perf_counter() - begun)
+        part = select(parameters, chosen[members])
+        left_out += timed(spec, part, len(members), effects, most_draws=MOST_DRAWS).left_out
     return len(chosen), left_out

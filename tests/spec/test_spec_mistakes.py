@@ -67,6 +67,9 @@ FIELDS = [
     ("accuracy.leakage_floor", 0, "must be greater than 0"),
     ("accuracy.tolerance", -1, "must be at least 0"),
     ("accuracy.tolerance", 1.1, "must be at most 1"),
+    ("accuracy.confidence", 0, "must be greater than 0"),
+    ("accuracy.confidence", 1, "must be less than 1"),
+    ("accuracy.confidence", "95 percent", "takes no unit"),
     ("instrument.laser.linewidth", "1 kHz", "did you mean 'line_width'?"),
     ("instrument.laser.line_shape", "lorenzian", "did you mean 'lorentzian'?"),
     ("atmosphere.profile", "mars", "must be one of none"),
@@ -78,6 +81,9 @@ FIELDS = [
     ("effects.leakage", 1, "must be one of auto, on, off"),
     ("effects.leakage", None, "must be one of auto, on, off"),
     ("draws.number", -1, "must be at least 0"),
+    ("draws.limit", -1, "must be at least 0"),
+    ("draws.limit", 2.5, "must be a whole number"),
+    ("draws.interval", "wald", "must be one of clopper_pearson, wilson"),
     ("draws.method", "luck", "must be one of probabilities, noise"),
     ("storage.block_points", 0, "must be at least 1"),
     ("seed", 1.5, "must be a whole number"),
@@ -229,6 +235,27 @@ def test_two_figures_of_one_file_are_refused():
     (mistake,) = mistakes_of(written(axes={"target.range": ["1 m"]}, figures=[figure, figure]))
     assert mistake.path == "figures[1]"
     assert "give it a name" in str(mistake)
+
+
+def test_a_fixed_number_of_draws_and_a_limit_exclude_each_other():
+    (mistake,) = mistakes_of(written({"draws.number": 5000, "draws.limit": "1e6"}))
+    assert str(mistake) == (
+        "draws.limit: stands beside draws.number, 5000: only one of them can say how much to draw "
+        "(you wrote 1000000); keep limit to draw until accuracy.tolerance is met, or number to draw "
+        "so many times"
+    )
+    for draws in ({"number": 0, "limit": 5}, {"number": 5, "limit": 0}, {"limit": "1e12"}):
+        assert Spec.from_mapping(written(draws=draws)).draws.any
+
+
+@pytest.mark.parametrize("draws", [{"number": 3}, {"limit": 3}])
+@pytest.mark.parametrize("variable", ["n_draws", "pd_up_half_width", "n_detected_up"])
+def test_figures_of_what_is_drawn_ask_for_draws(draws, variable):
+    figures = [{"kind": "slices", "variable": variable, "x": "range"}]
+    mapping = written(axes={"target.range": ["1 m", "2 m"]}, figures=figures)
+    assert Spec.from_mapping(mapping | {"draws": draws}).figures
+    (mistake,) = mistakes_of(mapping)
+    assert "set draws: {number: ...} or {limit: ...}" in str(mistake)
 
 
 TEN = """\

@@ -27,6 +27,7 @@ POINTS = {
     "aperture": 3 * 20082,
     "fft_size": 3 * 20082,
     "beam_divergence": 6 * 30078,
+    "speckled_target": 24 * 4,
 }
 
 
@@ -54,7 +55,9 @@ def test_a_shipped_study_loads_and_agrees_with_the_schema(path, validator):
     validator.validate(spec.to_yaml_mapping())
 
 
-@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in STUDIES if path.stem != "speckled_target"], ids=lambda path: path.stem
+)
 def test_a_reproduction_makes_the_thesiss_choices(path):
     parameters = load(path).parameters()
     efficiency = parameters["instrument.telescope.optical_efficiency"]
