@@ -1,8 +1,8 @@
 """What drawing until a tolerance is met costs in coverage and bias, by simulation.
 
-Run with `make stopping`, some minutes on one core: points of known pd, many of each, are drawn until
-their half-width is within the tolerance, by the shipped rule (sweep.model.sampling) and by looking
-after every batch. Writes the table in docs/draws.md.
+Run with `make stopping`, two minutes on one core: points of known pd, many of each, are drawn
+until their half-width is within the tolerance, by the shipped rule (sweep.model.sampling) and by
+looking after every batch. Writes the table in docs/draws.md.
 """
 
 import sys

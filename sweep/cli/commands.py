@@ -165,7 +165,7 @@ def plan(spec: Path, workers: int | None) -> None:
 @main.command()
 @STORE
 def status(store: Path) -> None:
-    """Say how far STORE is, also while it runs somewhere else, and how well it knows what it drew."""
+    """Say how far STORE is, also while it runs somewhere else, and how sure its draws are."""
     from sweep.tasks.progress import duration
     from sweep.tasks.status import status as read
 

@@ -9,8 +9,8 @@ probabilities, and Clopper and Pearson's [Biometrika 26, 404, 1934], at least ri
 
 Of a mean m of n values within 0..1 with the variance s^2 of their own: nothing limits from below
 what rare values might add that no draw has shown yet, and s^2 = 0 after n equal values proves
-nothing. But a mean that lies d above m by rarer values up to 1 has a variance that is larger as
-well, by at most (1 - m) d; one that lies d below, by values down to 0, by at most m d. The
+nothing. But a mean that lies d above m by rare values between m and 1 has a variance that is larger
+as well, by at most (1 - m) d; one that lies d below, by values down to 0, by at most m d. The
 interval holds all means that such a variance makes likely, as the score interval does:
 
     n d^2 = z^2 (s^2 + q d),    q = 1 - m above, m below,

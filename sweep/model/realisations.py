@@ -160,7 +160,7 @@ class Means:
         Of outputs other than logarithms, nan where there is nothing of one; the variance is
         unbiased, and nan with a single draw.
         """
-        rows = np.ix_([_NAMES.index(name) for name in names], points)
+        rows = np.ix_(np.array([_NAMES.index(name) for name in names]), points)
         n = self._count[rows]
         with np.errstate(invalid="ignore"):
             return np.where(n > 0, self._mean[rows], np.nan), self._spread[rows] / (n - 1.0), n

@@ -44,8 +44,9 @@ class Promise(NamedTuple):
 
     def of(self, points: np.ndarray, size: int) -> "Promise":
         """The promise made of some of `size` points."""
-        arrays = (np.broadcast_to(a, (size,))[points] for a in (self.tolerance, self.confidence))
-        return Promise(*arrays, self.interval)
+        tolerance = np.broadcast_to(self.tolerance, (size,))[points]
+        confidence = np.broadcast_to(self.confidence, (size,))[points]
+        return Promise(tolerance, confidence, self.interval)
 
 
 class Drawn(Protocol):
@@ -207,7 +208,10 @@ class Sample:
 
     def _some(self, points: np.ndarray) -> Parameters:
         """Parameters of some of the points."""
-        return {path: v[points] if np.ndim(v) else v for path, v in self._parameters.items()}
+        return {
+            path: v[points] if isinstance(v, np.ndarray) and v.ndim else v
+            for path, v in self._parameters.items()
+        }
 
     def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
         """How far pd of some points may be off with the promised confidence, (4, points).

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
 MOST_TILES = 4096
 
-#: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds of which
-#: the best counts.
+#: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
+#: which the best counts.
 COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS = 4, 24, 20, 3
 
 

@@ -1,7 +1,7 @@
-"""Intervals: their defining equations, scipy's slow ones, and their coverage, exact where it can be.
+"""Intervals: their defining equations, scipy's slow ones, and their coverage, exact if possible.
 
 A count moves in steps, and whether one more of them belongs to the likely ones changes coverage by
-its probability: intervals that are right on the average may fall short by as much (`STEP`).
+its probability: intervals that are right on the average may fall short by as much, a step.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def test_they_are_scipys(ours, theirs):
 
 
 def coverage(estimate, interval, weight, truth):
-    """Probability that estimate +- half-width holds the truth, and the largest step near its ends."""
+    """Probability that estimate +- half-width holds the truth; the largest step near its ends."""
     within = abs(estimate - truth) <= half_width(estimate, interval) + 1e-15
     edges = np.flatnonzero(np.diff(within.astype(int), prepend=0, append=0))
     near = np.unique(np.clip(np.concatenate([edges - 1, edges]), 0, weight.size - 1))

@@ -153,7 +153,7 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
 
 
 def test_the_logarithm_of_a_mean_keeps_twelve_digits_over_hundreds_of_decades():
-    """Against exact sums of the numbers over the largest; one draw in a thousand carries them all."""
+    """Against exact sums of the numbers over the largest; few of the draws carry them all."""
     random = np.random.default_rng(4)
     logs = np.array([-2000.0, -300.0, -20.0])[:, None] * random.uniform(0.9, 1.1, (3, 5000))
     means = realisations.Means(3)

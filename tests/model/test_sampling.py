@@ -193,8 +193,8 @@ class Coins:
 def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     """5 sigma of 4000 trials are 1.7 %; Wilson's may lack a step at either end of its counts.
 
-    The bias is a tenth of the tolerance at most (docs/draws.md): it is largest about pd = tolerance,
-    where a sample without a detection stops early.
+    The bias is a tenth of the tolerance at most (docs/draws.md), and largest where pd is about the
+    tolerance: there a sample without a detection stops early.
     """
     trials = 4000
     for pd in (0.0, 1e-4, 0.3 * tolerance, tolerance, 1.3 * tolerance, 0.2, 0.5, 0.8, 0.9999, 1.0):

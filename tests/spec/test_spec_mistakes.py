@@ -241,8 +241,8 @@ def test_a_fixed_number_of_draws_and_a_limit_exclude_each_other():
     (mistake,) = mistakes_of(written({"draws.number": 5000, "draws.limit": "1e6"}))
     assert str(mistake) == (
         "draws.limit: stands beside draws.number, 5000: only one of them can say how much to draw "
-        "(you wrote 1000000); keep limit to draw until accuracy.tolerance is met, or number to draw "
-        "so many times"
+        "(you wrote 1000000); keep limit to draw until accuracy.tolerance is met, or number to "
+        "draw so many times"
     )
     for draws in ({"number": 0, "limit": 5}, {"number": 5, "limit": 0}, {"limit": "1e12"}):
         assert Spec.from_mapping(written(draws=draws)).draws.any

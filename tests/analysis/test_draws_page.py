@@ -1,0 +1,46 @@
+"""docs/draws.md says what is so: its spec, its fields, its arrays, and what its table shows."""
+
+import re
+from pathlib import Path
+
+import yaml
+from drawn_studies import study
+
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS
+from sweep.spec import Draws, Spec
+
+PAGE = (Path(__file__).parents[2] / "docs" / "draws.md").read_text(encoding="utf-8")
+
+
+def cells(start):
+    """Cells of the rows of tables that begin with some words."""
+    lines = [line for line in PAGE.splitlines() if line.startswith(f"| {start}")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_the_spec_shown_promises_the_defaults():
+    (shown,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    written = yaml.load(shown, Loader=yaml.BaseLoader)
+    spec = Spec.from_mapping(study({}).to_yaml_mapping() | written, base=Path("."))
+    assert spec.draws.adaptive and spec.accuracy == study({}).accuracy
+
+
+def test_every_field_and_every_array_is_listed():
+    fields = [name.strip("`") for name, _ in cells("`draws.")]
+    assert sorted(fields) == sorted(f"draws.{name}" for name in Draws.model_fields)
+    arrays = {name.split("`")[1] for name, _ in cells("`") if "." not in name}
+    assert arrays == {"n_draws", "pd_up_half_width", "accuracy_missed", "pd_up_error",
+                      "n_detected_up"}  # fmt: skip
+    assert arrays <= {*ACCURACY_OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS}
+
+
+def test_the_table_keeps_what_the_text_says_of_it():
+    """5 sigma of 40,000 and of 4000 trials; Wilson's steps besides."""
+    rows = cells("counts") + cells("means")
+    assert len(rows) == 30
+    for kind, _, looks, covered, bias, _ in rows:
+        room = 0.5 if kind.startswith("counts") else 1.7
+        room += 0.7 if "Wilson" in kind else 0
+        assert float(covered.split(" ")[0]) >= 95 - room, kind
+        assert abs(float(bias.split(" ")[0])) < 0.1, kind
+        assert looks in ("shipped", "every batch")
