@@ -1,0 +1,91 @@
+"""What is told of a study's draws: tolerances along an axis, studies half done, what would help."""
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from small import STUDY, quiet, small
+
+from sweep.tasks.accuracy_table import accuracy_table
+
+ROUGH = {
+    "target": STUDY["target"] | {"roughness": "10 um"},
+    "footprint": {"beamlets": 1},
+    "draws": {"limit": 400, "batch": 20},
+}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    axes = {
+        "target.range": ["1 km", "2 km", "4 km"],
+        "accuracy.tolerance": [0.1, 0.04, 0.0],
+        "accuracy.confidence": [0.8, 0.99],
+    }
+    return quiet(small(**ROUGH, axes=axes), tmp_path_factory.mktemp("a") / "a.zarr").store
+
+
+def test_each_point_keeps_the_promise_that_is_made_of_it(store):
+    dataset = xr.open_zarr(store)
+    numbers, widths = dataset.n_draws.values, dataset.pd_shot_half_width.values
+    tolerance = dataset.tolerance.values[:, None]
+    settled = numbers < 400
+    assert (widths <= tolerance)[settled].all() and settled.any()
+    assert (numbers[:, 0] <= numbers[:, 1]).all() and (numbers[:, 2] == 400).all()
+    assert (numbers[..., 0] <= numbers[..., 1]).all()
+    assert (widths[:, 2, 0] < widths[:, 2, 1]).all()
+    # All of them are looks at the same draws.
+    same = dataset.pd_shot.values[:, 2]
+    np.testing.assert_array_equal(same[:, 0], same[:, 1])
+    assert "tolerance" not in dataset.pd_shot_half_width.attrs
+
+
+def test_the_worst_point_is_told_with_its_own_tolerance(store):
+    dataset = xr.open_zarr(store)
+    over = {name: dataset[f"{name}_half_width"] - dataset.tolerance
+            for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot")}  # fmt: skip
+    for row in accuracy_table(store):
+        assert row.missed == pytest.approx(float(over[row.name].max()), rel=1e-12)
+        assert row.tolerance == 0 and row.needed == math.inf and row.draws == 400
+        assert row.met == int((over[row.name] <= 0).sum()) and row.points == 18
+        assert names_the_place(row.where, dataset, over[row.name])
+
+
+def names_the_place(where, dataset, over):
+    """Whether some words name the place of the largest excess."""
+    i, j, k = np.unravel_index(np.argmax(over.values), over.shape)
+    expected = f"range {dataset.range.values[i]:.4g} km, tolerance 0, "
+    return where == expected + f"confidence {dataset.confidence.values[k]:.4g}"
+
+
+def test_draws_that_are_said_to_do_about_do(tmp_path):
+    """A fixed number is told as well, and as many again as are said to be needed meet it."""
+    axes, accuracy = {"target.range": ["2 km"]}, {"tolerance": 0.02}
+    few = small(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
+    rows = accuracy_table(quiet(few, tmp_path / "few.zarr").store)
+    assert [row.met for row in rows] == [0, 0, 0, 0] and {row.draws for row in rows} == {300}
+    needed = int(max(row.needed for row in rows))
+    enough = small(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
+    for row in accuracy_table(quiet(enough, tmp_path / "enough.zarr").store):
+        assert row.half_width < 0.022
+
+
+def test_blocks_that_are_not_computed_are_not_told(tmp_path):
+    from sweep.tasks.driver import run
+
+    def broken(study, block):
+        if block:
+            raise ValueError("not today")
+        return study.evaluate(block)
+
+    spec = small(**ROUGH, axes={"target.range": ["1 km", "2 km"]}, storage={"block_points": 1})
+    outcome = run(spec, store=tmp_path / "half.zarr", scheduler="none", progress=False,
+                  evaluate=broken)  # fmt: skip
+    assert outcome.blocks_done == 1
+    assert {row.points for row in accuracy_table(outcome.store)} == {1}
+    assert xr.open_zarr(outcome.store).n_draws.values[1] == -1
+
+
+def test_a_study_without_draws_has_none(tmp_path):
+    assert accuracy_table(quiet(small(axes={}), tmp_path / "none.zarr").store) == []
