@@ -85,6 +85,9 @@ def run(
 ) -> None:
     """Compute the study SPEC into a Zarr store.
 
+    A table at the end says how probable detection is; where the study draws, another says at how
+    many points that is known within accuracy.tolerance, and how many draws the worst one needs.
+
     \b
       sweep run experiments/quickstart.yaml
       sweep run experiments/range_angle.yaml --store /data/range_angle.zarr --workers 8
@@ -165,7 +168,10 @@ def plan(spec: Path, workers: int | None) -> None:
 @main.command()
 @STORE
 def status(store: Path) -> None:
-    """Say how far STORE is, also while it runs somewhere else, and how sure its draws are."""
+    """Say how far STORE is, also while it runs somewhere else.
+
+    Where it draws, a table says at how many points accuracy.tolerance is met.
+    """
     from sweep.tasks.progress import duration
     from sweep.tasks.status import status as read
 
