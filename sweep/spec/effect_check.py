@@ -166,5 +166,4 @@ def _is_there(parameter: Parameter) -> Condition:
 
     One that is something by default only says how an effect acts that another brings.
     """
-    brings = parameter.default in (0, "none")
-    return lambda value: (value != parameter.default) & brings
+    return lambda value: (value != parameter.default) & parameter.brings

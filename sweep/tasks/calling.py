@@ -66,7 +66,23 @@ class Calling:
                 self._known[int(tile)] = int(flag), float(error)
         found = [self._known[t] for t in tiles.tolist()]
         flags, errors = np.array([f for f, _ in found], np.uint32), np.array([e for _, e in found])
-        return Called(flags[place], errors[place])
+        return Called(flags[place] & ~self._absent(block), errors[place])
+
+    def _absent(self, block: int) -> np.ndarray:
+        """Flags of random effects that points have nothing of, whatever their tiles have.
+
+        A smooth target is no limit of rough ones: without speckle beamlets add as powers.
+        """
+        from sweep.model.effects.catalogue import DEFAULTS
+        from sweep.model.effects.catalogue import EFFECTS as ALL
+
+        grid = self.tiles.grid
+        parameters = DEFAULTS | grid.parameters(block)
+        flags = np.zeros(grid.block_size(block), np.uint32)
+        for k, effect in enumerate(ALL):
+            if effect.is_random and self._modes[effect.name] == "auto":
+                flags |= np.where(effect.absent(parameters), np.uint32(1 << k), np.uint32(0))
+        return flags
 
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these."""

@@ -113,3 +113,19 @@ def test_a_plan_is_made_once_for_a_tile(monkeypatch):
     for block in range(Grid(spec).n_blocks):
         calling.of_block(block)
     assert sorted(planned) == list(range(calling.tiles.number))
+
+
+def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
+    """Its beamlets add as powers; rough ones' at random."""
+    axes = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}
+    footprint = {"beamlets": 7, "phases": "incoherent"}
+    draws = {"number": 50, "batch": 50}
+    beside = small(axes=axes, footprint=footprint, draws=draws)
+    alone = small(axes=axes | {"target.roughness": ["0 um"]}, footprint=footprint, draws=draws)
+    bit = np.uint32(1 << NAMES.index("speckle"))
+    assert (whole(beside, "effects") & bit > 0).tolist() == [[False] * 2, [True] * 2]
+    np.testing.assert_allclose(
+        whole(beside, "pd_shot")[0], whole(alone, "pd_shot")[0], atol=1e-3, rtol=0
+    )
+    assert (whole(beside, "pd_shot_error")[0] == 0).all()
+    assert (whole(beside, "pd_shot_error")[1] > 0).any()

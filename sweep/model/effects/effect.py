@@ -14,7 +14,7 @@ import numpy as np
 
 from sweep.model.effects.change import Bound
 from sweep.model.ground import Ground
-from sweep.model.preparation import Shots
+from sweep.model.preparation import Parameters, Shots
 
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
@@ -47,6 +47,11 @@ class Parameter:
     options: tuple[str, ...] = ()
     category: bool = False
     """Whether points are computed together only where they share it; words always are."""
+
+    @property
+    def brings(self) -> bool:
+        """Whether other values than the default bring the effect; else it says how it acts."""
+        return self.default in (0, "none")
 
 
 class Scene(NamedTuple):
@@ -94,3 +99,11 @@ class Effect:
     def is_random(self) -> bool:
         """Whether it is simulated by draws."""
         return self.turn is not None or self.draw is not None
+
+    def absent(self, parameters: Parameters) -> np.ndarray:
+        """Whether points have nothing of it, by the parameters that bring it; (n,) or scalar."""
+        brought = [parameter for parameter in self.parameters if parameter.brings]
+        absent = np.asarray(bool(brought))
+        for parameter in brought:
+            absent = absent & np.equal(parameters[parameter.path], parameter.default)
+        return absent
