@@ -62,6 +62,11 @@ OUTPUTS: dict[str, Output] = {
     "snr_down": _snr("down-chirp"),
     "snr_doppler": _snr("Doppler segment", NO_DOPPLER),
     "beamlets": Output("1", "number of beamlets that were simulated"),
+    "beamlets_error": Output(
+        "1",
+        "largest change of a probability of detection by more beamlets",
+        "summed over the segments; nan where their number was given, or no number is enough",
+    ),
     "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
     "range_error": Output(
         "m", "reported less true range, without noise", "peak bins of the three segments resolved"

@@ -27,6 +27,9 @@ Parameters = Mapping[str, float | int | str | np.ndarray]
 LASER, CHIRP, TELESCOPE, RECEIVER, PROCESSING = (
     f"instrument.{part}." for part in ("laser", "chirp", "telescope", "receiver", "processing")
 )
+BEAMLETS_ERROR = "footprint.beamlets_error"
+"""Error of pd that the number of beamlets leaves, where that followed from the tolerance."""
+
 CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 """Numbers that points must share to be prepared together; words they must share all."""
 
@@ -88,6 +91,8 @@ class Shots:
     """Chance of leakage, of all bins far from the lines, that need not be looked for."""
     line_tolerance: np.ndarray
     """Error of a bin by taking few lines for many, over sigma."""
+    beamlets_error: np.ndarray
+    """Error of pd that the number of beamlets leaves; nan where it was given."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -299,6 +304,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=p["accuracy.leakage_floor"],
         leakage_tolerance=LEAKAGE_SHARE * np.asarray(p["accuracy.tolerance"]),
+        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(np.nan)),
         line_tolerance=LINE_SHARE * np.asarray(p["accuracy.tolerance"]),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],

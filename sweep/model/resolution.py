@@ -26,6 +26,7 @@ from sweep.model.effects.line_spread import (
 )
 from sweep.model.effects.lobes import lobe
 from sweep.model.preparation import (
+    BEAMLETS_ERROR,
     CHIRP,
     LASER,
     PROCESSING,
@@ -70,12 +71,15 @@ def resolved_categories(
         if int(p[BEAMLETS]) > 0:
             yield index, p
             continue
-        number, pattern = np.asarray(1), np.asarray("line")
+        number, pattern, error = np.asarray(1), np.asarray("line"), np.asarray(0.0)
         if "footprint" in effects:
-            number, pattern = (
-                beamlets_needed(p, index.size) if _is_open(p) else map(np.asarray, finest(p))
-            )
-        for some, q in categories(p | {BEAMLETS: number, PATTERN: pattern}, further):
+            if _is_open(p):
+                number, pattern, error = beamlets_needed(p, index.size)
+            else:
+                number, pattern = map(np.asarray, finest(p))
+                error = np.asarray(np.nan)
+        chosen = {BEAMLETS: number, PATTERN: pattern, BEAMLETS_ERROR: error}
+        for some, q in categories(p | chosen, further):
             yield index[some], q
 
 
@@ -94,25 +98,35 @@ def _is_open(words: Mapping[str, Any]) -> bool:
     return ground.powers_add(words) and str(words[PATTERN]) not in ("hexagonal", "sunflower")
 
 
-def beamlets_needed(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of beamlets, and their pattern, of points whose powers add, (n,) each."""
+def beamlets_needed(
+    p: Mapping[str, np.ndarray], size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Beamlets of points whose powers add: number, pattern, and error that is left, (n,) each.
+
+    The error is that of the probabilities of detection, summed over the segments.
+    """
     along, across = _spreads(p, size)
-    number, _ = quadrature.nodes_needed(_window(p), along, allowed_power_error(p, size))
+    per_power = _pd_for_power(p) + np.zeros(size)
+    allowed = SHARE * np.asarray(p["accuracy.tolerance"], float) / per_power
+    number, error = quadrature.nodes_needed(_window(p), along, allowed)
     # Across the slope all that a line of beamlets does not show is how the squares vary.
     missed = 0.5 * lobe(_window(p), 1024, 1024).curvature * 2 * across**2
-    square = (missed > allowed_power_error(p, size)) | (str(p[PATTERN]) == "square")
+    square = (missed > allowed) | (str(p[PATTERN]) == "square")
     side = np.minimum(number, _SQUARE_SIDE)
-    return np.where(square, side * side, number), np.where(square, "square", "line")
+    error = np.where(square & (number > _SQUARE_SIDE), 1.0, error)
+    return (
+        np.where(square, side * side, number),
+        np.where(square, "square", "line"),
+        np.minimum(error * per_power, 1.0),
+    )
 
 
-def allowed_power_error(p: Mapping[str, np.ndarray], size: int) -> np.ndarray:
-    """What the largest bin's power may be off by, over that power, (n,)."""
-    tolerance = np.asarray(p["accuracy.tolerance"], float)
+def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Most that pd changes, summed over the segments, for the relative change of a bin's power."""
     b = detection.threshold(tnr=p[PROCESSING + "tnr"], bin_deviation=np.asarray(1.0))
     a = 0.5 * (b + np.sqrt(b * b + 2))
     steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
-    allowed: np.ndarray = 2 * SHARE * tolerance / (_SEGMENTS * steepest) + np.zeros(size)
-    return allowed
+    return np.asarray(_SEGMENTS * steepest / 2)
 
 
 def _spreads(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -64,6 +64,7 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
         "snr_down": snr[2],
         "snr_doppler": snr[1],
         "beamlets": np.full(shots.size, float(shots.offset.shape[1])),
+        "beamlets_error": shots.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,

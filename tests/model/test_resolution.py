@@ -41,6 +41,7 @@ def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, wi
             assert abs(found[name] - exact[name]).max() <= resolution.SHARE * tolerance, name
         for name in SNRS:
             assert abs(np.sqrt(found[name] / exact[name]) - 1).max() <= tolerance, name
+        assert (found["beamlets_error"] <= resolution.SHARE * tolerance).all()
         assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9
 
 
@@ -111,3 +112,15 @@ def test_tolerance_0_takes_what_errs_least(table_4_1):
     found = shot.evaluate(parameters | {"accuracy.tolerance": 0.0})
     for name in PDS:
         assert abs(found[name] - exact[name]).max() <= 1e-7
+
+
+def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):
+    """Spread over thousands of bins: a beam of 50 mrad grazing the ground at 10 km."""
+    parameters = table_4_1(
+        phases="incoherent", range=1e4, grazing_angle=np.radians([0.5, 80.0]), fft_size=2**12,
+        beam_divergence=np.array([0.05, 1e-4]), bandwidth=1e9,
+    ) | AUTO  # fmt: skip
+    found = shot.evaluate(parameters | {"accuracy.tolerance": 1e-3})
+    assert found["beamlets_error"][0] > 1e-3 >= found["beamlets_error"][1]
+    by_hand = shot.evaluate(parameters | {"footprint.beamlets": 7, "accuracy.tolerance": 1e-3})
+    assert np.isnan(by_hand["beamlets_error"]).all()
