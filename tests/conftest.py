@@ -49,6 +49,8 @@ TABLE_4_1 = {
     "footprint.beamlets": 109,
     "footprint.phases": "coherent",
     "accuracy.tolerance": 0.0,
+    "accuracy.line_error": -1.0,
+    "accuracy.leakage_error": -1.0,
     "accuracy.leakage_floor": 0.1,
 }
 """The instrument of [T] Table 4.1 with the target that PHYSICS section 3 reads into its figures."""

@@ -65,7 +65,7 @@ OUTPUTS: dict[str, Output] = {
     "beamlets_error": Output(
         "1",
         "largest change of a probability of detection by more beamlets",
-        "summed over the segments; nan where their number was given, or no number is enough",
+        "summed over the segments; 0 where their number is given, and so part of what is asked",
     ),
     "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
     "range_error": Output(

@@ -41,6 +41,9 @@ LEAKAGE_SHARE = 0.02
 """Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
 
 
+AUTOMATIC = -1.0
+"""Stands for an error that follows from the tolerance."""
+
 LINE_SHARE = 0.1
 """The same, for errors of bins over sigma: pd changes by half as much in each segment."""
 
@@ -92,7 +95,7 @@ class Shots:
     line_tolerance: np.ndarray
     """Error of a bin by taking few lines for many, over sigma."""
     beamlets_error: np.ndarray
-    """Error of pd that the number of beamlets leaves; nan where it was given."""
+    """Error of pd that the number of beamlets leaves; 0 where it was given."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -303,9 +306,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=p["accuracy.leakage_floor"],
-        leakage_tolerance=LEAKAGE_SHARE * np.asarray(p["accuracy.tolerance"]),
-        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(np.nan)),
-        line_tolerance=LINE_SHARE * np.asarray(p["accuracy.tolerance"]),
+        leakage_tolerance=_allowed(p, "accuracy.leakage_error", LEAKAGE_SHARE),
+        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
+        line_tolerance=_allowed(p, "accuracy.line_error", LINE_SHARE),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
         noise_scale=per_ampere,
@@ -317,6 +320,12 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
     )
+
+
+def _allowed(p: Mapping[str, np.ndarray], path: str, share: float) -> np.ndarray:
+    """An error as it was set, or a share of the tolerance."""
+    given = np.asarray(p[path], float)
+    return np.where(given == AUTOMATIC, share * np.asarray(p["accuracy.tolerance"], float), given)
 
 
 def relative_amplitude(architecture: str, echo: np.ndarray) -> np.ndarray:

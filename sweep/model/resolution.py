@@ -77,7 +77,6 @@ def resolved_categories(
                 number, pattern, error = beamlets_needed(p, index.size)
             else:
                 number, pattern = map(np.asarray, finest(p))
-                error = np.asarray(np.nan)
         chosen = {BEAMLETS: number, PATTERN: pattern, BEAMLETS_ERROR: error}
         for some, q in categories(p | chosen, further):
             yield index[some], q

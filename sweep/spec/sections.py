@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from sweep.model.intervals import COUNTED
+from sweep.model.preparation import AUTOMATIC
 from sweep.model.reflectance import LAWS
 from sweep.spec.effect_fields import with_modes, with_parameters
 from sweep.spec.instrument import Part
@@ -94,6 +95,17 @@ class Effects(Part):
     """Which physical effects are simulated: where the scene calls for it, always or never."""
 
 
+def _share(about: str) -> Numeric:
+    """Rule of a part of the tolerance that can be set by hand."""
+    return Numeric(
+        about=f"{about}; auto: as accuracy.tolerance needs",
+        example="1e-6",
+        at_least="0",
+        at_most="1",
+        words=(("auto", int(AUTOMATIC)),),
+    )
+
+
 class Accuracy(Part):
     """How far the computation goes; part of a study's identity."""
 
@@ -117,6 +129,12 @@ class Accuracy(Part):
             below="1",
         ),
     ] = 0.95
+    line_error: Annotated[
+        float, _share("Error of a bin, in noise sigmas, by few lines for many")
+    ] = AUTOMATIC
+    leakage_error: Annotated[
+        float, _share("Chance of leakage far from the lines that is not looked for")
+    ] = AUTOMATIC
     leakage_floor: Annotated[
         float,
         Numeric(

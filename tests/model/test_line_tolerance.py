@@ -69,3 +69,13 @@ def _parameters(table_4_1):
         phases="coherent", fft_size=2**12, range=10 ** rng.uniform(0.5, 4, 8), power=1e-2,
         grazing_angle=np.radians(rng.uniform(2, 90, 8)), radial_velocity=150.0,
     )  # fmt: skip
+
+
+def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
+    parameters = DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
+    given = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}
+    ((_, by_hand),) = prepare(parameters | given | {"accuracy.tolerance": 0.1})
+    assert (by_hand.line_tolerance, by_hand.leakage_tolerance) == (1e-4, 2e-5)
+    ((_, auto),) = prepare(parameters | {"accuracy.tolerance": 0.1})
+    assert auto.line_tolerance == pytest.approx(0.01)
+    assert auto.leakage_tolerance == pytest.approx(0.002)

@@ -75,6 +75,8 @@ SAME_GEOMETRY = {
     "instrument.telescope.aperture": "50 mm",
     "instrument.chirp.duration": "400 us",
     "accuracy.leakage_floor": 0.2,
+    "accuracy.line_error": 0.2,
+    "accuracy.leakage_error": 0.2,
     "draws": {"number": 5},
     "navigation": {"test_level": 0.01},
     "storage": {"block_shots": 64},

@@ -129,6 +129,8 @@ def other_value(path):
         "target.reflectance": 0.3,
         "instrument.processing.acquisition_delay": "1 us",
         "accuracy.leakage_floor": 0.2,
+        "accuracy.line_error": 0.2,
+        "accuracy.leakage_error": 0.2,
         "accuracy.tolerance": 0.2,
         "accuracy.confidence": 0.9,
         "instrument.processing.bits": 12,
