@@ -39,11 +39,13 @@ class Commands(click.Group):
             raise
         except Exception as error:
             from sweep.analysis.opening import NotAStoreError
+            from sweep.model.unsupported import UnsupportedShot
             from sweep.scenes.errors import SceneError
             from sweep.spec import SpecError
             from sweep.tasks.errors import TaskError
 
-            if not isinstance(error, (NotAStoreError, SceneError, SpecError, TaskError)):
+            told = (NotAStoreError, SceneError, SpecError, TaskError, UnsupportedShot)
+            if not isinstance(error, told):
                 raise
             click.echo(str(error), err=True)
             ctx.exit(MISTAKE)

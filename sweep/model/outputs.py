@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 NO_DOPPLER = "nan for direct detection, which has no optical Doppler segment"
+NO_ECHO = "nan where no light comes back"
+NO_BIN = "-inf where the detection occupies every bin, so that none is left to raise an alarm"
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ OUTPUTS: dict[str, Output] = {
         "what Tables 4.3 to 4.5 of the thesis print",
     ),
     "log10_pfa_bin": Output("1", "log10 of pfa_bin", "finite where pfa_bin underflows"),
-    "log10_pfa_segment": Output("1", "log10 of pfa_segment"),
-    "log10_pfa_shot": Output("1", "log10 of pfa_shot"),
+    "log10_pfa_segment": Output("1", "log10 of pfa_segment", NO_BIN),
+    "log10_pfa_shot": Output("1", "log10 of pfa_shot", NO_BIN),
     "p_leakage_up": Output(
         "1", "probability that leaked signal raises a further group, up-chirp", "over noise alone"
     ),
@@ -69,12 +71,19 @@ OUTPUTS: dict[str, Output] = {
     ),
     "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
     "range_error": Output(
-        "m", "reported less true range, without noise", "peak bins of the three segments resolved"
+        "m",
+        "reported less true range, without noise",
+        f"peak bins of the three segments resolved; {NO_ECHO}",
     ),
     "radial_velocity_error": Output(
-        "m s-1", "reported less true radial velocity, without noise", "positive when closing"
+        "m s-1",
+        "reported less true radial velocity, without noise",
+        f"positive when closing; {NO_ECHO}",
     ),
 }
+
+WITHOUT_ECHO = tuple(name for name, output in OUTPUTS.items() if NO_ECHO in output.comment)
+"""What has no value where no light comes back."""
 
 
 def _count(what: str) -> Output:

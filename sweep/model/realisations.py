@@ -32,8 +32,6 @@ BEAMLETS = 1 << 19
 
 _NAMES = list(OUTPUTS)
 _LOGARITHMS = np.array([name.startswith("log10_") for name in _NAMES])
-_WITHOUT_ECHO = ("range_error", "radial_velocity_error")
-"""What has no value in a draw that sends nothing back."""
 
 
 class Stretch(NamedTuple):
@@ -119,15 +117,8 @@ def evaluate(
     """
     means = Means(len(keys))
     for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
-        means.add(stretch.point, outputs_of(stretch.shots))
+        means.add(stretch.point, statistics(stretch.shots))
     return means.results()
-
-
-def outputs_of(shots: Shots) -> dict[str, np.ndarray]:
-    """Outputs of each draw, (m,); where nothing is sent back, nan for what is then unknown."""
-    outputs = statistics(shots)
-    dark = shots.echo_power == 0
-    return outputs | {name: np.where(dark, np.nan, outputs[name]) for name in _WITHOUT_ECHO}
 
 
 def certain(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

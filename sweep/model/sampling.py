@@ -23,8 +23,8 @@ from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_co
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
 from sweep.model.outputs import DRAW_OUTPUTS, PROMISED
 from sweep.model.preparation import Parameters
-from sweep.model.realisations import Means, certain, outputs_of, random_effects, realise
-from sweep.model.shot import evaluate
+from sweep.model.realisations import Means, certain, random_effects, realise
+from sweep.model.shot import evaluate, statistics
 
 GROWTH = 1.25
 """Draws at a look over those at the one before; the last round's surplus is half of that, about."""
@@ -197,7 +197,7 @@ class Sample:
         for point, number, shots in realise(
             self._some(points), self._effects, keys=keys, first_draw=first, draws=ends[-1] - first
         ):
-            found = outputs_of(shots)
+            found = statistics(shots)
             means.add(points[point], found)
             rows = Rows(point, keys[point], number, number + 1)
             if self._method == "probabilities":

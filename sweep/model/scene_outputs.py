@@ -89,7 +89,11 @@ STATISTICS: dict[str, SceneOutput] = {
     "snr_up": _shot("1", "signal-to-noise ratio, up-chirp, strongest bin"),
     "surfaces_seen": _shot("1", "groups of bins above the threshold, up-chirp", dtype="int16"),
 }
-"""Probabilities of each shot, before any draw; nan where nothing is seen."""
+"""Probabilities of each shot, before any draw.
+
+Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
+``pd_doppler`` of direct detection, which has no optical Doppler segment.
+"""
 
 SIMULATED: dict[str, SceneOutput] = {
     "effects": _shot("1", "effects that were simulated", dtype="uint32"),

@@ -11,6 +11,7 @@ from sweep.model import chances, waveform
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.modulation import choices, stretches
+from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import evaluate_segments, workspace
 
@@ -42,7 +43,7 @@ def evaluate(parameters: Parameters, effects: Collection[str] = CORE) -> dict[st
 
 
 def statistics(shots: Shots) -> dict[str, np.ndarray]:
-    """Outputs of prepared shots, each (n,)."""
+    """Outputs of prepared shots, each (n,); without an echo, nan for what is then unknown."""
     found = find(shots)
     pd, miss, magnitude, _, exempted, leakage = np.moveaxis(found, 1, 0)
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
@@ -69,7 +70,8 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,
     }
-    return results
+    dark = shots.echo_power == 0
+    return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
 
 
 def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:

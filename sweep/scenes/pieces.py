@@ -1,4 +1,4 @@
-"""Pieces cut out of a ground."""
+"""Pieces of a ground, cut out or marked off."""
 
 from __future__ import annotations
 
@@ -40,3 +40,23 @@ def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
         corner[axis] += first * step
         cuts.append(slice(first, last + 1))
     return Terrain(terrain.heights[cuts[0], cuts[1]], terrain.spacing, corner)
+
+
+def square(
+    terrain: Terrain, *, centre: Sequence[float], size: float
+) -> tuple[float, float, float, float]:
+    """World (x least, y least, x largest, y largest) of a square, as far as there is ground [m].
+
+    Parameters as of :func:`piece`.
+
+    Raises
+    ------
+    ValueError
+        Where the square holds nothing of the terrain.
+    """
+    west, south, east, north = terrain.bounds
+    (x, y), half = centre[:2], size / 2
+    bounds = max(x - half, west), max(y - half, south), min(x + half, east), min(y + half, north)
+    if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        raise ValueError(f"there is no ground within {half:g} m of ({x:g}, {y:g}) m")
+    return bounds

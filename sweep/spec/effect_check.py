@@ -10,6 +10,7 @@ import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
+from sweep.model.effects.solar_background import SUN_RADIUS
 from sweep.spec.axes import Axis
 from sweep.spec.effect_fields import OFF, ON
 from sweep.spec.fields import rules_of
@@ -33,6 +34,8 @@ class Need(NamedTuple):
     """Whether values of that one will not do."""
     rule: str
     remedy: str
+    if_on: bool = False
+    """Whether the parameter's effect has the same need wherever it is forced on."""
 
 
 def _above_zero(path: str, asks: Condition, other: str) -> Need:
@@ -55,6 +58,15 @@ NEEDS = (
         lambda architecture: architecture == "direct",
         "makes speckle, of which direct detection averages over an unknown number",
         "take a coherent receiver",
+        if_on=True,
+    ),
+    Need(
+        "target.sun_distance",
+        lambda distance: (distance > 0) & (distance < SUN_RADIUS),
+        "instrument.laser.wavelength",
+        lambda wavelength: wavelength > 0,
+        f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
+        "set it to 1 au or so",
     ),
 )
 
@@ -107,10 +119,12 @@ def _need_findings(
     """Parameters of effects without others that they need."""
     for need in NEEDS:
         owner = next(e for e in EFFECTS if any(p.path == need.path for p in e.parameters))
-        conditions = {need.path: need.asks, need.other: need.lacks}
-        if modes.get(owner.name, OFF) != OFF and has_point(conditions, values, axes):
-            remedy = f"{need.remedy}, or effects.{owner.name}: off"
+        mode = modes.get(owner.name, OFF)
+        remedy = f"{need.remedy}, or effects.{owner.name}: off"
+        if mode != OFF and has_point({need.path: need.asks, need.other: need.lacks}, values, axes):
             yield Finding(place_on_grid(need.path, axes), need.rule, remedy, ABSENT)
+        elif need.if_on and mode == ON and has_point({need.other: need.lacks}, values, axes):
+            yield Finding((SECTION, owner.name), need.rule, remedy, ON)
 
 
 def without_draws(
@@ -120,14 +134,17 @@ def without_draws(
 
     Parameters are those of :func:`effect_findings`.
     """
+    rule = "is simulated by draws, and the study has none"
+    for effect in EFFECTS:
+        if effect.is_random and modes.get(effect.name) == ON:
+            remedy = "set draws.limit or draws.number, or leave it out"
+            yield Finding((SECTION, effect.name), rule, remedy, ON)
     for effect, parameter in _random_and_there(values, axes, modes):
-        yield Finding(
-            place_on_grid(parameter.path, axes),
-            "is simulated by draws, and the study has none",
+        remedy = (
             "set draws.limit to draw until accuracy.tolerance is met, draws.number to draw so many "
-            f"times, or effects.{effect.name}: off",
-            ABSENT,
+            f"times, or effects.{effect.name}: off"
         )
+        yield Finding(place_on_grid(parameter.path, axes), rule, remedy, ABSENT)
 
 
 def not_in_flights(

@@ -144,7 +144,13 @@ class Table(_Drawing):
     where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
     minimum_range: Annotated[
         float,
-        Numeric(about="Nearer ranges are left out", si_unit="m", example="5 m", at_least="0 m"),
+        Numeric(
+            about="Nearer ranges are left out",
+            si_unit="m",
+            example="5 m",
+            at_least="0 m",
+            at_most="1e15 m",
+        ),
     ] = 0.0
     printed: Annotated[Printed, _PRINTED] = ()
 

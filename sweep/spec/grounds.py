@@ -48,7 +48,7 @@ _RELIEF_SLOPE = of.number(
 class Relief(Part):
     """Fractal relief, for what a survey is too coarse to show."""
 
-    hurst: Annotated[float, of.number("Hurst exponent", "0.9", above="0", at_most="0.999")]
+    hurst: Annotated[float, of.number("Hurst exponent", "0.9", at_least="1e-3", at_most="0.999")]
     rms_slope: Annotated[float, _RELIEF_SLOPE]
     baseline: Annotated[float, of.size("Distance at which the slope is stated", "10 m")]
     seed: Annotated[int, of.seed()] = 0
@@ -240,7 +240,7 @@ class RasterGround(Ground):
         tuple[float, ...] | None,
         Several(
             about="Metres of a degree eastwards and northwards, of a raster in degrees",
-            of=of.number("Metres", "110900", above="0"),
+            of=of.number("Metres", "110900", at_least="1e-6"),
             least=2,
             most=2,
         ),

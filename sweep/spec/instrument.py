@@ -25,10 +25,24 @@ class Laser(Part):
     """Transmitter: wavelength, power and beam."""
 
     wavelength: Annotated[
-        float, Numeric(about="Optical wavelength", si_unit="m", example="1550 nm", above="0 m")
+        float,
+        Numeric(
+            about="Optical wavelength",
+            si_unit="m",
+            example="1550 nm",
+            at_least="1 nm",
+            at_most="100 m",
+        ),
     ]
     power: Annotated[
-        float, Numeric(about="Transmitted optical power", si_unit="W", example="1 W", above="0 W")
+        float,
+        Numeric(
+            about="Transmitted optical power",
+            si_unit="W",
+            example="1 W",
+            at_least="1e-18 W",
+            at_most="1e9 W",
+        ),
     ]
     beam_divergence: Annotated[
         float,
@@ -36,7 +50,7 @@ class Laser(Part):
             about="Full angle of the beam, for a Gaussian beam between its 1/e^2 points",
             si_unit="rad",
             example="50 urad",
-            above="0 rad",
+            at_least="1e-12 rad",
             at_most="90 deg",
         ),
     ]
@@ -48,7 +62,13 @@ class Chirp(Part):
 
     bandwidth: Annotated[
         float,
-        Numeric(about="Frequency swept in one chirp", si_unit="Hz", example="1 GHz", above="0 Hz"),
+        Numeric(
+            about="Frequency swept in one chirp",
+            si_unit="Hz",
+            example="1 GHz",
+            at_least="1 mHz",
+            at_most="1e15 Hz",
+        ),
     ]
     start_frequency: Annotated[
         float,
@@ -57,10 +77,18 @@ class Chirp(Part):
             si_unit="Hz",
             example="5.5 GHz",
             at_least="0 Hz",
+            at_most="1e15 Hz",
         ),
     ]
     duration: Annotated[
-        float, Numeric(about="Length of one segment", si_unit="s", example="500 us", above="0 s")
+        float,
+        Numeric(
+            about="Length of one segment",
+            si_unit="s",
+            example="500 us",
+            at_least="1 ps",
+            at_most="1e6 s",
+        ),
     ]
 
 
@@ -69,7 +97,14 @@ class Telescope(Part):
     """Receiving optics."""
 
     aperture: Annotated[
-        float, Numeric(about="Diameter of the aperture", si_unit="m", example="25 mm", above="0 m")
+        float,
+        Numeric(
+            about="Diameter of the aperture",
+            si_unit="m",
+            example="25 mm",
+            at_least="1 um",
+            at_most="1 km",
+        ),
     ]
     optical_efficiency: Annotated[
         float,
@@ -88,7 +123,13 @@ class Receiver(Part):
 
     responsivity: Annotated[
         float,
-        Numeric(about="Responsivity at unit gain", si_unit="A/W", example="1.1 A/W", above="0 A/W"),
+        Numeric(
+            about="Responsivity at unit gain",
+            si_unit="A/W",
+            example="1.1 A/W",
+            at_least="1e-9 A/W",
+            at_most="1e3 A/W",
+        ),
     ]
     detector_bandwidth: Annotated[
         float,
@@ -96,12 +137,19 @@ class Receiver(Part):
             about="Electrical bandwidth of the detector",
             si_unit="Hz",
             example="400 MHz",
-            above="0 Hz",
+            at_least="1 mHz",
+            at_most="1e15 Hz",
         ),
     ]
     optical_passband: Annotated[
         float,
-        Numeric(about="Width of the optical filter", si_unit="m", example="25 nm", at_least="0 m"),
+        Numeric(
+            about="Width of the optical filter",
+            si_unit="m",
+            example="25 nm",
+            at_least="0 m",
+            at_most="100 m",
+        ),
     ]
     noise_equivalent_power: Annotated[
         float,
@@ -110,6 +158,7 @@ class Receiver(Part):
             si_unit="W/Hz^0.5",
             example="5 pW/rtHz",
             at_least="0 W/Hz^0.5",
+            at_most="100 W/Hz^0.5",
         ),
     ]
     transimpedance: Annotated[
@@ -118,7 +167,8 @@ class Receiver(Part):
             about="Gain of the transimpedance amplifier",
             si_unit="ohm",
             example="7 kohm",
-            above="0 ohm",
+            at_least="1 uohm",
+            at_most="1e12 ohm",
         ),
     ]
     amplifier_bandwidth: Annotated[
@@ -127,7 +177,8 @@ class Receiver(Part):
             about="Electrical bandwidth of the amplifier",
             si_unit="Hz",
             example="400 MHz",
-            above="0 Hz",
+            at_least="1 mHz",
+            at_most="1e15 Hz",
         ),
     ]
     amplifier_noise_current: Annotated[
@@ -137,6 +188,7 @@ class Receiver(Part):
             si_unit="A",
             example="25 nA",
             at_least="0 A",
+            at_most="1 kA",
         ),
     ]
     architecture: Annotated[
@@ -148,7 +200,8 @@ class Receiver(Part):
             about="Power of the local oscillator; direct detection has none",
             si_unit="W",
             example="1 mW",
-            above="0 W",
+            at_least="1e-18 W",
+            at_most="1e9 W",
         ),
     ] = 1e-3
     mixing_efficiency: Annotated[
@@ -156,7 +209,7 @@ class Receiver(Part):
         Numeric(
             about="Efficiency at which echo and local oscillator mix",
             example="0.7",
-            above="0",
+            at_least="1e-9",
             at_most="1",
         ),
     ] = 1.0
@@ -187,7 +240,7 @@ class Receiver(Part):
         Numeric(
             about="Depth of the intensity modulation; direct only",
             example="0.9",
-            above="0",
+            at_least="1e-9",
             at_most="1",
         ),
     ] = 1.0
@@ -197,13 +250,18 @@ class Receiver(Part):
             about="Load whose thermal noise limits direct detection; direct only",
             si_unit="ohm",
             example="50 ohm",
-            above="0 ohm",
+            at_least="1 uohm",
+            at_most="1e12 ohm",
         ),
     ] = 50.0
     temperature: Annotated[
         float,
         Numeric(
-            about="Temperature of the load; direct only", si_unit="K", example="290 K", above="0 K"
+            about="Temperature of the load; direct only",
+            si_unit="K",
+            example="290 K",
+            at_least="1 nK",
+            at_most="1e9 K",
         ),
     ] = 290.0
 
@@ -213,7 +271,14 @@ class Processing(Part):
     """Sampling, transform and threshold."""
 
     sample_rate: Annotated[
-        float, Numeric(about="Rate of the ADC", si_unit="Hz", example="600 MHz", above="0 Hz")
+        float,
+        Numeric(
+            about="Rate of the ADC",
+            si_unit="Hz",
+            example="600 MHz",
+            at_least="1 mHz",
+            at_most="1e15 Hz",
+        ),
     ]
     fft_size: Annotated[
         int,
@@ -226,7 +291,7 @@ class Processing(Part):
         Numeric(
             about="Threshold over the standard deviation of a noise-only bin's magnitude",
             example="10",
-            above="0",
+            at_least="1e-6",
             at_most="1e6",
         ),
     ]
@@ -240,6 +305,7 @@ class Processing(Part):
             si_unit="s",
             example="70 us",
             at_least="0 s",
+            at_most="1e6 s",
         ),
     ] = 0.0
     bins_counted: Annotated[

@@ -116,8 +116,10 @@ def _read_element(rule: Rule, index: int, written: object) -> Any:
     try:
         return rule.read(written)
     except QuantityError as error:
-        raise QuantityError(f"holds {written!r} as value {index}, which {error.rule}",
-                            error.suggestion) from None  # fmt: skip
+        value = written if isinstance(written, str | int | float) else type(written).__name__
+        told = f"holds {value!r:.60} as value {index}, which {error.rule}"
+        remedy = error.suggestion or f"write e.g. {getattr(rule, 'example', 'ground')}"
+        raise QuantityError(told, remedy) from None
 
 
 _STEERED = Several(

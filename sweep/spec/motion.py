@@ -12,7 +12,6 @@ from sweep.model.geometry import attitude as laws
 from sweep.model.geometry import quaternion
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import Either, File, Flag, Several
-from sweep.spec.rules import Numeric
 
 if TYPE_CHECKING:
     from sweep.model.geometry.platform import Flight, Path
@@ -25,18 +24,14 @@ Span = tuple[float, float]
 _SPEED = "30 m/s"
 
 
-def _speed(about: str) -> Any:
-    return Numeric(about=about, si_unit="m/s", example=_SPEED, at_least="0 m/s")
-
-
 class Straight(Part):
     """A straight line, the speed changing at a constant rate."""
 
     kind: Literal["straight"]
     begin: Annotated[Vector, of.position("Where it begins")] = Field(alias="from")
     to: Annotated[Vector, of.position("Where it ends")]
-    initial_speed: Annotated[float, _speed("Speed at the beginning")]
-    final_speed: Annotated[float | None, _speed("Speed at the end; the initial one")] = None
+    initial_speed: Annotated[float, of.speed("Speed at the beginning")]
+    final_speed: Annotated[float | None, of.speed("Speed at the end; the initial one")] = None
 
     def path(self, files: Files, span: Span | None = None) -> Path:
         """The path."""
@@ -57,7 +52,7 @@ class Acceleration(Part):
     position: Annotated[Vector, of.position("Position at the beginning")]
     velocity: Annotated[Vector, of.vector("Velocity at the beginning", "m/s", _SPEED)]
     acceleration: Annotated[Vector, of.vector("Acceleration", "m/s^2", "1 m/s^2")] = (0, 0, 0)
-    duration: Annotated[float, of.duration("How long it lasts", above="0 s")]
+    duration: Annotated[float, of.duration("How long it lasts", at_least="1 ns")]
 
     def path(self, files: Files, span: Span | None = None) -> Path:
         """The path."""
@@ -91,7 +86,7 @@ class Still(Part):
     position: Annotated[Vector, of.position("Where it stays")]
     duration: Annotated[
         float | None,
-        of.duration("How long; a target stays throughout the flight by default", above="0 s"),
+        of.duration("How long; a target stays throughout the flight by default", at_least="1 ns"),
     ] = None
 
     def path(self, files: Files, span: Span | None = None) -> Path:

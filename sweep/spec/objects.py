@@ -61,7 +61,9 @@ class MeshObject(Solid):
     up: Annotated[
         str | None, Choice(about="Its vertical axis; y for glTF, else z", options=("y", "z"))
     ] = None
-    scale: Annotated[float, of.number("Factor on all lengths", "2", above="0")] = 1.0
+    scale: Annotated[
+        float, of.number("Factor on all lengths", "2", at_least="1e-9", at_most="1e9")
+    ] = 1.0
 
     def shape(self, files: Files) -> Facets:
         """Its facets before they are turned."""
@@ -107,7 +109,8 @@ class MartianRocks(Part):
 
     kind: Literal["martian_rocks"]
     abundance: Annotated[
-        float, of.number("Fraction of the ground under rocks", "5 %", above="0", at_most="0.9")
+        float,
+        of.number("Fraction of the ground under rocks", "5 %", at_least="1e-9", at_most="0.9"),
     ]
 
     def law(self) -> Law:
@@ -124,9 +127,9 @@ class PowerLaw(Part):
     density: Annotated[
         float,
         Numeric(about="Number per area of 1 m or larger", si_unit="m^-2", example="0.01 m^-2",
-                above="0 m^-2"),
+                at_least="1e-12 m^-2", at_most="1e6 m^-2"),
     ]  # fmt: skip
-    exponent: Annotated[float, of.number("Exponent", "2.5", above="0", at_most="20")]
+    exponent: Annotated[float, of.number("Exponent", "2.5", at_least="1e-3", at_most="20")]
 
     def law(self) -> Law:
         """Size-frequency law."""
@@ -150,7 +153,7 @@ class Boulders(Material):
         float | None, of.size("Side of that square; all of the ground by default", "200 m")
     ] = None
     height_ratio: Annotated[
-        float, of.number("Height over diameter", "0.5", above="0", at_most="10")
+        float, of.number("Height over diameter", "0.5", at_least="1e-6", at_most="10")
     ] = 0.5
     elongation: Annotated[
         float, of.number("Largest ratio of long to short axis", "1.5", at_least="1", at_most="10")
@@ -167,10 +170,11 @@ class Boulders(Material):
             For too many of them, or none of the ground within the square.
         """
         from sweep.model.geometry.boulders import Shape, draw_boulders
-        from sweep.scenes.pieces import piece
+        from sweep.scenes.pieces import square
 
+        bounds = None
         if self.within is not None:
-            ground = piece(ground, centre=self.centre, size=self.within)
+            bounds = square(ground, centre=self.centre, size=self.within)
         return draw_boulders(
             generator("boulders", self.seed),
             self.law.law(),
@@ -178,6 +182,7 @@ class Boulders(Material):
             smallest=self.smallest,
             largest=self.largest,
             shape=Shape(self.height_ratio, self.elongation, self.subdivisions),
+            bounds=bounds,
         )
 
 

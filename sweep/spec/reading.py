@@ -26,6 +26,8 @@ DEEPEST = 30
 MOST_NODES = 200_000
 
 _DECIMAL = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
+_NO_FILE = "check the path, which is relative to the file that names it"
+_NO_YAML = "look at the brackets, quotes, colons and indentation there and above"
 _PLAIN_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
@@ -83,9 +85,10 @@ def read_document(path: Path) -> Document:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         rule = f"is no valid YAML: {error.problem or error.context}"
-        raise _file_error(path, rule, line=mark.line + 1 if mark else None) from None
+        raise _file_error(path, rule, _NO_YAML, mark.line + 1 if mark else None) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise _file_error(path, f"is no valid YAML: {str(error).splitlines()[0]}") from None
+        rule = f"is no valid YAML: {str(error).splitlines()[0]}"
+        raise _file_error(path, rule, _NO_YAML) from None
     document = Document({}, file=str(path))
     if not isinstance(root, yaml.MappingNode):
         raise _file_error(path, "must hold a mapping", "write e.g. 'title: A study'")
@@ -104,7 +107,7 @@ def _read_text(path: Path) -> str:
         raise _file_error(path, "is a directory", "name a YAML file") from None
     except (OSError, ValueError) as error:
         raise _file_error(
-            path, f"cannot be read: {getattr(error, 'strerror', '') or error}"
+            path, f"cannot be read: {getattr(error, 'strerror', '') or error}", _NO_FILE
         ) from None
     if len(content) > LARGEST_FILE:
         raise _file_error(
@@ -113,7 +116,7 @@ def _read_text(path: Path) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise _file_error(path, "is no UTF-8 text") from None
+        raise _file_error(path, "is no UTF-8 text", "save it as UTF-8") from None
 
 
 def _file_error(path: Path, rule: str, suggestion: str = "", line: int | None = None) -> SpecError:
@@ -125,8 +128,8 @@ def _similar_file(path: Path) -> str:
     try:
         names = [p.name for p in path.parent.iterdir() if p.suffix in (".yaml", ".yml")]
     except OSError:
-        return ""
-    return near_miss(path.name, names)
+        return _NO_FILE
+    return near_miss(path.name, names, otherwise=_NO_FILE)
 
 
 class _Loader(yaml.SafeLoader):

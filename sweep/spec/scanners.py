@@ -24,7 +24,7 @@ _REACH = {"at_least": "0 deg", "at_most": "89 deg"}
 
 def _interval(default: str) -> Numeric:
     about = f"Time from one beam of a cycle to the next; {default} by default"
-    return of.duration(about, "10 ms", at_least="0 s")
+    return of.duration(about, "10 ms")
 
 
 _TOGETHER = _interval("0, all at once,")
@@ -85,7 +85,7 @@ class Squares(Part):
         Numbers,
         Several(
             about="Angle by which each element of an axis throws the beam to either side",
-            of=of.angle("Angle", "15 deg", above="0 deg", at_most="45 deg"),
+            of=of.angle("Angle", "15 deg", at_least="1e-6 deg", at_most="45 deg"),
             least=1,
             most=5,
         ),

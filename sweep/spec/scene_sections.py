@@ -31,6 +31,7 @@ class Scene(Part):
             si_unit="W/m^3",
             example="0.5 W/m^2/nm",
             at_least="0 W/m^3",
+            at_most="1e18 W/m^3",
         ),
     ] = 0.0
 

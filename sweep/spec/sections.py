@@ -16,7 +16,14 @@ class Target(Part):
     """A flat plane, seen at an angle."""
 
     range: Annotated[
-        float, Numeric(about="Distance to the target", si_unit="m", example="2 km", above="0 m")
+        float,
+        Numeric(
+            about="Distance to the target",
+            si_unit="m",
+            example="2 km",
+            at_least="1 nm",
+            at_most="1e15 m",
+        ),
     ]
     grazing_angle: Annotated[
         float,
@@ -24,7 +31,7 @@ class Target(Part):
             about="Angle between beam and surface, 90 deg along the normal",
             si_unit="rad",
             example="15 deg",
-            above="0 deg",
+            at_least="1e-6 deg",
             at_most="90 deg",
         ),
     ]
@@ -56,6 +63,7 @@ class Target(Part):
             si_unit="W/m^3",
             example="0.5 W/m^2/nm",
             at_least="0 W/m^3",
+            at_most="1e18 W/m^3",
         ),
     ] = 0.0
 
@@ -141,7 +149,7 @@ class Accuracy(Part):
             about="Bins with less leaked signal than so many noise sigmas count as noise alone, "
             "where bins are taken one by one: in draws, padded FFTs, tabulated windows",
             example="0.1",
-            above="0",
+            at_least="1e-9",
             at_most="1000",
         ),
     ] = 0.1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -36,7 +37,6 @@ _SCIPY_WINDOWS = (
     "general_gaussian",
     "general_hamming",
     "kaiser",
-    "kaiser_bessel_derived",
     "lanczos",
     "parzen",
     "taylor",
@@ -92,7 +92,12 @@ def _try_window(name: str, parameters: tuple[float, ...]) -> None:
     from scipy.signal import get_window  # slow to import, and seldom needed
 
     try:
-        values = get_window((name, *parameters) if parameters else name, 16)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            values = get_window((name, *parameters) if parameters else name, 16)
+    except UserWarning:
+        rule = "has parameters that make it unsuitable for spectral analysis"
+        raise QuantityError(rule, "take others, for chebwin 45 or more") from None
     except (ValueError, TypeError, ArithmeticError, MemoryError):
         known = name in _WINDOWS or name in _SCIPY_WINDOWS
         if known:
@@ -100,6 +105,6 @@ def _try_window(name: str, parameters: tuple[float, ...]) -> None:
                 "has parameters that this window does not take", "write e.g. 'kaiser(8.6)'"
             ) from None
         suggestion = near_miss(name, _WINDOWS + _SCIPY_WINDOWS, otherwise="write e.g. 'hamming'")
-        raise QuantityError("is no window that scipy.signal knows", suggestion) from None
+        raise QuantityError("is no periodic window that scipy.signal makes", suggestion) from None
     if not np.all(np.isfinite(values)) or not np.sum(values) > 0:
         raise QuantityError("has parameters that make no usable window")

@@ -84,6 +84,10 @@ class Calling:
                 flags |= np.where(effect.absent(parameters), np.uint32(1 << k), np.uint32(0))
         return flags
 
+    def of_point(self, point: int) -> tuple[str, ...]:
+        """Names of the effects that are simulated at a point of the first block."""
+        return names_of(int(self.of_block(0).flags[point]))
+
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these."""
         from sweep.model.effects.block import Block

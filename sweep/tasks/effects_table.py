@@ -214,7 +214,8 @@ def _some_points(calling: Calling, tile: int) -> tuple[np.ndarray, tuple[str, ..
     slices = calling.tiles.points(tile)
     shape = tuple(s.stop - s.start for s in slices)
     few = np.unique(np.linspace(0, int(np.prod(shape)) - 1, COST_POINTS).astype(np.int64))
-    at = [i + s.start for i, s in zip(np.unravel_index(few, shape), slices, strict=True)]
+    along = np.unravel_index(few, shape) if shape else ()
+    at = [i + s.start for i, s in zip(along, slices, strict=True)]
     numbers = np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few
     ((_, plan),) = calling.plans(np.array([tile]))
     return numbers, tuple(n for n, kept in zip(NAMES, plan.kept[:, 0], strict=True) if kept)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks.calling import EFFECTS, ERROR, Called
+from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
 from sweep.tasks.grid import Grid, Value, canonical_rows
 from sweep.tasks.study import Results
 
@@ -138,11 +138,12 @@ def with_few_draws(spec: Spec, most: int) -> Spec:
 def compile_kernels(spec: Spec, grid: Grid) -> None:
     """Compile what the model compiles, once, before workers get blocks and find it on disk.
 
-    One draw of a point with every effect that may be called for, and one with none.
+    One draw of a point with every effect that may be called for, and one with none. Random effects
+    are not for every instrument: of these, only what the point itself calls for.
     """
     from sweep.model.effects.catalogue import EFFECTS as ALL
 
     modes, once = spec.modes(), with_few_draws(spec, 1)
-    may_be = [e.name for e in ALL if modes[e.name] != "off" and (once.draws.any or not e.is_random)]
-    for effects in (may_be, ()):
+    may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
+    for effects in ({*may_be, *Calling(spec, grid).of_point(0)}, ()):
         evaluate_points(once, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)

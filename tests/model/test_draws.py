@@ -7,9 +7,9 @@ from sweep.model import philox
 from sweep.model.draws import draw
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.realisations import outputs_of, realise
+from sweep.model.realisations import realise
 from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate
+from sweep.model.shot import evaluate, statistics
 
 DRAWS = 40_000
 """5 sigma of a proportion is at most 5 * sqrt(1/4 / 40,000) = 0.0125: a 2 % error shows."""
@@ -132,7 +132,7 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
     table = {name: np.empty((6, draws)) for name in names}
     for point, number, shots in realise(parameters, chosen, keys=_keys(6), draws=draws):
-        outputs = outputs_of(shots)
+        outputs = statistics(shots)
         quiet = (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
         for name, values in (outputs | {"alarm": 1 - quiet}).items():
             if name in table:

@@ -11,9 +11,10 @@ from sweep.model.effects import pointing_jitter, scintillation
 from sweep.model.effects.catalogue import CORE
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.realisations import evaluate, outputs_of, realise
+from sweep.model.realisations import evaluate, realise
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate as evaluate_without
+from sweep.model.shot import statistics
 
 DRAWS = 20_000
 RANDOM = ("pointing_jitter", "speckle", "scintillation")
@@ -49,7 +50,7 @@ def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
     for point, draw, shots in realise(
         parameters, effects, keys=chosen, first_draw=first_draw, draws=draws
     ):
-        for name, values in outputs_of(shots).items():
+        for name, values in statistics(shots).items():
             names[name][point, draw - first_draw] = values
     return names
 
@@ -205,7 +206,7 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     square = (power - 1) ** 2
     assert square.mean() == pytest.approx(scintillation.index(legs), abs=5 * square.std() / root)
     for stretch in stretches[:2]:
-        shots, outputs = stretch.shots, outputs_of(stretch.shots)
+        shots, outputs = stretch.shots, statistics(stretch.shots)
         share = shots.echo_power / plain.shots.echo_power[0]
         quiet = plain.shots.noise_sources["signal_shot"][0]
         np.testing.assert_allclose(shots.noise_sources["signal_shot"], share * quiet, rtol=1e-12)

@@ -34,7 +34,7 @@ FIELDS = [
     ("scene.solar_irradiance", 3, "needs a unit"),
     (f"{GROUND}.kind", "plan", "did you mean 'plane'?"),
     (f"{GROUND}.size", 3000, "needs a unit (you wrote 3000); write e.g. '3 km'"),
-    (f"{GROUND}.size", "0 m", "must be greater than 0 m"),
+    (f"{GROUND}.size", "0 m", "must be at least 1 um"),
     (f"{GROUND}.size", ..., "is missing; write e.g. 'size: 3 km'"),
     (f"{GROUND}.reflectance", ..., "is missing; write e.g. 'reflectance: 0.1'"),
     (f"{GROUND}.reflectance_law", "lambrt", "did you mean 'lambert'?"),

@@ -137,6 +137,7 @@ def other_value(path):
         "instrument.receiver.field_of_view": "1 mrad",
         "target.pointing_jitter": "1 mrad",
         "target.sun_elevation": "1 rad",
+        "target.sun_distance": "1.5 au",
         "atmosphere.profile": "layer",
     }
     rule = parameter_rules()[path]

@@ -154,6 +154,7 @@ PARAMETERS = (
         default=0.0,
         example="1e-4 1/m",
         at_least="0 1/m",
+        at_most="1e9 1/m",
         category=True,
     ),
     Parameter(
@@ -162,7 +163,8 @@ PARAMETERS = (
         si_unit="m",
         default=1e3,
         example="1 km",
-        above="0 m",
+        at_least="1 um",
+        at_most="1e15 m",
         category=True,
     ),
     Parameter(

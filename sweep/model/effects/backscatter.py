@@ -229,7 +229,8 @@ EFFECT = Effect(
             si_unit="sr",
             default=50.0,
             example="50 sr",
-            above="0 sr",
+            at_least="1e-6 sr",
+            at_most="1e9 sr",
         ),
     ),
 )

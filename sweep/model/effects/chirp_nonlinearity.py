@@ -197,6 +197,8 @@ def _error(shape: str, about: str) -> Parameter:
         si_unit="Hz",
         default=0.0,
         example="100 kHz",
+        at_least="-1e15 Hz",
+        at_most="1e15 Hz",
     )
 
 
@@ -215,7 +217,7 @@ EFFECT = Effect(
             about="Periods of the sinusoidal error over the sweep",
             default=1.0,
             example="5",
-            above="0",
+            at_least="1e-6",
             at_most="1000",
         ),
     ),

@@ -30,6 +30,7 @@ from numba import njit
 
 from sweep.model.elementary import sincos_cycles
 from sweep.model.equivalent import dot
+from sweep.model.unsupported import UnsupportedShot
 
 Phase = Callable[[np.ndarray], np.ndarray]
 """Phase error [cycles], (n, m), at places x of the record, (m,), -1..1."""
@@ -85,7 +86,7 @@ def split_lines(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
 
     Raises
     ------
-    ValueError
+    UnsupportedShot
         A phase error wanders over more bins than :data:`MOST_LINES` lines can stand for (some
         500), or is not smooth.
 
@@ -114,9 +115,12 @@ def split_lines(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
         left = np.concatenate([tried[~good], left[~inside]])
         if not left.size:
             return _assembled(fits, centre.size)
-    raise ValueError(
-        f"a phase error over the record, {2 * half[left].max():.3g} bins wide, is beyond what"
-        f" {MOST_LINES} lines stand for"
+    raise UnsupportedShot(
+        "range walk, acceleration and the errors of the chirp together spread a line over "
+        f"{2 * half[left].max():.3g} bins within a record, and some 500 can be simulated: lower "
+        "target.radial_velocity, target.acceleration or instrument.chirp.quadratic_error, "
+        "cubic_error, sinusoidal_error or error_periods; or shorten the record by "
+        "instrument.processing.fft_size"
     )
 
 

@@ -227,7 +227,7 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
     f = line.lobe
     double = image_factor(line, extreme)
     on_axis, one_place = f.least(line.bin_offset) ** 2, line.bin_offset == line.bin_offset_least
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         second = 0.5 * f.curvature * rms**2
         slant = np.minimum(f.slope, f.curvature * line.bin_offset)
         least = on_axis - slant * mean - second - line.tilt * rms
@@ -295,14 +295,14 @@ def moved_change(
     with_least, with_most = power_range(moved, together, beamlets)
     least, most = power_range(still, present, beamlets)
     double = np.maximum(image_factor(still, wide + shift), 1.05)
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         uphill = np.exp(np.minimum(still.tilt * (wide + shift), 50.0))
         change = f.slope * (mean + shift) + f.curvature * (present.rms * rms + rms**2 / 2)
         change = double * uphill * (change + still.tilt * (rms + shift)) / least
-    change = np.where(np.isnan(change), np.inf, change)
-    less, more = _gain(moved, still, shift)
-    low = np.maximum(1 - change, less * with_least / most)
-    high = np.minimum(1 + change, more * with_most / least)
+        change = np.where(np.isnan(change), np.inf, change)
+        less, more = _gain(moved, still, shift)
+        low = np.fmax(1 - change, less * with_least / most)
+        high = np.fmin(1 + change, more * with_most / least)
     same = (extreme == 0) & (shift == 0)
     return Change(signal=(np.sqrt(np.where(same, 1.0, low)), np.sqrt(np.where(same, 1.0, high))))
 

@@ -46,6 +46,7 @@ from sweep.model.effects.phase_bounds import (
 )
 from sweep.model.effects.span import Operand, Span
 from sweep.model.preparation import Shots
+from sweep.model.unsupported import UnsupportedShot
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
@@ -62,6 +63,10 @@ _FEW_LAGS = 0.1
 
 _MOST_NOISE = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
+
+
+MOST_BINS = 500
+"""Standard deviation of a Gaussian line [bins of fs/L] that shifts stand for."""
 
 
 class Shifts(NamedTuple):
@@ -83,6 +88,11 @@ def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
     duration : (n,) ndarray
         Length of the record L/fs [s].
 
+    Raises
+    ------
+    UnsupportedShot
+        For a line of more than :data:`MOST_BINS` bins standard deviation.
+
     Notes
     -----
     One shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
@@ -91,6 +101,12 @@ def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
     summation formula; the Gaussian's tails are cut where they hold as much.
     """
     deviation = np.atleast_1d(DEVIATION_OF_FWHM * np.asarray(fwhm, float) * duration)
+    if deviation.max(initial=0.0) > MOST_BINS:
+        raise UnsupportedShot(
+            f"instrument.laser.line_width makes a line of {deviation.max():.3g} bins standard "
+            f"deviation, and {MOST_BINS} can be simulated: lower it, or shorten the record by "
+            "instrument.processing.fft_size"
+        )
     room = math.sqrt(math.log(2 / TOLERANCE) / 2) / math.pi
     per_deviation = deviation + room  # s / h
     reach = math.sqrt(2 * math.log(1 / TOLERANCE))
@@ -373,6 +389,7 @@ EFFECT = Effect(
             default=0.0,
             example="10 kHz",
             at_least="0 Hz",
+            at_most="1e15 Hz",
         ),
         Parameter(
             path=_SHAPE,

@@ -118,6 +118,7 @@ EFFECT = Effect(
             default=0.0,
             example="-155 dB/Hz",
             at_least="0 1/Hz",
+            at_most="100 1/Hz",
         ),
         Parameter(
             path=_REJECTION,

@@ -244,6 +244,7 @@ EFFECT = Effect(
             default=0.0,
             example="1 V",
             at_least="0 V",
+            at_most="1e12 V",
         ),
     ),
 )

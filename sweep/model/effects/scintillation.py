@@ -300,6 +300,7 @@ EFFECT = Effect(
             default=1e-14,
             example="1e-14 m^(-2/3)",
             at_least="0 m^(-2/3)",
+            at_most="100 m^(-2/3)",
             category=True,
         ),
         Parameter(

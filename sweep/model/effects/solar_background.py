@@ -73,7 +73,9 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
-    exitance = 2 * np.pi * PLANCK * SPEED_OF_LIGHT**2 / x**5 / np.expm1(exponent)
+    # 1 / (e^u - 1), written so that it fades to 0 where e^u exceeds what a float holds.
+    photons = np.exp(-exponent) / -np.expm1(-exponent)
+    exitance = 2 * np.pi * PLANCK * SPEED_OF_LIGHT**2 / x**5 * photons
     dilution = np.where(d > 0, (SUN_RADIUS / np.where(d > 0, d, 1.0)) ** 2, 0.0)
     return np.asarray(exitance * dilution * np.maximum(np.sin(elevation), 0.0))
 
@@ -136,6 +138,7 @@ EFFECT = Effect(
             default=0.0,
             example="1.52 au",
             at_least="0 m",
+            at_most="1e18 m",
         ),
         Parameter(
             path=_ELEVATION,

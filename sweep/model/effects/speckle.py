@@ -333,6 +333,7 @@ EFFECT = Effect(
             default=0.0,
             example="10 um",
             at_least="0 m",
+            at_most="1 km",
         ),
     ),
 )

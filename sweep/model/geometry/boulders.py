@@ -48,6 +48,7 @@ def draw_boulders(
     largest: float,
     surface: int = 0,
     shape: Shape = ROUND,
+    bounds: tuple[float, float, float, float] | None = None,
 ) -> Facets:
     """Boulders on a terrain, from a size-frequency law.
 
@@ -68,6 +69,8 @@ def draw_boulders(
         Surface index of the facets.
     shape : Shape
         Their form.
+    bounds : (x least, y least, x largest, y largest) of float, optional
+        World rectangle that they stand in [m]; that of the terrain by default.
 
     Raises
     ------
@@ -75,7 +78,7 @@ def draw_boulders(
         As `frequency.scatter`.
     """
     x, y, diameter = scatter(
-        generator, law, bounds=terrain.bounds, smallest=smallest, largest=largest
+        generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
     )
     elongation = generator.uniform(1.0, shape.elongation, len(x))
     heading = generator.uniform(0.0, math.pi, len(x))

@@ -12,8 +12,8 @@ from sweep.model.effects.change import pd_change
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.pointing_jitter import angles, turned
 from sweep.model.geometry.jitter import jitter_directions
-from sweep.model.realisations import outputs_of, realise
-from sweep.model.shot import evaluate, find
+from sweep.model.realisations import realise
+from sweep.model.shot import evaluate, find, statistics
 
 DRAWS = 20_000
 
@@ -33,7 +33,7 @@ def draws_of(parameters, sigma, draws, points=1):
     values = {}
     shaken = parameters | {"target.pointing_jitter": sigma}
     for stretch in realise(shaken, (*CORE, "pointing_jitter"), keys=keys(points), draws=draws):
-        for name, value in outputs_of(stretch.shots).items():
+        for name, value in statistics(stretch.shots).items():
             row = values.setdefault(name, np.full((points, draws), np.nan))
             row[stretch.point, stretch.draw] = value
     return values

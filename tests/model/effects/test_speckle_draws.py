@@ -9,9 +9,9 @@ from sweep.model.effects import speckle
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.effect import Realisation
 from sweep.model.marcum import marcum_q1
-from sweep.model.realisations import evaluate, outputs_of, realise
+from sweep.model.realisations import evaluate, realise
 from sweep.model.shot import evaluate as evaluate_without
-from sweep.model.shot import find
+from sweep.model.shot import find, statistics
 
 AGREEMENT = 1e-9
 """Largest difference from the truth over the peak: the truth's own floor is 1e-11."""
@@ -305,7 +305,7 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
     }  # fmt: skip
     effects = (*SPECKLED, "line_width")
     (stretch,) = realise(parameters, effects, keys=keys(1), draws=50)
-    ratio = stretch.shots.pedestal / outputs_of(stretch.shots)["snr_up"]
+    ratio = stretch.shots.pedestal / statistics(stretch.shots)["snr_up"]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # the image's phase moves with it
     assert np.ptp(stretch.shots.pedestal) > 0.5 * stretch.shots.pedestal.mean()
 

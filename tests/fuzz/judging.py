@@ -1,0 +1,150 @@
+"""What must hold of every study, however odd: it computes to sane numbers or is refused in words."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, NO_BIN, OUTPUTS, WITHOUT_ECHO
+from sweep.model.unsupported import UnsupportedShot
+from sweep.spec import Mistake, Spec, SpecError, from_stored, load
+from sweep.tasks import plan as planning
+from sweep.tasks.effects_table import effects_table
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.study import Results
+
+ROUNDING = 1e-9
+"""What sums of probabilities may be off: 1e-12 seen, and no effect is as small."""
+
+PROBABILITIES = ("pd_", "miss_", "pfa_", "p_leakage_")
+FINITE = tuple(name for name in OUTPUTS if not name.endswith("_doppler"))
+NO_BIN_LEFT = tuple(name for name, output in OUTPUTS.items() if output.comment == NO_BIN)
+
+
+class Verdict(NamedTuple):
+    """What has come of a study: why it was refused; empty where it was computed."""
+
+    refusals: tuple[str, ...] = ()
+
+
+@contextmanager
+def strictly() -> Iterator[None]:
+    """Context in which every warning is an error, whoever gives it."""
+    with warnings.catch_warnings(), np.errstate(divide="warn", over="warn", invalid="warn"):
+        warnings.simplefilter("error")
+        yield
+
+
+def judge(file: Path) -> Verdict:
+    """A spec of a flat target read from its file, planned, evaluated in a plain loop, looked at.
+
+    Raises
+    ------
+    AssertionError
+        For numbers that can not be.
+    Exception
+        Whatever else goes wrong: a spec is computed, or refused by a `SpecError`.
+    """
+    with strictly():
+        try:
+            spec = load(file)
+        except SpecError as error:
+            for mistake in error.mistakes:
+                look_at_mistake(mistake)
+            return Verdict(tuple(f"{kind_of(m)}" for m in error.mistakes))
+        assert isinstance(spec, Spec)
+        assert from_stored(spec.to_json()).id == spec.id, "a stored spec is another"
+        try:
+            planned = planning.plan(spec)
+            effects_table(spec, costs=False)
+            study = GridStudy(spec)
+            for block in range(study.n_blocks):
+                look_at_results(spec, study, study.evaluate(block), block)
+        except UnsupportedShot as error:
+            assert "instrument." in str(error) and ": " in str(error)
+            return Verdict((str(error)[:50],))
+        assert planned.points == study.points > 0 and planned.seconds > 0
+    return Verdict()
+
+
+def kind_of(mistake: Mistake) -> str:
+    """A mistake without its numbers."""
+    words = [word for word in mistake.rule.split() if not any(c.isdigit() for c in word)]
+    return f"{mistake.path.split('[')[0]}: {' '.join(words)[:60]}"
+
+
+def look_at_mistake(mistake: Mistake) -> None:
+    """A mistake names its field, the rule, and what to do: said by the rule itself or beside it."""
+    assert mistake.path or mistake.file, "a mistake without a place"
+    assert mistake.rule.strip(), "a mistake without a rule"
+    says_what_to_do = mistake.rule.startswith(("must ", "needs ", "takes ", "can not be made: "))
+    assert says_what_to_do or mistake.suggestion, f"no remedy: {mistake}"
+
+
+def look_at_results(spec: Spec, study: GridStudy, results: Results, block: int) -> None:
+    """Results of a block: all there, of the right shape, and numbers that can be."""
+    extent = study.grid.extent(block)
+    assert set(results) == set(study.chunks(block)), "outputs are missing, or too many"
+    direct = np.broadcast_to(
+        np.asarray(study.grid.parameters(block)["instrument.receiver.architecture"]) == "direct",
+        (study.grid.block_size(block),),
+    ).reshape(extent)
+    for name, values in results.items():
+        assert values.shape[: len(extent)] == extent, f"{name} has the shape {values.shape}"
+        if name.startswith(PROBABILITIES):
+            _probability(name, values)
+        if name in FINITE:
+            there = values[values != -np.inf] if name in NO_BIN_LEFT else values
+            there = values[results["snr_up"] > 0] if name in WITHOUT_ECHO else there
+            assert np.isfinite(there).all(), f"{name} is not finite"
+        elif name in OUTPUTS:
+            assert np.array_equal(np.isnan(values), direct), f"{name} is nan for no reason"
+    _signal_and_noise(results)
+    if spec.draws.number:
+        _draws(spec, results, direct)
+
+
+def _probability(name: str, values: np.ndarray) -> None:
+    there = values[~np.isnan(values)]
+    assert ((there >= 0) & (there <= 1)).all(), f"{name} is no probability: {there}"
+
+
+def _signal_and_noise(results: Results) -> None:
+    """What every point keeps, with draws or without."""
+    for segment in ("up", "down", "doppler", "shot"):
+        total = results[f"pd_{segment}"] + results[f"miss_{segment}"]
+        assert not (np.abs(total - 1) > ROUNDING).any(), segment
+    least = np.minimum(results["pd_up"], results["pd_down"])
+    assert (results["pd_shot"] <= least + ROUNDING).all(), "a shot is likelier than its segments"
+    assert (results["noise_variance"] > 0).all(), "no noise"
+    for name in ("snr_up", "snr_down", "snr_doppler"):
+        assert not (results[name] < 0).any(), name
+    for name in ("bin", "segment", "shot"):
+        pfa, log10 = results[f"pfa_{name}"], results[f"log10_pfa_{name}"]
+        assert (log10 <= 0).all(), f"log10_pfa_{name}"
+        # A logarithm of 1e4 keeps 12 digits: those of the probability are its last four.
+        likely = log10 > -300
+        near = np.isclose(np.log10(pfa[likely]), log10[likely], rtol=1e-9, atol=1e-9)
+        assert near.all() and (pfa[~likely] < 1e-299).all(), f"log10_pfa_{name}"
+
+
+def _draws(spec: Spec, results: Results, direct: np.ndarray) -> None:
+    """Counts of draws between none and all, and errors of means of none or several draws."""
+    (batches,) = (a.values for a in GridStudy(spec).arrays() if a.name == "batch_draws")
+    for name in DRAW_OUTPUTS:
+        assert (results[name] <= batches).all(), f"{name} has more than all"
+        if name != "n_detected_doppler":
+            assert (results[name] >= 0).all(), name
+    for kind in ("detected", "false_alarm"):
+        both = np.minimum(results[f"n_{kind}_up"], results[f"n_{kind}_down"])
+        assert (results[f"n_{kind}_shot"] <= both).all(), f"n_{kind}_shot"
+    for name in ERROR_OUTPUTS:
+        nan = np.isnan(results[name])
+        assert (results[name][~nan] >= 0).all(), name
+        reason = (direct & ("doppler" in name)) | (spec.draws.number == 1)
+        assert not (nan & ~reason).any(), f"{name} is nan for no reason"

@@ -1,0 +1,132 @@
+"""What must hold of every flight, however odd: point clouds of sane numbers, or words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from judging import Verdict, kind_of, look_at_mistake, strictly
+
+from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.unsupported import UnsupportedShot
+from sweep.scenes.errors import SceneError
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import SceneSpec, SpecError, from_stored, load
+from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.scene_plan import scene_plan
+from sweep.tasks.stretches import Part
+from sweep.tasks.study import Results
+
+UNIT = 1e-9
+"""What a unit vector's length may be off."""
+
+
+def judge_flight(file: Path) -> Verdict:
+    """A spec of a flight read from its file, planned, cast, looked at in a plain loop."""
+    with strictly():
+        try:
+            spec = load(file)
+        except SpecError as error:
+            for mistake in error.mistakes:
+                look_at_mistake(mistake)
+            return Verdict(tuple(kind_of(m) for m in error.mistakes))
+        assert isinstance(spec, SceneSpec)
+        assert from_stored(spec.to_json(), file.parent).id == spec.id, "a stored spec is another"
+        try:
+            study = FlightStudy(spec, file.with_suffix(".zarr"))
+            for eyepoints in study.eyepoint_studies():
+                _look_through(study, eyepoints)
+            scene_plan(spec, store=file.with_suffix(".zarr"))
+        except SceneError as error:
+            # Of a field of the spec, or of a file that the scene names.
+            assert error.rule and error.remedy, f"no remedy: {error}"
+            return Verdict((error.rule[:50],))
+        except UnsupportedShot as error:
+            assert "instrument." in str(error), f"no field named: {error}"
+            return Verdict((str(error)[:50],))
+    return Verdict()
+
+
+def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
+    """All shots of a scanner: what they see, and every place along axes and draws."""
+    seen = eyepoints.see(np.arange(eyepoints.points))
+    look_at_shots(seen)
+    shots = from_arrays(seen, eyepoints.weight)
+    stretches = study.scanners[eyepoints.scanner]
+    for *axes, draws in np.ndindex(*stretches.along[:-1]):
+        part = Part(eyepoints.scanner, tuple(axes), draws, 0)
+        called = study.call(part, shots)
+        assert np.isfinite(called.error).all() and (called.error >= 0).all(), "effects_error"
+        found = study.look(part, seen, shots, called, first=0)
+        architecture = study._parameters(part)["instrument.receiver.architecture"]
+        look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
+
+
+def look_at_shots(seen: Results) -> None:
+    """Where the instrument is and what its beams hit: numbers throughout, but for misses."""
+    for name in (*SHOTS, *CYCLES):
+        missing = np.isinf(seen[name]) if name in ("beam_range", "true_altitude") else False
+        if name == "beam_radial_velocity":
+            missing = np.isnan(seen[name]) & np.isinf(seen["beam_range"])
+        assert (np.isfinite(seen[name]) | missing).all(), f"{name} is not finite"
+    length = np.linalg.norm(seen["beam_direction"], axis=-1)
+    assert (np.abs(length - 1) < UNIT).all(), "beam_direction is no unit vector"
+    assert (seen["beam_range"] > 0).all(), "beam_range"
+    hit = seen["surface"] >= 0
+    cosine = seen["cos_incidence"][hit]
+    assert ((cosine >= 0) & (cosine <= 1 + UNIT)).all(), "cos_incidence"
+    assert np.isfinite(seen["offset"][hit]).all(), "offset"
+
+
+def look_at_cloud(seen: Results, found: Results, *, navigates: bool, direct: bool) -> None:
+    """Statistics, points and navigation: nan where there is nothing, and nowhere else."""
+    wanted = {*STATISTICS, *POINTS, *(NAVIGATION if navigates else ())}
+    assert set(found) == wanted, "outputs are missing, or too many"
+    sees = (seen["surface"] >= 0).any(axis=1)
+    for name in STATISTICS:
+        values = found[name]
+        if values.dtype.kind != "f":
+            continue
+        there = sees | name.startswith("pfa_")
+        if name == "pd_doppler" and direct:
+            there = np.zeros_like(sees)
+        assert np.isfinite(values[there]).all(), f"{name} is nan for no reason"
+        assert np.isnan(values[~there]).all(), f"{name} of nothing"
+        if name.startswith(("pd_", "pfa_")):
+            assert ((values[there] >= 0) & (values[there] <= 1)).all(), f"{name}: {values[there]}"
+    _points(found, sees)
+    if navigates:
+        _navigation(found)
+
+
+def _points(found: Results, sees: np.ndarray) -> None:
+    """Points where flags say so."""
+    flags = found["flags"]
+    point, true = flags > 0, (flags & 1) > 0
+    for name, output in POINTS.items():
+        values = found[name]
+        if output.dtype != "float64":
+            continue
+        there = point if values.ndim == point.ndim else point[..., None]
+        assert not (~np.isnan(values) & ~there).any(), f"{name} where there is no point"
+        if name in ("range", "range_interpolated", "position", "snr"):
+            assert np.isfinite(values[point]).all(), f"{name} is not finite"
+        if name.endswith("standard_error"):
+            assert not (values[point] < 0).any(), name
+    pd = found["pd"][true]
+    assert ((pd >= 0) & (pd <= 1)).all(), "pd of a point"
+    assert np.isfinite(found["true_range"][true]).all(), "true_range of a true point"
+
+
+def _navigation(found: Results) -> None:
+    """Solutions with variances that can be, and none without a status."""
+    velocity, covariance = found["velocity"], found["velocity_covariance"]
+    solved = found["velocity_beams"] > 0
+    assert np.isnan(velocity[~solved]).all(), "a velocity of no beams"
+    assert np.isfinite(velocity[solved]).all(), "velocity"
+    variances = np.diagonal(covariance[solved], axis1=-2, axis2=-1)
+    assert (variances >= 0).all(), "velocity_covariance"
+    level = found["altitude_beams"] > 0
+    assert np.isfinite(found["altitude"][level]).all(), "altitude"
+    assert (found["altitude_variance"][level] >= 0).all(), "altitude_variance"
