@@ -203,7 +203,10 @@ def _spelled(text: str) -> str:
 
 def _show(value: Fraction) -> str:
     """A number as a user would write it."""
-    return f"{float(value):.12g}"
+    try:
+        return f"{float(value):.12g}"
+    except OverflowError:
+        return "1e300"
 
 
 def _factors(text: str) -> list[tuple[str, Fraction]] | None:

@@ -187,7 +187,7 @@ class _Walk:
         values: dict[str, Any] = {}
         for key_node, child in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
-                self.finding(location, "has a key that is no word", "", ABSENT)
+                self.finding(location, "has a key that is no word", "begin it with a word", ABSENT)
                 continue
             key = key_node.value
             line = key_node.start_mark.line + 1

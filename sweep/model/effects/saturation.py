@@ -35,6 +35,7 @@ from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.span import Span
 from sweep.model.preparation import Shots
+from sweep.model.unsupported import UnsupportedShot
 
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
@@ -159,21 +160,35 @@ def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.n
 
 _FULL_SCALE = "instrument.processing.full_scale"
 
+MOST_BEYOND = 1e6
+"""Signal or noise over full scale; what clipping leaves has lost as many digits as this has."""
+
 
 def act(shots: Shots, scene: Scene) -> Shots:
     """Line and noise as clipping leaves them; its harmonics are left out.
 
     The record is taken for one sine with the power of all lines.
+
+    Raises
+    ------
+    UnsupportedShot
+        For records that exceed full scale more than :data:`MOST_BEYOND` times.
     """
     full_scale = np.asarray(scene.parameters[_FULL_SCALE], float)
     limited = full_scale > 0
     if not limited.any():
         return shots
-    left = clipping(
-        amplitude=np.maximum(beat_amplitude(shots), _SMALLEST),
-        deviation=np.sqrt(shots.noise_variance),
-        full_scale=np.where(limited, full_scale, _NO_LIMIT),
-    )
+    amplitude = np.maximum(beat_amplitude(shots), _SMALLEST)
+    deviation = np.sqrt(shots.noise_variance)
+    limit = np.where(limited, full_scale, _NO_LIMIT)
+    beyond = float((np.maximum(amplitude, deviation) / limit).max())
+    if beyond > MOST_BEYOND:
+        raise UnsupportedShot(
+            f"instrument.processing.full_scale is exceeded {beyond:.3g} times by signal or noise, "
+            f"and {MOST_BEYOND:g} times can be simulated: raise it, or lower "
+            "instrument.receiver.transimpedance"
+        )
+    left = clipping(amplitude=amplitude, deviation=deviation, full_scale=limit)
     return replace(
         shots,
         beat_scale=shots.beat_scale * left.signal_gain,

@@ -1,0 +1,141 @@
+"""A hundred or two of random specs, valid and spoilt; `make fuzz` looks at thousands."""
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from judging import judge
+from judging_commands import judge_command
+from judging_flights import judge_flight
+from random_flights import PARTS as FLIGHT_PARTS
+from random_flights import flights, write_files
+from random_studies import PARTS, studies
+from smaller import shrunk, swiftly
+from spoilt_specs import GARBAGE, ODD, Spoilt, dumped, spoilt
+from written_values import values
+
+from sweep.spec import SceneSpec, Spec
+from sweep.spec.fields import rule_of
+from sweep.spec.list_rules import File
+from sweep.spec.rules import Numeric, Rule
+from sweep.spec.structure import all_parts
+from sweep.units import QuantityError
+
+FEW = settings(
+    derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
+    phases=[Phase.generate],
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def quick():
+    with swiftly():
+        yield
+
+
+@pytest.fixture(scope="module")
+def file(folder):
+    return folder / "now.yaml"
+
+
+@settings(FEW, max_examples=80)
+@given(written=studies())
+def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
+    file.write_text(dumped(written), encoding="utf-8")
+    judge(file)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    place = tmp_path_factory.mktemp("flown")
+    write_files(place)
+    return place
+
+
+def test_a_flight_is_computed_to_sane_points_or_refused_in_words(flown):
+    @settings(FEW, max_examples=40)
+    @given(written=flights(flown))
+    def holds(written):
+        (flown / "now.yaml").write_text(dumped(written), encoding="utf-8")
+        judge_flight(flown / "now.yaml")
+
+    holds()
+
+
+def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(flown):
+    @settings(FEW, max_examples=150)
+    @given(wrong=spoilt(st.one_of(studies(), flights(flown))))
+    def holds(wrong):
+        judge_command(flown / "spoilt.yaml", wrong)
+
+    holds()
+
+
+@pytest.mark.parametrize("text", GARBAGE)
+def test_another_text_in_a_specs_place_is_refused_in_words(file, text):
+    assert judge_command(file, Spoilt(text, "another text")).refusals
+
+
+def _all_fields():
+    for model in all_parts(Spec, SceneSpec):
+        for name, field in model.model_fields.items():
+            rule = rule_of(field)
+            if rule is not None:
+                yield pytest.param(model, name, rule, id=f"{model.__name__}.{name}")
+
+
+ALL_FIELDS = list(_all_fields())
+
+
+@pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
+def test_every_number_has_a_smallest_and_a_largest_value(model, name, rule):
+    """What has no bounds ends in overflows and nans: the fuzz goes to both ends of every field."""
+    number = getattr(rule, "of", rule)
+    if isinstance(number, Numeric):
+        assert number.at_most is not None and (number.at_least or number.above) is not None
+
+
+@pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
+def test_every_field_refuses_odd_values_in_words_or_takes_them(model, name, rule):
+    for written in ODD:
+        try:
+            rule.read(written)
+        except QuantityError as error:
+            assert error.rule and "<" not in error.rule
+
+
+FIGURES = ("_Where", "_PrintedNumbers", "View", "_ReadAxes")
+"""Rules of figures, which the fuzz leaves alone, and of axes, which have strategies of their own."""
+
+
+@pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
+def test_every_rule_has_a_strategy_all_of_whose_values_it_takes(model, name, rule: Rule):
+    if isinstance(rule, File):
+        assert f"{model.__name__}.{name}" in FLIGHT_PARTS.files
+        return
+    if type(rule).__name__ in FIGURES:
+        return
+
+    @settings(FEW, max_examples=6)
+    @given(values(rule, 300.0))
+    def holds(written):
+        rule.read(written)
+
+    holds()
+
+
+def test_a_failing_spec_is_shrunk_to_what_makes_it_fail():
+    written = {"a": {"b": 1, "c": [1, 2]}, "d": 3}
+    assert shrunk(written, lambda w: w.get("a", {}).get("b") == 1) == {"a": {"b": 1}}
+
+
+def test_tightened_bounds_are_those_of_fields_that_there_are():
+    """A field that is renamed is no longer held to a small cost: this says so first."""
+    known = {f"{m.__name__}.{n}" for m in all_parts(Spec, SceneSpec) for n in m.model_fields}
+    bases = {
+        f"{base.__name__}.{n}"
+        for m in all_parts(Spec, SceneSpec)
+        for base in m.__mro__
+        for n in getattr(base, "model_fields", ())
+    }
+    for parts in (PARTS, FLIGHT_PARTS):
+        assert set(parts.cheap) | parts.dear | set(parts.files) <= known | bases
