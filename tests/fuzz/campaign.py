@@ -112,7 +112,7 @@ def report(name: str, tally: Tally, folder: Path) -> None:
     )
     for kind, count in tally.kinds.most_common(KINDS):
         print(f"  {count:6,}  {kind}")
-    for i, (seconds, text) in enumerate(tally.times):
+    for i, (_, text) in enumerate(tally.times):
         (folder / f"{name}_slow_{i}.yaml").write_text(text, encoding="utf-8", errors="replace")
     slowest = ", ".join(f"{seconds:.1f}" for seconds, _ in tally.times)
     print(f"  slowest: {slowest} s ({folder}/{name}_slow_*.yaml)")

@@ -1,4 +1,4 @@
-"""What must hold of every study, however odd: it computes to sane numbers or is refused in words."""
+"""What must hold of every study, however odd: sane numbers, or a refusal in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random flights over scenes: every kind of object, path, attitude and scanner, few rays and shots."""
+"""Random flights: every kind of object, path, attitude and scanner; few rays and shots."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ TIMING = (DURATION, DELAY, RANGE, SAMPLE_RATE)
 
 def mended(written: dict[str, Any]) -> dict[str, Any]:
     """The study without what its combination of values is refused for, as far as that is known."""
-    for _ in range(4):
+    for _ in range(8):
         try:
             Spec.from_mapping(written)
         except SpecError as error:
@@ -82,12 +82,13 @@ def mended(written: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mend(written: dict[str, Any], path: str) -> None:
-    """Take out a field or an axis that is to blame; of a record's length, all that it depends on."""
+    """Take out a field or an axis that is to blame; of a record's length, all that counts."""
     axes = written.get("axes", {})
-    axis = path.removeprefix("axes.").split(".zip")[0]
-    if axis != path and axis in axes:
-        del axes[axis]
-    blamed = TIMING if path == DURATION or axis not in parameter_rules() else (path,)
+    blamed = TIMING if path == DURATION else (path,)
+    if path.startswith("axes."):
+        axis = path.removeprefix("axes.").split(".zip")[0]
+        axes.pop(axis, None)
+        blamed = (axis,) if axis in parameter_rules() else TIMING
     for each in blamed:
         drop(written, each)
         rule = parameter_rules().get(each)

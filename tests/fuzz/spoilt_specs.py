@@ -205,7 +205,8 @@ AXES = (
     {"cut": {"zip": {"target.range": ["1 m", "2 m"], "instrument.laser.power": ["1 W"]}}},
     {"batch": {"zip": {"target.range": ["1 m", "2 m"]}}}, {"cut": {"zip": "zip"}},
     {"instrument.laser": ["1 W"]}, {"instrument.laser.power.watts": ["1 W"]},
-    {"axes.target.range": ["1 m"]}, {"instrument.laser.power": {"linear": ["1 W", "1 m"], "number": 2}},
+    {"axes.target.range": ["1 m"]}, 
+    {"instrument.laser.power": {"linear": ["1 W", "1 m"], "number": 2}},
     {"effects.leakage": ["on"]}, {"footprint.phases": {"linear": [1, 2], "number": 2}},
     {"instrument.processing.fft_size": {"linear": [2, 5], "number": 3}},
     {"instrument.receiver.noise_figure": {"log": ["1 dB", "5 dB"], "number": 3}},
@@ -257,9 +258,7 @@ def _cut(draw: st.DrawFn, written: dict[str, Any]) -> Spoilt:
 def _stray(draw: st.DrawFn, written: dict[str, Any]) -> Spoilt:
     text = dumped(written)
     first = draw(st.integers(0, len(text)))
-    stray = draw(
-        st.sampled_from(list("\t:{}[]'\"&*!|>%@`#,-?é\u2029\x00\x85") + ["\r", "- ", ": "])
-    )
+    stray = draw(st.sampled_from([*"\t:{}[]'\"&*!|>%@`#,-?é\u2029\x00\x85", "\r", "- ", ": "]))
     return Spoilt(text[:first] + stray + text[first:], f"a stray {stray!r}")
 
 

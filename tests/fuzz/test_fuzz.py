@@ -104,7 +104,7 @@ def test_every_field_refuses_odd_values_in_words_or_takes_them(model, name, rule
 
 
 FIGURES = ("_Where", "_PrintedNumbers", "View", "_ReadAxes")
-"""Rules of figures, which the fuzz leaves alone, and of axes, which have strategies of their own."""
+"""Rules of figures, which the fuzz leaves alone, and of axes, whose strategies are apart."""
 
 
 @pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)

@@ -31,7 +31,7 @@ def bound(block: "Block") -> Change:
     apart = line.edge - np.asarray(spread.extreme, float)
     inside, beside, outside = (line.lobe.tail(m * apart) for m in (1.5, 0.5, 1.0))
     least_power, _ = power_range(line, spread, block.number)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         far = (beside**2 + outside**2) / least_power
         high = np.sqrt(np.maximum(1 + inside**2 / least_power, far))
     if not block.adds_amplitudes:

@@ -1,0 +1,187 @@
+"""What the fuzz has found, one test each."""
+
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from judging import judge, strictly
+from plain_study import plain
+from smaller import swiftly
+from spoilt_specs import dumped
+
+from sweep.cli import main
+from sweep.model.effects.line_splitting import split_lines
+from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
+from sweep.model.effects.saturation import MOST_BEYOND
+from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
+from sweep.model.unsupported import UnsupportedShot
+from sweep.spec import SceneSpec, Spec, SpecError
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.plan import plan
+
+
+@pytest.fixture(autouse=True)
+def quick():
+    with swiftly():
+        yield
+
+
+def judged(tmp_path, written):
+    """A verdict over a study as written."""
+    (tmp_path / "found.yaml").write_text(dumped(written))
+    return judge(tmp_path / "found.yaml")
+
+
+def refused(written):
+    """The words that a study is refused with."""
+    with pytest.raises(SpecError) as caught:
+        Spec.from_mapping(written)
+    return str(caught.value)
+
+
+def planned(tmp_path, written):
+    """`sweep plan` over a study."""
+    (tmp_path / "found.yaml").write_text(dumped(written))
+    return CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")], catch_exceptions=False)
+
+
+def test_a_study_without_axes_is_planned_with_what_its_effects_cost(tmp_path):
+    assert planned(tmp_path, plain()).exit_code == 0
+
+
+def test_direct_detection_with_draws_is_planned_though_it_knows_no_speckle(tmp_path):
+    direct = plain({"instrument.receiver.architecture": "direct", "draws.number": 3})
+    assert plan(Spec.from_mapping(direct)).points == 1
+    assert not judged(tmp_path, direct).refusals
+    assert "averages over an unknown number" in refused(direct | {"effects": {"speckle": "on"}})
+
+
+@pytest.mark.parametrize("effect", ["pointing_jitter", "speckle", "scintillation"])
+def test_a_random_effect_that_is_on_needs_draws(effect):
+    assert f"effects.{effect}: is simulated by draws" in refused(plain(effects={effect: True}))
+    Spec.from_mapping(plain({"draws.number": 2}, effects={effect: True}))
+
+
+BEYOND = {
+    "record": {"target.radial_velocity": "900 km/s", "instrument.chirp.bandwidth": "100 THz"},
+    "chirp": {"instrument.chirp.quadratic_error": "1 THz"},
+    "line": {"instrument.laser.line_width": "1 THz"},
+    "clipped": {"instrument.processing.full_scale": "1e-15 V"},
+}
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_a_shot_beyond_the_model_is_refused_with_field_limit_value_and_remedy(name, tmp_path):
+    told = planned(tmp_path, plain(BEYOND[name]))
+    assert told.exit_code == 2 and told.stdout == ""
+    assert re.search(r"(instrument|target)\.\w+", told.stderr)
+    assert "can be simulated: " in told.stderr and re.search(r"\d", told.stderr)
+
+
+def test_the_limits_of_the_model_are_where_they_are_said_to_be():
+    width = np.array([MOST_BINS / 0.4246609 * 0.99])  # of a record of 1 s, a bin is 1 Hz
+    assert gaussian_shifts(fwhm=width, duration=np.ones(1)).weight.sum() == pytest.approx(1)
+    with pytest.raises(UnsupportedShot, match="line_width"):
+        gaussian_shifts(fwhm=width * 1.02, duration=np.ones(1))
+    with pytest.raises(UnsupportedShot, match="fft_size"):
+        split_lines(lambda x: 1e6 * x[None] ** 2)
+    assert MOST_BEYOND**2 < 1e15  # what is left of 16 digits by variances that cancel
+
+
+def test_nothing_that_comes_back_has_no_range_error_with_draws_or_without(tmp_path):
+    for draws in ({}, {"draws.number": 3}, {"draws.number": 3, "target.roughness": "1 mm"}):
+        dark = plain({"target.reflectance": 0} | draws)
+        results = GridStudy(Spec.from_mapping(dark)).evaluate(0)
+        assert np.isnan(results["range_error"]) and np.isnan(results["radial_velocity_error"])
+        assert not judged(tmp_path, dark).refusals
+
+
+def test_sunlight_of_the_far_ultraviolet_fades_to_nothing_in_silence():
+    with strictly():
+        light = sunlight(wavelength=[1e-9, 30e-9, 500e-9], distance=1.496e11, elevation=1.57)
+    assert light[0] == 0 and 0 < light[1] < 1e-3 * light[2]
+    # Wien's limit, where e^u exceeds what 1 could matter to: u = 16.6 at 150 nm.
+    wien = sunlight(wavelength=[150e-9, 151e-9], distance=1.496e11, elevation=1.57)
+    u = 6.62607015e-34 * 299792458 / (1.380649e-23 * 5772.0) / np.array([150e-9, 151e-9])
+    ratio = (151 / 150) ** 5 * np.exp(u[1] - u[0])
+    assert wien[0] / wien[1] == pytest.approx(ratio, rel=1e-6)
+
+
+def test_nobody_can_be_inside_the_sun():
+    near = f"{0.99 * SUN_RADIUS} m"
+    assert "target.sun_distance: must be 0" in refused(plain({"target.sun_distance": near}))
+    Spec.from_mapping(plain({"target.sun_distance": f"{1.01 * SUN_RADIUS} m"}))
+
+
+@pytest.mark.parametrize("written", ["1e400 m", "-1e9999 W", "9e300 m"])
+def test_a_pure_number_with_a_unit_is_refused_however_large(written):
+    words = refused(plain({"instrument.processing.tnr": written}))
+    assert "is a pure number and takes no unit" in words
+
+
+def test_a_window_that_scipy_warns_of_or_can_not_make_is_refused():
+    for window in ("chebwin(30)", "kaiser_bessel_derived(4)"):
+        assert "instrument.processing.window" in refused(
+            plain({"instrument.processing.window": window})
+        )
+    with strictly():
+        Spec.from_mapping(plain({"instrument.processing.window": "chebwin(60)"}))
+
+
+EXTREME = {
+    "all light lost in one bin": {
+        "instrument.receiver.detector_bandwidth": "1 mHz", "target.transverse_velocity": "1e6 m/s",
+        "instrument.processing.fft_size": 6,
+    },
+    "a spread of 1e160 bins": {
+        "instrument.laser.beam_divergence": "90 deg", "target.grazing_angle": "1e-6 deg",
+        "instrument.laser.wavelength": "1 nm", "target.transverse_velocity": "1000 km/s",
+    },
+    "no gain at all": {"instrument.receiver.transimpedance": "1 uohm",
+                       "instrument.laser.power": "1e-18 W"},
+}  # fmt: skip
+"""Ends of the fields' bounds at which bounds on effects overflowed or divided by nothing."""
+
+
+@pytest.mark.parametrize("name", EXTREME)
+def test_the_ends_of_the_bounds_are_computed_without_a_warning(name, tmp_path):
+    judged(tmp_path, plain(EXTREME[name]))
+
+
+def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
+    from sweep.spec.files import Files
+
+    rocks = {
+        "kind": "boulders", "on": "ground", "law": {"kind": "power", "density": "0.1 m^-2",
+        "exponent": 2}, "smallest": "1 m", "largest": "3 m", "within": "60 m",
+        "centre": ["500 m", "-300 m"], "reflectance": 0.2,
+    }  # fmt: skip
+    thing = SceneSpec.model_fields["scene"].annotation.model_validate(
+        {"objects": {"ground": {"kind": "plane", "size": "4 km", "reflectance": 0.1},
+                     "rocks": rocks}}
+    ).objects  # fmt: skip
+    facets = thing["rocks"].facets(thing["ground"].terrain(Files(".")))
+    corners = facets.world.reshape(len(facets.faces) // 96, -1, 3)  # 96 faces each
+    middles = corners.mean(axis=1)
+    # 0.1 (1 - 1/9) 60^2 = 320 of them, 5 sigma to each side; each reaches 2 m beyond its middle.
+    assert abs(len(middles) - 320) < 5 * 320**0.5
+    assert (np.abs(middles[:, :2] - [500, -300]) < 30.5).all()
+    assert np.ptp(middles[:, :2], axis=0).min() > 55
+
+
+def test_boulders_beside_the_ground_are_refused():
+    from sweep.scenes.pieces import square
+    from sweep.spec.drawn_grounds import Plane
+    from sweep.spec.files import Files
+
+    ground = Plane(kind="plane", size="100 m", reflectance=0.1).terrain(Files("."))
+    assert square(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
+    with pytest.raises(ValueError, match="there is no ground within 10 m"):
+        square(ground, centre=(90.0, 0.0), size=20.0)
+
+
+def test_a_file_that_is_no_yaml_is_told_with_a_remedy(tmp_path):
+    (tmp_path / "found.yaml").write_text("title: [a\nb: }")
+    told = CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")])
+    assert told.exit_code == 2 and "look at the brackets" in told.stderr

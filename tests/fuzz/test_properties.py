@@ -1,0 +1,221 @@
+"""What physics promises of any study at all: monotonic, symmetric, the same in other words.
+
+Effects are simulated wherever they change anything (tolerance 0), so that no two points of a study
+differ by what was left out.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import strategies as st
+from plain_study import INSTRUMENT
+from random_studies import drop, mended, studies
+
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.unsupported import UnsupportedShot
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import SceneSpec, Spec, SpecError, from_stored
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.stretches import Part
+
+SOME = settings(
+    derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
+    phases=[Phase.generate], max_examples=25,
+)  # fmt: skip
+
+SIGNAL = ("snr_up", "snr_down", "snr_doppler", "pd_up", "pd_down", "pd_doppler", "pd_shot")
+ROUNDING = 1e-9
+"""Relative error of closed-form sums over some ten lines, 1e-13 seen, and of probabilities."""
+
+RANDOM = tuple(p.path for effect in EFFECTS if effect.is_random for p in effect.parameters)
+CLIPPING = ("instrument.processing.full_scale", "instrument.processing.bits")
+MOVING = (
+    "target.radial_velocity", "target.transverse_velocity", "target.acceleration",
+    "instrument.chirp.quadratic_error", "instrument.chirp.cubic_error",
+    "instrument.chirp.sinusoidal_error",
+)  # fmt: skip
+
+
+def steady(written, *paths):
+    """The study of one point, without draws, with all effects that it has, and without paths."""
+    for section in ("axes", "draws", "effects", "accuracy"):
+        written.pop(section, None)
+    written["accuracy"] = {"tolerance": 0}
+    written["storage"] = {"block_points": 1000}
+    for path in (*RANDOM, *paths):
+        drop(written, path)
+    return mended(written)
+
+
+def results_of(written):
+    """Results of a study of one block; studies that are refused are passed over."""
+    try:
+        study = GridStudy(Spec.from_mapping(written))
+        return study.evaluate(0)
+    except (SpecError, UnsupportedShot):
+        assume(False)
+
+
+def falls(values):
+    """Whether values fall anywhere by more than rounding."""
+    low, high = values[:-1], values[1:]
+    return bool((high < low * (1 - ROUNDING) - 1e-300).any())
+
+
+@pytest.mark.parametrize(
+    ("path", "factors"),
+    [
+        ("instrument.laser.power", (0.1, 1, 1.5, 40)),
+        ("instrument.telescope.aperture", (0.3, 1, 1.2, 5)),
+        ("target.reflectance", (0.01, 0.4, 0.41, 1)),
+    ],
+)
+@settings(SOME)
+@given(written=studies())
+def test_more_light_is_never_worse(path, factors, written):
+    """SNR and pd of a segment rise with the echo E: SNR goes as E / (a + b E), as E^2 / (a + b E)
+    of direct detection, where light that is noise (echo, sun, air) grows with the aperture or the
+    power at the most as the echo does; and the threshold over the noise does not rise. Clipping
+    breaks it, which so is left out.
+    """
+    written = steady(written, *CLIPPING)
+    base = Spec.from_mapping(written).parameters()[path] if path != "target.reflectance" else 1
+    unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
+    results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
+    for name in SIGNAL:
+        assert not falls(results[name]), (name, results[name])
+
+
+@settings(SOME)
+@given(written=studies())
+def test_a_higher_threshold_detects_less_and_alarms_less(written):
+    written = steady(written)
+    axes = {"instrument.processing.tnr": [0.01, 1, 5, 5.1, 30]}
+    results = results_of(written | {"axes": axes})
+    for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot", "pfa_bin", "log10_pfa_bin"):
+        values = results[name][::-1]
+        assert not falls(values - values.min() if name.startswith("log10") else values), name
+
+
+@settings(SOME)
+@given(written=studies())
+def test_without_movement_up_and_down_chirp_are_alike(written):
+    """Their beats then are range beats of either sign. Phases differ by the carriers, so that it
+    holds where these play no part: beamlets that add as powers, which those of direct detection
+    do not, and no images."""
+    written = steady(written, *MOVING)
+    written["effects"] = {"image": "off"}
+    written["footprint"]["phases"] = "incoherent"
+    assume(written["instrument"]["receiver"].get("architecture") != "direct")
+    results = results_of(written)
+    for name in ("snr", "pd", "miss", "p_leakage"):
+        up, down = results[f"{name}_up"], results[f"{name}_down"]
+        # Bins just at the threshold may count in one and not in the other.
+        assert np.allclose(up, down, rtol=1e-6, atol=1e-12), name
+    assert np.isnan(results["radial_velocity_error"]) or abs(results["radial_velocity_error"]) == 0
+
+
+@settings(SOME)
+@given(written=studies())
+def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
+    written = mended(written)
+    spec = Spec.from_mapping(written)
+    again = from_stored(spec.to_json())
+    assert again.id == spec.id
+    try:
+        ours, theirs = GridStudy(spec).evaluate(0), GridStudy(again).evaluate(0)
+    except UnsupportedShot:
+        return
+    for name, values in ours.items():
+        assert np.array_equal(values, theirs[name], equal_nan=values.dtype.kind == "f"), name
+
+
+@settings(SOME)
+@given(written=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
+def test_neither_seed_nor_blocks_change_what_is_not_random(written, seed, blocks):
+    written = mended(written)
+    drop(written, "draws.number")
+    other = written | {"seed": seed, "storage": {"block_points": blocks}}
+    ours, theirs = results_of(written | {"storage": {}}), GridStudy(Spec.from_mapping(other))
+    where = theirs.grid.block(theirs.n_blocks - 1)
+    for name, values in theirs.evaluate(theirs.n_blocks - 1).items():
+        assert np.array_equal(values, ours[name][where], equal_nan=values.dtype.kind == "f"), name
+
+
+def turned(x, y, z, *, turn, shift):
+    """A place after a turn about z and a shift, as written."""
+    c, s = math.cos(turn), math.sin(turn)
+    moved = np.array([c * x - s * y, s * x + c * y, z]) + shift
+    return [f"{value!r} m" for value in moved.tolist()]
+
+
+def flight_in(instrument, turn, shift):
+    """A descent over a slope with a box and a ball on it, in a frame that is turned and shifted."""
+    place = {"turn": turn, "shift": np.asarray(shift, float)}
+    heading = f"{turn!r} rad"
+    slope = {"kind": "plane", "size": "9 km", "slope": "7 deg", "uphill": heading}
+    return {
+        "title": "Frames",
+        "instrument": instrument,
+        "scene": {
+            "objects": {
+                "slope": slope | {"reflectance": 0.1, "position": turned(0, 0, 0, **place)},
+                "box": {
+                    "kind": "box", "size": ["60 m", "90 m", "50 m"], "reflectance": 0.5,
+                    "position": turned(100, 20, 20, **place), "rotation": {"heading": heading},
+                },
+                "ball": {
+                    "kind": "sphere", "radius": "40 m", "subdivisions": 2, "reflectance": 0.3,
+                    "position": turned(-80, 60, 5, **place), "rotation": {"heading": heading},
+                },
+            }
+        },
+        "platform": {
+            "path": {
+                "kind": "straight", "initial_speed": "80 m/s", "final_speed": "60 m/s",
+                "from": turned(-90, 0, 700, **place), "to": turned(130, 50, 500, **place),
+            },
+            "attitude": {"kind": "nadir", "heading": heading},
+        },
+        "scanners": {"cone": {"kind": "cone", "beams": 5, "half_angle": "9 deg", "rate": "5 Hz"}},
+        "footprint": {"beamlets": 7},
+        "accuracy": {"tolerance": 0},
+    }  # fmt: skip
+
+
+def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
+    """What all shots of that flight see, and its statistics."""
+    spec = SceneSpec.from_mapping(flight_in(instrument, turn, shift))
+    study = FlightStudy(spec, Path("nowhere.zarr"))
+    (eyepoints,) = study.eyepoint_studies()
+    seen = eyepoints.see(np.arange(eyepoints.points))
+    shots, part = from_arrays(seen, eyepoints.weight), Part("cone", (), 0, 0)
+    return seen, study.look(part, seen, shots, study.call(part, shots), first=0)
+
+
+@settings(SOME, max_examples=6)
+@given(
+    turn=st.floats(-4, 4).map(lambda x: round(x, 3)),
+    shift=st.tuples(*[st.integers(-100_000, 100_000)] * 3),
+)
+def test_a_flight_is_the_same_in_any_frame(turn, shift):
+    """Places of up to 1e5 m are rounded to 1e-11 m, and a beam at 9 deg + 7 deg of incidence, or
+    the edge of a facet, makes less than ten times that of it; as much of 1e3 m is 1e-13 rad, and
+    of 80 m/s 1e-11 m/s. A range bin is 0.3 m: 1e-10 of a bin is 1e-9 of a bin's magnitude.
+    """
+    seen, found = seen_in(INSTRUMENT)
+    other, same = seen_in(INSTRUMENT, turn, shift)
+    assert np.isfinite(seen["beam_range"]).all()
+    assert len(set(seen["beam_surface"].tolist())) > 1, "nothing but the slope is seen"
+    assert np.array_equal(seen["beam_surface"], other["beam_surface"])
+    assert np.allclose(seen["beam_range"], other["beam_range"], rtol=0, atol=1e-9)
+    speed = "beam_radial_velocity"
+    assert np.allclose(seen[speed], other[speed], rtol=0, atol=1e-9)
+    for name in ("snr_up", "pd_up", "pd_down", "pd_shot", "pfa_up"):
+        assert np.allclose(found[name], same[name], rtol=1e-6, atol=1e-12), name
