@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import resource
 import sys
 import time
 import traceback
@@ -32,6 +33,8 @@ from spoilt_specs import Spoilt, dumped, spoilt
 
 FOLDER = Path("results/fuzz")
 SLOWEST, KINDS = 5, 25
+MOST_MEMORY = 8 << 30
+"""Address space of a campaign [bytes]."""
 
 
 @dataclass
@@ -169,6 +172,8 @@ def main() -> None:
     parser.add_argument("--only", choices=["valid", "invalid"])
     parser.add_argument("--replay", type=Path)
     asked = parser.parse_args()
+    # A spec that asks for more memory than this has failed, and takes no machine down with it.
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
     with swiftly():
         if asked.replay:
             return replay(asked.replay)

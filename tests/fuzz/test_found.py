@@ -15,6 +15,8 @@ from sweep.model.effects.line_splitting import split_lines
 from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
+from sweep.model.geometry.resampling import smooth
+from sweep.model.geometry.terrain import Terrain
 from sweep.model.unsupported import UnsupportedShot
 from sweep.spec import SceneSpec, Spec, SpecError
 from sweep.tasks.grid_study import GridStudy
@@ -179,6 +181,15 @@ def test_boulders_beside_the_ground_are_refused():
     assert square(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
     with pytest.raises(ValueError, match="there is no ground within 10 m"):
         square(ground, centre=(90.0, 0.0), size=20.0)
+
+
+def test_a_ground_is_not_blurred_by_more_than_its_own_size():
+    """The filter's memory goes by its width: 1e9 m over steps of 6 m took all that there was."""
+    ground = Terrain(np.arange(12.0).reshape(3, 4), (10.0, 10.0), np.zeros(3))
+    assert np.ptp(smooth(ground, width=30.0).heights) < np.ptp(ground.heights)
+    for width in (31.0, 1e9):
+        with pytest.raises(ValueError, match="the ground's 30 m"):
+            smooth(ground, width=width)
 
 
 def test_a_file_that_is_no_yaml_is_told_with_a_remedy(tmp_path):

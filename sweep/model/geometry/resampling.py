@@ -76,10 +76,12 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
     Raises
     ------
     ValueError
-        For a negative width.
+        For a negative width, or one beyond the ground's longer side: its memory goes by the width.
     """
-    if not width >= 0:
-        raise ValueError(f"the smoothing width must be at least 0 m, not {width}")
+    west, south, east, north = terrain.bounds
+    side = max(east - west, north - south)
+    if not 0 <= width <= side:
+        raise ValueError(f"the smoothing width must be 0 m to the ground's {side:g} m, not {width}")
     there = np.isfinite(terrain.heights)
     sigma = [width / abs(step) for step in reversed(terrain.spacing)]
     kept = np.where(there, terrain.heights, 0.0)
