@@ -214,12 +214,14 @@ def _factors(text: str) -> list[tuple[str, Fraction]] | None:
     factors = []
     sign = 1
     text = re.sub(r"^1\s*/", "/", text.replace("**", "^"))
-    for piece in _OPERATOR.split(text):
-        operator = piece.strip()
-        if operator in ("", "*", "/"):
-            sign = -1 if operator == "/" else 1
+    for place, piece in enumerate(_OPERATOR.split(text)):
+        factor = piece.strip()
+        if place % 2:
+            sign = -1 if factor == "/" else 1
             continue
-        match = _FACTOR.fullmatch(operator)
+        if place == 0 and text.lstrip().startswith("/"):
+            continue  # 1/m
+        match = _FACTOR.fullmatch(factor)
         if match is None:
             return None
         factors.append((match["name"], sign * Fraction(match["exponent"] or match["ratio"] or 1)))

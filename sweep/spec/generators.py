@@ -244,7 +244,9 @@ def _stepped(bounds: list[Fraction], unit: Unit, rule: Numeric, location: Locati
     """Values from first to last, last included where a step lands on it."""
     first, last, step = bounds
     if step == 0:
-        raise Rejected(Finding(location, "has a step of zero", "", ABSENT))
+        raise Rejected(
+            Finding(location, "has a step of zero", "list the values", ABSENT)
+        )
     if (last - first) / step < 0:
         raise Rejected(
             Finding(
@@ -273,7 +275,7 @@ def _regular(progression: Progression, unit: Unit, rule: Numeric, location: Loca
         return Values(si_values(progression, unit), unit, progression)
     exact = progression.mapped(unit.factor, unit.offset)
     if exact.start.denominator != 1 or exact.increment.denominator != 1:
-        raise Rejected(Finding(location, "gives values that are not whole", "", ABSENT))
+        raise Rejected(Finding(location, "gives values that are not whole", "list them", ABSENT))
     steps = np.arange(progression.number, dtype=np.int64)
     return Values(int(exact.start) + int(exact.increment) * steps, unit, progression)
 

@@ -122,6 +122,20 @@ def test_a_pure_number_with_a_unit_is_refused_however_large(written):
     assert "is a pure number and takes no unit" in words
 
 
+@pytest.mark.parametrize("unit", ["m*", "m/", "m//", "*m", "m*/s", "m * ", "W/m^2/nm/", "/"])
+def test_an_operator_without_a_unit_to_it_is_no_unit(unit):
+    field = "target.solar_irradiance" if "W" in unit else "target.range"
+    assert f"{field}: " in refused(plain({field: f"5 {unit}"}))
+
+
+def test_a_generator_of_no_use_is_told_what_to_do():
+    for path, axis in (
+        ("target.range", {"step": ["1 m", "9 m", "0 m"]}),
+        ("instrument.processing.fft_size", {"linear": [2, 5], "number": 3}),
+    ):
+        assert "list" in refused(plain(axes={path: axis}))
+
+
 def test_a_window_that_scipy_warns_of_or_can_not_make_is_refused():
     for window in ("chebwin(30)", "kaiser_bessel_derived(4)"):
         assert "instrument.processing.window" in refused(
