@@ -244,9 +244,7 @@ def _stepped(bounds: list[Fraction], unit: Unit, rule: Numeric, location: Locati
     """Values from first to last, last included where a step lands on it."""
     first, last, step = bounds
     if step == 0:
-        raise Rejected(
-            Finding(location, "has a step of zero", "list the values", ABSENT)
-        )
+        raise Rejected(Finding(location, "has a step of zero", "list the values", ABSENT))
     if (last - first) / step < 0:
         raise Rejected(
             Finding(
