@@ -3,7 +3,7 @@
 Shots may carry phase errors that all lines of a segment share (:class:`PhaseError`), and a
 Gaussian width of their beat. The compiled code takes both as numbers: each line becomes a few
 lines (:mod:`sweep.model.effects.line_splitting`), each spectrum the mean over a few shifts
-(:func:`sweep.model.effects.line_width.gaussian_shifts`). They are worked out for a stretch of
+(:func:`sweep.model.effects.gaussian_line.gaussian_shifts`). They are worked out for a stretch of
 points at a time, so that what they take of memory does not grow with the number of points; shots
 without them are one stretch, and pay for nothing.
 
@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_splitting import split_lines
-from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.preparation import Shots
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE

@@ -64,6 +64,9 @@ def studies(draw: st.DrawFn) -> dict[str, Any]:
     return mended(written) if draw(st.integers(0, 4)) else written
 
 
+QUANTA = ("instrument.receiver.responsivity", "instrument.laser.wavelength")
+"""What electrons a photon follow from."""
+
 TIMING = (DURATION, DELAY, RANGE, SAMPLE_RATE)
 """Parameters that a record's length follows from."""
 
@@ -84,7 +87,7 @@ def mended(written: dict[str, Any]) -> dict[str, Any]:
 def _mend(written: dict[str, Any], path: str) -> None:
     """Take out a field or an axis that is to blame; of a record's length, all that counts."""
     axes = written.get("axes", {})
-    blamed = TIMING if path == DURATION else (path,)
+    blamed = {DURATION: TIMING, QUANTA[0]: QUANTA}.get(path, (path,))
     if path.startswith("axes."):
         axis = path.removeprefix("axes.").split(".zip")[0]
         axes.pop(axis, None)

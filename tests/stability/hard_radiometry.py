@@ -9,12 +9,8 @@ from cases import EPS, Family
 from table_shots import parameters, shots
 
 from sweep.model.effects.catalogue import CORE, EFFECTS
-from sweep.model.effects.line_width import (
-    coherent_share,
-    gaussian_shifts,
-    pedestal_density,
-    pedestal_power,
-)
+from sweep.model.effects.gaussian_line import gaussian_shifts
+from sweep.model.effects.line_width import coherent_share, pedestal_density, pedestal_power
 from sweep.model.effects.saturation import clipping
 from sweep.model.shot import evaluate
 from sweep.model.spectra import segment_spectrum

@@ -5,7 +5,7 @@ import pytest
 from effect_points import point_block, scene, shots_of, small, tile_block
 from phase_error_checks import check_blocks
 
-from sweep.model.effects import line_width
+from sweep.model.effects import gaussian_line, line_width
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.gaussian_line import gaussian_bound
 from sweep.model.window import samples, transform, window
@@ -38,7 +38,7 @@ def assert_mean_power(records, name, bins, expected):
 
 def gaussian_power(name, y, fwhm):
     """The module's mean power of a single line, from its shifts."""
-    shifts = line_width.gaussian_shifts(fwhm=np.array([fwhm]), duration=np.array([DURATION]))
+    shifts = gaussian_line.gaussian_shifts(fwhm=np.array([fwhm]), duration=np.array([DURATION]))
     form = window(name, LENGTH)
     each = np.abs(transform(form, (y[:, None] - shifts.offset[0]).ravel())) ** 2
     return each.reshape(y.size, -1) @ shifts.weight[0]
@@ -74,14 +74,14 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
 
 def test_shifts_of_many_points_are_those_of_each():
     fwhm = np.array([0.0, 3.0, 20.0]) / DURATION
-    together = line_width.gaussian_shifts(fwhm=fwhm, duration=DURATION)
+    together = gaussian_line.gaussian_shifts(fwhm=fwhm, duration=DURATION)
     assert (together.weight >= 0).all()
     np.testing.assert_allclose(together.weight.sum(axis=1), 1)
     variance = (together.weight * together.offset**2).sum(axis=1)
     np.testing.assert_allclose(variance, np.array([0.0, 9.0, 400.0]) / (8 * np.log(2)), rtol=1e-9)
     assert (together.weight[0] > 0).sum() == 1  # no width, one shift
     for i, width in enumerate(fwhm):
-        alone = line_width.gaussian_shifts(fwhm=fwhm[[i]], duration=DURATION)
+        alone = gaussian_line.gaussian_shifts(fwhm=fwhm[[i]], duration=DURATION)
         for one, other in zip(alone, together, strict=True):
             kept = alone.weight[0] > 0, together.weight[i] > 0
             assert one[0, kept[0]].tobytes() == other[i, kept[1]].tobytes(), width
