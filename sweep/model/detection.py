@@ -12,6 +12,7 @@ from sweep.model.crossings import (
     any_crossing,
     crossing_series,
 )
+from sweep.model.marcum import marcum_q1_pair
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 """Standard deviation of |X| in a noise-only bin, in units of sigma (per quadrature)."""
@@ -124,3 +125,33 @@ def assess(magnitude, count, sigma, level, floor, exempt):
         added_crossings(x, number, beta, series, chance)
         some += (1.0 - some) * any_crossing(chance, 0, number)
     return peak, exempted, some
+
+
+@njit(cache=True, error_model="numpy")
+def detect_rows(magnitude, first, bins, deviation, level, out):
+    """Detections in spectra without noise that are given bin by bin.
+
+    Parameters
+    ----------
+    magnitude : (m, count) float64
+        |X| of runs of bins.
+    first : (m,) int64
+        Number of each run's first bin.
+    bins : (int, float)
+        Last bin of the spectrum, N/2, and bin width [Hz]; bins outside 0..N/2 are passed over.
+    deviation, level : (m,) float64
+        Noise per quadrature of bins that hold lines; threshold.
+    out : (6, m) float64
+        Result, by the names of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage.
+    """
+    half, width = bins
+    exempt = np.empty(magnitude.shape[1], np.bool_)
+    for i in range(magnitude.shape[0]):
+        low = max(-first[i], 0)
+        high = min(half + 1 - first[i], magnitude.shape[1])
+        run = magnitude[i, low:high]
+        peak, exempted = mark(run, run.size, level[i], exempt)
+        found, missed = marcum_q1_pair(run[peak] / deviation[i], level[i] / deviation[i])
+        out[0, i], out[1, i], out[2, i] = found, missed, run[peak]
+        out[3, i] = (first[i] + low + peak) * width
+        out[4, i], out[5, i] = exempted, 0.0

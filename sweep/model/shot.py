@@ -3,7 +3,7 @@
 This module composes; the physics is in the others.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 
@@ -18,13 +18,37 @@ from sweep.model.segments import evaluate_segments, workspace
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
 
 
-def evaluate(parameters: Parameters, effects: Collection[str] = CORE) -> dict[str, np.ndarray]:
+def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
+    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
+
+    ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
+    """
+    found = []
+    for stretch in stretches(shots):
+        out = np.full((3, 6, stretch.row.size), np.nan)
+        evaluate_segments(
+            stretch.points, stretch.row, stretch.scene, shots.segments,
+            choices(shots, every_bin=every_bin), shots.kernel(),
+            workspace(stretch.lines, shots.fft_size), out,
+        )  # fmt: skip
+        found.append(out)
+    return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
+
+
+def evaluate(
+    parameters: Parameters,
+    effects: Collection[str] = CORE,
+    *,
+    look: Callable[[Shots], np.ndarray] = find,
+) -> dict[str, np.ndarray]:
     """Statistics of n shots on a flat plane.
 
     Parameters
     ----------
     parameters, effects
         As of :func:`sweep.model.chain.prepare`.
+    look
+        What finds the peaks in the spectra, :func:`find` or another way to the same.
 
     Returns
     -------
@@ -33,18 +57,21 @@ def evaluate(parameters: Parameters, effects: Collection[str] = CORE) -> dict[st
     """
     groups = list(prepare(parameters, effects))
     if len(groups) == 1:
-        return statistics(groups[0][1])
+        return statistics(groups[0][1], look(groups[0][1]))
     size = sum(index.size for index, _ in groups)
     results: dict[str, np.ndarray] = {}
     for index, shots in groups:
-        for name, values in statistics(shots).items():
+        for name, values in statistics(shots, look(shots)).items():
             results.setdefault(name, np.empty(size))[index] = values
     return results
 
 
-def statistics(shots: Shots) -> dict[str, np.ndarray]:
-    """Outputs of prepared shots, each (n,); without an echo, nan for what is then unknown."""
-    found = find(shots)
+def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Outputs of prepared shots, each (n,); without an echo, nan for what is then unknown.
+
+    ``found`` is what :func:`find` finds, if that is known.
+    """
+    found = find(shots) if found is None else found
     pd, miss, magnitude, _, exempted, leakage = np.moveaxis(found, 1, 0)
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
     alarms = _false_alarms(shots, exempted)
@@ -72,23 +99,6 @@ def statistics(shots: Shots) -> dict[str, np.ndarray]:
     }
     dark = shots.echo_power == 0
     return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
-
-
-def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
-    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
-
-    ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
-    """
-    found = []
-    for stretch in stretches(shots):
-        out = np.full((3, 6, stretch.row.size), np.nan)
-        evaluate_segments(
-            stretch.points, stretch.row, stretch.scene, shots.segments,
-            choices(shots, every_bin=every_bin), shots.kernel(),
-            workspace(stretch.lines, shots.fft_size), out,
-        )  # fmt: skip
-        found.append(out)
-    return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
 
 
 def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:

@@ -12,6 +12,7 @@ import numpy as np
 
 from sweep.model import receiver, window
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import detect_rows
 from sweep.model.preparation import Shots
 from sweep.model.waveform import SIGNS
 
@@ -44,6 +45,23 @@ def spectrum(shots: Shots, i: int, segment: int, *, range_walk: bool = True) -> 
     if shots.incoherent:
         return np.sqrt(power)
     return np.abs(np.fft.rfft(w * total.real, shots.fft_size))
+
+
+def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
+    """What each segment's spectrum holds, as :func:`sweep.model.shot.find`; no leakage.
+
+    Of what befalls lines within a record, the walk alone; the records know no other.
+    """
+    found, table = np.full((3, 6, shots.size), np.nan), shots.point_table()
+    for i in range(shots.size):
+        bins = shots.fft_size // 2, float(shots.sample_rate[i]) / shots.fft_size
+        for segment in map(int, np.flatnonzero(shots.segments)):
+            magnitude, out = spectrum(shots, i, segment, range_walk=range_walk), np.empty((6, 1))
+            detect_rows(
+                magnitude[None], np.zeros(1, np.int64), bins, table[13, [i]], table[11, [i]], out
+            )
+            found[segment, :, i] = out[:, 0]
+    return found
 
 
 def analytic_record(

@@ -1,0 +1,132 @@
+"""The thesis's way on an oversampled grid against the closed form of the same lines."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sweep.model import oversampled, spectra, truth
+from sweep.model.chain import prepare
+from sweep.model.shot import evaluate, find
+
+WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")
+
+DEPOSIT = {
+    "rectangular": (0.05, 1e-10),
+    "hamming": (0.03, 1e-12),
+    "hann": (0.03, 1e-12),
+    "kaiser(8.6)": (0.03, 1e-12),
+}
+"""Largest error over the lines' summed peaks, of the nearest cell and of ten.
+
+A line moved by 1/32 bin changes |W| by at most that times its steepest slope: 0.6 of the peak a bin
+for Hann, 1.4 for a rectangle, whose next sidelobe it meets. Lagrange's remainder with ten cells is
+a^10 437^2 / 10! / 218 = 2e-11 for a frequency a = pi/16 a cell, the window's ends; inside it falls
+with the tenth power.
+"""
+
+
+def drawn(table_4_1, number=12, **changes):
+    rng = np.random.default_rng(5)
+    scene = table_4_1(
+        range=rng.uniform(10.0, 1e4, number),
+        grazing_angle=np.radians(rng.uniform(2.0, 90.0, number)),
+        radial_velocity=rng.choice([150.0, -30.0, 0.0], number),
+        **changes,
+    )
+    ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
+    return shots
+
+
+def error(shots, degree):
+    """Largest difference near the lines over the peak of all of them in phase.
+
+    Of |X|; of |X|^2 where powers add, as a root of rounding is much.
+    """
+    worst, order = 0.0, 2 if shots.incoherent else 1
+    for i in range(shots.size):
+        gain = 1 / (1 + (2e8 / shots.detector_bandwidth) ** 2)  # of lines below 200 MHz, at least
+        peak = shots.amplitude[shots.row[i]]
+        peak = np.sqrt((peak**2).sum()) if shots.incoherent else peak.sum()
+        peak *= np.broadcast_to(shots.beat_scale, shots.size)[i] * shots.window.sum / 2 * gain
+        for segment in range(3):
+            _, exact = spectra.segment_spectrum(shots, i, segment)
+            bins, found = oversampled.spectrum(shots, i, segment, degree=degree)
+            inner = slice(bins.size // 4, -bins.size // 4)
+            apart = np.abs(found**order - exact[bins] ** order) / peak**order
+            worst = max(worst, apart[inner].max())
+    return worst
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("window", DEPOSIT)
+def test_lines_in_cells_are_as_near_as_cells_can_be(window, phases, table_4_1):
+    number = 2 if "kaiser" in window else 12  # whose whole spectrum takes its time
+    shots = replace(drawn(table_4_1, number, window=window, phases=phases), image=False)
+    nearest, shared = DEPOSIT[window]
+    assert 1e-3 < error(shots, 0) < nearest
+    # Powers have twice the bandwidth: 2^10 times the remainder.
+    assert error(shots, 9) < (shared if phases == "coherent" else 1024 * shared)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("acquisition_delay", [0.0, 350e-6])
+def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table_4_1):
+    """Doppler lines 0.3 bins from DC and from Nyquist; padded records, odd ones too."""
+    for fft_size in (8192, 8191, 2**17):
+        width = 600e6 / fft_size
+        nyquist = (fft_size // 2) * width
+        v = (np.array([0.3, nyquist / width - 0.3]) * width) * 1550e-9 / 2
+        scene = table_4_1(
+            radial_velocity=v, phases=phases, fft_size=fft_size, beamlets=7,
+            acquisition_delay=acquisition_delay,
+        )  # fmt: skip
+        ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
+        for i in range(2):
+            _, exact = spectra.segment_spectrum(shots, i, 1)
+            bins, found = oversampled.spectrum(shots, i, 1, degree=9)
+            edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
+            assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
+            without = spectra.segment_spectrum(replace(shots, image=False), i, 1)[1]
+            assert np.abs(without - exact).max() > 0.01 * exact.max()
+
+
+def test_the_same_detections_come_of_it(table_4_1):
+    rng = np.random.default_rng(6)
+    scene = table_4_1(
+        range=rng.uniform(200.0, 9000.0, 40), grazing_angle=np.radians(rng.uniform(5.0, 90.0, 40))
+    )
+    exact = evaluate(scene, WITHOUT_LEAKAGE, look=find)
+    found = evaluate(scene, WITHOUT_LEAKAGE, look=lambda s: oversampled.find(s, degree=9))
+    for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
+        # Images beyond the grid are left out: 1e-4 of a line at the very most.
+        assert found[name] == pytest.approx(exact[name], rel=2e-3, abs=1e-3), name
+    assert found["log10_pfa_shot"] == pytest.approx(exact["log10_pfa_shot"], abs=1e-4)
+
+
+def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
+    wide = prepare(table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE)
+    ((_, shots),) = wide
+    assert list(oversampled.grid_sizes(shots)) == [2**13, 2**12]
+    assert list(oversampled.grid_sizes(shots, 2**11)) == [2**13, 2**11]
+    bins, found = oversampled.spectrum(shots, 0, 0, degree=9)
+    _, exact = spectra.segment_spectrum(shots, 0, 0)
+    assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
+
+
+def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
+    scene = table_4_1(
+        range=np.array([700.0, 3000.0]), fft_size=4096, beamlets=19, radial_velocity=0.0
+    )
+    exact = evaluate(scene, WITHOUT_LEAKAGE)
+    found = evaluate(scene, WITHOUT_LEAKAGE, look=truth.find)
+    for name in ("pd_up", "pd_doppler", "pd_shot", "miss_shot", "snr_up", "range_error"):
+        assert found[name] == pytest.approx(exact[name], rel=1e-6, abs=1e-9), name
+    assert np.array_equal(found["pfa_shot"], exact["pfa_shot"])
+
+
+def test_direct_detection_has_no_doppler_segment(table_4_1):
+    scene = table_4_1(architecture="direct", range=np.array([20.0, 30.0]), radial_velocity=0.0)
+    for look in (oversampled.find, truth.find):
+        found = evaluate(scene | {"instrument.processing.fft_size": 4096}, ("image",), look=look)
+        assert np.isnan(found["pd_doppler"]).all() and (found["pd_up"] > 0).all()
