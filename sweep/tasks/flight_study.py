@@ -225,7 +225,7 @@ class FlightStudy:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
         return plan_shots(
             eyepoints,
-            self._parameters(part),
+            self.parameters_at(part),
             self.spec.surfaces(),
             modes=self.spec.modes(),
             tiles=tiles,
@@ -276,7 +276,7 @@ class FlightStudy:
         for index, effects in called.groups():
             some = cloud(
                 eyepoints.some(index),
-                parameters=self._parameters(part),
+                parameters=self.parameters_at(part),
                 surfaces=self.spec.surfaces(),
                 keys=keys[index],
                 first_draw=begin,
@@ -290,7 +290,8 @@ class FlightStudy:
                 found.setdefault(name, np.empty(room, values.dtype))[index] = values
         return found
 
-    def _parameters(self, part: Part) -> Mapping[str, Any]:
+    def parameters_at(self, part: Part) -> Mapping[str, Any]:
+        """SI values of all parameters at a block's place along the axes."""
         parameters = dict(self.spec.parameters())
         for axis, index in zip(self.spec.axes, part.axes, strict=True):
             for member in axis.members:

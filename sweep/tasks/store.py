@@ -20,7 +20,7 @@ import numpy as np
 
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.study import ArrayLayout, Study
+from sweep.tasks.study import ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
     import zarr
@@ -37,7 +37,7 @@ WRITTEN_WHOLE: ArrayConfigLike = {
 }  # else a chunk equal to the fill looks undone
 
 
-def create(path: str | Path, study: Study) -> Path:
+def create(path: str | Path, study: Content) -> Path:
     """A new store without results: every array's metadata, what is known beforehand, and the spec.
 
     It is built beside its place and renamed into it, so that a creation cut short leaves nothing
@@ -68,7 +68,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(aside)
 
 
-def _build(path: Path, study: Study) -> None:
+def _build(path: Path, study: Content) -> None:
     import zarr
 
     group = zarr.create_group(path, zarr_format=3, attributes=_attributes(study))
@@ -80,7 +80,7 @@ def _build(path: Path, study: Study) -> None:
     _consolidate(path)
 
 
-def _attributes(study: Study) -> dict[str, Any]:
+def _attributes(study: Content) -> dict[str, Any]:
     return study.attributes() | {
         "study_id": study.id,
         "model_version": versions.model(),

@@ -43,15 +43,28 @@ class ArrayLayout:
         return replace(self, name=f"{group}/{self.name}")
 
 
-class Study(Protocol):
-    """A study as the driver and its workers see it.
-
-    No two blocks share a chunk of any array, and every chunk belongs to a block.
-    """
+class Content(Protocol):
+    """What a store is made of."""
 
     @property
     def id(self) -> str:
         """Hash of all that its results depend on."""
+
+    def attributes(self) -> dict[str, Any]:
+        """What its store says of it, but for versions; the same wherever it is made."""
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """Groups of its store and their attributes."""
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Every array of its store."""
+
+
+class Study(Content, Protocol):
+    """A study as the driver and its workers see it.
+
+    No two blocks share a chunk of any array, and every chunk belongs to a block.
+    """
 
     @property
     def unit(self) -> str:
@@ -70,15 +83,6 @@ class Study(Protocol):
 
     def points_in(self, blocks: np.ndarray) -> int:
         """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
-
-    def attributes(self) -> dict[str, Any]:
-        """What its store says of it, but for versions; the same wherever it is made."""
-
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """Groups of its store and their attributes."""
-
-    def arrays(self) -> list[ArrayLayout]:
-        """Every array of its store."""
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """Chunks that a block writes, whole: the position of one in each of some arrays."""

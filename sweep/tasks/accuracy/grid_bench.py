@@ -1,0 +1,154 @@
+"""Points of a grid to try rungs on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.model.effects.flags import flags_of, names_of
+from sweep.tasks.accuracy.bench import NOT_IN_TRUTH, Seen, Trial, look_of, of_lines, seen_in
+from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
+from sweep.tasks.accuracy.sample import neighbours, spread
+from sweep.tasks.calling import Calling
+from sweep.tasks.evaluate import evaluate_points
+from sweep.tasks.grid import Grid
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+
+class GridBench:
+    """A sample of the points of a grid.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    points
+        Points of the sample, fewer where the grid has fewer.
+    """
+
+    unit = "points"
+
+    def __init__(self, spec: Spec, points: int) -> None:
+        self.spec = spec
+        self._grid = Grid(spec)
+        self._numbers = spread(self._grid.shape, points)
+        self._calling: dict[str, Calling] = {}
+
+    @property
+    def size(self) -> int:
+        """Points of the sample."""
+        return len(self._numbers)
+
+    def parts(self, points: int) -> list[np.ndarray]:
+        """The sample in parts of about so many points."""
+        return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
+
+    def effects(self, rung: Rung) -> frozenset[str]:
+        """Effects that a rung calls for anywhere in the sample."""
+        flags, _, _ = self._planned(rung, np.arange(self.size))
+        return frozenset(name for flag in np.unique(flags) for name in names_of(int(flag)))
+
+    def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
+        """A rung on a part of the sample, with `times` points of its tile for each.
+
+        A plan serves a whole tile, so that a point takes its share of the time.
+        """
+        calling = self._calling_of(rung)
+        flags, planning, numbers = self._planned(rung, part, times)
+        outputs: dict[str, np.ndarray] = {}
+        spent = 0.0
+        for members, effects in self._groups(rung, flags):
+            chosen = numbers[members].ravel()
+            parameters = calling.tiles.grid.parameters_at(chosen)
+            begun = time.perf_counter()
+            found = self._evaluated(rung, calling.tiles.grid.spec, parameters, len(chosen), effects)
+            spent += time.perf_counter() - begun
+            for name, values in found.items():
+                room = (len(part), *values.shape[1:])
+                outputs.setdefault(name, np.empty(room, values.dtype))[members] = values[::times]
+        draws = int(calling.tiles.grid.spec.draws.number)
+        planning = planning if rung.plans else 0.0
+        seconds = spent / numbers.size + planning
+        return Trial(seen_in(outputs, rung.estimate, draws), seconds, planning)
+
+    def forget(self) -> None:
+        """Nothing is shared."""
+
+    def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
+        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        from sweep.model import shot, truth
+        from sweep.model.effects.catalogue import EFFECTS
+
+        random = {effect.name for effect in EFFECTS if effect.is_random}
+        flags, _, numbers = self._planned(rung, np.array([place]))
+        effects = [n for n in names_of(int(flags[0])) if n not in NOT_IN_TRUTH | random]
+        parameters = self._calling_of(rung).tiles.grid.parameters_at(numbers.ravel())
+        # Records walk by themselves, whatever effects are named.
+        in_time = shot.evaluate(parameters, effects, look=truth.find)
+        return seen_in(in_time, MEAN, 0), seen_in(shot.evaluate(parameters, effects), MEAN, 0)
+
+    def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+        """Number of each point in C order, and its place along each axis."""
+        found = {"number": (self._numbers, {"long_name": "number of the point of the study"})}
+        index = np.unravel_index(self._numbers, self._grid.shape) if self._grid.shape else ()
+        for axis, along in zip(self.spec.axes, index, strict=True):
+            for member in axis.members:
+                attributes = {"units": member.units, "path": member.path}
+                found[member.name] = (np.asarray(member.display)[along], attributes)
+        return found
+
+    def _calling_of(self, rung: Rung) -> Calling:
+        if rung.name not in self._calling:
+            spec = rung.of(self.spec)
+            self._calling[rung.name] = Calling(spec, Grid(spec))  # type: ignore[arg-type]
+        return self._calling[rung.name]
+
+    def _planned(
+        self, rung: Rung, part: np.ndarray, times: int = 1
+    ) -> tuple[np.ndarray, float, np.ndarray]:
+        """Flags (n,), time that planning takes a point, and numbers of points (n, times)."""
+        tiles = self._calling_of(rung).tiles
+        shape = tiles.grid.shape
+        index = np.unravel_index(self._numbers[part], shape) if shape else ()
+        along = [i // side for i, side in zip(index, tiles.shape, strict=True)]
+        own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(part), np.int64)
+        numbers, where = np.unique(own, return_inverse=True)
+        flags = np.empty(len(numbers), np.uint32)
+        begun = time.perf_counter()
+        for chosen, plan in self._calling_of(rung).plans(numbers):
+            flags[chosen] = flags_of(plan.kept)
+        spent = time.perf_counter() - begun
+        boxes = [tiles.points(int(tile)) for tile in numbers]
+        served = sum(int(np.prod([s.stop - s.start for s in box])) for box in boxes)
+        places = zip(*index, strict=True) if shape else [()] * len(part)
+        around = [
+            neighbours(tuple(map(int, point)), boxes[tile], shape, times)
+            for point, tile in zip(places, where, strict=True)
+        ]
+        return flags[where], spent / served, np.array(around)
+
+    def _groups(
+        self, rung: Rung, flags: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
+        if rung.cells:
+            written = Rung(name="as written", kind=WRITTEN)
+            yield np.arange(len(flags)), of_lines(self.effects(written))
+            return
+        for flag in np.unique(flags):
+            yield np.flatnonzero(flags == flag), names_of(int(flag))
+
+    @staticmethod
+    def _evaluated(
+        rung: Rung, spec: Spec, parameters: Any, count: int, effects: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        from sweep.model.shot import evaluate
+
+        if not rung.cells:
+            return evaluate_points(spec, parameters, count, effects)
+        found = evaluate(parameters, effects, look=look_of(rung))
+        return {name: np.broadcast_to(values, (count,)) for name, values in found.items()}

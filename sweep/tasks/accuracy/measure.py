@@ -1,0 +1,260 @@
+"""All rungs of a study tried on a sample of its points, round after round."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.tasks.accuracy.bench import Bench, Seen, Trial
+from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, Ladder, Rung, ladder
+
+if TYPE_CHECKING:
+    from sweep.tasks.accuracy.rungs import Declared
+    from sweep.tasks.interrupt import Interrupts
+    from sweep.tasks.progress import Progress
+
+POINTS, TIME_LIMIT = 200, 60.0
+"""Points of a sample; time that trying may take [s]."""
+
+MOST_ROUNDS = 9
+
+PARTS = 4
+"""Parts of a sample: as many, at the least, as between which it can be broken off."""
+
+LONG_ENOUGH = 0.05
+"""Time of a trial [s] from which on its calls cost nothing beside the points themselves."""
+
+MOST_TIMES = 64
+"""Points that are timed for each point of the sample, at the most."""
+
+FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
+"""Shares of the time limit by which the first round, and then the truth, ends."""
+
+LEAST_IN_TRUTH = 3
+"""Points in the time domain, however long they take."""
+
+TRUTH_BEAMLETS = 109
+"""Beamlets in the time domain where accuracy decides on their number: each is a record."""
+
+FIXED_AS_AT = (1e-1, 1e-3, 1e-6)
+"""Tolerances whose effects are tried at every point alike."""
+
+
+@dataclass
+class Measured:
+    """What rungs came to, by rung and point of the sample."""
+
+    ladder: Ladder
+    seen: list[Seen]
+    """One a rung, (points, ...) each."""
+    done: np.ndarray
+    """Places in the sample of the points that every rung was tried on."""
+    seconds: np.ndarray
+    """(rungs, rounds): a point, planning included."""
+    planning: np.ndarray
+    """(rungs, rounds): a point."""
+    times: np.ndarray
+    """(rungs,): points timed for each."""
+    truth: dict[int, tuple[Seen, Seen]] = field(default_factory=dict)
+    """By place in the sample: in the time domain, and as the reference has it."""
+    stopped: str = ""
+    """Why the sample is not whole; empty where it is."""
+
+
+class Nothing(Exception):
+    """Broken off before any point was through."""
+
+
+class Measurement:
+    """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
+
+    Parameters
+    ----------
+    bench
+        The sample.
+    time_limit
+        Time that all may take [s], about.
+    told, interrupts
+        Where to say how far it is; what breaks it off.
+    """
+
+    def __init__(
+        self, bench: Bench, *, time_limit: float, told: Progress, interrupts: Interrupts
+    ) -> None:
+        self._bench, self._limit = bench, time_limit
+        self._told, self._interrupts = told, interrupts
+        self._begun = time.monotonic()
+        self._ladder = self._completed(ladder(bench.spec))
+        self._times = np.ones(len(self._ladder.rungs), np.int64)
+
+    def run(self) -> Measured:
+        """All rounds that the time allows, the first of them at least in part.
+
+        Raises
+        ------
+        Nothing
+            Broken off before any point was through.
+        """
+        rungs = self._ladder.rungs
+        self._told.say(
+            f"trying {len(rungs)} settings on {self._bench.size:,} {self._bench.unit} of the study"
+        )
+        parts = self._bench.parts(self._part_points())
+        rounds = self._planned_rounds(parts)
+        self._told.begin(points=len(rungs) * len(parts) * rounds, done=0, unit="trials")
+        try:
+            return self._rounds(parts, rounds)
+        finally:
+            self._told.end()
+
+    def _rounds(self, parts: list[np.ndarray], rounds: int) -> Measured:
+        first = self._round(parts, until=FIRST_ROUND)
+        if not first:
+            raise Nothing
+        kept = parts[: len(first)]
+        measured = self._gathered(kept, first)
+        if len(kept) < len(parts):
+            measured.stopped = "interrupted" if self._interrupts.stopping else "time limit"
+        self._add_truth(measured)
+        for _ in range(rounds - 1):
+            again = self._round(kept, until=1.0)
+            if len(again) < len(kept):
+                break
+            timed = self._gathered(kept, again)
+            measured.seconds = np.column_stack([measured.seconds, timed.seconds])
+            measured.planning = np.column_stack([measured.planning, timed.planning])
+        return measured
+
+    def _completed(self, rungs: Ladder) -> Ladder:
+        """The ladder, with the effects that tolerances call for fixed at every point."""
+        at = {
+            float(rung.overrides["accuracy.tolerance"]): rung
+            for rung in rungs.rungs
+            if rung.kind == ADAPTIVE
+        }
+        if not any(rung.kind == ALL_ON for rung in rungs.rungs):
+            return rungs
+        sets = {t: self._bench.effects(at[t]) for t in FIXED_AS_AT if t in at}
+        self._bench.forget()
+        return rungs.with_fixed(sets)
+
+    def _part_points(self) -> int:
+        """Points of a part: a few parts, and more where a point takes its time."""
+        first = self._bench.parts(1)[0]
+        for _ in range(2):  # the first compiles what there is to compile
+            spent = sum(self._timed(i, first) for i in range(len(self._ladder.rungs)))
+        fitting = FIRST_ROUND * self._limit * len(first) / spent
+        return max(1, min(self._bench.size, int(fitting)) // PARTS)
+
+    def _planned_rounds(self, parts: list[np.ndarray]) -> int:
+        """Rounds that fit in; before that, how many points each rung needs to be timed well."""
+        spent = 0.0
+        for i in range(len(self._ladder.rungs)):
+            took = self._timed(i, parts[0])
+            while took < LONG_ENOUGH / 2 and self._times[i] < MOST_TIMES:
+                self._times[i] *= 2
+                took = self._timed(i, parts[0])
+            spent += took
+        left = self._limit - (time.monotonic() - self._begun)
+        return max(1, min(MOST_ROUNDS, int(0.7 * left / (spent * len(parts)))))
+
+    def _timed(self, rung: int, part: np.ndarray) -> float:
+        begun = time.monotonic()
+        if self._interrupts.stopping:
+            raise Nothing
+        self._try(rung, part)
+        self._bench.forget()
+        return time.monotonic() - begun
+
+    def _try(self, rung: int, part: np.ndarray) -> Trial:
+        return self._bench.try_on(self._ladder.rungs[rung], part, int(self._times[rung]))
+
+    def _round(self, parts: list[np.ndarray], *, until: float) -> list[list[Trial]]:
+        """Every rung on every part that there is time for; the first at least, if uninterrupted."""
+        done: list[list[Trial]] = []
+        for part in parts:
+            if done and time.monotonic() - self._begun > until * self._limit:
+                break
+            trials = []
+            for rung in range(len(self._ladder.rungs)):
+                if self._interrupts.stopping:
+                    return done
+                trials.append(self._try(rung, part))
+                self._told.advance(points=1, failed=0)
+            self._bench.forget()
+            done.append(trials)
+        return done
+
+    def _gathered(self, parts: list[np.ndarray], trials: list[list[Trial]]) -> Measured:
+        """A round, with its parts put together."""
+        places = np.concatenate(parts)
+        share = np.array([len(part) for part in parts]) / len(places)
+
+        def mean(value: Callable[[Trial], float]) -> np.ndarray:
+            return np.array([[value(t) for t in row] for row in trials]).T @ share
+
+        by_rung = zip(*trials, strict=True)
+        seen = [
+            Seen(*map(np.concatenate, zip(*(t.seen for t in row), strict=True))) for row in by_rung
+        ]
+        return Measured(
+            ladder=self._ladder, seen=seen, done=places, times=self._times,
+            seconds=mean(lambda t: t.seconds)[:, None], planning=mean(lambda t: t.planning)[:, None],
+        )  # fmt: skip
+
+    def _add_truth(self, measured: Measured) -> None:
+        """Points of the sample in the time domain, as many as there is time for."""
+        rung = self._in_time_domain()
+        for place in measured.done.tolist():
+            late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
+            if self._interrupts.stopping or (late and len(measured.truth) >= LEAST_IN_TRUTH):
+                break
+            in_time, reference = self._bench.truth(rung, place)
+            if np.isfinite(in_time.pd).any():
+                measured.truth[place] = in_time, reference
+        self._bench.forget()
+
+    def _in_time_domain(self) -> Rung:
+        """The reference, with no more beamlets than there is time for."""
+        reference = self._ladder.reference
+        if "footprint.beamlets" not in reference.overrides:
+            return reference
+        fewer: dict[str, Any] = {"footprint.beamlets": TRUTH_BEAMLETS}
+        return replace(reference, name="in time", overrides={**reference.overrides, **fewer})
+
+
+def bench_of(spec: Declared, points: int) -> Bench:
+    """A sample of a study's points."""
+    from sweep.spec import SceneSpec
+    from sweep.tasks.accuracy.flight_bench import FlightBench
+    from sweep.tasks.accuracy.grid_bench import GridBench
+
+    return FlightBench(spec, points) if isinstance(spec, SceneSpec) else GridBench(spec, points)
+
+
+def differences(measured: Measured) -> Iterator[tuple[str, np.ndarray]]:
+    """Errors of all rungs against the reference, (rungs, points) each, by name."""
+    reference = measured.seen[-1]
+    found = [apart(seen, reference) for seen in measured.seen]
+    for name, values in zip(ERRORS, zip(*found, strict=True), strict=True):
+        yield name, np.array(values)
+
+
+ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error")
+
+
+def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Largest differences of pd, of log10 pfa, and of magnitudes in relation, (n,) each."""
+    either = np.isfinite(seen.pd) | np.isfinite(other.pd)
+    # What sees nothing detects nothing.
+    pd = np.where(either, np.abs(np.nan_to_num(seen.pd) - np.nan_to_num(other.pd)), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pfa = np.abs(seen.log10_pfa - other.log10_pfa)
+        magnitude = np.abs(seen.magnitude / other.magnitude - 1)
+    same = seen.log10_pfa == other.log10_pfa
+    pfa = np.where(same, 0.0, pfa)
+    return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, magnitude))  # type: ignore[return-value]

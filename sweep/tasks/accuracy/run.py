@@ -1,0 +1,219 @@
+"""The measurement of what accuracy costs, from a spec to its store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.tasks import identity, store, versions
+from sweep.tasks.accuracy.bench import Bench
+from sweep.tasks.accuracy.measure import (
+    POINTS,
+    TIME_LIMIT,
+    Measured,
+    Measurement,
+    apart,
+    bench_of,
+    differences,
+)
+from sweep.tasks.accuracy.rungs import REFERENCE, Rung
+from sweep.tasks.errors import StoreError
+from sweep.tasks.interrupt import Interrupts
+from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.study import ArrayLayout
+
+if TYPE_CHECKING:
+    from sweep.tasks.accuracy.rungs import Declared
+
+KIND = "accuracy"
+"""Kind of the store."""
+
+_ABOUT = {
+    "pd_error": ("1", "largest error of a probability of detection, of segments and shot"),
+    "log10_pfa_error": ("1", "error of log10 of a probability of false alarm"),
+    "magnitude_error": ("1", "relative error of the magnitude of the peak bins"),
+    "standard_error": ("1", "standard error that the setting itself tells, where it draws"),
+}
+
+
+def measure(
+    spec: Declared,
+    *,
+    store_path: Path,
+    points: int = POINTS,
+    time_limit: float = TIME_LIMIT,
+    overwrite: bool = False,
+    progress: bool | Progress = True,
+) -> bool:
+    """Try a ladder of settings on a sample of a study's points, and store what they came to.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    store_path
+        Path of the store to make; it is there whole, or not at all.
+    points
+        Points of the sample.
+    time_limit
+        Time that trying may take [s], about.
+    overwrite
+        Whether to put the new store in the place of one that is there.
+    progress
+        As of :func:`sweep.tasks.driver.run`.
+
+    Returns
+    -------
+    bool
+        Whether any point was through before it was interrupted; without one there is no store.
+
+    Raises
+    ------
+    StoreError
+        Where a store is in the way or can't be written.
+    SceneError
+        Where a file of a scene is missing, changed or unfit.
+    """
+    from sweep.tasks.accuracy.measure import Nothing
+
+    _refuse_in_the_way(store_path, overwrite)
+    told = chosen(progress)
+    with Interrupts() as interrupts:
+        bench = bench_of(spec, points)
+        try:
+            measured = Measurement(
+                bench, time_limit=time_limit, told=told, interrupts=interrupts
+            ).run()
+        except Nothing:
+            return False
+    if store_path.exists():
+        store.remove(store_path)
+    store.create(store_path, Content(spec, bench, measured))
+    return True
+
+
+def _refuse_in_the_way(path: Path, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if identity.read_attributes(path)["kind"] != KIND:
+        raise StoreError(f"{path} holds a study's results: name another --store")
+    if not overwrite:
+        raise StoreError(f"{path} is there already: --overwrite measures anew")
+
+
+class Content:
+    """What the store holds: errors by rung and point, seconds by rung and round.
+
+    Parameters
+    ----------
+    spec, bench, measured
+        The study, the sample of its points, and what rungs came to on it.
+    """
+
+    def __init__(self, spec: Declared, bench: Bench, measured: Measured) -> None:
+        self._spec, self._bench, self._measured = spec, bench, measured
+
+    @property
+    def id(self) -> str:
+        """That of the study."""
+        return self._spec.id
+
+    def attributes(self) -> dict[str, Any]:
+        """The spec, what the errors are taken against, and what was measured on."""
+        measured = self._measured
+        found = {
+            "kind": KIND,
+            "title": self._spec.title,
+            "question": "What does accuracy cost in time?",
+            "spec": self._spec.to_json(),
+            "reference": measured.ladder.reference.name.removeprefix("reference: "),
+            "environment": {"processor": versions.processor(), **versions.software()},
+            "unit": self._bench.unit,
+            "points": self._points(),
+            "notes": list(measured.ladder.notes),
+            "stopped": measured.stopped,
+            "coordinates": " ".join(["kind", *self._bench.coordinates()]),
+        }
+        return found | self._truth()
+
+    def _points(self) -> int:
+        return len(self._measured.done)
+
+    def _truth(self) -> dict[str, Any]:
+        """How far the reference is from the time domain, at the most; None where not looked at."""
+        pairs = self._measured.truth.values()
+        found = [apart(in_time, reference) for in_time, reference in pairs]
+        worst = np.max(found, axis=(0, 2)) if found else [None] * 3
+        return {
+            "truth_points": len(found),
+            "truth_pd_difference": None if not found else float(worst[0]),
+            "truth_magnitude_difference": None if not found else float(worst[2]),
+        }
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Coordinates, errors, seconds."""
+        measured, rungs = self._measured, self._measured.ladder.rungs
+        found = [
+            _array("rung", ("rung",), _texts(rung.name for rung in rungs)),
+            _array("kind", ("rung",), _texts(rung.kind for rung in rungs)),
+            _array("tolerance", ("rung",), np.array([_tolerance(r) for r in rungs]), "1",
+                   "tolerance of an adaptive setting"),
+            _array("times", ("rung",), measured.times, "1", "points timed for each of the sample"),
+            _array("seconds", ("rung", "round"), measured.seconds, "s",
+                   "time a point on one core, planning included"),
+            _array("planning", ("rung", "round"), measured.planning, "s",
+                   "planning's share of it"),
+        ]  # fmt: skip
+        errors = dict(differences(measured))
+        errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
+        for name, values in errors.items():
+            found.append(_array(name, ("rung", "point"), values, *_ABOUT[name]))
+        found.append(self._truth_array())
+        for name, (values, attributes) in self._bench.coordinates().items():
+            chosen_ = np.asarray(values)[measured.done]
+            layout = _array(
+                name, ("point",), _texts(chosen_) if chosen_.dtype == object else chosen_
+            )
+            layout.attributes.update(attributes)  # type: ignore[attr-defined]
+            found.append(layout)
+        return found
+
+    def _truth_array(self) -> ArrayLayout:
+        """Differences of pd between reference and time domain; nan where it was not looked at."""
+        measured = self._measured
+        values = np.full(len(measured.done), np.nan)
+        for place, (in_time, reference) in measured.truth.items():
+            values[np.flatnonzero(measured.done == place)] = apart(in_time, reference)[0]
+        long_name = "difference of a probability of detection from the time domain's"
+        return _array("truth_pd_difference", ("point",), values, "1", long_name)
+
+
+def _tolerance(rung: Rung) -> float:
+    value = rung.overrides.get("accuracy.tolerance", np.nan)
+    return float(value) if rung.kind != REFERENCE else np.nan
+
+
+def _texts(values: Any) -> np.ndarray:
+    return np.array(list(values), object)
+
+
+def _array(
+    name: str, dims: tuple[str, ...], values: np.ndarray, units: str = "", long_name: str = ""
+) -> ArrayLayout:
+    attributes = {"units": units, "long_name": long_name} if long_name else {}
+    text = values.dtype == object
+    return ArrayLayout(
+        name=name,
+        shape=values.shape,
+        chunks=tuple(max(1, n) for n in values.shape),
+        dims=dims,
+        dtype="string" if text else str(values.dtype),
+        attributes=attributes,
+        values=values,
+    )

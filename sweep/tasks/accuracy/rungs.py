@@ -1,0 +1,241 @@
+"""Rungs: settings of a study that are tried against each other, as overrides of its spec."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
+
+    Declared = Spec | SceneSpec
+
+WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, THESIS, DRAWS, REFERENCE = (
+    "as written", "adaptive", "all on", "fixed effects", "beamlets", "thesis", "draws", "reference",
+)  # fmt: skip
+"""Kinds of rungs."""
+
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+NUMBERS = (1, 7, 19, 37, 61, 109, 217, 1009, 4003)
+"""Beamlets that a study might fix: full shells of a hexagonal lattice, as far as they are."""
+
+FINEST, FINEST_RAYS = 10009, 1009
+"""Beamlets of the reference; of a flight, where each is a ray."""
+
+FINEST_TOLERANCE = 1e-9
+"""Tolerance of the reference where the number of beamlets follows from it."""
+
+DRAW_NUMBERS = (10, 100, 1000, 10000)
+
+LONG_RUN = 4
+"""Draws of the reference over those of the longest rung."""
+
+MEAN, COUNTS = "mean", "counts"
+"""What is read off draws: the mean of each draw's probability, or how many were detected."""
+
+_TOLERANCE, _BEAMLETS, _DRAWS = "accuracy.tolerance", "footprint.beamlets", "draws.number"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rung:
+    """A setting of a study.
+
+    Parameters
+    ----------
+    name, kind
+        What it is called; one of the kinds above.
+    overrides
+        Values of fields of the spec by dotted path, as one would write them.
+    plans
+        Whether effects are planned, and the time that this takes counts.
+    cells, degree
+        Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit
+        (:mod:`sweep.model.oversampled`); else 0.
+    estimate
+        What is read off draws.
+    """
+
+    name: str
+    kind: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    plans: bool = True
+    cells: int = 0
+    degree: int = 0
+    estimate: str = MEAN
+
+    def of(self, spec: Declared) -> Declared:
+        """The spec with the overrides put onto it.
+
+        Raises
+        ------
+        SpecError
+            Where it then is no study any more.
+        """
+        if not self.overrides:
+            return spec
+        written = copy.deepcopy(spec.to_yaml_mapping())
+        for path, value in self.overrides.items():
+            *sections, name = path.split(".")
+            place = written
+            for section in sections:
+                place = place.setdefault(section, {})
+            place[name] = value
+        return type(spec).from_mapping(written, base=getattr(spec, "base", "."))
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Rungs, the reference last, and what there is to say of them."""
+
+    rungs: tuple[Rung, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def reference(self) -> Rung:
+        """The rung that the errors of all others are taken against."""
+        return self.rungs[-1]
+
+    def with_fixed(self, sets: Mapping[float, frozenset[str]]) -> Ladder:
+        """The ladder with rungs that simulate the same effects at every point.
+
+        Parameters
+        ----------
+        sets
+            Effects that a tolerance calls for anywhere.
+        """
+        from sweep.model.effects.catalogue import EFFECTS
+
+        further, seen = [], set()
+        for tolerance, names in sets.items():
+            if names not in seen:
+                seen.add(names)
+                modes = {
+                    f"effects.{effect.name}": "on" if effect.name in names else "off"
+                    for effect in EFFECTS
+                }
+                name = f"{len(names)} effects everywhere, as at {tolerance:g}"
+                further.append(Rung(name=name, kind=FIXED, overrides=modes, plans=False))
+        place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
+        return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
+
+
+def ladder(spec: Declared) -> Ladder:
+    """The rungs of a study, without those whose effects are fixed."""
+    if _draws(spec):
+        return _drawn_ladder(spec)
+    notes: list[str] = []
+    adaptive = {_BEAMLETS: "auto"} if _beamlets_follow(spec) else {}
+    rungs = [Rung(name="as written", kind=WRITTEN)]
+    if _on_axis(spec, _TOLERANCE):
+        notes.append("accuracy.tolerance is on an axis: left as it is")
+    else:
+        rungs += [
+            Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=adaptive | {_TOLERANCE: t})
+            for t in TOLERANCES
+        ]
+    every = _every_effect(spec)
+    rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every, plans=False))
+    finest = every
+    if why := _beamlets_fixed(spec):
+        notes.append(f"the number of beamlets is left alone: {why}")
+    else:
+        most = FINEST_RAYS if _is_flight(spec) else FINEST
+        rungs += [
+            Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
+            for n in NUMBERS
+            if n < most
+        ]
+        finest = every | (adaptive or {_BEAMLETS: most})
+        finest |= {_TOLERANCE: FINEST_TOLERANCE} if adaptive else {}
+    rungs += _thesis_rungs()
+    name = "all effects on" + ("" if _beamlets_fixed(spec) else f", beamlets {finest[_BEAMLETS]}")
+    reference = Rung(name=f"reference: {name}", kind=REFERENCE, overrides=finest, plans=False)
+    return Ladder((*rungs, reference), tuple(notes))
+
+
+def _thesis_rungs() -> Iterator[Rung]:
+    """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten."""
+    for cells, degree in ((11, 0), (12, 0), (12, 9)):
+        how = "nearest cell" if degree == 0 else f"degree {degree}"
+        yield Rung(
+            name=f"thesis: 2^{cells} FFT, {how}", kind=THESIS, plans=False, cells=1 << cells,
+            degree=degree,
+        )  # fmt: skip
+
+
+def _drawn_ladder(spec: Declared) -> Ladder:
+    """Numbers of draws and what is read off them, against a long run with other draws."""
+    rungs = [Rung(name="as written", kind=WRITTEN)]
+    rungs += [
+        Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides={_TOLERANCE: t})
+        for t in TOLERANCES[:4]
+    ]
+    noise = {"draws.method": "noise"}
+    for number in DRAW_NUMBERS:
+        each = {_DRAWS: number}
+        rungs += [
+            Rung(name=f"{number} draws, mean", kind=DRAWS, overrides=each),
+            Rung(name=f"{number} draws, counts", kind=DRAWS, overrides=each, estimate=COUNTS),
+            Rung(
+                name=f"{number} draws, noise", kind=DRAWS, overrides=each | noise, estimate=COUNTS
+            ),
+        ]
+    number = LONG_RUN * DRAW_NUMBERS[-1]
+    other = {_DRAWS: number, "seed": int(spec.seed) ^ 1}
+    reference = Rung(
+        name=f"reference: {number} other draws, all effects on", kind=REFERENCE,
+        overrides=_every_effect(spec) | other, plans=False,
+    )  # fmt: skip
+    note = "errors are differences from a long run with other draws, so they are random too"
+    return Ladder((*rungs, reference), (note,))
+
+
+def _every_effect(spec: Declared) -> dict[str, Any]:
+    """All effects on, each with the scene's own parameters."""
+    from sweep.model.effects.catalogue import EFFECTS
+
+    may = {e.name for e in EFFECTS if not e.is_random or (_draws(spec) and not _is_flight(spec))}
+    return {f"effects.{effect.name}": "on" for effect in EFFECTS if effect.name in may}
+
+
+def _is_flight(spec: Declared) -> bool:
+    from sweep.spec import SceneSpec
+
+    return isinstance(spec, SceneSpec)
+
+
+def _draws(spec: Declared) -> bool:
+    """Whether probabilities are means over draws: of a flight they are not."""
+    return not _is_flight(spec) and bool(spec.draws.number)
+
+
+def _on_axis(spec: Declared, path: str) -> bool:
+    return any(member.path == path for axis in spec.axes for member in axis.members)
+
+
+def _beamlets_fixed(spec: Declared) -> str:
+    """Why the number of beamlets is the scene's and not accuracy's; empty where it is."""
+    phases = spec.parameters()["footprint.phases"]
+    if phases == "coherent":
+        return "with coherent phases it is part of the scene, as the thesis has it"
+    if spec.instrument.receiver.architecture == "direct":
+        return "in direct detection beamlets add as amplitudes, and are part of the scene"
+    if _on_axis(spec, _BEAMLETS) or _on_axis(spec, "footprint.phases"):
+        return "it is on an axis"
+    return ""
+
+
+def _beamlets_follow(spec: Declared) -> bool:
+    """Whether the number of beamlets may follow from the tolerance, `auto`."""
+    from sweep.spec import SpecError
+
+    if _beamlets_fixed(spec):
+        return False
+    try:
+        Rung(name="", kind=ADAPTIVE, overrides={_BEAMLETS: "auto"}).of(spec)
+    except SpecError:
+        return False
+    return True

@@ -1,0 +1,65 @@
+"""Which points of a study stand for all of it: fixed by its shape alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import qmc
+
+
+def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
+    """Numbers of points of a grid, in C order over it, spread evenly along every axis.
+
+    Any stretch from the first is spread as well, so that a part of the sample stands for all.
+    They follow Halton's sequence.
+
+    Parameters
+    ----------
+    shape
+        Points along each axis.
+    number
+        Points wanted; all where there are fewer.
+
+    Returns
+    -------
+    (n,) ndarray of int64
+        Without repetition.
+    """
+    total = math.prod(shape)
+    if not shape or total <= 1:
+        return np.zeros(min(total, number), np.int64)
+    sequence = qmc.Halton(len(shape), scramble=False)
+    sequence.fast_forward(1)  # the first point is the grid's corner
+    found: dict[int, None] = {}
+    for _ in range(64):
+        index = np.floor(sequence.random(2 * number) * shape).astype(np.int64)
+        found |= dict.fromkeys(np.ravel_multi_index(tuple(index.T), shape).tolist())
+        if len(found) >= min(number, total):
+            break
+    else:  # some points of small grids are never met
+        found |= dict.fromkeys(range(min(total, 2 * number)))
+    return np.fromiter(found, np.int64)[:number]
+
+
+def neighbours(
+    point: tuple[int, ...], box: tuple[slice, ...], shape: tuple[int, ...], number: int
+) -> np.ndarray:
+    """Numbers of a point of a grid and of those that follow it in a box, round the box's end.
+
+    Parameters
+    ----------
+    point
+        Place along each axis.
+    box, shape
+        Slices of the box along each axis; points of the whole grid along each axis.
+    number
+        Points wanted, the first of them `point` itself; repeated where the box has fewer.
+    """
+    if not shape:
+        return np.zeros(number, np.int64)
+    extent = tuple(s.stop - s.start for s in box)
+    own = np.ravel_multi_index([p - s.start for p, s in zip(point, box, strict=True)], extent)
+    places = np.unravel_index((own + np.arange(number)) % math.prod(extent), extent)
+    along = [p + s.start for p, s in zip(places, box, strict=True)]
+    return np.asarray(np.ravel_multi_index(along, shape))
