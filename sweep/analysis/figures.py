@@ -10,7 +10,7 @@ import xarray as xr
 
 from sweep.analysis import canvas, false_alarms, labels, mean_table, slices, surface_figure, tables
 from sweep.analysis.defaults import default_figures
-from sweep.analysis.opening import SCENE, kind_of, read_attributes
+from sweep.analysis.opening import ACCURACY, SCENE, kind_of, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points, confined, points
 from sweep.analysis.tabular import Page
@@ -69,9 +69,13 @@ def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Pa
     Raises
     ------
     NotAStoreError
-        Where there is no store of a grid of points or of a scene.
+        Where there is no store of a grid of points, of a scene or of what accuracy costs.
     """
     store_path = Path(store_path)
+    if kind_of(read_attributes(store_path)) == ACCURACY:
+        from sweep.analysis.accuracy import report
+
+        return report.draw(store_path, None if directory is None else Path(directory))
     beside = store_path.with_name(f"{store_path.name.removesuffix('.zarr')}-figures")
     directory = beside if directory is None else Path(directory)
     if kind_of(read_attributes(store_path)) == SCENE:

@@ -15,10 +15,11 @@ BATCH = "batch"
 NOT_COUNTED = -1
 """What a count holds where its block is not computed."""
 
-GRID, SCENE = "grid", "scene"
+GRID, SCENE, ACCURACY = "grid", "scene", "accuracy"
 _HOLDS = {
     GRID: "a grid of points: sweep.open() opens it",
     SCENE: "a scene's point clouds: sweep.open_scene() opens it",
+    ACCURACY: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
     "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
 }
 """What the kinds of stores hold, and what to do with them."""

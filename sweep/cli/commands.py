@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.telling import (
     conclude,
     grid_plan,
@@ -64,6 +65,7 @@ def main() -> None:
       sweep status results/quickstart.zarr        how far is it? (any time)
       sweep resume results/quickstart.zarr        go on after an interruption
       sweep figures results/quickstart.zarr       draw it
+      sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
 
     A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
     them as PLY, LAS or CSV.
@@ -257,6 +259,55 @@ def _list(files: list[Path]) -> None:
 
 
 @main.command()
+@SPEC
+@click.option(
+    "--store",
+    type=click.Path(path_type=Path),
+    help="Where to [results/<name of the spec>_accuracy.zarr].",
+)
+@click.option(
+    "--points", type=click.IntRange(min=1), default=200, help="Points of the sample [200]."
+)
+@click.option(
+    "--time-limit",
+    type=click.FloatRange(min=0, min_open=True),
+    default=60.0,
+    metavar="SECONDS",
+    help="Time that it may take, about [60].",
+)
+@click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+def accuracy(
+    spec: Path, store: Path | None, points: int, time_limit: float, overwrite: bool
+) -> None:
+    """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
+
+    A sample of the study's own points, the same every time, is computed with the spec as it is
+    written, with effects on demand at tolerances from 0.1 to 1e-6, with all effects on, with the
+    same effects everywhere, with fixed numbers of beamlets or draws, and in the way of the thesis.
+    Errors are taken against the finest of them all, and that is held against the time domain.
+    All settings take turns on parts of the sample, round after round, so that whatever slows the
+    machine slows them alike; the best round counts. Planning is counted, storing is not.
+
+    The table has the time a point on one core and the errors; * marks settings that no other is
+    both as fast and as accurate as. The store holds errors by setting and point, and opens with
+    xarray; the figure is beside it, and `sweep figures` draws it anew. Ctrl-C keeps what is done.
+
+    \b
+      sweep accuracy experiments/quickstart.yaml
+      sweep accuracy experiments/range_angle.yaml --points 1000 --time-limit 600
+      sweep accuracy experiments/square_high_descent.yaml --overwrite
+    """  # noqa: D301
+    from sweep.spec import load
+    from sweep.tasks.accuracy.run import measure
+
+    path = store or Path("results") / f"{spec.stem}_accuracy.zarr"
+    measured = measure(
+        load(spec), store_path=path, points=points, time_limit=time_limit, overwrite=overwrite
+    )
+    _list(conclude_accuracy(path, measured=measured))
+
+
+@main.command()
 @STORE
 @click.option(
     "--output",
@@ -265,9 +316,9 @@ def _list(files: list[Path]) -> None:
 )
 def figures(store: Path, output: Path | None) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
-    from sweep.tasks.studies import read
+    from sweep.tasks.studies import check
 
-    read(store)
+    check(store)
     from sweep.analysis.figures import draw
 
     _list(draw(store, output))

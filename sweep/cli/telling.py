@@ -54,7 +54,7 @@ def conclude(outcome: Outcome, store: Path) -> None:
 def _print_summary(store: Path) -> None:
     from sweep.tasks.identity import read_attributes
 
-    _print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
+    print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
 
 
 def _grid_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
@@ -126,7 +126,7 @@ def _scene_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
     )
 
 
-def _print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
+def print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
     """Print a table; `words` names a column that may be broken into lines."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -188,7 +188,7 @@ def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
     table = _effects(study, store, costs=True)
     there = [row for row in table.rows if row.bound > 0 or row.share > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
-    _print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
+    print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
     absent = [row.name for row in table.rows if row not in there]
     if absent:
         click.echo(f"Nothing of these in the scene: {', '.join(absent).replace('_', ' ')}.")

@@ -15,6 +15,9 @@ from sweep.tasks.recipe import read_recipe
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
 
+ACCURACY = "accuracy"
+"""Kind of the stores of `sweep accuracy`, in which there is no study."""
+
 AnyStudy = GridStudy | EyepointStudy | FlightStudy
 
 
@@ -23,6 +26,18 @@ def study_of(spec: Spec | SceneSpec, path: Path) -> GridStudy | FlightStudy:
     from sweep.spec import SceneSpec
 
     return FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
+
+
+def check(path: Path) -> None:
+    """See that a path holds what `sweep figures` can draw.
+
+    Raises
+    ------
+    StoreError
+        As of :func:`read`.
+    """
+    if read_attributes(path)["kind"] != ACCURACY:
+        read(path)
 
 
 def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
@@ -34,6 +49,8 @@ def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
         Where there is no store, or not one of this program's, or one it can't read.
     """
     attributes, recipe = read_attributes(path), read_recipe(path)
+    if attributes["kind"] == ACCURACY:
+        raise StoreError(f"{path} holds what accuracy costs, no study: sweep figures draws it")
     base = Path(recipe["base"]) if "base" in recipe else None
     if attributes["kind"] == "eyepoints":
         return attributes, _eyepoints(path, recipe, base)

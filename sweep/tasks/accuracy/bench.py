@@ -1,4 +1,4 @@
-"""What a rung is tried on: a sample of a study's points, by the machinery that computes them all."""
+"""What a rung is tried on: a sample of points, by the machinery that computes all of them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from sweep.tasks.accuracy.rungs import COUNTS, Rung
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
     from sweep.tasks.accuracy.rungs import Declared
+
+    Look = Callable[[Shots], np.ndarray]
 
 SEGMENTS = ("up", "doppler", "down")
 
@@ -52,7 +54,10 @@ class Bench(Protocol):
     """A sample of a study's points."""
 
     unit: str
-    spec: Declared
+
+    @property
+    def spec(self) -> Declared:
+        """The study, as rungs are put onto it."""
 
     @property
     def size(self) -> int:
@@ -77,7 +82,7 @@ class Bench(Protocol):
         """Where the sample's points are: values and attributes by name."""
 
 
-def look_of(rung: Rung) -> Callable[[Shots], np.ndarray]:
+def look_of(rung: Rung) -> Look:
     """What finds a rung's peaks in the spectra."""
     from sweep.model import oversampled, shot
 

@@ -4,56 +4,80 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sweep.model.effects.flags import flags_of, names_of
-from sweep.tasks.accuracy.bench import NOT_IN_TRUTH, SEGMENTS, Seen, Trial, look_of, of_lines
-from sweep.tasks.accuracy.rungs import WRITTEN, Rung
+from sweep.tasks.accuracy.bench import (
+    NOT_IN_TRUTH,
+    Seen,
+    Trial,
+    look_of,
+    of_lines,
+    seen_in,
+)
+from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
 from sweep.tasks.accuracy.sample import spread
 from sweep.tasks.calling import TILE_SHOTS, Called
+from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.stretches import Part
+from sweep.tasks.stretches import Part, Stretches
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
-    from sweep.tasks.study import Results
+    from sweep.spec.world import World
+    from sweep.tasks.accuracy.bench import Look
 
-#: Tiles of the sample at the least, where the flight has them: one would stand for one moment.
-LEAST_TILES = 4
-
-_LEAST = 1e-300
-"""Probability of a false alarm below which all are alike."""
+#: Tiles that are computed together at the least, where the flight has them, and places along the
+#: axes that each scanner is looked at.
+LEAST_TILES, PLACES = 4, 2
 
 
-class Tile(NamedTuple):
-    """Whole cycles of one scanner that cover a tile of its shots, at one place along the axes."""
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """Whole cycles of one scanner that cover some tiles of its shots, at one place of the axes."""
 
     part: Part
-    first: int
-    stop: int
+    index: np.ndarray
+    """Numbers of the shots, rising."""
     start: int
-    """Place of its first shot in the sample."""
+    """Place of the first in the sample."""
 
     @property
     def places(self) -> np.ndarray:
         """Places of its shots in the sample."""
-        return np.arange(self.start, self.start + self.stop - self.first)
+        return np.arange(self.start, self.start + len(self.index))
 
 
 class Cast(NamedTuple):
-    """What the shots of a tile see, and the time that casting its rays took [s]."""
+    """What shots see, and the time that casting their rays took [s]."""
 
-    shots: Results
     eyepoints: Eyepoints
     seconds: float
 
 
+class _Caster(EyepointStudy):
+    """Eyepoints of a geometry in a world that others share, as building one can take seconds."""
+
+    def __init__(self, spec: SceneSpec, scanner: str, world: World) -> None:
+        super().__init__(spec, scanner)
+        self._world = world
+
+    @property
+    def world(self) -> World:
+        """The scene."""
+        return self._world
+
+
 class FlightBench:
-    """A sample of the shots of a flight, each with one draw.
+    """A sample of the shots of a flight.
+
+    What counts is rays, plans, spectra and probabilities; draws, points and navigation cost the
+    same whatever the accuracy, and are left out.
 
     Parameters
     ----------
@@ -66,41 +90,40 @@ class FlightBench:
     unit = "shots"
 
     def __init__(self, spec: SceneSpec, points: int) -> None:
-        self.spec = Rung(name="", kind=WRITTEN, overrides={"draws.number": 1}).of(spec)
+        self.spec = spec
         self._studies: dict[str, FlightStudy] = {}
-        self._cast: dict[tuple[str, Tile], Cast] = {}
+        self._cast: dict[tuple[str, int], Cast] = {}
+        self._geometry: dict[tuple[int, str], str] = {}
+        self._casters: dict[str, _Caster] = {}
+        self._names: dict[str, frozenset[str]] = {}
         self._tiles = self._sample(points)
 
     @property
     def size(self) -> int:
         """Shots of the sample."""
-        return self._tiles[-1].places[-1] + 1
+        return sum(len(tiles.index) for tiles in self._tiles)
 
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of one tile each."""
-        return [tile.places for tile in self._tiles]
+        """The sample scanner by scanner, and place by place along the axes."""
+        return [tiles.places for tiles in self._tiles]
 
     def effects(self, rung: Rung) -> frozenset[str]:
         """Effects that a rung calls for anywhere in the sample."""
-        study = self._study(rung)
-        found: set[str] = set()
-        for tile in self._tiles:
-            called = study.call(tile.part, self._seen(study, tile).eyepoints, first=tile.first)
-            found |= {name for flag in np.unique(called.flags) for name in names_of(int(flag))}
-        return frozenset(found)
+        if rung.name not in self._names:
+            study, found = self._study(rung), set()
+            for tiles in self._tiles:
+                called = _called(study, tiles, self._seen(study, tiles).eyepoints)
+                found |= {name for flag in np.unique(called.flags) for name in names_of(int(flag))}
+            self._names[rung.name] = frozenset(found)
+        return self._names[rung.name]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a tile of the sample; its rays count, `times` does not."""
-        study, tile = self._study(rung), self._tile(part)
-        cast = self._seen(study, tile)
-        called, planning = self._called(rung, study, tile, cast)
+        """A rung on a part of the sample; its rays count, `times` does not."""
+        study, tiles = self._study(rung), self._of(int(part[0]))
+        cast = self._seen(study, tiles)
+        called, planning = self._planned(rung, study, tiles, cast)
         begun = time.perf_counter()
-        if rung.cells:
-            seen = self._looked(rung, study, tile, cast.eyepoints, called)
-        else:
-            seen = _seen_in(
-                study.look(tile.part, cast.shots, cast.eyepoints, called, first=tile.first)
-            )
+        seen = _looked(rung, study, tiles, cast.eyepoints, called)
         spent = time.perf_counter() - begun + cast.seconds + planning
         return Trial(seen, spent / len(part), planning / len(part))
 
@@ -112,52 +135,54 @@ class FlightBench:
         """A shot in the time domain, and as the rung has it without what the truth lacks."""
         from sweep.model import shot, truth
 
-        study = self._study(rung)
-        tile = next(t for t in self._tiles if t.start <= place <= t.places[-1])
-        cast = self._seen(study, tile)
-        called, _ = self._called(rung, study, tile, cast)
-        one = np.array([place - tile.start])
+        study, tiles = self._study(rung), self._of(place)
+        cast = self._seen(study, tiles)
+        called, _ = self._planned(rung, study, tiles, cast)
+        one = np.array([place - tiles.start])
+        eyepoints = cast.eyepoints.some(one)
+        if not eyepoints.seen.all():
+            return _nothing(1), _nothing(1)
         names = [n for n in names_of(int(called.flags[one[0]])) if n not in NOT_IN_TRUTH]
-        looks = truth.find, shot.find
-        seen = (_found(study, tile, cast.eyepoints.some(one), names, look) for look in looks)
-        in_time, ordinary = seen
+        in_time, ordinary = (
+            _found(study, tiles, eyepoints, names, look) for look in (truth.find, shot.find)
+        )
         return in_time, ordinary
 
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
         """Scanner and number of each shot, and its place along the axes."""
-        counts = [tile.stop - tile.first for tile in self._tiles]
+        counts = [len(tiles.index) for tiles in self._tiles]
         scanners = np.repeat(np.array([t.part.scanner for t in self._tiles], object), counts)
-        numbers = np.concatenate([np.arange(t.first, t.stop) for t in self._tiles])
+        numbers = np.concatenate([tiles.index for tiles in self._tiles])
         found: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
             "scanner": (scanners, {"long_name": "scanner"}),
             "shot": (numbers, {"long_name": "number of the shot"}),
         }
         for k, axis in enumerate(self.spec.axes):
-            along = np.repeat([tile.part.axes[k] for tile in self._tiles], counts)
+            along = np.repeat([tiles.part.axes[k] for tiles in self._tiles], counts)
             for member in axis.members:
                 attributes = {"units": member.units, "path": member.path}
                 found[member.name] = (np.asarray(member.display)[along], attributes)
         return found
 
-    def _sample(self, points: int) -> list[Tile]:
-        """Tiles spread over scanners, flight and axes."""
+    def _sample(self, points: int) -> list[Tiles]:
+        """Tiles spread over scanners, axes and flight."""
         study = self._study(Rung(name="as written", kind=WRITTEN))
-        tiles: list[Tile] = []
-        number = max(LEAST_TILES, math.ceil(points / TILE_SHOTS / len(study.scanners)))
+        found: list[Tiles] = []
         start = 0
         for name, stretches in study.scanners.items():
-            total = stretches.total_cycles * stretches.shots_a_cycle
-            shape = (-(-total // TILE_SHOTS), *stretches.axes)
-            for at in np.transpose(np.unravel_index(spread(shape, number), shape)).tolist():
-                cycle = stretches.shots_a_cycle
-                first = at[0] * TILE_SHOTS // cycle * cycle
-                stop = min(-(-min((at[0] + 1) * TILE_SHOTS, total) // cycle) * cycle, total)
-                tiles.append(Tile(Part(name, tuple(at[1:]), 0, 0), first, stop, start))
-                start += stop - first
-        return tiles
+            axes = stretches.axes
+            places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
+            wanted = points / TILE_SHOTS / len(study.scanners) / len(places)
+            for place in places:
+                index = _spread_shots(stretches, max(LEAST_TILES, math.ceil(wanted)))
+                part = Part(name, tuple(int(i) for i in place), 0, 0)
+                found.append(Tiles(part, index, start))
+                start += len(index)
+        return found
 
-    def _tile(self, part: np.ndarray) -> Tile:
-        return next(tile for tile in self._tiles if tile.start == part[0])
+    def _of(self, place: int) -> Tiles:
+        """The tiles that a place of the sample is in."""
+        return next(tiles for tiles in reversed(self._tiles) if tiles.start <= place)
 
     def _study(self, rung: Rung) -> FlightStudy:
         if rung.name not in self._studies:
@@ -165,44 +190,67 @@ class FlightBench:
             self._studies[rung.name] = FlightStudy(spec, Path("nowhere.zarr"))  # type: ignore[arg-type]
         return self._studies[rung.name]
 
-    def _seen(self, study: FlightStudy, tile: Tile) -> Cast:
-        """What a tile's shots see: rays are cast once for all rungs of the same geometry."""
+    def _seen(self, study: FlightStudy, tiles: Tiles) -> Cast:
+        """What shots see: rays are cast once for all rungs of the same geometry."""
         from sweep.scenes.eyepoint_arrays import from_arrays
 
-        key = study.spec.geometry_id(tile.part.scanner), tile
-        if key not in self._cast:
-            caster = next(e for e in study.eyepoint_studies() if e.scanner == tile.part.scanner)
-            _ = caster.world
+        scanner = tiles.part.scanner
+        which = id(study), scanner
+        if which not in self._geometry:
+            self._geometry[which] = study.spec.geometry_id(scanner)
+        geometry = self._geometry[which]
+        if geometry not in self._casters:
+            self._casters[geometry] = _Caster(study.spec, scanner, world_of(self.spec))
+        if (geometry, tiles.start) not in self._cast:
+            caster = self._casters[geometry]
             begun = time.perf_counter()
-            shots = caster.see(np.arange(tile.first, tile.stop))
-            eyepoints = from_arrays(shots, caster.weight)
-            self._cast[key] = Cast(shots, eyepoints, time.perf_counter() - begun)
-        return self._cast[key]
+            eyepoints = from_arrays(caster.see(tiles.index), caster.weight)
+            self._cast[geometry, tiles.start] = Cast(eyepoints, time.perf_counter() - begun)
+        return self._cast[geometry, tiles.start]
 
-    def _called(
-        self, rung: Rung, study: FlightStudy, tile: Tile, cast: Cast
+    def _planned(
+        self, rung: Rung, study: FlightStudy, tiles: Tiles, cast: Cast
     ) -> tuple[Called, float]:
-        """What is simulated of a tile's shots, and the time [s] that it took to say."""
+        """What is simulated of shots, and the time [s] that it took to say."""
         if rung.cells:
             names = of_lines(self.effects(Rung(name="as written", kind=WRITTEN)))
             return _everywhere(frozenset(names), cast.eyepoints), 0.0
         begun = time.perf_counter()
-        called = study.call(tile.part, cast.eyepoints, first=tile.first)
+        called = _called(study, tiles, cast.eyepoints)
         return called, time.perf_counter() - begun if rung.plans else 0.0
 
-    def _looked(
-        self, rung: Rung, study: FlightStudy, tile: Tile, eyepoints: Eyepoints, called: Called
-    ) -> Seen:
-        """The thesis's way, of the shots that see anything."""
-        whole = _nothing(len(called.flags))
-        for flag in np.unique(called.flags):
-            index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
-            if index.size:
-                names = list(names_of(int(flag)))
-                seen = _found(study, tile, eyepoints.some(index), names, look_of(rung))
-                for values, some in zip(whole, seen, strict=True):
-                    values[index] = some
-        return whole
+
+def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
+    """Numbers of the shots, in whole cycles, of some tiles of a scanner."""
+    cycle = stretches.shots_a_cycle
+    total = stretches.total_cycles * cycle
+    some = np.sort(spread((-(-total // TILE_SHOTS),), tiles))
+    shots = (some[:, None] * TILE_SHOTS + np.arange(TILE_SHOTS)).ravel()
+    cycles = np.unique(shots[shots < total] // cycle)
+    return np.asarray((cycles[:, None] * cycle + np.arange(cycle)).ravel())
+
+
+def _called(study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints) -> Called:
+    """What is simulated of shots, planned in their tiles."""
+    number = len(tiles.index)
+    planned = study.planned(tiles.part, eyepoints, tiles.index // TILE_SHOTS)
+    nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
+    return nothing if planned is None else planned.called(number)
+
+
+def _looked(
+    rung: Rung, study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, called: Called
+) -> Seen:
+    """Statistics of shots, of those that see anything."""
+    whole = _nothing(len(called.flags))
+    for flag in np.unique(called.flags):
+        index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
+        if index.size:
+            names = list(names_of(int(flag)))
+            seen = _found(study, tiles, eyepoints.some(index), names, look_of(rung))
+            for values, some in zip(whole, seen, strict=True):
+                values[index] = some
+    return whole
 
 
 def _everywhere(names: frozenset[str], eyepoints: Eyepoints) -> Called:
@@ -215,33 +263,16 @@ def _everywhere(names: frozenset[str], eyepoints: Eyepoints) -> Called:
 
 
 def _found(
-    study: FlightStudy, tile: Tile, eyepoints: Eyepoints, names: list[str], look: Any
+    study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, names: list[str], look: Look
 ) -> Seen:
     """Statistics of shots that see something, from a way to look at their spectra."""
     from sweep.model.eyepoints import prepare_eyepoints
+    from sweep.model.shot import statistics
 
-    shots = prepare_eyepoints(
-        eyepoints, study.parameters_at(tile.part), study.spec.surfaces(), names
-    )
-    found = look(shots)
-    pd = found[:, 0].T
-    n = len(pd)
-    snr = found[0, 2] / shots.bin_deviation
-    seen = _nothing(n)
-    return seen._replace(
-        pd=np.column_stack([pd, pd[:, 0] * pd[:, 2]]), magnitude=snr[:, None] / math.sqrt(2)
-    )
-
-
-def _seen_in(outputs: Results) -> Seen:
-    """What counts of the statistics of shots."""
-    pd = np.stack([outputs[f"pd_{name}"] for name in (*SEGMENTS, "shot")], axis=1)
-    alarms = np.stack([outputs["pfa_up"], outputs["pfa_down"]], axis=1)
-    magnitude = np.sqrt(outputs["snr_up"])[:, None]
-    return _nothing(len(pd))._replace(
-        pd=pd, log10_pfa=np.log10(np.maximum(alarms, _LEAST)), magnitude=magnitude
-    )
+    parameters, surfaces = study.parameters_at(tiles.part), study.spec.surfaces()
+    shots = prepare_eyepoints(eyepoints, parameters, surfaces, names)
+    return seen_in(statistics(shots, look(shots)), MEAN, 0)
 
 
 def _nothing(shots: int) -> Seen:
-    return Seen(*(np.full(size, np.nan) for size in ((shots, 4), (shots, 2), (shots, 1), shots)))
+    return Seen(*(np.full(size, np.nan) for size in ((shots, 4), (shots, 2), (shots, 3), shots)))

@@ -38,6 +38,7 @@ class GridBench:
         self._grid = Grid(spec)
         self._numbers = spread(self._grid.shape, points)
         self._calling: dict[str, Calling] = {}
+        self._names: dict[str, frozenset[str]] = {}
 
     @property
     def size(self) -> int:
@@ -50,8 +51,11 @@ class GridBench:
 
     def effects(self, rung: Rung) -> frozenset[str]:
         """Effects that a rung calls for anywhere in the sample."""
-        flags, _, _ = self._planned(rung, np.arange(self.size))
-        return frozenset(name for flag in np.unique(flags) for name in names_of(int(flag)))
+        if rung.name not in self._names:
+            flags, _, _ = self._planned(rung, np.arange(self.size))
+            names = (name for flag in np.unique(flags) for name in names_of(int(flag)))
+            self._names[rung.name] = frozenset(names)
+        return self._names[rung.name]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """A rung on a part of the sample, with `times` points of its tile for each.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.tasks.accuracy.bench import Bench, Seen, Trial
-from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, Ladder, Rung, ladder
+from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, DRAWN, Ladder, Rung, ladder
 
 if TYPE_CHECKING:
     from sweep.tasks.accuracy.rungs import Declared
@@ -22,11 +23,11 @@ POINTS, TIME_LIMIT = 200, 60.0
 
 MOST_ROUNDS = 9
 
-PARTS = 4
-"""Parts of a sample: as many, at the least, as between which it can be broken off."""
+PARTS = 2
+"""Parts of a sample, at the least: whole ones are kept where it is broken off."""
 
-LONG_ENOUGH = 0.05
-"""Time of a trial [s] from which on its calls cost nothing beside the points themselves."""
+LONG_ENOUGH = 0.15
+"""Time of a trial [s] from which on its calls cost little beside the points themselves."""
 
 MOST_TIMES = 64
 """Points that are timed for each point of the sample, at the most."""
@@ -103,6 +104,7 @@ class Measurement:
         self._told.say(
             f"trying {len(rungs)} settings on {self._bench.size:,} {self._bench.unit} of the study"
         )
+        self._compile()
         parts = self._bench.parts(self._part_points())
         rounds = self._planned_rounds(parts)
         self._told.begin(points=len(rungs) * len(parts) * rounds, done=0, unit="trials")
@@ -145,22 +147,35 @@ class Measurement:
     def _part_points(self) -> int:
         """Points of a part: a few parts, and more where a point takes its time."""
         first = self._bench.parts(1)[0]
-        for _ in range(2):  # the first compiles what there is to compile
-            spent = sum(self._timed(i, first) for i in range(len(self._ladder.rungs)))
+        spent = sum(self._timed(i, first) for i in range(len(self._ladder.rungs)))
         fitting = FIRST_ROUND * self._limit * len(first) / spent
         return max(1, min(self._bench.size, int(fitting)) // PARTS)
 
+    def _compile(self) -> None:
+        """Compile what rungs compile, on those that are not long runs; it is not counted."""
+        few = min(int(rung.overrides.get(DRAWN, 0)) for rung in self._ladder.rungs[1:])
+        first = self._bench.parts(1)[0]
+        for i, rung in enumerate(self._ladder.rungs):
+            if int(rung.overrides.get(DRAWN, 0)) <= few and (i or not few):
+                self._timed(i, first)
+        self._begun = time.monotonic()
+
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
-        """Rounds that fit in; before that, how many points each rung needs to be timed well."""
-        spent = 0.0
-        for i in range(len(self._ladder.rungs)):
-            took = self._timed(i, parts[0])
-            while took < LONG_ENOUGH / 2 and self._times[i] < MOST_TIMES:
-                self._times[i] *= 2
-                took = self._timed(i, parts[0])
-            spent += took
+        """Rounds that fit in; before that, how many points each rung needs to be timed well.
+
+        As many for all of them, but for those that would take far longer.
+        """
+        took = [self._timed(i, parts[0]) for i in range(len(self._ladder.rungs))]
+        times, written = 1, took[0]
+        while written < LONG_ENOUGH / 2 and times < MOST_TIMES:
+            times *= 2
+            self._times[0] = times
+            written = self._timed(0, parts[0])
+        for i, alone in enumerate(took):
+            self._times[i] = min(times, 1 << max(0, int(math.log2(4 * LONG_ENOUGH / alone))))
+        spent = sum(self._timed(i, parts[0]) for i in range(len(self._ladder.rungs)))
         left = self._limit - (time.monotonic() - self._begun)
-        return max(1, min(MOST_ROUNDS, int(0.7 * left / (spent * len(parts)))))
+        return max(1, min(MOST_ROUNDS, int(0.75 * left / (spent * len(parts)))))
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
         begun = time.monotonic()
@@ -203,7 +218,8 @@ class Measurement:
         ]
         return Measured(
             ladder=self._ladder, seen=seen, done=places, times=self._times,
-            seconds=mean(lambda t: t.seconds)[:, None], planning=mean(lambda t: t.planning)[:, None],
+            seconds=mean(lambda t: t.seconds)[:, None],
+            planning=mean(lambda t: t.planning)[:, None],
         )  # fmt: skip
 
     def _add_truth(self, measured: Measured) -> None:
@@ -233,7 +249,9 @@ def bench_of(spec: Declared, points: int) -> Bench:
     from sweep.tasks.accuracy.flight_bench import FlightBench
     from sweep.tasks.accuracy.grid_bench import GridBench
 
-    return FlightBench(spec, points) if isinstance(spec, SceneSpec) else GridBench(spec, points)
+    if isinstance(spec, SceneSpec):
+        return FlightBench(spec, points)
+    return GridBench(spec, points)
 
 
 def differences(measured: Measured) -> Iterator[tuple[str, np.ndarray]]:

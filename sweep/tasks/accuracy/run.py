@@ -22,13 +22,11 @@ from sweep.tasks.accuracy.rungs import REFERENCE, Rung
 from sweep.tasks.errors import StoreError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout
 
 if TYPE_CHECKING:
     from sweep.tasks.accuracy.rungs import Declared
-
-KIND = "accuracy"
-"""Kind of the store."""
 
 _ABOUT = {
     "pd_error": ("1", "largest error of a probability of detection, of segments and shot"),
@@ -97,7 +95,7 @@ def measure(
 def _refuse_in_the_way(path: Path, overwrite: bool) -> None:
     if not path.exists():
         return
-    if identity.read_attributes(path)["kind"] != KIND:
+    if identity.read_attributes(path)["kind"] != ACCURACY:
         raise StoreError(f"{path} holds a study's results: name another --store")
     if not overwrite:
         raise StoreError(f"{path} is there already: --overwrite measures anew")
@@ -124,32 +122,31 @@ class Content:
         """The spec, what the errors are taken against, and what was measured on."""
         measured = self._measured
         found = {
-            "kind": KIND,
+            "kind": ACCURACY,
             "title": self._spec.title,
             "question": "What does accuracy cost in time?",
             "spec": self._spec.to_json(),
-            "reference": measured.ladder.reference.name.removeprefix("reference: "),
+            "reference": measured.ladder.about,
             "environment": {"processor": versions.processor(), **versions.software()},
             "unit": self._bench.unit,
-            "points": self._points(),
+            "points": len(self._measured.done),
+            "study_points": study_of(self._spec, Path()).points,
             "notes": list(measured.ladder.notes),
             "stopped": measured.stopped,
             "coordinates": " ".join(["kind", *self._bench.coordinates()]),
         }
         return found | self._truth()
 
-    def _points(self) -> int:
-        return len(self._measured.done)
-
     def _truth(self) -> dict[str, Any]:
-        """How far the reference is from the time domain, at the most; None where not looked at."""
-        pairs = self._measured.truth.values()
-        found = [apart(in_time, reference) for in_time, reference in pairs]
-        worst = np.max(found, axis=(0, 2)) if found else [None] * 3
+        """How far the reference is from the time domain, at the most; at how many points."""
+        found = [apart(*pair) for pair in self._measured.truth.values()]
+        if not found:
+            return {"truth_points": 0}
+        pd, _, magnitude = np.fmax.reduce(np.array(found), axis=(0, 2))
         return {
             "truth_points": len(found),
-            "truth_pd_difference": None if not found else float(worst[0]),
-            "truth_magnitude_difference": None if not found else float(worst[2]),
+            "truth_pd_difference": float(pd),
+            "truth_magnitude_difference": float(magnitude),
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:

@@ -28,15 +28,18 @@ FINEST, FINEST_RAYS = 10009, 1009
 FINEST_TOLERANCE = 1e-9
 """Tolerance of the reference where the number of beamlets follows from it."""
 
-DRAW_NUMBERS = (10, 100, 1000, 10000)
+DRAW_NUMBERS = (10, 100, 1000)
 
-LONG_RUN = 4
+LONG_RUN = 10
 """Draws of the reference over those of the longest rung."""
 
 MEAN, COUNTS = "mean", "counts"
 """What is read off draws: the mean of each draw's probability, or how many were detected."""
 
-_TOLERANCE, _BEAMLETS, _DRAWS = "accuracy.tolerance", "footprint.beamlets", "draws.number"
+_TOLERANCE, _BEAMLETS = "accuracy.tolerance", "footprint.beamlets"
+
+DRAWN = "draws.number"
+"""Field that holds the number of draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +94,8 @@ class Ladder:
     """Rungs, the reference last, and what there is to say of them."""
 
     rungs: tuple[Rung, ...]
+    about: str
+    """What the reference is."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -116,7 +121,7 @@ class Ladder:
                     f"effects.{effect.name}": "on" if effect.name in names else "off"
                     for effect in EFFECTS
                 }
-                name = f"{len(names)} effects everywhere, as at {tolerance:g}"
+                name = f"{len(names)} effects, as at {tolerance:g}"
                 further.append(Rung(name=name, kind=FIXED, overrides=modes, plans=False))
         place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
         return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
@@ -127,7 +132,7 @@ def ladder(spec: Declared) -> Ladder:
     if _draws(spec):
         return _drawn_ladder(spec)
     notes: list[str] = []
-    adaptive = {_BEAMLETS: "auto"} if _beamlets_follow(spec) else {}
+    adaptive: dict[str, Any] = {_BEAMLETS: "auto"} if _beamlets_follow(spec) else {}
     rungs = [Rung(name="as written", kind=WRITTEN)]
     if _on_axis(spec, _TOLERANCE):
         notes.append("accuracy.tolerance is on an axis: left as it is")
@@ -151,17 +156,19 @@ def ladder(spec: Declared) -> Ladder:
         finest = every | (adaptive or {_BEAMLETS: most})
         finest |= {_TOLERANCE: FINEST_TOLERANCE} if adaptive else {}
     rungs += _thesis_rungs()
-    name = "all effects on" + ("" if _beamlets_fixed(spec) else f", beamlets {finest[_BEAMLETS]}")
-    reference = Rung(name=f"reference: {name}", kind=REFERENCE, overrides=finest, plans=False)
-    return Ladder((*rungs, reference), tuple(notes))
+    reference = Rung(name="reference", kind=REFERENCE, overrides=finest, plans=False)
+    beamlets = finest.get(_BEAMLETS, "")
+    words = {"": "", "auto": f", beamlets as at {FINEST_TOLERANCE:g}"}
+    about = "all effects on" + words.get(beamlets, f", {beamlets} beamlets")
+    return Ladder((*rungs, reference), about, tuple(notes))
 
 
 def _thesis_rungs() -> Iterator[Rung]:
     """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten."""
     for cells, degree in ((11, 0), (12, 0), (12, 9)):
-        how = "nearest cell" if degree == 0 else f"degree {degree}"
+        how = f", degree {degree}" if degree else ""
         yield Rung(
-            name=f"thesis: 2^{cells} FFT, {how}", kind=THESIS, plans=False, cells=1 << cells,
+            name=f"thesis 2^{cells}{how}", kind=THESIS, plans=False, cells=1 << cells,
             degree=degree,
         )  # fmt: skip
 
@@ -175,7 +182,7 @@ def _drawn_ladder(spec: Declared) -> Ladder:
     ]
     noise = {"draws.method": "noise"}
     for number in DRAW_NUMBERS:
-        each = {_DRAWS: number}
+        each = {DRAWN: number}
         rungs += [
             Rung(name=f"{number} draws, mean", kind=DRAWS, overrides=each),
             Rung(name=f"{number} draws, counts", kind=DRAWS, overrides=each, estimate=COUNTS),
@@ -184,13 +191,13 @@ def _drawn_ladder(spec: Declared) -> Ladder:
             ),
         ]
     number = LONG_RUN * DRAW_NUMBERS[-1]
-    other = {_DRAWS: number, "seed": int(spec.seed) ^ 1}
+    other = {DRAWN: number, "seed": int(spec.seed) ^ 1}
     reference = Rung(
-        name=f"reference: {number} other draws, all effects on", kind=REFERENCE,
-        overrides=_every_effect(spec) | other, plans=False,
-    )  # fmt: skip
+        name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other, plans=False
+    )
     note = "errors are differences from a long run with other draws, so they are random too"
-    return Ladder((*rungs, reference), (note,))
+    about = f"{number} other draws, all effects on"
+    return Ladder((*rungs, reference), about, (note,))
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""What accuracy costs in time, read from the store of `sweep accuracy`."""

@@ -1,0 +1,162 @@
+"""Work and precision: error over time, a mark for each setting, and the front of the best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
+from matplotlib.ticker import FuncFormatter, LogLocator
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.accuracy import settings as of
+from sweep.analysis.accuracy.settings import Setting
+
+FLOOR = of.EXACT
+"""Error at which those that are smaller are drawn."""
+
+JOINED = (of.ADAPTIVE, "beamlets")
+"""Kinds whose settings are one method, looked at more or less closely."""
+
+MARKS = {
+    of.ADAPTIVE: ("o", canvas.LINES[0], "adaptive, by tolerance"),
+    "fixed effects": ("s", canvas.LINES[2], "the same effects everywhere"),
+    "beamlets": ("^", canvas.LINES[1], "fixed number of beamlets"),
+    "all on": ("D", canvas.LINES[3], "all effects on"),
+    "draws": ("P", canvas.LINES[5], "number of draws"),
+    of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
+    of.WRITTEN: ("*", canvas.LINES[6], "as written"),
+}
+"""Marker, colour and words of each kind."""
+
+
+def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
+    """The figure of a store that `sweep accuracy` made."""
+    drawn = of.candidates(settings)
+    sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
+    _front(axes, of.front(drawn))
+    for kind, (marker, colour, words) in MARKS.items():
+        some = of.of_kinds(drawn, kind)
+        for i, setting in enumerate(some):
+            _mark(axes, setting, marker, colour, words if i == 0 else "")
+        if kind in JOINED:
+            _join(axes, some, colour)
+        _name(axes, some, above=kind != "beamlets")
+    _finish(axes)
+    canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
+    canvas.caption(sheet, _note(dataset, drawn))
+    return sheet
+
+
+def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
+    """A mark at the error that counts, a line down to the one of 90 %, a dot at the median."""
+    time = 1e6 * setting.seconds
+    worst, most, half = (_shown(setting.quantile(q)) for q in (setting.likely, 0.9, 0.5))
+    if most > FLOOR:
+        axes.plot([time, time], [most, worst], color=colour, linewidth=1.0, alpha=0.6, zorder=2)
+        axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
+    if half > FLOOR:
+        axes.plot([time], [half], marker=".", color=colour, markersize=4, zorder=2)
+    size = 11 if marker == "*" else 7
+    axes.plot(
+        [time], [worst], marker=marker, color=colour, markersize=size, linestyle="",
+        markeredgecolor="white", markeredgewidth=0.7, label=words or None, zorder=4,
+    )  # fmt: skip
+
+
+def _join(axes: Axes, settings: Sequence[Setting], colour: str) -> None:
+    """A faint line through the settings of one method."""
+    times = [1e6 * setting.seconds for setting in settings]
+    errors = [_place(setting) for setting in settings]
+    axes.plot(times, errors, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
+
+
+def _place(setting: Setting) -> float:
+    return _shown(setting.quantile(setting.likely))
+
+
+def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
+    """Short names beside marks; settings whose marks are all but one have one name."""
+    left = list(settings)
+    while left:
+        first = left[0]
+        together = [s for s in left if _alike(s, first)]
+        left = [s for s in left if s not in together]
+        names = list(dict.fromkeys(filter(None, map(_short, together))))
+        if names:
+            text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            axes.annotate(
+                text, (1e6 * max(s.seconds for s in together), _place(first)),
+                xytext=(6, 5 if above else -10), textcoords="offset points", fontsize=7.5,
+                color=MARKS[first.kind][1],
+            )  # fmt: skip
+
+
+def _alike(one: Setting, other: Setting) -> bool:
+    """Whether two marks are too close for a name each."""
+    apart = np.log(one.seconds / other.seconds), np.log(_place(one) / _place(other))
+    return abs(apart[0]) < 0.25 and abs(apart[1]) < 1.2
+
+
+def _short(setting: Setting) -> str:
+    """What tells a setting from others of its kind."""
+    if setting.kind == of.ADAPTIVE:
+        return f"{setting.tolerance:.0e}".replace("e-0", "e-")
+    if setting.kind == of.THESIS:
+        return setting.name.removeprefix("thesis ")
+    if setting.kind == "beamlets":
+        return setting.name.split()[0]
+    return setting.name if setting.kind == "draws" else ""
+
+
+def _front(axes: Axes, best: Sequence[Setting]) -> None:
+    """The front as steps: what can be had for a time."""
+    times = [1e6 * setting.seconds for setting in best]
+    errors = [_shown(setting.error) for setting in best]
+    axes.step(
+        times, errors, where="post", color="0.35", linewidth=1.2, linestyle="--", zorder=1,
+        label="front of the best",
+    )  # fmt: skip
+
+
+def _shown(error: float) -> float:
+    return max(error, FLOOR)
+
+
+def _finish(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(FLOOR / 2, 2.5)
+    axes.margins(x=0.12)
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(plain)
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
+    axes.set_xlabel("time a point on one core (µs)")
+    axes.set_ylabel("error of a probability of detection")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
+    """What one has to know to read the figure."""
+    attributes = dataset.attrs
+    likely = settings[0].likely
+    worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} % of the points"
+    parts = [
+        f"mark: {worst} of {labels.counted(attributes['points'], attributes['unit'][:-1])}; "
+        f"bar: that of 90 % of them; dot: median; {FLOOR:g} and less at the foot",
+        f"best of {labels.counted(dataset.sizes['round'], 'round')}; "
+        f"reference: {attributes['reference']}",
+    ]
+    if attributes["truth_points"]:
+        difference = attributes["truth_pd_difference"]
+        parts.append(
+            f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
+            f"{difference:.0e} of it"
+        )
+    parts.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")
+    return labels.joined(parts)

@@ -1,0 +1,144 @@
+"""Settings with their errors and times: the front of the best, the cheapest, who beats whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+EXACT = 1e-9
+"""Error below which settings are alike: that of the reference itself."""
+
+WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
+FIXED = ("fixed effects", "beamlets", "all on", "draws")
+"""Kinds of settings that are the same at every point."""
+
+AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0
+"""What adaptive settings are held to: against the best fixed one, against the thesis's way."""
+
+LIKELY = 0.95
+"""Share of the points whose error counts where errors are random; else all of them do."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A rung, in numbers."""
+
+    name: str
+    kind: str
+    tolerance: float
+    rounds: np.ndarray
+    """Seconds a point by round."""
+    planning: float
+    """Seconds a point in the best round."""
+    pd_error: np.ndarray
+    """By point."""
+    log10_pfa_error: float
+    """Largest over the points; nan where it has none, as the next."""
+    magnitude_error: float
+    likely: float
+    """Share of the points that :attr:`error` is of."""
+
+    @property
+    def seconds(self) -> float:
+        """A point, in the best of the rounds."""
+        return float(np.min(self.rounds))
+
+    @property
+    def error(self) -> float:
+        """That which counts: the largest over points, or over most of them."""
+        return self.quantile(self.likely)
+
+    def quantile(self, share: float) -> float:
+        """Error of pd that this share of the points stays below."""
+        return float(np.nanquantile(self.pd_error, share))
+
+    def times_faster(self, other: Setting) -> float:
+        """Time of another over that of this, round by round, in the median."""
+        return float(np.median(other.rounds / self.rounds))
+
+
+def settings_in(dataset: xr.Dataset) -> list[Setting]:
+    """The settings of a store that `sweep accuracy` made, in its order."""
+    found = []
+    likely = LIKELY if np.isfinite(dataset.standard_error.values).any() else 1.0
+    for i in range(dataset.sizes["rung"]):
+        rung = dataset.isel(rung=i)
+        rounds = rung.seconds.values
+        found.append(
+            Setting(
+                name=str(rung.rung.values),
+                kind=str(rung.kind.values),
+                tolerance=float(rung.tolerance),
+                rounds=rounds,
+                planning=float(rung.planning.values[np.argmin(rounds)]),
+                pd_error=rung.pd_error.values,
+                log10_pfa_error=_largest(rung.log10_pfa_error.values),
+                magnitude_error=_largest(rung.magnitude_error.values),
+                likely=likely,
+            )
+        )
+    return found
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.fmax.reduce(values))
+
+
+def of_kinds(settings: Iterable[Setting], *kinds: str) -> list[Setting]:
+    """Settings of some kinds."""
+    return [setting for setting in settings if setting.kind in kinds]
+
+
+def candidates(settings: Iterable[Setting]) -> list[Setting]:
+    """All but the reference, which has no error of its own."""
+    return [setting for setting in settings if setting.kind != REFERENCE]
+
+
+def front(settings: Sequence[Setting]) -> list[Setting]:
+    """Settings that no other is both as fast and as accurate as, the fastest first."""
+    best: list[Setting] = []
+    for setting in sorted(settings, key=lambda s: (s.seconds, s.error)):
+        if not best or max(setting.error, EXACT) < max(best[-1].error, EXACT):
+            best.append(setting)
+    return best
+
+
+def cheapest(settings: Sequence[Setting], error: float) -> Setting | None:
+    """The fastest setting whose error is no larger."""
+    allowed = max(error, EXACT)
+    fitting = [setting for setting in settings if setting.error <= allowed]
+    return min(fitting, key=lambda s: s.seconds, default=None)
+
+
+@dataclass(frozen=True)
+class Duel:
+    """An adaptive setting against the fastest other that is as accurate; None where none is."""
+
+    adaptive: Setting
+    other: Setting | None
+
+    @property
+    def times_faster(self) -> float:
+        """How many times faster the adaptive one is; inf against nothing."""
+        return self.adaptive.times_faster(self.other) if self.other else float("inf")
+
+
+def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
+    """Each adaptive setting against the best that is the same at every point."""
+    fixed = of_kinds(settings, *FIXED)
+    return [Duel(one, cheapest(fixed, one.error)) for one in of_kinds(settings, ADAPTIVE)]
+
+
+def against_thesis(settings: Sequence[Setting]) -> list[Duel]:
+    """The fastest adaptive setting that is as accurate as the thesis's way, for each form of it."""
+    found = []
+    for thesis in of_kinds(settings, THESIS):
+        best = cheapest(of_kinds(settings, ADAPTIVE), thesis.error)
+        if best is not None:
+            found.append(Duel(best, thesis))
+    return found

@@ -1,0 +1,31 @@
+"""What `sweep accuracy` prints."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from sweep.cli.telling import INCOMPLETE, print_table
+
+
+def conclude_accuracy(store: Path, *, measured: bool) -> list[Path]:
+    """Print what settings came to, and draw it; the files. Leave where there is nothing."""
+    if not measured:
+        click.echo("Interrupted before any point was through: nothing is kept.", err=True)
+        sys.exit(INCOMPLETE)
+    from sweep.analysis.accuracy import report, text
+
+    dataset, settings = report.opened(store)
+    print_table(
+        "Time a point; error of pd (90 % of points, largest), of log10 pfa, of peak magnitude",
+        list(text.SHORT), text.short_rows(settings), "setting",
+    )  # fmt: skip
+    print_table(
+        "Cheapest setting for each error of pd", list(text.CHEAPEST), text.cheapest_rows(settings),
+        "cheapest setting",
+    )  # fmt: skip
+    for sentence in text.sentences(dataset, settings):
+        click.echo(sentence)
+    return [store, *report.draw(store)]
