@@ -54,6 +54,8 @@ class Bench(Protocol):
     """A sample of a study's points."""
 
     unit: str
+    most_times: int
+    """Points that may be timed for each of the sample."""
 
     @property
     def spec(self) -> Declared:

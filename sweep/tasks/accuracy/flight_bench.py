@@ -88,6 +88,7 @@ class FlightBench:
     """
 
     unit = "shots"
+    most_times = 1
 
     def __init__(self, spec: SceneSpec, points: int) -> None:
         self.spec = spec

@@ -29,9 +29,6 @@ PARTS = 2
 LONG_ENOUGH = 0.15
 """Time of a trial [s] from which on its calls cost little beside the points themselves."""
 
-MOST_TIMES = 64
-"""Points that are timed for each point of the sample, at the most."""
-
 FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 """Shares of the time limit by which the first round, and then the truth, ends."""
 
@@ -167,13 +164,15 @@ class Measurement:
         """
         took = [self._timed(i, parts[0]) for i in range(len(self._ladder.rungs))]
         times, written = 1, took[0]
-        while written < LONG_ENOUGH / 2 and times < MOST_TIMES:
+        while written < LONG_ENOUGH / 2 and times < self._bench.most_times:
             times *= 2
             self._times[0] = times
             written = self._timed(0, parts[0])
-        for i, alone in enumerate(took):
-            self._times[i] = min(times, 1 << max(0, int(math.log2(4 * LONG_ENOUGH / alone))))
-        spent = sum(self._timed(i, parts[0]) for i in range(len(self._ladder.rungs)))
+        if times > 1:
+            for i, alone in enumerate(took):
+                self._times[i] = min(times, 1 << max(0, int(math.log2(4 * LONG_ENOUGH / alone))))
+            took = [self._timed(i, parts[0]) for i in range(len(self._ladder.rungs))]
+        spent = sum(took)
         left = self._limit - (time.monotonic() - self._begun)
         return max(1, min(MOST_ROUNDS, int(0.75 * left / (spent * len(parts)))))
 

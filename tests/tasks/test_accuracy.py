@@ -1,0 +1,311 @@
+"""What accuracy costs: the sample, the ladder, and what trials come to."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from small import STUDY, small
+from small_flights import SCENE, small_scene
+
+from sweep.model.effects.catalogue import NAMES
+from sweep.tasks import progress
+from sweep.tasks.accuracy import measure, rungs
+from sweep.tasks.accuracy.bench import Seen
+from sweep.tasks.accuracy.flight_bench import FlightBench
+from sweep.tasks.accuracy.grid_bench import GridBench
+from sweep.tasks.accuracy.run import measure as measured
+from sweep.tasks.accuracy.sample import neighbours, spread
+from sweep.tasks.errors import StoreError
+
+COHERENT = {"beamlets": 9, "phases": "coherent"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hasty():
+    """Few rounds, and none of the patience that times in earnest take."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measure, "MOST_ROUNDS", 2)
+        patch.setattr(measure, "LONG_ENOUGH", 1e-3)
+        patch.setattr(measure, "UNTIL_TRUTH", 0.0)
+        yield
+
+
+# Sample
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (3, 4, 5), (10**9, 10**6), (1, 2, 1)])
+@pytest.mark.parametrize("number", [1, 12, 60, 200])
+def test_a_sample_has_no_point_twice_and_all_where_there_are_few(shape, number):
+    total = int(np.prod(shape, dtype=object))
+    found = spread(shape, number)
+    assert len(found) == len(set(found.tolist())) == min(number, total)
+    assert (found >= 0).all() and (found < total).all()
+    assert np.array_equal(found, spread(shape, number))
+
+
+def test_any_stretch_of_a_sample_reaches_along_every_axis():
+    index = np.unravel_index(spread((1000, 90), 200), (1000, 90))
+    for first, size in itertools.product((0, 50, 150), (50,)):
+        for along, length in zip(index, (1000, 90), strict=True):
+            counts = np.histogram(along[first : first + size], bins=5, range=(0, length))[0]
+            # Halton's points miss an even share by the discrepancy of 50 of them, some 2 or 3.
+            assert (np.abs(counts - size / 5) <= 4).all()
+
+
+def test_a_longer_sample_begins_with_the_shorter():
+    assert np.array_equal(spread((500, 60, 7), 300)[:100], spread((500, 60, 7), 100))
+
+
+def test_neighbours_stay_in_their_box_and_begin_with_the_point():
+    box, shape = (slice(4, 8), slice(6, 9)), (10, 12)
+    numbers = neighbours((7, 8), box, shape, 30)
+    assert numbers[0] == 7 * 12 + 8
+    inside = {i * 12 + j for i in range(4, 8) for j in range(6, 9)}
+    assert set(numbers.tolist()) == inside
+    assert np.array_equal(numbers[:12], numbers[12:24])
+    assert list(neighbours((), (), (), 2)) == [0, 0]
+
+
+# Ladder
+
+
+def test_overrides_are_put_onto_the_spec_and_leave_it_alone():
+    spec = small()
+    rung = rungs.Rung(name="x", kind=rungs.ADAPTIVE, overrides={"accuracy.tolerance": 0.25})
+    other = rung.of(spec)
+    assert other.accuracy.tolerance == 0.25 and spec.accuracy.tolerance == 1e-3
+    assert other.axes == spec.axes and other.target == spec.target
+
+
+def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
+    ladder = rungs.ladder(small())
+    kinds = [rung.kind for rung in ladder.rungs]
+    assert kinds[0] == rungs.WRITTEN and kinds[-1] == rungs.REFERENCE
+    adaptive = [rung for rung in ladder.rungs if rung.kind == rungs.ADAPTIVE]
+    tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
+    assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
+    numbers = [r.overrides["footprint.beamlets"] for r in ladder.rungs if r.kind == rungs.BEAMLETS]
+    assert numbers == list(rungs.NUMBERS)
+    finest = ladder.reference.of(small())
+    modes = finest.modes()
+    assert modes["range_walk"] == modes["leakage"] == "on" and modes["speckle"] == "auto"
+    assert len({rung.name for rung in ladder.rungs}) == len(ladder.rungs)
+
+
+def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
+    for changes, why in (
+        ({"footprint": COHERENT}, "coherent"),
+        ({"axes": {"footprint.beamlets": [7, 19]}}, "axis"),
+    ):
+        ladder = rungs.ladder(small(**changes))
+        assert not any("footprint.beamlets" in rung.overrides for rung in ladder.rungs)
+        (note,) = ladder.notes
+        assert why in note
+    assert "axis" in rungs.ladder(small(axes={"accuracy.tolerance": [0.1, 0.01]})).notes[0]
+
+
+def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
+    sets = {0.1: frozenset({"doppler"}), 1e-3: frozenset({"doppler"}), 1e-6: frozenset(NAMES[:2])}
+    ladder = rungs.ladder(small()).with_fixed(sets)
+    fixed = [rung for rung in ladder.rungs if rung.kind == rungs.FIXED]
+    assert [rung.name for rung in fixed] == ["1 effects, as at 0.1", "2 effects, as at 1e-06"]
+    modes = fixed[0].of(small()).modes()
+    assert modes["doppler"] == "on" and set(modes.values()) == {"on", "off"}
+    assert ladder.rungs[-1].kind == rungs.REFERENCE
+
+
+def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
+    spec = small(draws={"number": 20}, target=STUDY["target"] | {"roughness": "10 um"})
+    ladder = rungs.ladder(spec)
+    names = [rung.name for rung in ladder.rungs]
+    assert {"10 draws, mean", "100 draws, counts", "1000 draws, noise"} <= set(names)
+    reference = ladder.reference.of(spec)
+    assert reference.seed != spec.seed and reference.draws.number == 10000
+    assert reference.modes()["speckle"] == "on"
+
+
+# Trials
+
+
+@pytest.fixture(scope="module")
+def coherent(tmp_path_factory):
+    """A small coherent study, measured in a moment."""
+    store = tmp_path_factory.mktemp("accuracy") / "small.zarr"
+    spec = small(footprint=COHERENT)
+    assert measured(spec, store_path=store, points=10, progress=False)
+    return spec, store, xr.open_zarr(store).load()
+
+
+def test_the_store_has_errors_by_rung_and_point_and_seconds_by_rung_and_round(coherent):
+    spec, store, dataset = coherent
+    assert dataset.pd_error.dims == dataset.magnitude_error.dims == ("rung", "point")
+    assert dataset.seconds.dims == ("rung", "round") and dataset.sizes["point"] == 10
+    assert (dataset.seconds > dataset.planning).all() and (dataset.planning >= 0).all()
+    assert dataset.seconds.attrs["units"] == "s" and dataset.pd_error.attrs["long_name"]
+    assert dataset.attrs["kind"] == "accuracy" and dataset.attrs["study_points"] == 72
+    assert json.loads(dataset.attrs["spec"])["title"] == spec.title
+    assert {"processor", "numpy"} <= set(dataset.attrs["environment"])
+    grazing = dataset.grazing_angle
+    assert grazing.dims == ("point",) and set(grazing.values) <= {20.0, 50.0, 90.0}
+    assert not [p for p in store.parent.iterdir() if p != store]
+
+
+def test_errors_are_those_of_the_settings(coherent):
+    """Every effect kept: the reference itself; tolerances: kept; the thesis's way: some 1e-2."""
+    _, _, dataset = coherent
+    error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
+    assert error["reference"] == error["all effects on"] == 0
+    for name, tolerance in zip(dataset.rung.values, dataset.tolerance.values, strict=True):
+        if np.isfinite(tolerance):
+            assert error[name] <= tolerance, name
+    assert 1e-5 < error["thesis 2^12"] < 0.5
+    assert error["thesis 2^11"] == pytest.approx(error["thesis 2^12"], rel=1e-6)
+    assert dataset.attrs["truth_points"] >= 3
+    assert dataset.attrs["truth_pd_difference"] < 1e-7
+
+
+def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
+    """The machinery of a run: the same numbers, bit for bit."""
+    from sweep.tasks.evaluate import evaluate_block
+    from sweep.tasks.grid_study import GridStudy
+
+    spec, _, _ = coherent
+    bench = GridBench(spec, 72)
+    rung = rungs.Rung(name="coarse", kind=rungs.ADAPTIVE, overrides={"accuracy.tolerance": 0.1})
+    seen = bench.try_on(rung, np.arange(72), 3).seen
+    study = GridStudy(rung.of(spec))
+    blocks = [
+        evaluate_block(study.spec, study.grid, b, study.calling.of_block(b))
+        for b in range(study.n_blocks)
+    ]
+    whole = np.full(study.grid.shape, np.nan)
+    for b, results in enumerate(blocks):
+        whole[study.grid.block(b)] = results["pd_shot"]
+    numbers, _ = bench.coordinates()["number"]
+    assert np.array_equal(whole.ravel()[numbers], seen.pd[:, 3])
+
+
+def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
+    monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
+    monkeypatch.setattr(rungs, "FINEST", 1009)
+    monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
+    spec = small(footprint={"beamlets": 7})
+    measured(spec, store_path=tmp_path / "a.zarr", points=6, progress=False)
+    dataset = xr.open_zarr(tmp_path / "a.zarr").load()
+    error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
+    assert error["37 beamlets"] < error["1 beamlets"]
+
+
+def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(rungs, "DRAW_NUMBERS", (20, 80))
+    monkeypatch.setattr(rungs, "LONG_RUN", 5)
+    spec = small(
+        draws={"number": 20},
+        target=STUDY["target"] | {"roughness": "10 um", "range": "2 km"},
+        axes={"target.range": ["2 km", "3 km", "4 km", "5 km"]},
+        footprint={"beamlets": 7},
+    )
+    measured(spec, store_path=tmp_path / "a.zarr", points=4, progress=False)
+    dataset = xr.open_zarr(tmp_path / "a.zarr").load().set_index(rung="rung")
+    for name in ("20 draws, mean", "80 draws, counts", "80 draws, noise"):
+        rung = dataset.sel(rung=name)
+        # The worst of four probabilities at four points: five standard errors.
+        assert (rung.pd_error <= 5 * rung.standard_error + 0.02).all(), name
+    assert (dataset.sel(rung="80 draws, mean").standard_error > 0).any()
+    assert np.isnan(dataset.sel(rung="80 draws, counts").magnitude_error).all()
+
+
+def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
+    monkeypatch.setattr(rungs, "NUMBERS", (1, 19))
+    monkeypatch.setattr(rungs, "FINEST_RAYS", 61)
+    monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
+    store = tmp_path / "flight.zarr"
+    short = {"path": SCENE["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
+    spec = small_scene(platform=SCENE["platform"] | short)
+    measured(spec, store_path=store, points=30, progress=False)
+    dataset = xr.open_zarr(store).load()
+    assert set(dataset.scanner.values) == {"three", "line"} and dataset.attrs["unit"] == "shots"
+    assert set(dataset.power.values) == {0.01, 1.0}
+    error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
+    assert error["reference"] == 0 and error["19 beamlets"] <= error["1 beamlets"]
+    assert dataset.attrs["truth_pd_difference"] < 1e-4
+
+
+def test_what_a_flight_is_measured_with_is_what_its_run_gives():
+    """Statistics of a trial against those of the flight's own machinery."""
+    from sweep.tasks.calling import TILE_SHOTS
+
+    spec = small_scene()
+    bench = FlightBench(spec, 10_000)
+    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
+    part = bench.parts(1)[0]
+    seen = bench.try_on(rung, part, 1).seen
+    tiles = bench._of(0)
+    study = bench._study(rung)
+    caster = next(e for e in study.eyepoint_studies() if e.scanner == tiles.part.scanner)
+    from sweep.scenes.eyepoint_arrays import from_arrays
+
+    shots = caster.see(tiles.index)
+    eyepoints = from_arrays(shots, caster.weight)
+    called = study.call(tiles.part, eyepoints)
+    assert len(tiles.index) <= TILE_SHOTS
+    found = study.look(tiles.part, shots, eyepoints, called, first=0)
+    assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
+    assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
+
+
+def test_what_sees_nothing_detects_nothing():
+    def seen(pd):
+        pd = np.array([pd])
+        return Seen(pd, np.array([[-np.inf, -3.0]]), np.array([[1.0]]), np.array([np.nan]))
+
+    pd, pfa, magnitude = measure.apart(
+        seen([0.5, np.nan, 0.2, np.nan]), seen([0.4, 0.3, 0.2, np.nan])
+    )
+    assert (pd, pfa, magnitude) == (pytest.approx([0.3]), [0.0], [0.0])
+
+
+def test_a_store_in_the_way_is_refused_and_left_alone(tmp_path, undisturbed):
+    with pytest.raises(StoreError, match="study's results"):
+        measured(small(), store_path=undisturbed, progress=False)
+
+
+class Broken(progress.Silent):
+    """Ctrl-C after so many trials."""
+
+    stopping = False
+
+    def __init__(self, after):
+        self.left = after
+
+    def advance(self, *, points, failed):
+        self.left -= points
+        self.stopping = self.left <= 0
+
+
+@pytest.mark.parametrize("trials, kept", [(1, 0), (1.5, 4), (2.5, 8)])
+def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
+    """A ladder of trials a part, two parts a round."""
+    bench = GridBench(small(footprint=COHERENT), 8)
+    asked = Broken(0)
+    tried = measure.Measurement(bench, time_limit=60.0, told=asked, interrupts=asked)
+    asked.left = int(trials * len(tried._ladder.rungs)) if kept else 3
+    if not kept:
+        with pytest.raises(measure.Nothing):
+            tried.run()
+        return
+    found = tried.run()
+    assert len(found.done) == kept and bool(found.truth) == (kept == 8)
+    assert found.stopped == ("interrupted" if kept < 8 else "")
+    assert found.seconds.shape == (len(found.ladder.rungs), 1)
+
+
+def test_what_is_broken_off_before_any_point_is_through_leaves_nothing(tmp_path, monkeypatch):
+    def broken(self):
+        raise measure.Nothing
+
+    monkeypatch.setattr(measure.Measurement, "run", broken)
+    assert not measured(small(), store_path=tmp_path / "a.zarr", progress=False)
+    assert not list(tmp_path.iterdir())
