@@ -10,8 +10,11 @@ import click
 from sweep.cli.telling import INCOMPLETE, print_table
 
 
-def conclude_accuracy(store: Path, *, measured: bool) -> list[Path]:
-    """Print what settings came to, and draw it; the files. Leave where there is nothing."""
+def conclude_accuracy(store: Path, *, measured: bool) -> tuple[list[Path], bool]:
+    """Print what settings came to, and draw it: the files, and whether it was not interrupted.
+
+    Leaves with the exit code of what is incomplete where nothing was measured.
+    """
     if not measured:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
         sys.exit(INCOMPLETE)
@@ -28,4 +31,4 @@ def conclude_accuracy(store: Path, *, measured: bool) -> list[Path]:
     )  # fmt: skip
     for sentence in text.sentences(dataset, settings):
         click.echo(sentence)
-    return [store, *report.draw(store)]
+    return [store, *report.draw(store)], dataset.attrs["stopped"] != "interrupted"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import click
 
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.telling import (
+    INCOMPLETE,
     conclude,
     grid_plan,
     scene_plan,
@@ -304,7 +306,10 @@ def accuracy(
     measured = measure(
         load(spec), store_path=path, points=points, time_limit=time_limit, overwrite=overwrite
     )
-    _list(conclude_accuracy(path, measured=measured))
+    files, whole = conclude_accuracy(path, measured=measured)
+    _list(files)
+    if not whole:
+        sys.exit(INCOMPLETE)
 
 
 @main.command()

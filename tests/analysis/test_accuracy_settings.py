@@ -1,0 +1,144 @@
+"""Fronts, cheapest settings and who beats whom, on made-up data whose answers are plain."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep.analysis.accuracy import figure, report, settings, text
+from sweep.analysis.opening import NotAStoreError
+
+MADE_UP = [
+    # name, kind, tolerance, us a point, errors by point
+    ("as written", "as written", np.nan, 20.0, [1e-4, 1e-5, 0.0]),
+    ("auto at 0.1", "adaptive", 0.1, 10.0, [5e-2, 1e-3, 0.0]),
+    ("auto at 0.001", "adaptive", 1e-3, 20.0, [5e-4, 1e-5, 0.0]),
+    ("auto at 1e-06", "adaptive", 1e-6, 40.0, [0.0, 0.0, 0.0]),
+    ("19 beamlets", "beamlets", np.nan, 12.0, [4e-2, 4e-2, 0.0]),
+    ("109 beamlets", "beamlets", np.nan, 18.0, [5e-4, 0.0, 0.0]),
+    ("all effects on", "all on", np.nan, 200.0, [1e-10, 0.0, 0.0]),
+    ("thesis 2^12", "thesis", np.nan, 90.0, [6e-2, 2e-2, 1e-2]),
+    ("thesis 2^12, degree 9", "thesis", np.nan, 120.0, [6e-4, 2e-4, 1e-4]),
+    ("reference", "reference", np.nan, 300.0, [0.0, 0.0, 0.0]),
+]
+
+
+@pytest.fixture
+def dataset():
+    """The made-up settings as a store has them: three rounds, the second the quietest."""
+    names, kinds, tolerances, times, errors = zip(*MADE_UP, strict=True)
+    error = ("rung", "point"), np.array(errors)
+    seconds = 1e-6 * np.outer(times, [1.5, 1.0, 2.0])
+    return xr.Dataset(
+        {
+            "pd_error": error,
+            "log10_pfa_error": error,
+            "magnitude_error": error,
+            "standard_error": (("rung", "point"), np.full((len(names), 3), np.nan)),
+            "seconds": (("rung", "round"), seconds),
+            "planning": (("rung", "round"), seconds / 10),
+            "tolerance": ("rung", np.array(tolerances)),
+        },
+        coords={"rung": np.array(names, object), "kind": ("rung", np.array(kinds, object))},
+        attrs={
+            "title": "Made up", "study_points": 1_000_000, "unit": "points", "points": 3,
+            "reference": "all effects on", "truth_points": 2, "truth_pd_difference": 1e-12,
+            "truth_magnitude_difference": 2e-9, "notes": ["a note"], "stopped": "",
+            "study_id": "0123456789", "model_version": "4",
+        },
+    )  # fmt: skip
+
+
+def test_the_front_is_what_nothing_else_is_both_as_fast_and_as_accurate_as(dataset):
+    found = settings.front(settings.candidates(settings.settings_in(dataset)))
+    names = [s.name for s in found]
+    assert names == ["auto at 0.1", "19 beamlets", "109 beamlets", "as written", "auto at 1e-06"]
+
+
+def test_errors_below_the_references_own_are_alike(dataset):
+    """1e-10 of `all effects on` is no better than the 0 of a setting five times as fast."""
+    found = settings.settings_in(dataset)
+    assert settings.cheapest(settings.candidates(found), 0.0).name == "auto at 1e-06"
+
+
+@pytest.mark.parametrize(
+    "error, name",
+    [(0.1, "auto at 0.1"), (4e-2, "19 beamlets"), (1e-3, "109 beamlets"), (1e-5, "auto at 1e-06")],
+)
+def test_the_cheapest_setting_meets_the_error_at_every_point(dataset, error, name):
+    found = settings.candidates(settings.settings_in(dataset))
+    assert settings.cheapest(found, error).name == name
+    assert settings.cheapest([], error) is None
+
+
+def test_the_best_round_counts_and_ratios_are_taken_round_by_round(dataset):
+    dataset.seconds[2, :] = 1e-6 * np.array([30.0, 40.0, 40.0])  # one round of it disturbed
+    one, *_ = settings.of_kinds(settings.settings_in(dataset), "as written")
+    other = settings.settings_in(dataset)[2]
+    assert one.seconds == pytest.approx(20e-6) and other.seconds == pytest.approx(30e-6)
+    assert one.times_faster(other) == pytest.approx(1.0)
+
+
+def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
+    duels = settings.against_fixed(settings.settings_in(dataset))
+    assert [(d.adaptive.name, d.other.name) for d in duels] == [
+        ("auto at 0.1", "19 beamlets"),
+        ("auto at 0.001", "109 beamlets"),
+        ("auto at 1e-06", "all effects on"),
+    ]
+    assert [d.times_faster for d in duels] == pytest.approx([1.2, 0.9, 5.0])
+    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
+    assert "0.9 to 5 times" in told and "NOT kept" in told
+    dataset.seconds[5] *= 1.02  # 0.918 of its time: within the 10 %
+    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
+    assert told.endswith(": kept.")
+
+
+def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
+    none = dataset.isel(rung=[0, 1, 2, 3, 9])
+    duels = settings.against_fixed(settings.settings_in(none))
+    assert all(d.other is None and d.times_faster == np.inf for d in duels)
+    assert any("no fixed setting" in s for s in text.sentences(none, settings.settings_in(none)))
+
+
+def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
+    duels = settings.against_thesis(settings.settings_in(dataset))
+    assert [d.adaptive.name for d in duels] == ["auto at 0.1", "auto at 0.001"]
+    assert [d.times_faster for d in duels] == pytest.approx([9.0, 6.0])
+    told = " ".join(text.sentences(dataset, settings.settings_in(dataset)))
+    assert "9 times as fast as thesis 2^12" in told and "times as fast: kept" in told
+
+
+def test_where_errors_are_random_most_of_the_points_count(dataset):
+    dataset.standard_error[:] = 0.01
+    found = settings.settings_in(dataset)[1]
+    assert found.error == pytest.approx(np.quantile([5e-2, 1e-3, 0.0], 0.95))
+
+
+def test_the_page_has_every_setting_and_the_sentences(dataset):
+    found = text.page(dataset, settings.settings_in(dataset)).text()
+    assert all(name in found for name, *_ in MADE_UP)
+    assert "all 1,000,000 points take 20 s on one core" in found
+    assert "at 2 points it is within <1e-9 of the time domain's pd" in found
+    assert "A note." in found and "Not the whole sample" not in found
+
+
+def test_marks_stand_at_times_and_errors(dataset):
+    sheet = figure.draw(dataset, settings.settings_in(dataset))
+    (axes,) = sheet.axes
+    marks = {
+        tuple(np.ravel(line.get_data()))
+        for line in axes.lines
+        if line.get_marker() in "os^DPv*" and len(line.get_xdata()) == 1
+    }
+    expected = {
+        (us, max(max(e), figure.FLOOR)) for _, kind, _, us, e in MADE_UP if kind != "reference"
+    }
+    assert {(round(t, 9), e) for t, e in marks} == expected
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    words = {t.get_text() for t in axes.texts}
+    assert {"1e-1", "19", "2^12"} <= words
+
+
+def test_a_store_of_another_kind_is_refused(tmp_path):
+    with pytest.raises(NotAStoreError, match="there is no store"):
+        report.opened(tmp_path / "none.zarr")

@@ -1,0 +1,82 @@
+"""`sweep accuracy` from spec to table, store and figure, and what it refuses."""
+
+import pytest
+from test_cli import STUDY, refused, sweep
+
+from sweep.tasks.accuracy import measure
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A directory of one's own with a spec, small.yaml, in it, and little patience."""
+    coherent = STUDY.replace("beamlets: 9", "beamlets: 9, phases: coherent")
+    (tmp_path / "small.yaml").write_text(coherent)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(measure, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(measure, "LONG_ENOUGH", 1e-4)
+    monkeypatch.setattr(measure, "UNTIL_TRUTH", 0.0)
+    return tmp_path
+
+
+def test_the_command_prints_tables_and_statements_and_writes_store_figure_and_text(here):
+    result = sweep("accuracy", "small.yaml", "--points", "6")
+    assert result.exit_code == 0
+    for shown in (
+        "auto at 1e-06", "all effects on", "thesis 2^12, degree 9", "Cheapest setting",
+        "As written:", "Against the thesis's way", "best single fixed setting", "time domain",
+        "small_accuracy.zarr", "small_accuracy.png",
+    ):  # fmt: skip
+        assert shown in result.stdout, shown
+    assert "6 points" in result.stderr and "trials" in result.stderr
+    results = here / "results"
+    assert (results / "small_accuracy.png").stat().st_size > 10_000
+    assert "Settings" in (results / "small_accuracy.txt").read_text()
+    names = {path.name for path in results.iterdir()}
+    assert names == {f"small_accuracy.{suffix}" for suffix in ("zarr", "png", "txt")}
+    store = results / "small_accuracy.zarr"
+    refused(sweep("accuracy", "small.yaml"), "--overwrite")
+    refused(sweep("status", store), "holds what accuracy costs")
+    refused(sweep("resume", store), "holds what accuracy costs")
+    drawn = sweep("figures", store, "--output", "drawn")
+    assert drawn.exit_code == 0 and (here / "drawn" / "small_accuracy.png").exists()
+
+
+def test_mistakes_end_in_plain_words_and_exit_code_2(here):
+    refused(sweep("accuracy", "absent.yaml"), "does not exist")
+    refused(sweep("accuracy", "small.yaml", "--points", "0"), "--points")
+    refused(sweep("accuracy", "small.yaml", "--time-limit", "0"), "--time-limit")
+    (here / "wrong.yaml").write_text(STUDY.replace("25 mm", "25"))
+    refused(sweep("accuracy", "wrong.yaml"), "telescope")
+    (here / "notes").mkdir()
+    refused(sweep("accuracy", "small.yaml", "--store", "notes"), "is not a Zarr store")
+    assert not (here / "results").exists()
+
+
+def test_nothing_is_left_where_it_is_broken_off_at_once(here, monkeypatch):
+    def broken(self):
+        raise measure.Nothing
+
+    monkeypatch.setattr(measure.Measurement, "run", broken)
+    result = sweep("accuracy", "small.yaml")
+    assert result.exit_code == 3 and "nothing is kept" in result.stderr
+    assert not (here / "results").exists()
+
+
+def test_what_is_kept_of_an_interrupted_measurement_is_told_with_exit_code_3(here, monkeypatch):
+    whole = measure.Measurement.run
+
+    def cut(self):
+        found = whole(self)
+        found.stopped = "interrupted"
+        return found
+
+    monkeypatch.setattr(measure.Measurement, "run", cut)
+    result = sweep("accuracy", "small.yaml", "--points", "3")
+    assert result.exit_code == 3 and "(interrupted): 3 points" in result.stdout
+    assert (here / "results" / "small_accuracy.png").exists()
+
+
+def test_help_says_what_is_measured_and_how():
+    told = sweep("accuracy", "--help").stdout
+    for word in ("tolerances", "thesis", "Ctrl-C", "--time-limit", "--points", "xarray"):
+        assert word in told
