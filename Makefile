@@ -5,6 +5,7 @@ READY := .venv/.ready
 
 .PHONY: demo test test-all stability fuzz bench effects stopping lock forget-kernels clean
 SEED ?= 1
+.PHONY: demo test test-all bench effects accuracy lock forget-kernels clean
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
@@ -42,6 +43,8 @@ effects: $(READY)
 
 stopping: $(READY)
 	$(BIN)/python benchmarks/stopping.py
+accuracy: $(READY)
+	$(BIN)/python benchmarks/accuracy.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete

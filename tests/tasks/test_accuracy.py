@@ -124,6 +124,9 @@ def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
     reference = ladder.reference.of(spec)
     assert reference.seed != spec.seed and reference.draws.number == 10000
     assert reference.modes()["speckle"] == "on"
+    many = rungs.ladder(small(draws={"number": 10**9}))
+    assert many.rungs[0].of(spec).draws.number == 10000
+    assert "10000 of the 1000000000 draws" in many.notes[1]
 
 
 # Trials
@@ -231,6 +234,8 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
     assert error["reference"] == 0 and error["19 beamlets"] <= error["1 beamlets"]
     assert dataset.attrs["truth_pd_difference"] < 1e-4
+    cycles = spec.cycles("three") * 3 + spec.cycles("line") * spec.shots_a_cycle("line")
+    assert dataset.attrs["study_points"] == 2 * cycles
 
 
 def test_what_a_flight_is_measured_with_is_what_its_run_gives():

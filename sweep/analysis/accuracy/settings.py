@@ -117,7 +117,7 @@ def cheapest(settings: Sequence[Setting], error: float) -> Setting | None:
 
 @dataclass(frozen=True)
 class Duel:
-    """An adaptive setting against the fastest other that is as accurate; None where none is."""
+    """An adaptive setting against another, both with no more than an error; None where none is."""
 
     adaptive: Setting
     other: Setting | None
@@ -129,9 +129,14 @@ class Duel:
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
-    """Each adaptive setting against the best that is the same at every point."""
-    fixed = of_kinds(settings, *FIXED)
-    return [Duel(one, cheapest(fixed, one.error)) for one in of_kinds(settings, ADAPTIVE)]
+    """For each error that adaptive settings have: the fastest of them, the fastest fixed one."""
+    adaptive, fixed = of_kinds(settings, ADAPTIVE), of_kinds(settings, *FIXED)
+    found = []
+    for error in sorted({max(setting.error, EXACT) for setting in adaptive}, reverse=True):
+        best = cheapest(adaptive, error)
+        if best is not None:
+            found.append(Duel(best, cheapest(fixed, error)))
+    return found
 
 
 def against_thesis(settings: Sequence[Setting]) -> list[Duel]:

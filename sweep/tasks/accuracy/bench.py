@@ -65,6 +65,10 @@ class Bench(Protocol):
     def size(self) -> int:
         """Points of the sample."""
 
+    @property
+    def whole(self) -> int:
+        """Points of the study, each computed once: draws of a flight are none of their own."""
+
     def parts(self, points: int) -> list[np.ndarray]:
         """The sample in parts of about so many points: places in it."""
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from sweep.spec.world import World
     from sweep.tasks.accuracy.bench import Look
 
-#: Tiles that are computed together at the least, where the flight has them, and places along the
-#: axes that each scanner is looked at.
-LEAST_TILES, PLACES = 4, 2
+#: Tiles that are computed together and that there are in all, at the least, where the flight has
+#: them; places along the axes at which each scanner is looked at.
+TOGETHER, LEAST_TILES, PLACES = 2, 4, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +103,12 @@ class FlightBench:
     def size(self) -> int:
         """Shots of the sample."""
         return sum(len(tiles.index) for tiles in self._tiles)
+
+    @property
+    def whole(self) -> int:
+        """Shots of the flight, times places along the axes."""
+        stretches = self._study(Rung(name="as written", kind=WRITTEN)).scanners.values()
+        return sum(s.total_cycles * s.shots_a_cycle * math.prod(s.axes) for s in stretches)
 
     def parts(self, points: int) -> list[np.ndarray]:
         """The sample scanner by scanner, and place by place along the axes."""
@@ -173,9 +179,9 @@ class FlightBench:
         for name, stretches in study.scanners.items():
             axes = stretches.axes
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
-            wanted = points / TILE_SHOTS / len(study.scanners) / len(places)
+            wanted = max(points / TILE_SHOTS, LEAST_TILES) / len(study.scanners) / len(places)
             for place in places:
-                index = _spread_shots(stretches, max(LEAST_TILES, math.ceil(wanted)))
+                index = _spread_shots(stretches, max(TOGETHER, math.ceil(wanted)))
                 part = Part(name, tuple(int(i) for i in place), 0, 0)
                 found.append(Tiles(part, index, start))
                 start += len(index)

@@ -46,6 +46,11 @@ class GridBench:
         """Points of the sample."""
         return len(self._numbers)
 
+    @property
+    def whole(self) -> int:
+        """Points of the study."""
+        return self._grid.points
+
     def parts(self, points: int) -> list[np.ndarray]:
         """The sample in parts of about so many points."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points)))

@@ -87,7 +87,8 @@ class Measurement:
         self._told, self._interrupts = told, interrupts
         self._begun = time.monotonic()
         self._ladder = self._completed(ladder(bench.spec))
-        self._times = np.ones(len(self._ladder.rungs), np.int64)
+        self._rungs = self._ladder.rungs
+        self._times = np.ones(len(self._rungs), np.int64)
 
     def run(self) -> Measured:
         """All rounds that the time allows, the first of them at least in part.
@@ -97,14 +98,13 @@ class Measurement:
         Nothing
             Broken off before any point was through.
         """
-        rungs = self._ladder.rungs
         self._told.say(
-            f"trying {len(rungs)} settings on {self._bench.size:,} {self._bench.unit} of the study"
+            f"trying {len(self._rungs)} settings on {self._bench.size:,} {self._bench.unit}"
         )
         self._compile()
         parts = self._bench.parts(self._part_points())
         rounds = self._planned_rounds(parts)
-        self._told.begin(points=len(rungs) * len(parts) * rounds, done=0, unit="trials")
+        self._told.begin(points=len(self._rungs) * len(parts) * rounds, done=0, unit="trials")
         try:
             return self._rounds(parts, rounds)
         finally:
@@ -144,16 +144,16 @@ class Measurement:
     def _part_points(self) -> int:
         """Points of a part: a few parts, and more where a point takes its time."""
         first = self._bench.parts(1)[0]
-        spent = sum(self._timed(i, first) for i in range(len(self._ladder.rungs)))
+        spent = sum(self._timed(i, first) for i in range(len(self._rungs)))
         fitting = FIRST_ROUND * self._limit * len(first) / spent
         return max(1, min(self._bench.size, int(fitting)) // PARTS)
 
     def _compile(self) -> None:
         """Compile what rungs compile, on those that are not long runs; it is not counted."""
-        few = min(int(rung.overrides.get(DRAWN, 0)) for rung in self._ladder.rungs[1:])
-        first = self._bench.parts(1)[0]
-        for i, rung in enumerate(self._ladder.rungs):
-            if int(rung.overrides.get(DRAWN, 0)) <= few and (i or not few):
+        first, numbers = self._bench.parts(1)[0], [r.overrides.get(DRAWN) for r in self._rungs]
+        few = min((number for number in numbers if number is not None), default=None)
+        for i, number in enumerate(numbers):
+            if number == few:
                 self._timed(i, first)
         self._begun = time.monotonic()
 
@@ -162,7 +162,7 @@ class Measurement:
 
         As many for all of them, but for those that would take far longer.
         """
-        took = [self._timed(i, parts[0]) for i in range(len(self._ladder.rungs))]
+        took = [self._timed(i, parts[0]) for i in range(len(self._rungs))]
         times, written = 1, took[0]
         while written < LONG_ENOUGH / 2 and times < self._bench.most_times:
             times *= 2
@@ -171,7 +171,7 @@ class Measurement:
         if times > 1:
             for i, alone in enumerate(took):
                 self._times[i] = min(times, 1 << max(0, int(math.log2(4 * LONG_ENOUGH / alone))))
-            took = [self._timed(i, parts[0]) for i in range(len(self._ladder.rungs))]
+            took = [self._timed(i, parts[0]) for i in range(len(self._rungs))]
         spent = sum(took)
         left = self._limit - (time.monotonic() - self._begun)
         return max(1, min(MOST_ROUNDS, int(0.75 * left / (spent * len(parts)))))
@@ -185,7 +185,7 @@ class Measurement:
         return time.monotonic() - begun
 
     def _try(self, rung: int, part: np.ndarray) -> Trial:
-        return self._bench.try_on(self._ladder.rungs[rung], part, int(self._times[rung]))
+        return self._bench.try_on(self._rungs[rung], part, int(self._times[rung]))
 
     def _round(self, parts: list[np.ndarray], *, until: float) -> list[list[Trial]]:
         """Every rung on every part that there is time for; the first at least, if uninterrupted."""
@@ -194,7 +194,7 @@ class Measurement:
             if done and time.monotonic() - self._begun > until * self._limit:
                 break
             trials = []
-            for rung in range(len(self._ladder.rungs)):
+            for rung in range(len(self._rungs)):
                 if self._interrupts.stopping:
                     return done
                 trials.append(self._try(rung, part))

@@ -22,7 +22,7 @@ from sweep.tasks.accuracy.rungs import REFERENCE, Rung
 from sweep.tasks.errors import StoreError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.studies import ACCURACY, study_of
+from sweep.tasks.studies import ACCURACY
 from sweep.tasks.study import ArrayLayout
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Content:
             "environment": {"processor": versions.processor(), **versions.software()},
             "unit": self._bench.unit,
             "points": len(self._measured.done),
-            "study_points": study_of(self._spec, Path()).points,
+            "study_points": self._bench.whole,
             "notes": list(measured.ladder.notes),
             "stopped": measured.stopped,
             "coordinates": " ".join(["kind", *self._bench.coordinates()]),

@@ -175,9 +175,15 @@ def _thesis_rungs() -> Iterator[Rung]:
 
 def _drawn_ladder(spec: Declared) -> Ladder:
     """Numbers of draws and what is read off them, against a long run with other draws."""
-    rungs = [Rung(name="as written", kind=WRITTEN)]
+    longest = LONG_RUN * DRAW_NUMBERS[-1]
+    notes = ["errors are differences from a long run with other draws, so they are random too"]
+    own: dict[str, Any] = {}
+    if spec.draws.number > longest:
+        own = {DRAWN: longest}
+        notes.append(f"with {longest} of the {spec.draws.number} draws that are written")
+    rungs = [Rung(name="as written", kind=WRITTEN, overrides=own)]
     rungs += [
-        Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides={_TOLERANCE: t})
+        Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=own | {_TOLERANCE: t})
         for t in TOLERANCES[:4]
     ]
     noise = {"draws.method": "noise"}
@@ -190,14 +196,12 @@ def _drawn_ladder(spec: Declared) -> Ladder:
                 name=f"{number} draws, noise", kind=DRAWS, overrides=each | noise, estimate=COUNTS
             ),
         ]
-    number = LONG_RUN * DRAW_NUMBERS[-1]
-    other = {DRAWN: number, "seed": int(spec.seed) ^ 1}
+    other = {DRAWN: longest, "seed": int(spec.seed) ^ 1}
     reference = Rung(
         name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other, plans=False
     )
-    note = "errors are differences from a long run with other draws, so they are random too"
-    about = f"{number} other draws, all effects on"
-    return Ladder((*rungs, reference), about, (note,))
+    about = f"{longest} other draws, all effects on"
+    return Ladder((*rungs, reference), about, tuple(notes))
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:

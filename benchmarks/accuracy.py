@@ -1,0 +1,178 @@
+"""What accuracy costs in time: docs/accuracy.md and its figures, from `sweep accuracy` itself.
+
+Run with `make accuracy`, some quarter of an hour. Names of studies below as arguments measure
+those alone and print their sections; --time-limit SECONDS is that of each (180).
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from sweep.analysis import canvas
+from sweep.analysis.accuracy import figure, report, text
+from sweep.spec import load
+from sweep.tasks.accuracy.run import measure
+from sweep.tasks.accuracy.rungs import WRITTEN, Rung
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+class Study(NamedTuple):
+    """A study to measure: an experiment, what is put onto it, and why it is looked at."""
+
+    experiment: str
+    heading: str
+    about: str
+    overrides: dict = {}  # noqa: RUF012
+
+
+STUDIES = {
+    "published": Study(
+        "range_angle",
+        "The published study",
+        "The thesis's range-angle study, 900,000 points, with the coherent footprint of 109 "
+        "beamlets that it has. Their number is part of that scene, so what can be chosen is "
+        "which effects are simulated, and where.",
+    ),
+    "rough_ground": Study(
+        "range_angle",
+        "The same over rough ground",
+        "The same grid as a user would ask for it today: the footprint's powers add, which is the "
+        "mean over rough ground. How many beamlets it takes is now a question of accuracy: one "
+        "serves at normal incidence, and at a grazing angle of 1 degree at 10 km hundreds.",
+        {"title": "Detection over range and grazing angle, rough ground",
+         "footprint.phases": "incoherent"},
+    ),
+    "landing": Study(
+        "scan_pattern_comparison",
+        "A landing",
+        "Three, four and sixteen beams in a descent from 2 km, with all of the light and with "
+        "little of it. A point is a shot with its rays: casting them, planning, spectra and "
+        "probabilities.",
+    ),
+    "speckle": Study(
+        "quickstart",
+        "A speckled target",
+        "A rough plane whose speckle is drawn. Draws are what accuracy costs here: the mean of "
+        "each draw's probabilities, detections counted against them, or noise in every bin.",
+        {"title": "Detection over range and grazing angle, speckled",
+         "footprint.phases": "incoherent", "target.roughness": "10 um", "draws.number": 100},
+    ),
+}  # fmt: skip
+
+HEAD = """# What accuracy costs
+
+How accurate is a probability of detection, and what does each digit cost? `sweep accuracy`
+answers that for any spec, on a sample of its own points, in a minute:
+
+```sh
+sweep accuracy experiments/range_angle.yaml
+```
+
+This page is what it says of four studies; `make accuracy` measures and writes it anew. No number
+on it is written by hand.
+
+## How it is measured
+
+A ladder of settings is put onto the spec. Each is computed by the machinery that computes the
+study, in one process, on one core: the spec as it is written; effects on demand (`auto`) at
+tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a
+tolerance calls for anywhere; fixed numbers of beamlets, where they add as powers; numbers of
+draws, where the study draws; and the way that the thesis describes. All take turns on parts of
+the sample, round after round, so that whatever slows the machine slows them alike. The best round
+counts for the times, and ratios are medians of those within each round. Planning is counted with
+what it plans; storing is not counted.
+
+The **error** of a setting at a point is the largest difference, over the segments and the shot,
+of a probability of detection from the reference's: all effects on, and the finest footprint of
+all. The error that a setting is said to have is the largest over the points, for that is what a
+tolerance promises; the figures show as well what 90 % of the points stay below. Where draws make
+errors random, it is that of 95 % of them. The reference itself is held against the time domain,
+sample by sample, at some of the same points.
+
+**The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
+cells a bin, and convolves it with the window's transform by an FFT of 2^11 or 2^12. It is written
+to be as fast as that can fairly be (`sweep/model/oversampled.py`: batches of real or complex
+FFTs, the way back only at the bins), has no leakage and no range walk to compute, and shares
+preparation and detection with the rest. With a deposit of degree 9 the lines are where they
+belong.
+
+Two things are asked of the adaptive settings, and the answers below are computed: at equal error
+they shall never be slower by more than 10 % than the best single fixed setting; and at least 5
+times as fast as the thesis's way at the error that this has.
+"""
+
+TAIL = """
+## On your own study
+
+```sh
+sweep accuracy my_study.yaml --points 500 --time-limit 300
+```
+
+prints the tables, draws the figure and leaves a store that opens with xarray:
+
+```python
+import xarray as xr
+
+ds = xr.open_zarr("results/my_study_accuracy.zarr")
+ds.pd_error.max("point")        # by setting
+ds.seconds.min("round")         # a point
+```
+
+Take the cheapest setting that meets the error you can live with: for most studies that is
+`accuracy: {tolerance: ...}` and nothing else.
+"""
+
+
+def section(name: str, study: Study, time_limit: float) -> str:
+    """A study's part of the page; its figure is drawn."""
+    spec = Rung(name="", kind=WRITTEN, overrides=study.overrides).of(
+        load(ROOT / "experiments" / f"{study.experiment}.yaml")
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        store = Path(folder) / f"{name}.zarr"
+        measure(spec, store_path=store, time_limit=time_limit)
+        dataset, settings = report.opened(store)
+    picture = canvas.save(figure.draw(dataset, settings), DOCS / f"accuracy_{name}.png")
+    put = ", ".join(f"`{k}: {v}`" for k, v in study.overrides.items() if k != "title")
+    source = f"`experiments/{study.experiment}.yaml`" + (f" with {put}" if put else "")
+    parts = [
+        f"## {study.heading}",
+        f"{study.about} ({source})",
+        f"![Error over time of each setting]({picture.name})",
+        "\n".join(f"- {sentence}" for sentence in text.sentences(dataset, settings)),
+        table(text.CHEAPEST, text.cheapest_rows(settings)),
+        "All settings; `front`: none is both as fast and as accurate.",
+        table(text.COLUMNS, text.rows(settings)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def table(columns, rows) -> str:
+    """A table in Markdown."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def main() -> None:
+    """The whole page, or some of its sections."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*STUDIES, []])
+    parser.add_argument("--time-limit", type=float, default=180.0)
+    asked = parser.parse_args()
+    sections = [
+        section(name, study, asked.time_limit)
+        for name, study in STUDIES.items()
+        if not asked.names or name in asked.names
+    ]
+    if asked.names:
+        print("\n".join(sections))
+    else:
+        page = "\n".join([HEAD, *sections]) + TAIL
+        (DOCS / "accuracy.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
