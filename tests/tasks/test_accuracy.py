@@ -87,7 +87,8 @@ def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
     tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
     numbers = [r.overrides["footprint.beamlets"] for r in ladder.rungs if r.kind == rungs.BEAMLETS]
-    assert numbers == list(rungs.NUMBERS)
+    assert numbers == [*rungs.NUMBERS, *rungs.NODES]
+    assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)
     finest = ladder.reference.of(small())
     modes = finest.modes()
     assert modes["range_walk"] == modes["leakage"] == "on" and modes["speckle"] == "auto"
@@ -192,13 +193,15 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
 
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
-    monkeypatch.setattr(rungs, "FINEST", 1009)
+    monkeypatch.setattr(rungs, "NODES", (33,))
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
     spec = small(footprint={"beamlets": 7})
     measured(spec, store_path=tmp_path / "a.zarr", points=6, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load()
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
-    assert error["37 beamlets"] < error["1 beamlets"]
+    assert error["33 in a line"] < 1e-6 < error["37 beamlets"] < error["1 beamlets"]
+    for t in (1e-1, 1e-3, 1e-6):
+        assert error[f"auto at {t:g}"] <= t
 
 
 def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
@@ -225,6 +228,8 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "FINEST_RAYS", 61)
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
     store = tmp_path / "flight.zarr"
+    # Each beamlet is a ray: their number is fixed in adaptive settings too.
+    assert "footprint.beamlets" not in rungs.ladder(small_scene()).rungs[1].overrides
     short = {"path": SCENE["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
     spec = small_scene(platform=SCENE["platform"] | short)
     measured(spec, store_path=store, points=30, progress=False)

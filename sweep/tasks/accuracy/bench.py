@@ -110,9 +110,9 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
     if estimate == COUNTS:
         counts = [outputs[f"n_detected_{name}"].sum(axis=1) for name in (*SEGMENTS, "shot")]
         pd = np.stack(counts, axis=1) / draws
-        nothing = np.full((len(pd), 1), np.nan)
+        nothing = np.full((len(pd), 3), np.nan)
         error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / draws)
-        return Seen(pd, nothing, nothing, error.max(axis=1))
+        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1))
     pd = np.stack([outputs[name] for name in names], axis=1)
     alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
     magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]

@@ -22,24 +22,40 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 NUMBERS = (1, 7, 19, 37, 61, 109, 217, 1009, 4003)
 """Beamlets that a study might fix: full shells of a hexagonal lattice, as far as they are."""
 
-FINEST, FINEST_RAYS = 10009, 1009
-"""Beamlets of the reference; of a flight, where each is a ray."""
+NODES = (3, 9, 33, 163, 1234)
+"""Beamlets in a line along the slope that a study over a plane might fix."""
+
+FIXED_NODES = 163
+"""Of these where effects are fixed too: enough for the widest footprints."""
+
+OF_THESIS = 109
+"""Beamlets of [T 3.3.1]."""
+
+FINEST_RAYS = 1009
+"""Beamlets of a flight's reference, where each is a ray."""
 
 FINEST_TOLERANCE = 1e-9
-"""Tolerance of the reference where the number of beamlets follows from it."""
+"""Tolerance of the reference where the number of beamlets follows from it: over a plane."""
 
 DRAW_NUMBERS = (10, 100, 1000)
 
 LONG_RUN = 10
 """Draws of the reference over those of the longest rung."""
 
+DRAWN_TOLERANCES = (1e-1, 3e-2, 1e-2)
+"""Tolerances until which points are drawn."""
+
 MEAN, COUNTS = "mean", "counts"
 """What is read off draws: the mean of each draw's probability, or how many were detected."""
 
-_TOLERANCE, _BEAMLETS = "accuracy.tolerance", "footprint.beamlets"
+_TOLERANCE = "accuracy.tolerance"
+_BEAMLETS, _PATTERN = "footprint.beamlets", "footprint.pattern"
+_LINE = "line"
 
 DRAWN = "draws.number"
 """Field that holds the number of draws."""
+
+_LIMIT = "draws.limit"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +113,8 @@ class Ladder:
     about: str
     """What the reference is."""
     notes: tuple[str, ...] = ()
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    """What else is fixed where effects are."""
 
     @property
     def reference(self) -> Rung:
@@ -122,7 +140,8 @@ class Ladder:
                     for effect in EFFECTS
                 }
                 name = f"{len(names)} effects, as at {tolerance:g}"
-                further.append(Rung(name=name, kind=FIXED, overrides=modes, plans=False))
+                overrides = modes | dict(self.fixed)
+                further.append(Rung(name=name, kind=FIXED, overrides=overrides, plans=False))
         place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
         return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
 
@@ -132,44 +151,52 @@ def ladder(spec: Declared) -> Ladder:
     if _draws(spec):
         return _drawn_ladder(spec)
     notes: list[str] = []
-    adaptive: dict[str, Any] = {_BEAMLETS: "auto"} if _beamlets_follow(spec) else {}
     rungs = [Rung(name="as written", kind=WRITTEN)]
+    why = _beamlets_fixed(spec)
+    follow: dict[str, Any] = {} if why or _is_flight(spec) else {_BEAMLETS: "auto"}
     if _on_axis(spec, _TOLERANCE):
         notes.append("accuracy.tolerance is on an axis: left as it is")
     else:
         rungs += [
-            Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=adaptive | {_TOLERANCE: t})
+            Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=follow | {_TOLERANCE: t})
             for t in TOLERANCES
         ]
     every = _every_effect(spec)
     rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every, plans=False))
-    finest = every
-    if why := _beamlets_fixed(spec):
+    finest, about = every, "all effects on"
+    if why:
         notes.append(f"the number of beamlets is left alone: {why}")
+    elif follow:
+        finest = every | follow | {_TOLERANCE: FINEST_TOLERANCE}
+        about += f", beamlets as at {FINEST_TOLERANCE:g}"
     else:
-        most = FINEST_RAYS if _is_flight(spec) else FINEST
-        rungs += [
-            Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
-            for n in NUMBERS
-            if n < most
-        ]
-        finest = every | (adaptive or {_BEAMLETS: most})
-        finest |= {_TOLERANCE: FINEST_TOLERANCE} if adaptive else {}
-    rungs += _thesis_rungs()
+        finest = every | {_BEAMLETS: FINEST_RAYS}
+        about += f", {FINEST_RAYS} beamlets"
+    rungs += _numbers(spec) if not why else ()
+    rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
     reference = Rung(name="reference", kind=REFERENCE, overrides=finest, plans=False)
-    beamlets = finest.get(_BEAMLETS, "")
-    words = {"": "", "auto": f", beamlets as at {FINEST_TOLERANCE:g}"}
-    about = "all effects on" + words.get(beamlets, f", {beamlets} beamlets")
-    return Ladder((*rungs, reference), about, tuple(notes))
+    fixed = {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE} if follow else {}
+    return Ladder((*rungs, reference), about, tuple(notes), fixed)
 
 
-def _thesis_rungs() -> Iterator[Rung]:
+def _numbers(spec: Declared) -> Iterator[Rung]:
+    """Fixed numbers of beamlets: in a lattice, and in a line where the ground is a plane."""
+    flight = _is_flight(spec)
+    for n in NUMBERS:
+        if not flight or n < FINEST_RAYS:
+            yield Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
+    for n in () if flight else NODES:
+        put = {_BEAMLETS: n, _PATTERN: _LINE}
+        yield Rung(name=f"{n} in a line", kind=BEAMLETS, overrides=put)
+
+
+def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
     """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten."""
     for cells, degree in ((11, 0), (12, 0), (12, 9)):
         how = f", degree {degree}" if degree else ""
         yield Rung(
-            name=f"thesis 2^{cells}{how}", kind=THESIS, plans=False, cells=1 << cells,
-            degree=degree,
+            name=f"thesis 2^{cells}{how}", kind=THESIS, overrides=overrides, plans=False,
+            cells=1 << cells, degree=degree,
         )  # fmt: skip
 
 
@@ -178,17 +205,23 @@ def _drawn_ladder(spec: Declared) -> Ladder:
     longest = LONG_RUN * DRAW_NUMBERS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     own: dict[str, Any] = {}
-    if spec.draws.number > longest:
-        own = {DRAWN: longest}
-        notes.append(f"with {longest} of the {spec.draws.number} draws that are written")
+    for path, written in ((DRAWN, spec.draws.number), (_LIMIT, getattr(spec.draws, "limit", 0))):
+        if written > longest:
+            own = {path: longest}
+            notes.append(f"with {longest} of the {written} draws that are written")
     rungs = [Rung(name="as written", kind=WRITTEN, overrides=own)]
-    rungs += [
-        Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=own | {_TOLERANCE: t})
-        for t in TOLERANCES[:4]
-    ]
-    noise = {"draws.method": "noise"}
+    may_stop = _may_stop(spec)
+    if may_stop:
+        rungs += [
+            Rung(
+                name=f"auto at {t:g}", kind=ADAPTIVE,
+                overrides={DRAWN: 0, _LIMIT: longest, _TOLERANCE: t},
+            )
+            for t in DRAWN_TOLERANCES
+        ]  # fmt: skip
+    noise, to_the_end = {"draws.method": "noise"}, {_LIMIT: 0} if may_stop else {}
     for number in DRAW_NUMBERS:
-        each = {DRAWN: number}
+        each = {DRAWN: number} | to_the_end
         rungs += [
             Rung(name=f"{number} draws, mean", kind=DRAWS, overrides=each),
             Rung(name=f"{number} draws, counts", kind=DRAWS, overrides=each, estimate=COUNTS),
@@ -196,12 +229,17 @@ def _drawn_ladder(spec: Declared) -> Ladder:
                 name=f"{number} draws, noise", kind=DRAWS, overrides=each | noise, estimate=COUNTS
             ),
         ]
-    other = {DRAWN: longest, "seed": int(spec.seed) ^ 1}
+    other = {DRAWN: longest, "seed": int(spec.seed) ^ 1} | to_the_end
     reference = Rung(
         name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other, plans=False
     )
     about = f"{longest} other draws, all effects on"
     return Ladder((*rungs, reference), about, tuple(notes))
+
+
+def _may_stop(spec: Declared) -> bool:
+    """Whether points can be drawn until their tolerance is met."""
+    return "limit" in type(spec.draws).model_fields
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
@@ -220,7 +258,9 @@ def _is_flight(spec: Declared) -> bool:
 
 def _draws(spec: Declared) -> bool:
     """Whether probabilities are means over draws: of a flight they are not."""
-    return not _is_flight(spec) and bool(spec.draws.number)
+    if _is_flight(spec):
+        return False
+    return spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0
 
 
 def _on_axis(spec: Declared, path: str) -> bool:
@@ -234,19 +274,6 @@ def _beamlets_fixed(spec: Declared) -> str:
         return "with coherent phases it is part of the scene, as the thesis has it"
     if spec.instrument.receiver.architecture == "direct":
         return "in direct detection beamlets add as amplitudes, and are part of the scene"
-    if _on_axis(spec, _BEAMLETS) or _on_axis(spec, "footprint.phases"):
+    if any(_on_axis(spec, path) for path in (_BEAMLETS, _PATTERN, "footprint.phases")):
         return "it is on an axis"
     return ""
-
-
-def _beamlets_follow(spec: Declared) -> bool:
-    """Whether the number of beamlets may follow from the tolerance, `auto`."""
-    from sweep.spec import SpecError
-
-    if _beamlets_fixed(spec):
-        return False
-    try:
-        Rung(name="", kind=ADAPTIVE, overrides={_BEAMLETS: "auto"}).of(spec)
-    except SpecError:
-        return False
-    return True
