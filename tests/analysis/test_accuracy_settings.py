@@ -41,8 +41,9 @@ def dataset():
         coords={"rung": np.array(names, object), "kind": ("rung", np.array(kinds, object))},
         attrs={
             "title": "Made up", "study_points": 1_000_000, "unit": "points", "points": 3,
-            "reference": "all effects on", "truth_points": 2, "truth_pd_difference": 1e-12,
-            "truth_magnitude_difference": 2e-9, "notes": ["a note"], "stopped": "",
+            "reference": "all effects on", "truth_points": 2, "truth_beamlets": 109,
+            "truth_pd_difference": 1e-12, "truth_magnitude_difference": 2e-9,
+            "notes": ["a note"], "stopped": "",
             "study_id": "0123456789", "model_version": "4",
         },
     )  # fmt: skip
@@ -118,7 +119,10 @@ def test_the_page_has_every_setting_and_the_sentences(dataset):
     found = text.page(dataset, settings.settings_in(dataset)).text()
     assert all(name in found for name, *_ in MADE_UP)
     assert "all 1,000,000 points take 20 s on one core" in found
-    assert "at 2 points it is within <1e-9 of the time domain's pd" in found
+    assert (
+        "at 2 points, with 109 beamlets in both, it is within <1e-9 of the time domain's pd"
+        in found
+    )
     assert "A note." in found and "Not the whole sample" not in found
 
 

@@ -86,7 +86,8 @@ def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
     adaptive = [rung for rung in ladder.rungs if rung.kind == rungs.ADAPTIVE]
     tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
-    numbers = [r.overrides["footprint.beamlets"] for r in ladder.rungs if r.kind == rungs.BEAMLETS]
+    fixed = [rung for rung in ladder.rungs if rung.kind in (rungs.BEAMLETS, rungs.IN_A_LINE)]
+    numbers = [rung.overrides["footprint.beamlets"] for rung in fixed]
     assert numbers == [*rungs.NUMBERS, *rungs.NODES]
     assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)
     finest = ladder.reference.of(small())

@@ -17,13 +17,14 @@ from sweep.analysis.accuracy.settings import Setting
 FLOOR = of.EXACT
 """Error at which those that are smaller are drawn."""
 
-JOINED = (of.ADAPTIVE, "beamlets")
+JOINED = (of.ADAPTIVE, of.BEAMLETS, of.IN_A_LINE)
 """Kinds whose settings are one method, looked at more or less closely."""
 
 MARKS = {
     of.ADAPTIVE: ("o", canvas.LINES[0], "adaptive, by tolerance"),
     "fixed effects": ("s", canvas.LINES[2], "the same effects everywhere"),
-    "beamlets": ("^", canvas.LINES[1], "fixed number of beamlets"),
+    of.BEAMLETS: ("^", canvas.LINES[1], "number of beamlets in a lattice"),
+    of.IN_A_LINE: ("<", canvas.LINES[7], "number of beamlets in a line"),
     "all on": ("D", canvas.LINES[3], "all effects on"),
     "draws": ("P", canvas.LINES[5], "number of draws"),
     of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
@@ -43,7 +44,7 @@ def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
             _mark(axes, setting, marker, colour, words if i == 0 else "")
         if kind in JOINED:
             _join(axes, some, colour)
-        _name(axes, some, above=kind != "beamlets")
+        _name(axes, some, above=kind not in (of.BEAMLETS, of.IN_A_LINE))
     _finish(axes)
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
@@ -106,7 +107,7 @@ def _short(setting: Setting) -> str:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == of.THESIS:
         return setting.name.removeprefix("thesis ")
-    if setting.kind == "beamlets":
+    if setting.kind in (of.BEAMLETS, of.IN_A_LINE):
         return setting.name.split()[0]
     return setting.name if setting.kind == "draws" else ""
 

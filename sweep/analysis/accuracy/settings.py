@@ -14,7 +14,8 @@ EXACT = 1e-9
 """Error below which settings are alike: that of the reference itself."""
 
 WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
-FIXED = ("fixed effects", "beamlets", "all on", "draws")
+BEAMLETS, IN_A_LINE = "beamlets", "in a line"
+FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, "all on", "draws")
 """Kinds of settings that are the same at every point."""
 
 AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0

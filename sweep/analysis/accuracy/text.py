@@ -135,8 +135,9 @@ def _reference(attributes: dict) -> str:
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ", not held against the time domain."
+    fewer = f", with {n} beamlets in both," if (n := attributes["truth_beamlets"]) else ""
     return text + (
-        f"; at {attributes['truth_points']} points it is within "
+        f"; at {attributes['truth_points']} {attributes['unit']}{fewer} it is within "
         f"{error(attributes['truth_pd_difference'])} of the time domain's pd, within "
         f"{error(attributes['truth_magnitude_difference'])} of its magnitudes."
     )

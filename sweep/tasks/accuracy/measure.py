@@ -59,6 +59,8 @@ class Measured:
     """(rungs,): points timed for each."""
     truth: dict[int, tuple[Seen, Seen]] = field(default_factory=dict)
     """By place in the sample: in the time domain, and as the reference has it."""
+    truth_beamlets: int = 0
+    """Of both, where their number is not the reference's; else 0."""
     stopped: str = ""
     """Why the sample is not whole; empty where it is."""
 
@@ -224,6 +226,8 @@ class Measurement:
     def _add_truth(self, measured: Measured) -> None:
         """Points of the sample in the time domain, as many as there is time for."""
         rung = self._in_time_domain()
+        if rung is not self._ladder.reference:
+            measured.truth_beamlets = TRUTH_BEAMLETS
         for place in measured.done.tolist():
             late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
             if self._interrupts.stopping or (late and len(measured.truth) >= LEAST_IN_TRUTH):

@@ -145,6 +145,7 @@ class Content:
         pd, _, magnitude = np.fmax.reduce(np.array(found), axis=(0, 2))
         return {
             "truth_points": len(found),
+            "truth_beamlets": self._measured.truth_beamlets,
             "truth_pd_difference": float(pd),
             "truth_magnitude_difference": float(magnitude),
         }

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
     Declared = Spec | SceneSpec
 
-WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, THESIS, DRAWS, REFERENCE = (
-    "as written", "adaptive", "all on", "fixed effects", "beamlets", "thesis", "draws", "reference",
+WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, THESIS, DRAWS, REFERENCE = (
+    "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line", "thesis",
+    "draws", "reference",
 )  # fmt: skip
 """Kinds of rungs."""
 
@@ -187,7 +188,7 @@ def _numbers(spec: Declared) -> Iterator[Rung]:
             yield Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
     for n in () if flight else NODES:
         put = {_BEAMLETS: n, _PATTERN: _LINE}
-        yield Rung(name=f"{n} in a line", kind=BEAMLETS, overrides=put)
+        yield Rung(name=f"{n} in a line", kind=IN_A_LINE, overrides=put)
 
 
 def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
