@@ -40,10 +40,11 @@ STUDIES = {
         "range_angle",
         "The same over rough ground",
         "The same grid as a user would ask for it today: the footprint's powers add, which is the "
-        "mean over rough ground. How many beamlets it takes is now a question of accuracy: one "
-        "serves at normal incidence, and at a grazing angle of 1 degree at 10 km hundreds.",
+        "mean over rough ground, and `auto` takes as many beamlets as the tolerance needs, point "
+        "by point. Against it stand fixed numbers of them, in the thesis's lattice or in a line "
+        "along the slope.",
         {"title": "Detection over range and grazing angle, rough ground",
-         "footprint.phases": "incoherent"},
+         "footprint.phases": "incoherent", "footprint.beamlets": "auto"},
     ),
     "landing": Study(
         "scan_pattern_comparison",
@@ -58,7 +59,8 @@ STUDIES = {
         "A rough plane whose speckle is drawn. Draws are what accuracy costs here: the mean of "
         "each draw's probabilities, detections counted against them, or noise in every bin.",
         {"title": "Detection over range and grazing angle, speckled",
-         "footprint.phases": "incoherent", "target.roughness": "10 um", "draws.number": 100},
+         "footprint.phases": "incoherent", "footprint.beamlets": "auto",
+         "target.roughness": "10 um", "draws.number": 100},
     ),
 }  # fmt: skip
 
@@ -81,9 +83,9 @@ study, in one process, on one core: the spec as it is written; effects on demand
 tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a
 tolerance calls for anywhere; fixed numbers of beamlets, where they add as powers; numbers of
 draws, where the study draws; and the way that the thesis describes. All take turns on parts of
-the sample, round after round, so that whatever slows the machine slows them alike. The best round
-counts for the times, and ratios are medians of those within each round. Planning is counted with
-what it plans; storing is not counted.
+the sample, round after round, so that whatever slows the machine slows them alike. Times are those
+that the processor spends on the work. The best round counts for them, and ratios are medians of
+those within each round. Planning is counted with what it plans; storing is not counted.
 
 The **error** of a setting at a point is the largest difference, over the segments and the shot,
 of a probability of detection from the reference's: all effects on, and the finest footprint of

@@ -22,7 +22,7 @@ def conclude_accuracy(store: Path, *, measured: bool) -> tuple[list[Path], bool]
 
     dataset, settings = report.opened(store)
     print_table(
-        "Time a point; error of pd (90 % of points, largest), of log10 pfa, of peak magnitude",
+        "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude",
         list(text.SHORT), text.short_rows(settings), "setting",
     )  # fmt: skip
     print_table(

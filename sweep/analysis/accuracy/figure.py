@@ -17,7 +17,10 @@ from sweep.analysis.accuracy.settings import Setting
 FLOOR = of.EXACT
 """Error at which those that are smaller are drawn."""
 
-JOINED = (of.ADAPTIVE, of.BEAMLETS, of.IN_A_LINE)
+BY_NUMBER = (of.BEAMLETS, of.IN_A_LINE, of.MEANS, of.COUNTED, of.IN_NOISE)
+"""Kinds whose settings are told apart by the number that their names begin with."""
+
+JOINED = (of.ADAPTIVE, *BY_NUMBER)
 """Kinds whose settings are one method, looked at more or less closely."""
 
 MARKS = {
@@ -26,7 +29,9 @@ MARKS = {
     of.BEAMLETS: ("^", canvas.LINES[1], "number of beamlets in a lattice"),
     of.IN_A_LINE: ("<", canvas.LINES[7], "number of beamlets in a line"),
     "all on": ("D", canvas.LINES[3], "all effects on"),
-    "draws": ("P", canvas.LINES[5], "number of draws"),
+    of.MEANS: ("P", canvas.LINES[5], "mean over so many draws"),
+    of.COUNTED: ("^", canvas.LINES[1], "detections in so many draws"),
+    of.IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
     of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
     of.WRITTEN: ("*", canvas.LINES[6], "as written"),
 }
@@ -44,8 +49,8 @@ def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
             _mark(axes, setting, marker, colour, words if i == 0 else "")
         if kind in JOINED:
             _join(axes, some, colour)
-        _name(axes, some, above=kind not in (of.BEAMLETS, of.IN_A_LINE))
-    _finish(axes)
+        _name(axes, some, above=kind not in BY_NUMBER)
+    _finish(axes, min(_shown(setting.quantile(0.5)) for setting in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
     return sheet
@@ -107,9 +112,9 @@ def _short(setting: Setting) -> str:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == of.THESIS:
         return setting.name.removeprefix("thesis ")
-    if setting.kind in (of.BEAMLETS, of.IN_A_LINE):
+    if setting.kind in BY_NUMBER:
         return setting.name.split()[0]
-    return setting.name if setting.kind == "draws" else ""
+    return ""
 
 
 def _front(axes: Axes, best: Sequence[Setting]) -> None:
@@ -126,10 +131,10 @@ def _shown(error: float) -> float:
     return max(error, FLOOR)
 
 
-def _finish(axes: Axes) -> None:
+def _finish(axes: Axes, least: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(FLOOR / 2, 2.5)
+    axes.set_ylim(max(FLOOR, least) / 2, 2.5)
     axes.margins(x=0.12)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -146,7 +151,7 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     """What one has to know to read the figure."""
     attributes = dataset.attrs
     likely = settings[0].likely
-    worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} % of the points"
+    worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} %"
     parts = [
         f"mark: {worst} of {labels.counted(attributes['points'], attributes['unit'][:-1])}; "
         f"bar: that of 90 % of them; dot: median; {FLOOR:g} and less at the foot",

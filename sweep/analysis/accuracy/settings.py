@@ -15,7 +15,8 @@ EXACT = 1e-9
 
 WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
 BEAMLETS, IN_A_LINE = "beamlets", "in a line"
-FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, "all on", "draws")
+MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
+FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, "all on", MEANS, COUNTED, IN_NOISE)
 """Kinds of settings that are the same at every point."""
 
 AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0

@@ -45,7 +45,7 @@ class Trial:
 
     seen: Seen
     seconds: float
-    """A point, planning included."""
+    """Processor time of a point, planning included: what others use of the machine is no part."""
     planning: float
     """A point."""
 

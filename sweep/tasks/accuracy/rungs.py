@@ -12,10 +12,11 @@ if TYPE_CHECKING:
 
     Declared = Spec | SceneSpec
 
-WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, THESIS, DRAWS, REFERENCE = (
+WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, THESIS, REFERENCE = (
     "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line", "thesis",
-    "draws", "reference",
+    "reference",
 )  # fmt: skip
+MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 """Kinds of rungs."""
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -224,12 +225,13 @@ def _drawn_ladder(spec: Declared) -> Ladder:
     for number in DRAW_NUMBERS:
         each = {DRAWN: number} | to_the_end
         rungs += [
-            Rung(name=f"{number} draws, mean", kind=DRAWS, overrides=each),
-            Rung(name=f"{number} draws, counts", kind=DRAWS, overrides=each, estimate=COUNTS),
+            Rung(name=f"{number} draws, mean", kind=MEANS, overrides=each),
+            Rung(name=f"{number} draws, counts", kind=COUNTED, overrides=each, estimate=COUNTS),
             Rung(
-                name=f"{number} draws, noise", kind=DRAWS, overrides=each | noise, estimate=COUNTS
+                name=f"{number} draws, noise", kind=IN_NOISE, overrides=each | noise,
+                estimate=COUNTS,
             ),
-        ]
+        ]  # fmt: skip
     other = {DRAWN: longest, "seed": int(spec.seed) ^ 1} | to_the_end
     reference = Rung(
         name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other, plans=False
