@@ -32,6 +32,7 @@ MARKS = {
     of.MEANS: ("P", canvas.LINES[5], "mean over so many draws"),
     of.COUNTED: ("^", canvas.LINES[1], "detections in so many draws"),
     of.IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
+    of.CLOSED_FORM: ("X", canvas.LINES[5], "in closed form what the thesis's way has"),
     of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
     of.WRITTEN: ("*", canvas.LINES[6], "as written"),
 }

@@ -14,9 +14,10 @@ EXACT = 1e-9
 """Error below which settings are alike: that of the reference itself."""
 
 WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
+CLOSED_FORM = "closed form"
 BEAMLETS, IN_A_LINE = "beamlets", "in a line"
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
-FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, "all on", MEANS, COUNTED, IN_NOISE)
+FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COUNTED, IN_NOISE)
 """Kinds of settings that are the same at every point."""
 
 AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0

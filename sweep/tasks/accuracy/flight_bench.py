@@ -219,7 +219,7 @@ class FlightBench:
         self, rung: Rung, study: FlightStudy, tiles: Tiles, cast: Cast
     ) -> tuple[Called, float]:
         """What is simulated of shots, and the time [s] that it took to say."""
-        if rung.cells:
+        if rung.of_lines:
             names = of_lines(self.effects(Rung(name="as written", kind=WRITTEN)))
             return _everywhere(frozenset(names), cast.eyepoints), 0.0
         begun = thread_time()

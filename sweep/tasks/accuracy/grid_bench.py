@@ -145,7 +145,7 @@ class GridBench:
     def _groups(
         self, rung: Rung, flags: np.ndarray
     ) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        if rung.cells:
+        if rung.of_lines:
             written = Rung(name="as written", kind=WRITTEN)
             yield np.arange(len(flags)), of_lines(self.effects(written))
             return

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
     Declared = Spec | SceneSpec
 
-WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, THESIS, REFERENCE = (
-    "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line", "thesis",
-    "reference",
+WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, CLOSED_FORM, THESIS, REFERENCE = (
+    "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line", "closed form",
+    "thesis", "reference",
 )  # fmt: skip
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 """Kinds of rungs."""
@@ -72,6 +72,9 @@ class Rung:
         Values of fields of the spec by dotted path, as one would write them.
     plans
         Whether effects are planned, and the time that this takes counts.
+    of_lines
+        Whether only what the thesis's way can have is simulated: no effects within a record, no
+        leakage.
     cells, degree
         Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit
         (:mod:`sweep.model.oversampled`); else 0.
@@ -83,6 +86,7 @@ class Rung:
     kind: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
     plans: bool = True
+    of_lines: bool = False
     cells: int = 0
     degree: int = 0
     estimate: str = MEAN
@@ -193,13 +197,17 @@ def _numbers(spec: Declared) -> Iterator[Rung]:
 
 
 def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
-    """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten."""
+    """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten.
+
+    Before them the same beamlets with the same effects in closed form, like for like.
+    """
+    like: dict[str, Any] = {"overrides": overrides, "plans": False, "of_lines": True}
+    yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, **like)
     for cells, degree in ((11, 0), (12, 0), (12, 9)):
         how = f", degree {degree}" if degree else ""
         yield Rung(
-            name=f"thesis 2^{cells}{how}", kind=THESIS, overrides=overrides, plans=False,
-            cells=1 << cells, degree=degree,
-        )  # fmt: skip
+            name=f"thesis 2^{cells}{how}", kind=THESIS, cells=1 << cells, degree=degree, **like
+        )
 
 
 def _drawn_ladder(spec: Declared) -> Ladder:
