@@ -3,9 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects stopping lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping lock forget-kernels clean
 SEED ?= 1
-.PHONY: demo test test-all bench effects accuracy lock forget-kernels clean
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
@@ -43,6 +42,7 @@ effects: $(READY)
 
 stopping: $(READY)
 	$(BIN)/python benchmarks/stopping.py
+
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py
 

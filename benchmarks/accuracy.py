@@ -54,13 +54,10 @@ STUDIES = {
         "probabilities.",
     ),
     "speckle": Study(
-        "quickstart",
+        "speckled_target",
         "A speckled target",
         "A rough plane whose speckle is drawn. Draws are what accuracy costs here: the mean of "
         "each draw's probabilities, detections counted against them, or noise in every bin.",
-        {"title": "Detection over range and grazing angle, speckled",
-         "footprint.phases": "incoherent", "footprint.beamlets": "auto",
-         "target.roughness": "10 um", "draws.number": 100},
     ),
 }  # fmt: skip
 

@@ -84,7 +84,7 @@ def tell_accuracy(store: Path) -> None:
     from sweep.tasks.accuracy_table import accuracy_table
 
     if rows := accuracy_table(store):
-        _print_table(
+        print_table(
             "Half-widths of what is drawn",
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
             [_accuracy_cells(row) for row in rows],

@@ -59,7 +59,7 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
         called = study.call(part, shots)
         assert np.isfinite(called.error).all() and (called.error >= 0).all(), "effects_error"
         found = study.look(part, seen, shots, called, first=0)
-        architecture = study._parameters(part)["instrument.receiver.architecture"]
+        architecture = study.parameters_at(part)["instrument.receiver.architecture"]
         look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from cases import EPS, Family
 from table_shots import parameters
 
-from sweep.model.draws import simulate
 from sweep.model.effects.catalogue import CORE
 from sweep.model.navigation_tally import Tally, merge
 from sweep.model.outputs import OUTPUTS
 from sweep.model.realisations import Means
+from sweep.model.sampling import simulate
 
 FAMILY = Family(
     "Statistics",

@@ -38,7 +38,7 @@ class Sidelobes(NamedTuple):
 def sidelobes(name: str, length: int) -> Sidelobes:
     """The table of the window of this name and length, prepared once and kept."""
     shape = window(name, length)
-    reach = min(REACH, length // 2 - 1)
+    reach = max(min(REACH, length // 2 - 1), 1)
     value = _magnitudes(shape, reach) / shape.sum
     cells = np.lib.stride_tricks.sliding_window_view(value, _SAMPLES + 1)[::_SAMPLES]
     beyond = shape.envelope[max(int(np.searchsorted(shape.reach, reach, "right")) - 1, 0)]
