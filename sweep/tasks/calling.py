@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 #: Arrays of a store that say what was simulated.
 EFFECTS, ERROR = "effects", "effects_error"
 
+TOLERANCE = "accuracy.tolerance"
+
 #: Shots of a flight that are planned together.
 TILE_SHOTS = 256
 
@@ -97,9 +99,7 @@ class Calling:
         for alike in self.tiles.alike(tiles):
             block = Block.of_plane(alike.parameters)
             tolerance = effects_tolerance(
-                block.words,
-                block.whole(BEAMLETS),
-                float(np.ravel(block["accuracy.tolerance"].low)[0]),
+                block.words, block.whole(BEAMLETS), float(np.ravel(block[TOLERANCE].low)[0])
             )
             yield alike.tiles, plan(block, modes=self._modes, tolerance=tolerance)
 
@@ -148,6 +148,7 @@ def plan_shots(
     from sweep.model.effects.catalogue import DEFAULTS
     from sweep.model.effects.planning import plan
     from sweep.model.eyepoints import seen_ground
+    from sweep.model.resolution import effects_tolerance
 
     seen = np.flatnonzero(eyepoints.seen)
     if not seen.size:
@@ -161,7 +162,8 @@ def plan_shots(
         np.append(starts, seen.size),
         rotating,
     )
-    planned = plan(block, modes=modes, tolerance=float(parameters["accuracy.tolerance"]))
+    tolerance = effects_tolerance({}, ground.beamlets.offset.shape[1], parameters[TOLERANCE])
+    planned = plan(block, modes=modes, tolerance=tolerance)
     tile = np.searchsorted(starts, np.arange(seen.size), "right") - 1
     return ShotsPlan(seen, tile, planned)
 
