@@ -24,6 +24,7 @@ def study(changes: Mapping[str, Any]) -> dict[str, Any]:
         "instrument": {"file": "experiments/instruments/table_4_1.yaml"},
         "target": target | {"radial_velocity": "150 m/s", "reflectance_law": "thesis"},
         "footprint": {"beamlets": 1, "phases": "coherent"},
+        "accuracy": {"tolerance": 0},
     }
     for path, value in changes.items():
         *sections, name = path.split(".")

@@ -69,7 +69,7 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
     expected = by_lags(name, y, np.exp(-2 * (np.pi * deviation * lag) ** 2))
     found = gaussian_power(name, y, bins_fwhm / DURATION)
     top = samples(name, LENGTH).sum() ** 2
-    assert np.abs(found - expected).max() < 10 * line_width.TOLERANCE * top
+    assert np.abs(found - expected).max() < 10 * gaussian_line.TOLERANCE * top
 
 
 def test_shifts_of_many_points_are_those_of_each():
