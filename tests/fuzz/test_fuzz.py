@@ -37,7 +37,7 @@ def file(folder):
     return folder / "now.yaml"
 
 
-@settings(FEW, max_examples=80)
+@settings(FEW, max_examples=50)
 @given(written=studies())
 def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
     file.write_text(dumped(written), encoding="utf-8")
@@ -52,7 +52,7 @@ def flown(tmp_path_factory):
 
 
 def test_a_flight_is_computed_to_sane_points_or_refused_in_words(flown):
-    @settings(FEW, max_examples=40)
+    @settings(FEW, max_examples=25)
     @given(written=flights(flown))
     def holds(written):
         (flown / "now.yaml").write_text(dumped(written), encoding="utf-8")
@@ -62,7 +62,7 @@ def test_a_flight_is_computed_to_sane_points_or_refused_in_words(flown):
 
 
 def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(flown):
-    @settings(FEW, max_examples=150)
+    @settings(FEW, max_examples=100)
     @given(wrong=spoilt(st.one_of(studies(), flights(flown))))
     def holds(wrong):
         judge_command(flown / "spoilt.yaml", wrong)

@@ -26,7 +26,7 @@ from sweep.tasks.stretches import Part
 
 SOME = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
-    phases=[Phase.generate], max_examples=25,
+    phases=[Phase.generate], max_examples=15,
 )  # fmt: skip
 
 SIGNAL = ("snr_up", "snr_down", "snr_doppler", "pd_up", "pd_down", "pd_doppler", "pd_shot")
