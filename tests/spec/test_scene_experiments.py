@@ -8,6 +8,7 @@ import pytest
 
 from sweep.model.eyepoints import observe
 from sweep.spec import SceneSpec, SpecError, load
+from sweep.spec.reading import read_document
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SHIPPED = (
@@ -196,10 +197,10 @@ def test_gale_crater_says_where_its_terrain_is_missing(tmp_path):
 
 
 def test_gale_crater_is_real_ground_under_all_beams_where_it_is_there():
-    try:
-        spec = load(GALE)
-    except SpecError:
+    terrain = read_document(GALE).value["scene"]["objects"]["ground"]["file"]
+    if not (GALE.parent / terrain).exists():
         pytest.skip("the terrain is no part of the repository")
+    spec = load(GALE)
     assert isinstance(spec, SceneSpec)
     spec, eyes = only("gale_crater_descent")
     assert eyes.seen.all() and (eyes.surface == 0).all()
