@@ -21,7 +21,7 @@ from numba import njit
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_splitting import split_lines
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
-from sweep.model.preparation import Shots
+from sweep.model.preparation import LINE_STEPS, Shots
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE
 
 POINTS = 256
@@ -97,7 +97,7 @@ def _levels(shots: Shots) -> np.ndarray:
     """How exactly each point's lines are to be split: a place in :data:`SPLIT_TOLERANCES`, (n,)."""
     amplitudes = shots.amplitude.sum(axis=1)[shots.row]
     whole = 0.5 * shots.beat_scale * amplitudes * shots.window.sum
-    error = shots.line_tolerance * shots.bin_deviation / 3
+    error = shots.line_tolerance * shots.bin_deviation / LINE_STEPS
     relative = np.where(whole > 0, error / np.where(whole > 0, whole, 1.0), np.inf)
     found = np.searchsorted(SPLIT_TOLERANCES, relative + np.zeros(shots.size), "right") - 1
     return np.asarray(np.maximum(found, 0))

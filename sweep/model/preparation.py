@@ -48,6 +48,10 @@ LINE_SHARE = 0.1
 """The same, for errors of bins over sigma: pd changes by half as much in each segment."""
 
 
+LINE_STEPS = 5
+"""Steps that take few lines for many, at the most: each may err by as much of the whole."""
+
+
 class PhaseError(NamedTuple):
     """A deterministic phase error over the record, common to the lines of a footprint."""
 

@@ -14,6 +14,7 @@ from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.modulation import modulate, reduce_lines, take_few
+from sweep.model.preparation import LINE_STEPS
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
@@ -79,9 +80,9 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
 def allowed(p, power):
     """Error of a bin, or of its power, that one step of taking few lines for many may make.
 
-    There are three such steps at the most. Powers are those of bins of half a sigma or more.
+    Powers are those of bins of half a sigma or more.
     """
-    error = p[15] * p[10] / 3.0
+    error = p[15] * p[10] / LINE_STEPS
     return error * p[10] if power else error
 
 
