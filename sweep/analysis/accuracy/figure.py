@@ -86,19 +86,27 @@ def _place(setting: Setting) -> float:
 
 def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
     """Short names beside marks; settings whose marks are all but one have one name."""
-    left = list(settings)
-    while left:
-        first = left[0]
-        together = [s for s in left if _alike(s, first)]
-        left = [s for s in left if s not in together]
-        names = list(dict.fromkeys(filter(None, map(_short, together))))
+    for together in _clusters(settings):
+        ladder = [_short(setting) for setting in settings if setting in together]
+        names = list(dict.fromkeys(filter(None, ladder)))
         if names:
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             axes.annotate(
-                text, (1e6 * max(s.seconds for s in together), _place(first)),
+                text, (1e6 * together[-1].seconds, _place(together[-1])),
                 xytext=(6, 5 if above else -10), textcoords="offset points", fontsize=7.5,
-                color=MARKS[first.kind][1],
+                color=MARKS[together[0].kind][1],
             )  # fmt: skip
+
+
+def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
+    """Settings by time, cut where a mark is far enough from the one before to be named."""
+    clusters: list[list[Setting]] = []
+    for setting in sorted(settings, key=lambda each: each.seconds):
+        if clusters and _alike(setting, clusters[-1][-1]):
+            clusters[-1].append(setting)
+        else:
+            clusters.append([setting])
+    return clusters
 
 
 def _alike(one: Setting, other: Setting) -> bool:
@@ -136,7 +144,7 @@ def _finish(axes: Axes, least: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(max(FLOOR, least) / 2, 2.5)
-    axes.margins(x=0.12)
+    axes.margins(x=0.16)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(plain)
