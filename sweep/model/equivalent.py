@@ -90,16 +90,26 @@ def equivalent_lines(
         low = min(low, delta[b])
         high = max(high, delta[b])
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    level = limits.shape[0] - 1
-    while level > 0 and limits[level, 0] > tolerance:
-        level -= 1
-    nodes = 1
-    while nodes < limits.shape[1] and limits[level, nodes] < band * half:
-        nodes += 1
+    nodes = nodes_for(band * half, tolerance, limits)
     nodes = nodes if nodes <= most else n
     return put_on_nodes(
         delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def nodes_for(turn, tolerance, limits):
+    """Nodes that serve lines within +-``turn`` radians of the kernel's band, or one more than any.
+
+    Other parameters as of :func:`equivalent_lines`.
+    """
+    level = limits.shape[0] - 1
+    while level > 0 and limits[level, 0] > tolerance:
+        level -= 1
+    nodes = 1
+    while nodes < limits.shape[1] and limits[level, nodes] < turn:
+        nodes += 1
+    return nodes
 
 
 @njit(cache=True, error_model="numpy")
@@ -129,6 +139,13 @@ def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_i
         for b in range(n):
             out_delta[b], out_re[b], out_im[b] = delta[b], re[b], im[b]
         return n
+    anterpolate(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work)
+    return nodes
+
+
+@njit(cache=True, error_model="numpy")
+def anterpolate(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
+    """Moves n weights onto Chebyshev nodes, few or many: parameters of :func:`put_on_nodes`."""
     x, previous, current = work[0], work[1], work[2]
     inverse = 1.0 / half if half > 0.0 else 0.0
     for b in range(n):
@@ -157,4 +174,3 @@ def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_i
             following_node[i] = after
     for i in range(nodes):
         out_delta[i] = middle + half * out_delta[i]
-    return nodes

@@ -100,7 +100,7 @@ def _tangent(z, square):
 
 
 @njit(cache=True, error_model="numpy")
-def _kernel(q, delta, coefficients, square):
+def kernel_beside(q, delta, coefficients, square):
     """K pi / N at q - delta bins: c_0 cot + sum (-1)^m c_m / 2 (cot + cot, m bins off each side).
 
     Distances are formed from whole numbers first, so that a pole's keeps its digits.
@@ -128,12 +128,12 @@ def _add_tile(tile, first, delta, re, im, n, image, fft_size, coefficients, powe
         if power:
             a = re[j] * scale * scale
             for i in range(len(tile)):
-                k = _kernel(first + i, d, coefficients, square)
+                k = kernel_beside(first + i, d, coefficients, square)
                 out_re[i] = fma(a * k, k, out_re[i])
         else:
             a = re[j] * scale if image else -re[j] * scale
             for i in range(len(tile)):
-                k = _kernel(first + i, d, coefficients, square)
+                k = kernel_beside(first + i, d, coefficients, square)
                 out_re[i] = fma(a, k, out_re[i])
                 out_im[i] = fma(b, k, out_im[i])
 
@@ -231,18 +231,29 @@ def far_sources(
     else:
         for j in range(lines):
             out[3, j], out[4, j], out[5, j] = work[5, j], out[1, j], out[2, j]
-    twice = 2 * centre
-    mirror = tangent[twice] if 2 * twice <= fft_size else -tangent[fft_size - twice]
-    step = math.pi / fft_size
     for j in range(lines):
-        out[0, j] = -step * _tangent(work[5, j] - offset, step * step)
         out[1, j] = out[1, j] if power else -out[1, j]
         out[2, j] = -out[2, j]
     for j in range(images):
-        small = step * _tangent(out[3, j] - offset, step * step)
-        out[3, j] = (mirror + small) / (1.0 - mirror * small)
         out[5, j] = -out[5, j]
+    seen_at(work[5], lines, centre, offset, fft_size, tangent, out[0], work[4])
+    seen_at(out[3], images, centre, offset, fft_size, tangent, work[4], out[3])
     return lines, images
+
+
+@njit(cache=True, error_model="numpy")
+def seen_at(places, n, centre, offset, fft_size, tangent, out, mirrored):
+    """Tan of n places as bins see them, and of their images; as of :func:`far_sources`.
+
+    ``mirrored`` may be the places themselves.
+    """
+    twice = 2 * centre
+    mirror = tangent[twice] if 2 * twice <= fft_size else -tangent[fft_size - twice]
+    step = math.pi / fft_size
+    for j in range(n):
+        small = step * _tangent(places[j] - offset, step * step)
+        out[j] = -small
+        mirrored[j] = (mirror + small) / (1.0 - mirror * small)
 
 
 @njit(cache=True, error_model="numpy")

@@ -21,13 +21,12 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
-from sweep.model.far_field import CLEARANCE, add_far_field
+from sweep.model.far_field import CLEARANCE
 from sweep.model.runs import (
-    DELTA,
-    IMAGES,
-    SOURCES,
     STRENGTH_IM,
     STRENGTH_RE,
+    add_afar,
+    bundle,
     magnitudes,
     near_bins,
     prepare_field,
@@ -44,7 +43,7 @@ SMOOTHNESS = 1e-7
 
 
 @njit(cache=True, error_model="numpy")
-def inspect(origin, n, noise, choices, kernel, room, exempt, series):
+def inspect(origin, n, form, noise, choices, kernel, room, exempt, series):
     """Run of bins, detection and leakage of a segment's lines.
 
     Parameters
@@ -52,6 +51,8 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     origin, n : int
         Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
         ``power`` |C_b|^2 and nothing; they become strengths.
+    form : bool
+        They are the nodes of a form, :mod:`sweep.model.power_forms`.
     noise : (float, float, float)
         sigma per quadrature; threshold; chance of leakage that may be left out.
     choices, kernel
@@ -72,8 +73,8 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     """
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
-    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
+    total, lowest, highest = bundle(n, form, power, room)
+    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     near, mirrored, fits = near_bins(
         origin, lowest, highest, CLEARANCE + len(kernel[1][2]), image, kernel
     )
@@ -88,7 +89,7 @@ def inspect(origin, n, noise, choices, kernel, room, exempt, series):
     reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
     alone = _all_beyond(total, float(clearance + reach), noise, image, kernel) <= noise[2]
     sources = not alone or reach > 0 or (image and not mirrored)
-    field = prepare_field(origin, n, spread, sources, choices, kernel, room)
+    field = prepare_field(origin, n, form, spread, sources, choices, kernel, room)
     if alone:
         low, high = max(near[0] - reach, 0), min(near[1] + reach, half_size)
         count = high - low + 1
@@ -273,14 +274,12 @@ def _points_beyond(side, low, count, centre, steepness, image, kernel, room, poi
 @njit(cache=True, error_model="numpy")
 def _far_chances(points, field, scale, beta, power, kernel, room, series):
     """Added chances at the points of the integrals, into row 4; the largest a^2/2 there."""
-    _, numerator, poles, _, _ = kernel[1]
-    _, lines_used, images_used, edge_re, edge_im = field
+    _, _, _, edge_re, edge_im, _ = field
     t, re, im, x = room[9, :points], room[11, :points], room[12, :points], room[3]
     re[:] = edge_re
     im[:] = edge_im
-    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
-    add_far_field(t, lines, lines_used, numerator, poles, power, re, im)
-    add_far_field(t, images, images_used, numerator, poles, power, re, im)
+    add_afar(t, False, field, power, kernel, room, re, im)
+    add_afar(t, True, field, power, kernel, room, re, im)
     for i in range(points):
         square = re[i] if power else re[i] * re[i] + im[i] * im[i]
         x[i] = scale * (square if square > 0.0 else 0.0)

@@ -189,7 +189,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
         Number of lines.
     """
     count = shifts[0].shape[1] if power else parts[0].shape[2]
-    if count == 0 or (not power and _is_whole(segment, i, parts)):
+    if count == 0 or (not power and is_whole(segment, i, parts)):
         return n
     fft_size, length = kernel[0]
     bins = fold * fft_size / length
@@ -220,7 +220,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
 
 
 @njit(cache=True, error_model="numpy")
-def _is_whole(segment, i, parts):
+def is_whole(segment, i, parts):
     """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
     own = parts[4][i]
     whole = parts[3][segment, own] == 1 and parts[0][segment, own, 0] == 0.0

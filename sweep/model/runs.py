@@ -14,6 +14,7 @@ from numba import njit
 from sweep.model import far_field
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
+from sweep.model.power_forms import FORM, add_form_afar, add_form_beside
 from sweep.model.spectrum import set_tangents
 
 DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
@@ -47,7 +48,7 @@ def reach_of(level, weights, envelope, reach):
 
 
 @njit(cache=True, error_model="numpy")
-def detect(origin, n, level, choices, kernel, room, exempt):
+def detect(origin, n, form, level, choices, kernel, room, exempt):
     """Run of bins and detection of a segment's lines, whatever leaks beside them.
 
     Parameters and results as of :func:`sweep.model.leakage.inspect`, without leakage; ``level`` is
@@ -55,8 +56,8 @@ def detect(origin, n, level, choices, kernel, room, exempt):
     """
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
-    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    total, lowest, highest = far_field.strengths(delta, re, im, n, power, room[9])
+    total, lowest, highest = bundle(n, form, power, room)
+    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     spread = lowest, highest
     poles = len(kernel[1][2])
     clearance = CLEARANCE + poles
@@ -72,7 +73,7 @@ def detect(origin, n, level, choices, kernel, room, exempt):
         if not fits:
             return 0, 0, 0, 0
         sources = beyond > clearance or (image and not mirrored)
-        field = prepare_field(origin, n, spread, sources, choices, kernel, room)
+        field = prepare_field(origin, n, form, spread, sources, choices, kernel, room)
         low = max(near[0] - max(beyond - clearance, 0), 0)
         high = min(near[1] + max(beyond - clearance, 0), half_size)
         count = high - low + 1
@@ -84,6 +85,19 @@ def detect(origin, n, level, choices, kernel, room, exempt):
         needed = _lifted(most, total, afar, highest - lowest, centre, image, kernel)
         if needed <= beyond:
             return low, count, peak, exempted
+
+
+@njit(cache=True, error_model="numpy")
+def bundle(n, form, power, room):
+    """Turns lines into strengths, unless they are nodes of a form.
+
+    Returns the sum of their magnitudes, for powers squared, and the range of positions.
+    """
+    if form:
+        return room[FORM + 3, 1], room[FORM + 3, 2], room[FORM + 3, 3]
+    return far_field.strengths(
+        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, room[9]
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -159,18 +173,23 @@ def near_bins(origin, lowest, highest, apart, image, kernel):
 
 
 @njit(cache=True, error_model="numpy")
-def prepare_field(origin, n, spread, sources, choices, kernel, room):
+def prepare_field(origin, n, form, spread, sources, choices, kernel, room):
     """What the far field needs.
 
     Bin that distances count from; number of sources of the lines and of their images; what the
-    window's first sample adds to every bin, real and imaginary. Without ``sources`` there are
-    none: all that matters is near.
+    window's first sample adds to every bin, real and imaginary; nodes of a form. Without
+    ``sources`` there are none: all that matters is near.
     """
     power, image = choices[0], choices[1]
     fft_size, poles, edge = kernel[0][0], len(kernel[1][2]), kernel[1][3]
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     centre = seen_from(origin, spread, fft_size)
     lines, images = 0, 0
+    if form:
+        far_field.seen_at(
+            delta, n, centre, centre - origin, fft_size, kernel[4], room[SOURCES], room[IMAGES]
+        )  # fmt: skip
+        return centre, n, n if image else 0, room[FORM + 3, 0] * (2.0 if image else 1.0), 0.0, n
     if sources:
         lines, images = far_field.far_sources(
             delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
@@ -180,17 +199,15 @@ def prepare_field(origin, n, spread, sources, choices, kernel, room):
     if not image:  # else the imaginary parts of line and image cancel
         images, edge_re = 0, 0.5 * edge_re
         edge_im = 0.0 if power else -0.5 * far_field.edge_field(re, n, edge, False)
-    return centre, lines, images, edge_re, edge_im
+    return centre, lines, images, edge_re, edge_im, 0
 
 
 @njit(cache=True, error_model="numpy")
 def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room):
     """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
-    coefficients, numerator, poles, _, _ = kernel[1]
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
-    centre, lines_used, images_used, edge_re, edge_im = field
+    centre, _, _, edge_re, edge_im, _ = field
     re, im, t = room[0, :count], room[1, :count], room[2, :count]
-    lines, images = room[SOURCES : SOURCES + 3], room[IMAGES : IMAGES + 3]
     re[:] = edge_re
     im[:] = edge_im
     set_tangents(low - centre, count, fft_size, kernel[4], t)
@@ -198,25 +215,45 @@ def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room
     for start, end in ((0, first), (last, count)):
         if start < end:
             at, part_re, part_im = t[start:end], re[start:end], im[start:end]
-            add_far_field(at, lines, lines_used, numerator, poles, power, part_re, part_im)
+            add_afar(at, False, field, power, kernel, room, part_re, part_im)
             if mirrored:
-                add_far_field(at, images, images_used, numerator, poles, power, part_re, part_im)
+                add_afar(at, True, field, power, kernel, room, part_re, part_im)
     if not mirrored:
-        add_far_field(t, images, images_used, numerator, poles, power, re, im)
-    delta, strength_re, strength_im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    first_bin, near_re, near_im = near[0] - origin, re[first:last], im[first:last]
-    add_near_field(
-        first_bin, delta, strength_re, strength_im, n, False, fft_size, coefficients, power,
-        room[5:7], near_re, near_im,
-    )  # fmt: skip
+        add_afar(t, True, field, power, kernel, room, re, im)
+    near_re, near_im = re[first:last], im[first:last]
+    _add_beside(near[0] - origin, DELTA, n, False, field, power, kernel, room, near_re, near_im)
     if mirrored:
         for b in range(n):
-            room[7, b] = -delta[b]
+            room[7, b] = -room[DELTA, b]
         first_bin = near[0] + origin - (fft_size if 2 * near[0] > half_size else 0)
-        add_near_field(
-            first_bin, room[7], strength_re, strength_im, n, True, fft_size, coefficients, power,
-            room[5:7], near_re, near_im,
-        )  # fmt: skip
+        _add_beside(first_bin, 7, n, True, field, power, kernel, room, near_re, near_im)
     for i in range(count):
         square = re[i] if power else re[i] * re[i] + im[i] * im[i]
         re[i] = math.sqrt(square if square > 0.0 else 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def add_afar(t, image, field, power, kernel, room, re, im):
+    """Adds what lines, or their images, hold in bins far from them; t is tan(pi q / N) there."""
+    _, numerator, poles, _, _ = kernel[1]
+    _, lines, images, _, _, form = field
+    row, used = (IMAGES, images) if image else (SOURCES, lines)
+    if form:
+        side = -1.0 if image else 1.0
+        add_form_afar(t, room[row], used, numerator, poles, side, room, re)
+    else:
+        add_far_field(t, room[row : row + 3], used, numerator, poles, power, re, im)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_beside(first, row, n, image, field, power, kernel, room, re, im):
+    """The same in bins first, first + 1 .. next to n lines, or images, with their places in row."""
+    coefficients, fft_size = kernel[1][0], kernel[0][0]
+    if field[5]:
+        side = -1.0 if image else 1.0
+        add_form_beside(first, room[row], n, fft_size, coefficients, side, room, re)
+    else:
+        add_near_field(
+            first, room[row], room[STRENGTH_RE], room[STRENGTH_IM], n, image, fft_size,
+            coefficients, power, room[5:7], re, im,
+        )  # fmt: skip

@@ -13,14 +13,15 @@ from sweep.model.far_field import MOST_POINTS
 from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.modulation import modulate, reduce_lines, take_few
+from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
+from sweep.model.power_forms import FORM, MOST_FORM, power_form
 from sweep.model.preparation import LINE_STEPS
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 SIGNS = (1.0, 0.0, -1.0)
 
-ROOM = 22
+ROOM = FORM + 4
 """Rows of scratch that :func:`segment_spectrum` and :func:`inspect_segment` need."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
@@ -187,24 +188,52 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
 
     Notes
     -----
-    Means of several spectra are those of amplitudes over shifts, and those of powers whose lines
-    are split: their bins are looked at one by one.
+    Means of several spectra are those of amplitudes over shifts: their bins are looked at one by
+    one. So are those of powers whose lines are split and spread too wide for a form.
     """
     power, _, leakage, every_bin = choices
-    several = scene[1][0].size if power else scene[2][0].size
-    if smooth(kernel) and not every_bin and not several:
-        origin, n, _ = _lines_of(segment, p, scene, at, power, kernel, room)
-        n = take_few(n, power, allowed(p, power), n // 2, kernel, room) if p[15] > 0.0 else n
-        chance = 0.0
-        if leakage:
+    if smooth(kernel) and not every_bin and (power or not scene[2][0].size):
+        origin, n, form = _smooth_lines(segment, p, scene, at, power, kernel, room)
+        count, chance = 0, 0.0
+        if leakage and n:
             low, count, peak, exempted, chance = inspect(
-                origin, n, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
+                origin, n, form, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
             )
-        else:
-            low, count, peak, exempted = detect(origin, n, p[11], choices, kernel, room, exempt)
+        elif n:
+            low, count, peak, exempted = detect(
+                origin, n, form, p[11], choices, kernel, room, exempt
+            )  # fmt: skip
         if count:
             return low, count, peak, exempted, chance
     return inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
+
+
+@njit(cache=True, error_model="numpy")
+def _smooth_lines(segment, p, scene, at, power, kernel, room):
+    """As :func:`_lines_of`: origin, number of lines, and whether they are a form's nodes.
+
+    None where the lines are split and spread too wide for that.
+    """
+    origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
+    parts = scene[1]
+    if not power or not parts[0].size or is_whole(segment, at[1], parts):
+        n = take_few(n, power, allowed(p, power), n // 2, kernel, room) if p[15] > 0.0 else n
+        return origin, n, False
+    n = take_few(n, power, allowed(p, power), n - 1, kernel, room)
+    total = 0.0
+    for b in range(n):
+        total += abs(room[STRENGTH_RE, b])
+    own = parts[4][at[1]]
+    number = parts[3][segment, own]
+    split = (
+        parts[0][segment, own, :number], parts[1][segment, own, :number],
+        parts[2][segment, own, :number],
+    )  # fmt: skip
+    error = allowed(p, False) / max(kernel[2][0] * math.sqrt(total), 1e-300)
+    size = power_form(
+        room[DELTA], room[STRENGTH_RE], n, fold, split, kernel[1][3], error, kernel[3], room
+    )  # fmt: skip
+    return origin, size, True
 
 
 @njit(cache=True, error_model="numpy")
@@ -228,7 +257,7 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
     ``lines`` as of :class:`sweep.model.modulation.Stretch`.
     """
-    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS) + 16
+    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, MOST_FORM**2) + 16
     return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 
