@@ -17,7 +17,7 @@ from sweep.model.elementary import fma
 AMPLITUDE_TOLERANCES = (1e-13, 1e-11, 1e-9, 1e-7, 1e-5)
 """Errors of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
 
-POWER_TOLERANCES = (1e-18, 1e-15, 1e-12, 1e-9, 1e-6)
+POWER_TOLERANCES = (1e-18, 1e-15, 1e-13, 1e-11, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
 """The same of powers: the root of the first is what a null of |X| shows."""
 
 MOST_NODES = 128
@@ -139,13 +139,6 @@ def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_i
         for b in range(n):
             out_delta[b], out_re[b], out_im[b] = delta[b], re[b], im[b]
         return n
-    anterpolate(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work)
-    return nodes
-
-
-@njit(cache=True, error_model="numpy")
-def anterpolate(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
-    """Moves n weights onto Chebyshev nodes, few or many: parameters of :func:`put_on_nodes`."""
     x, previous, current = work[0], work[1], work[2]
     inverse = 1.0 / half if half > 0.0 else 0.0
     for b in range(n):
@@ -174,3 +167,4 @@ def anterpolate(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im
             following_node[i] = after
     for i in range(nodes):
         out_delta[i] = middle + half * out_delta[i]
+    return nodes

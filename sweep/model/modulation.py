@@ -3,9 +3,10 @@
 Shots may carry phase errors that all lines of a segment share (:class:`PhaseError`), and a
 Gaussian width of their beat. The compiled code takes both as numbers: each line becomes a few
 lines (:mod:`sweep.model.effects.line_splitting`), each spectrum the mean over a few shifts
-(:func:`sweep.model.effects.gaussian_line.gaussian_shifts`). They are worked out for a stretch of
-points at a time, so that what they take of memory does not grow with the number of points; shots
-without them are one stretch, and pay for nothing.
+(:func:`sweep.model.effects.gaussian_line.gaussian_shifts`). Split lines that add as powers are
+looked at as forms of few kernels (:mod:`sweep.model.power_forms`). They are worked out for a
+stretch of points at a time, so that what they take of memory does not grow with the number of
+points; shots without them are one stretch, and pay for nothing.
 
 Shifts are about the middle of the record: there, lines and images keep their phases.
 """

@@ -20,12 +20,18 @@ import math
 from numba import njit
 
 from sweep.model.elementary import fma, sincos_cycles
-from sweep.model.equivalent import anterpolate, nodes_for
+from sweep.model.equivalent import dot, nodes_for
 from sweep.model.far_field import kernel_beside
 from sweep.model.spectrum import fraction
 
 MOST_FORM = 64
 """Nodes at the most; bundles that spread wider are looked at bin by bin."""
+
+WIDTH = 2 * MOST_FORM**2
+"""Numbers that a row of scratch must hold: products of nodes, moments of lines."""
+
+LEAST_ERROR = 1e-13
+"""Error of amplitudes put on nodes, relative to the sum of all, that is never asked to be less."""
 
 TILE = 32
 """Bins that are done together."""
@@ -55,13 +61,14 @@ def power_form(delta, power, n, fold, parts, edge, tolerance, limits, room):
         Error of |X|, over that of all lines in phase on the peak.
     limits : (levels, m) float64
         :func:`sweep.model.equivalent.node_limits`.
-    room : (>= FORM + 4, >= MOST_FORM^2) float64
+    room : (>= FORM + 4, >= WIDTH) float64
         Scratch.
 
     Returns
     -------
     int
-        Number of nodes; 0 where more than :data:`MOST_FORM` are needed, and all is as it was.
+        Number of nodes; 0 where more than :data:`MOST_FORM` are needed, or the lines are too many
+        for :data:`WIDTH`, and all is as it was.
     """
     place, re, im = parts
     lowest, highest, least, most = delta[0], delta[0], fold * place[0], fold * place[0]
@@ -74,8 +81,8 @@ def power_form(delta, power, n, fold, parts, edge, tolerance, limits, room):
         each += math.hypot(re[k], im[k])
     lowest, highest = lowest + least, highest + most
     middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
-    size = nodes_for(math.pi * half, tolerance / each, limits)
-    if size > MOST_FORM:
+    size = nodes_for(math.pi * half, max(tolerance / each, LEAST_ERROR), limits)
+    if size > MOST_FORM or size * n > WIDTH:
         return 0
     _products(delta, power, n, fold, parts, middle, half, size, room)
     room[FORM + 3, 0] *= edge * edge
@@ -90,39 +97,101 @@ def power_form(delta, power, n, fold, parts, edge, tolerance, limits, room):
 @njit(cache=True, error_model="numpy")
 def _products(delta, power, n, fold, parts, middle, half, size, room):
     """G_ij, those beside the diagonal doubled, g_j and g; the nodes' positions into row 4."""
-    place, re, im = parts
     gram, linear = room[FORM], room[FORM + 1]
-    node, a, b, at, other, sine = room[4], room[5], room[6], room[0], room[1], room[2]
-    gram[: size * size] = 0.0
-    linear[:size] = 0.0
-    room[FORM + 3, 0] = 0.0
-    for k in range(place.size):
-        other[k] = fold * im[k]
-    for line in range(n):
-        for k in range(place.size):
-            at[k] = delta[line] + fold * place[k]
-        anterpolate(at, re, other, place.size, middle, half, size, node, a, b, room[7:12])
-        if line == 0:
-            for j in range(size):  # nodes on a bin are moved off it by the last digit
-                on_bin = node[j] == math.floor(node[j])
-                delta_j = node[j] + (max(3e-16 * abs(node[j]), 1e-30) if on_bin else 0.0)
-                sine[j] = sincos_cycles(0.5 * delta_j)[0]
-        sum_a, sum_b, c = 0.0, 0.0, power[line]
+    toward, sum_re, sum_im = room[5], room[6, :n], room[7, :n]
+    to_nodes = room[FORM + 2, : size * size].reshape((size, size))
+    _nodes(middle, half, size, room[4], room[8], to_nodes)
+    moment_re = room[11, : size * n].reshape((size, n))
+    moment_im = room[12, : size * n].reshape((size, n))
+    x, previous, current = room[8, :n], room[9, :n], room[10, :n]
+    _moments(delta, n, fold, parts, middle, half, x, previous, current, moment_re, moment_im)
+    sum_re[:] = 0.0
+    sum_im[:] = 0.0
+    for m in range(size):
+        toward[m] = 0.0
         for j in range(size):
-            a[j] *= sine[j]
-            b[j] *= sine[j]
-            sum_a += a[j]
-            sum_b += b[j]
+            toward[m] += to_nodes[m, j]  # S_b of a moment of 1
+        for line in range(n):
+            sum_re[line] += toward[m] * moment_re[m, line]
+            sum_im[line] += toward[m] * moment_im[m, line]
+    constant = 0.0
+    for line in range(n):
+        x[line] = power[line]
+        constant += power[line] * (sum_re[line] * sum_re[line] + sum_im[line] * sum_im[line])
+    room[FORM + 3, 0] = constant
+    for m in range(size):
+        one, two = moment_re[m], moment_im[m]
+        for line in range(n):
+            previous[line], current[line] = x[line] * one[line], x[line] * two[line]
+        linear[m] = dot(current, sum_re, n) - dot(previous, sum_im, n)
+        for j in range(m + 1):
+            value = dot(previous, moment_re[j], n) + dot(current, moment_im[j], n)
+            gram[m * size + j] = value
+            gram[j * size + m] = value
+    _to_nodes(gram, linear, to_nodes, size, room[0], room[1])
+
+
+@njit(cache=True, error_model="numpy")
+def _moments(delta, n, fold, parts, middle, half, x, previous, current, moment_re, moment_im):
+    """Chebyshev moments of each line's parts, (moments, lines)."""
+    place, re, im = parts
+    inverse = 1.0 / half if half > 0.0 else 0.0
+    moment_re[:] = 0.0
+    moment_im[:] = 0.0
+    for k in range(place.size):
+        a, b = re[k], fold * im[k]
+        for line in range(n):
+            x[line] = (delta[line] + fold * place[k] - middle) * inverse
+            previous[line], current[line] = 1.0, x[line]
+        for m in range(moment_re.shape[0]):
+            into_re, into_im = moment_re[m], moment_im[m]
+            for line in range(n):
+                into_re[line] += a * previous[line]
+                into_im[line] += b * previous[line]
+                following = 2.0 * x[line] * current[line] - previous[line]
+                previous[line], current[line] = current[line], following
+
+
+@njit(cache=True, error_model="numpy")
+def _nodes(middle, half, size, node, turns, to_nodes):
+    """Chebyshev nodes, and the strengths (moments, nodes) of moments of 1."""
+    for j in range(size):
+        turns[j] = sincos_cycles(0.25 * (2 * j + 1) / size)[1]
+        node[j] = middle + half * turns[j]
+        if node[j] == math.floor(node[j]):  # on a bin: moved off it by the last digit
+            node[j] += max(3e-16 * abs(node[j]), 1e-30)
+        to_nodes[0, j] = sincos_cycles(0.5 * node[j])[0] / size
+    for m in range(1, size):
+        for j in range(size):
+            before = to_nodes[m - 2, j] if m > 2 else 2.0 * to_nodes[0, j]
+            now = turns[j] * (to_nodes[m - 1, j] if m > 1 else to_nodes[0, j])
+            to_nodes[m, j] = 2.0 * now - (before if m > 1 else 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _to_nodes(gram, linear, to_nodes, size, rows, total):
+    """G and g_j from those of moments; what lies beside the diagonal doubled and put below it."""
+    for m in range(size):  # rows of G T
+        rows[:size] = 0.0
+        for k in range(size):
+            factor = gram[m * size + k]
+            for j in range(size):
+                rows[j] += factor * to_nodes[k, j]
+        gram[m * size : m * size + size] = rows[:size]
+    rows[:size] = 0.0
+    for m in range(size):
+        for j in range(size):
+            rows[j] += linear[m] * to_nodes[m, j]
+    linear[:size] = rows[:size]
+    total[: size * size] = gram[: size * size]
+    gram[: size * size] = 0.0
+    for m in range(size):  # T^t (G T), half of it
         for i in range(size):
-            row, one, two = gram[i * size : i * size + i + 1], 2.0 * c * a[i], 2.0 * c * b[i]
+            factor = to_nodes[m, i] * 2.0
             for j in range(i + 1):
-                row[j] += one * a[j] + two * b[j]
-            linear[i] += c * (b[i] * sum_a - a[i] * sum_b)
-        room[FORM + 3, 0] += c * (sum_a * sum_a + sum_b * sum_b)
+                gram[i * size + j] += factor * total[m * size + j]
     for i in range(size):
         gram[i * size + i] *= 0.5
-        on_bin = node[i] == math.floor(node[i])
-        node[i] += max(3e-16 * abs(node[i]), 1e-30) if on_bin else 0.0
 
 
 @njit(cache=True, error_model="numpy")

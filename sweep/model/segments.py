@@ -14,7 +14,7 @@ from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
-from sweep.model.power_forms import FORM, MOST_FORM, power_form
+from sweep.model.power_forms import FORM, WIDTH, power_form
 from sweep.model.preparation import LINE_STEPS
 from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
@@ -257,7 +257,7 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
     ``lines`` as of :class:`sweep.model.modulation.Stretch`.
     """
-    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, MOST_FORM**2) + 16
+    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, WIDTH) + 16
     return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 

@@ -1,0 +1,101 @@
+"""Powers of lines with phase errors as forms of few kernels, against records in the time domain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_optional_lines import exact, prepared, scene
+
+from sweep.model import modulation, segments
+from sweep.model.crossings import crossing_series
+from sweep.model.preparation import PhaseError
+
+WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop")
+AGREEMENT = 1e-9
+"""Largest difference of |X|, relative to all lines in phase on the peak."""
+
+PLACES = {
+    "in the band": {},
+    "folded": {"range": 9000.0, "radial_velocity": -400.0, "duration": 700e-6},
+    "at DC": {"range": 0.5, "radial_velocity": 0.0},
+    "near DC": {"range": 8.0, "radial_velocity": 0.0},
+    "at Nyquist": {"range": 2249.0, "radial_velocity": 0.0},
+}
+NO_WIDTH = np.zeros(1), np.ones(1)
+
+
+def drifting(shots, drift):
+    """Shots with a frequency drift of so many bins within the record, and a cubic phase."""
+
+    def phase(x, sign, drift):
+        return (sign + 0.5) * drift[:, None] * (x**2 / 8 + x**3 / 60 + 0.1 * x)
+
+    return replace(shots, phase_errors=(PhaseError(phase, {"drift": np.array([drift])}),))
+
+
+def run_of_bins(shots, segment):
+    """Bins that detection and leakage look at one by one, |X| there, and whether it was a form."""
+    point = modulation.single(shots, 0)
+    room, exempt, series = segments.workspace(point.lines, shots.fft_size)
+    crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
+    shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
+    _, nodes, form = segments._smooth_lines(*shot, True, shots.kernel(), room)
+    low, count, *_ = segments.inspect_segment(
+        *shot, modulation.choices(shots), shots.kernel(), room, exempt, series
+    )
+    return np.arange(low, low + count), room[0, :count].copy(), form and nodes > 0
+
+
+def apart(shots, segment):
+    """Largest difference of a bin from the time domain's, and the peak of all lines in phase."""
+    bins, fast, form = run_of_bins(shots, segment)
+    slow = exact(shots, 0, segment, NO_WIDTH)
+    assert slow.argmax() in bins
+    amplitudes = shots.amplitude[shots.row[0]]
+    peak = 0.5 * shots.beat_scale * shots.window.sum * np.sqrt((amplitudes**2).sum())
+    return abs(fast - slow[bins]).max(), float(peak), form
+
+
+@pytest.mark.parametrize(
+    "place, image", [*((place, True) for place in PLACES), ("in the band", False)]
+)
+@pytest.mark.parametrize("window", WINDOWS)
+def test_bins_are_those_of_the_record(window, place, image, table_4_1):
+    """From gentle drifts to those over ten bins; bright, so that runs are wide."""
+    without = () if image else ("image",)
+    parameters = scene(
+        table_4_1, window=window, phases="incoherent", power=10.0, tnr=4.0, **PLACES[place]
+    )
+    shots = prepared(parameters, without=without)
+    for drift in (1e-3, 0.1, 1.0, 4.0, 10.0):
+        for segment in (0, 2):
+            missed, peak, form = apart(drifting(shots, drift), segment)
+            assert missed < AGREEMENT * peak
+            assert form or drift > 0.1
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_bins_are_within_what_is_allowed(window, table_4_1):
+    changed = 0
+    for drift in (1e-3, 0.1, 1.0, 4.0):
+        for power in (1e-2, 1.0):
+            shots = drifting(
+                prepared(scene(table_4_1, window=window, phases="incoherent", power=power)), drift
+            )
+            for tolerance in (1e-1, 1e-3, 1e-5):
+                loose = replace(shots, line_tolerance=np.asarray(tolerance))
+                missed, peak, form = apart(loose, 0)
+                assert form or drift > 0.1
+                assert missed <= tolerance * shots.bin_deviation[0] + 1e-11 * peak
+                changed += missed > AGREEMENT * peak
+    assert changed > 3
+
+
+def test_bundles_too_wide_for_a_form_are_looked_at_bin_by_bin(table_4_1):
+    parameters = scene(
+        table_4_1, phases="incoherent", beam_divergence=2e-2, beamlets=61, grazing_angle=0.2,
+        range=4000.0,
+    )  # fmt: skip
+    missed, peak, form = apart(drifting(prepared(parameters), 1.0), 0)
+    assert not form
+    assert missed < AGREEMENT * peak
