@@ -35,7 +35,7 @@ class Block(TileLink):
         super().__init__(parameters)
         self.size, self.geometry = size, geometry
         self._at_rest = at_rest
-        self.number, self._pattern = _beamlets(self)
+        self.number, self.pattern = _beamlets(self)
         self.coherent = self.word("footprint.phases") == "coherent"
         self.segment_exists = (True, self.architecture != "direct", True)
         self.adds_amplitudes = self.coherent or self.architecture == "direct"
@@ -103,7 +103,7 @@ class Block(TileLink):
     @property
     def reach(self) -> float:
         """Farthest beamlet from the axis in the beam's standard deviations."""
-        return line_spread.reach_of(self.number, self._pattern)
+        return line_spread.reach_of(self.number, self.pattern)
 
     def at_rest(self) -> "Block":
         """The same tiles without the Doppler effect."""

@@ -9,11 +9,13 @@ over the bins that may leak, with A the magnitude of all lines together, E_k the
 the distances that lines may have from bin k, and b the threshold, all over sigma. Not among them
 are the detecting bin and those that surely reach the threshold, and all their neighbours; so A is
 in the main lobe at most what leaves the bin before k below the threshold. Bins amid lines that add
-as powers have what Parseval's theorem gives them together.
+as powers have what Parseval's theorem gives them together. Images are no nearer to a bin than the
+lines are, nor than these are to DC and Nyquist.
 
-Amplitudes may cancel. With S their sum and all lines within e bins of the axis's, bins have
-|S| |W| to A e max |W'|: either the largest is next to the axis's line, or S is so small that this
-leaves it open, and then every bin may leak, none with more than that makes of it.
+Amplitudes may cancel. With S the most that they add up to (:mod:`.footprint_sum`), their lines x_b
+from the axis's, bins have S |W| to sum a_b |x_b| max |W'|, and no more than A E_k. Either the
+largest is next to the axis's line, or their sum is so small that this leaves it open, and then
+every bin may leak, none with more than that makes of it.
 """
 
 import math
@@ -26,7 +28,8 @@ from numba import njit
 
 from sweep.model.effects.change import Mean
 from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.sidelobes import CELLS, LEVELS, sidelobes
+from sweep.model.effects.footprint_sum import footprint_sum
+from sweep.model.effects.sidelobes import CELLS, LEVELS, STEEPEST, sidelobes
 from sweep.model.effects.span import Span
 from sweep.model.marcum import excess_crossing
 from sweep.model.preparation import Shots
@@ -69,26 +72,28 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
         Threshold over sigma, likewise.
     """
     lines, extreme = block.lines, np.fmin(block.spread.extreme, block.fft_size)
-    powers = not block.adds_amplitudes
     uphill = np.exp(np.minimum(lines.tilt * extreme, 50.0))
     peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)
-    ratio = np.maximum(block.echo_ratio.high, 1.0)
-    whole = ratio if block.architecture == "direct" else np.sqrt(ratio)
-    image = lines.lobe.tail(lines.edge - extreme)
-    apart = 0.0 if powers else np.minimum(math.sqrt(lines.lobe.curvature) * extreme, 2.0)
-    columns = np.broadcast_arrays(
-        peak * whole * (1.0 if powers else block.gain.high), np.asarray(amplitude.low),
-        np.asarray(threshold.low), np.asarray(threshold.high), extreme, lines.bin_offset_least,
-        lines.bin_offset, image, apart,
-    )  # fmt: skip
+    most, together, lean = (peak * value for value in footprint_sum(block))
     shape = block.window
-    table = sidelobes(shape.name, shape.length)
-    steps = _steps(table.lowest.size / CELLS * block.fft_size / shape.length, block.fft_size)
+    table, ratio = sidelobes(shape.name, shape.length), shape.length / block.fft_size
+    edge = lines.edge - extreme
+    image, sloping = lines.lobe.tail(edge), STEEPEST * lines.lobe.tail(edge - 1 / ratio)
+    steepest = table.steepest[LEVELS, 0]
+    askew = np.minimum(lean * sloping * ratio, most * image)
+    columns = np.broadcast_arrays(
+        most, together, np.asarray(amplitude.low), np.asarray(threshold.low),
+        np.asarray(threshold.high), extreme, lines.bin_offset_least, lines.bin_offset, image,
+        np.minimum(together * image + askew, most * image),
+        askew + np.minimum(lean * ratio * steepest, 2 * most), lean * ratio,
+    )  # fmt: skip
+    steps = _steps(table.lowest.size / CELLS / ratio, block.fft_size)
     found = _union(
-        np.stack([c.ravel() for c in columns]), (table.highest, table.lowest),
-        (np.diff(steps), lines.lobe.tail(steps[:-1])),
-        (shape.length / block.fft_size, block.fft_size / 2, shape.equivalent_noise_bandwidth),
-        powers,
+        np.stack([c.ravel() for c in columns]), (table.highest, table.lowest, table.steepest),
+        (np.diff(steps), lines.lobe.tail(steps[:-1]),
+         STEEPEST * lines.lobe.tail(steps[:-1] - 1 / ratio)),
+        (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
+        not block.adds_amplitudes,
     ).reshape(columns[0].shape)  # fmt: skip
     if not block.segment_exists[1]:
         found[1] = 0.0
@@ -109,14 +114,14 @@ def _union(columns, table, far, sizes, powers):
     out = np.empty(columns.shape[1])
     for i in range(out.size):
         column = columns[:, i]
-        a, b = column[0], column[2]
+        together, b = column[1], column[3]
         first, second, limit, sure = _starts(column, table, sizes[0])
         total = 0.0
-        if limit < a:
-            total = _sum(a, first, second, column, table, far, sizes, powers)
+        if limit < together:
+            total = _sum(together, first, second, column, table, far, sizes, powers)
         if not sure:
-            other = _sum(min(a, limit), 0.0, 1.0, column, table, far, sizes, powers)
-            total = max(total, other)
+            other = min(together, limit)
+            total = max(total, _sum(other, 0.0, 1.0, column, table, far, sizes, powers))
         out[i] = min(total / -math.expm1(-0.5 * b * b), 1.0)
     return out
 
@@ -133,19 +138,19 @@ def _starts(column, table, ratio):
     sure : bool
         Whether the sum is above it.
     """
-    a, peak, _, b, extreme, least, most, image, apart = column
+    _, _, peak, b, _, extreme, least, most, image, _, askew, _ = column
     beyond, lowest = table[0][LEVELS], table[1]
-    other = a * (image + apart)
-    sum_ = max(peak - other, 0.0) / _read(beyond, (least - extreme) * ratio)
-    near = _read(lowest, (most + extreme) * ratio)
+    nearest = _read(beyond, (least - extreme) * ratio)
+    sum_ = max(peak - askew, 0.0) / (nearest + image)
+    near = _read(lowest, (most + extreme) * ratio) - 2.0 * image
     first, second = 2.0, 2.0
     gap = near - _read(beyond, (1.0 - most - extreme) * ratio)
-    if gap < 0.1 and sum_ * gap <= 2.0 * other:
+    if gap < 0.1 and sum_ * gap <= 2.0 * askew:
         first = 1.0
         gap = near - _read(beyond, (1.0 + least - extreme) * ratio)
-    limit = 2.0 * other / gap if gap > 0.0 else math.inf
+    limit = 2.0 * askew / gap if gap > 0.0 else math.inf
     # the furthest that bins are sure to reach the threshold
-    weakest = (b + other) / sum_
+    weakest = (b + askew) / sum_ + image
     reach = np.searchsorted(-lowest, -weakest, "right") / CELLS / ratio - extreme
     if reach > most:
         first = max(first, math.floor(reach - most) + 2.0)
@@ -156,12 +161,13 @@ def _starts(column, table, ratio):
 @njit(cache=True, error_model="numpy")
 def _sum(whole, first, second, column, table, far, sizes, powers):
     """Sum of the chances of the bins from the first two on, of lines that add up to ``whole``."""
-    a, _, b, upper, extreme, least, most, image, apart = column
+    a, _, _, b, upper, extreme, least, most, tail, image, askew, lean = column
     ratio, half, noise_bandwidth = sizes
     stride = max(int(1.0 / ratio), 1)
     width = (most - least + 2.0 * extreme + stride - 1.0) * ratio + 2.0 * _ROUNDING
     level = min(math.ceil(math.log2(math.floor(CELLS * min(width, 1.0)) + 2.0)) - 1, LEVELS)
-    row, lowest = table[0][level], table[1]
+    row, lowest, slope = table[0][level], table[1], table[2][level]
+    beyond, steepest = table[0][LEVELS], table[2][LEVELS]
     total = 0.0
     for side in range(2):
         start = second if side else first
@@ -169,22 +175,26 @@ def _sum(whole, first, second, column, table, far, sizes, powers):
         nearest, furthest = (-most, -least) if side else (least, most)
         nearest -= extreme
         inside = min(max(math.ceil(-nearest) - start, 0.0), half + 1.0)
-        total += _inside(inside, a, b, image, noise_bandwidth / ratio, powers)
+        amid = min(a, whole + lean * table[2][LEVELS, 0])
+        total += _inside(inside, amid, b, image, noise_bandwidth / ratio, powers)
         k = start + inside
         j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
         while j < row.size and total <= 1.0 and k <= half:
             # where the bin before reaches the threshold this one does not leak
             before = max(k + stride - 2.0 + furthest, most) + extreme
             least_before = _read(lowest, before * ratio)
-            most_whole = min(whole, (upper + a * (image + apart)) / max(least_before, 1e-300))
-            beside = min(most_whole * row[j] + apart * a, a * row[j])
-            beside = math.hypot(beside, a * image) if powers else beside + a * image
+            most_whole = min(whole, (upper + askew) / max(least_before - tail, 1e-300))
+            beside = min(most_whole * row[j] + lean * slope[j], a * row[j])
+            mirrored = min(min(whole * beyond[j] + lean * steepest[j], a * beyond[j]), image)
+            beside = math.hypot(beside, mirrored) if powers else beside + mirrored
             total += stride * excess_crossing(min(beside, b), b)
             k += stride
             j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
     for j in range(far[0].size):
-        both = math.hypot(far[1][j], image) if powers else far[1][j] + image
-        chance = excess_crossing(min(a * both, b), b)
+        beside = min(whole * far[1][j] + lean * far[2][j], a * far[1][j])
+        mirrored = min(beside, image)
+        both = math.hypot(beside, mirrored) if powers else beside + mirrored
+        chance = excess_crossing(min(both, b), b)
         if chance * half < _NEGLIGIBLE or total > 1.0:
             total += 2.0 * half * chance
             break
@@ -197,9 +207,10 @@ def _inside(number, a, b, image, energy, powers):
     """Sum of the chances of so many bins within the spread of lines."""
     if number <= 0.0:
         return 0.0
-    at = min(a * (math.hypot(1.0, image) if powers else 1.0 + image), b)
+    at = min(math.hypot(a, image) if powers else a + image, b)
     if powers:
-        number = min(number, max(_STAR * (energy + 2.0 * image * image) * (a / at) ** 2, 1.0))
+        energy += 2.0 * (image / a) ** 2
+        number = min(number, max(_STAR * energy * (a / at) ** 2, 1.0))
     return number * excess_crossing(at, b)
 
 

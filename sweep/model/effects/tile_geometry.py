@@ -47,6 +47,8 @@ class Geometry:
     """Largest |R_b - R_0| / R_0 on other surfaces."""
     rotating: bool = False
     """Whether any surface belongs to a body that turns."""
+    flat: bool = False
+    """Whether the ground is a plane."""
 
 
 def plane(p: Mapping[str, Span | str], number: int, pattern: str) -> Geometry:
@@ -79,6 +81,7 @@ def plane(p: Mapping[str, Span | str], number: int, pattern: str) -> Geometry:
             across=sideways, along=np.where(sideways > 0, along.magnitude, 0.0), **shape
         ),
         beside_share=Span.of(0.0),
+        flat=True,
     )
 
 

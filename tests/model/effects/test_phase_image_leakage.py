@@ -180,6 +180,27 @@ def test_the_bound_on_leakage_is_near_what_leaks(table_4_1, window, lines):
     assert ratios.size > 200 and ratios.min() >= 1 and np.median(ratios) <= 30
 
 
+@pytest.mark.parametrize("window", ["hamming", "hann", "blackman", "kaiser(8.6)"])
+def test_the_bound_on_leakage_is_near_what_leaks_of_any_scene(table_4_1, window):
+    of_all = {"footprint", "doppler", "image", "leakage"}
+    ratios = {"incoherent": [], "coherent": []}
+    for seed in range(16):
+        power = 10 ** np.random.default_rng((5, seed)).uniform(-7, 1, 40)
+        for phases, phased in (("incoherent", set()), ("coherent", {"footprint_phase"})):
+            parameters = scene(
+                table_4_1, 40, seed, fft_size=2**13, window=window, power=power, across=0.0,
+                phases=phases,
+            )  # fmt: skip
+            leaks = found(parameters, of_all | phased)[:, 5]
+            most = leakage_bound(point_block(parameters))
+            assert (leaks <= most * (1 + 1e-9) + 1e-12).all()
+            noticed = (leaks > 1e-9) & (leaks < 0.5)
+            ratios[phases].append(most[noticed] / leaks[noticed])
+    powers, amplitudes = (np.concatenate(each) for each in ratios.values())
+    assert amplitudes.size > 300 and np.median(amplitudes) <= 200
+    assert np.median(np.concatenate([powers, amplitudes])) <= 30 and np.median(powers) <= 10
+
+
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 def test_lines_spread_over_all_bins_and_beyond_may_leak_in_any(table_4_1, phases):
     parameters = scene(
