@@ -20,8 +20,8 @@ A footprint whose lines add as powers and spread by s [bins, standard deviation]
 broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
 
 The error under noise follows to first order from the noise in phase with the signal, which the
-window correlates between bins. The Cramer-Rao bound is that of the whole record without a window;
-three magnitudes of a windowed spectrum do not reach it.
+window correlates between bins. The Cramer-Rao bound (:mod:`sweep.model.cramer_rao`) is that of the
+whole record without a window; three magnitudes of a windowed spectrum do not reach it.
 """
 
 import math
@@ -169,28 +169,6 @@ def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
     rest = math.sqrt(max(1 - near**2, 0.0))
     across = (far - near**2) / rest if rest > 0 else 0.0
     return near, rest, across, math.sqrt(max(1 - near**2 - across**2, 0.0))
-
-
-def cramer_rao_bound(window: Window, fft_size: int, ratio: np.ndarray) -> np.ndarray:
-    """Least standard deviation [bins of fs/N] of any unbiased estimate of a tone's frequency.
-
-    Parameters
-    ----------
-    window, fft_size
-        Window (length L) and FFT size N.
-    ratio : (n,) ndarray
-        Magnitude of the tone on a bin over the noise sigma per quadrature, in this window.
-
-    Notes
-    -----
-    Amplitude, phase and frequency unknown, white noise of variance s^2: the variance of the
-    frequency is at least 24 s^2 / (A^2 L (L^2 - 1)) [rad^2 a sample; Rife and Boorstyn 1974].
-    With |X| = A sum(w) / 2 and sigma^2 = sum(w^2) s^2 / 2 the ratio gives s / A.
-    """
-    length = window.length
-    noise_over_amplitude = window.sum / (math.sqrt(2 * window.energy) * np.asarray(ratio))
-    least = math.sqrt(24 / (length * (length**2 - 1.0))) * noise_over_amplitude
-    return np.asarray(least * fft_size / (2 * math.pi))
 
 
 @njit(cache=True, error_model="numpy")
