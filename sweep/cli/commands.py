@@ -14,7 +14,6 @@ from sweep.cli.telling import (
     conclude,
     grid_plan,
     scene_plan,
-    tell_accuracy,
     tell_effects,
     warn_before,
 )
@@ -28,6 +27,16 @@ WORKERS = click.option(
 )
 SCHEDULER = click.option(
     "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
+)
+
+BLOCK_TIMEOUT = click.option(
+    "--block-timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Give a block up that takes longer, twice [none].",
+)
+DURABLE = click.option(
+    "--durable", is_flag=True, help="Blocks count once they are on the disk: safe from power loss."
 )
 
 
@@ -66,6 +75,7 @@ def main() -> None:
       sweep run experiments/quickstart.yaml       do it, on all cores
       sweep status results/quickstart.zarr        how far is it? (any time)
       sweep resume results/quickstart.zarr        go on after an interruption
+      sweep verify results/quickstart.zarr        is every byte as it was written?
       sweep figures results/quickstart.zarr       draw it
       sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
 
@@ -86,8 +96,16 @@ def main() -> None:
 @WORKERS
 @SCHEDULER
 @click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+@BLOCK_TIMEOUT
+@DURABLE
 def run(
-    spec: Path, store: Path | None, workers: int | None, scheduler: str | None, overwrite: bool
+    spec: Path,
+    store: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    overwrite: bool,
+    block_timeout: float | None,
+    durable: bool,
 ) -> None:
     """Compute the study SPEC into a Zarr store.
 
@@ -111,6 +129,8 @@ def run(
         workers=workers,
         scheduler=scheduler,
         overwrite=overwrite,
+        block_timeout=block_timeout,
+        durable=durable,
     )
     conclude(outcome, _shown(outcome.store))
 
@@ -126,10 +146,24 @@ def _default_store(spec: Path) -> Path:
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="Go on only if the store holds this study.",
 )
+@click.option("--retry-failed", is_flag=True, help="Also try again what failed before.")
 @WORKERS
 @SCHEDULER
-def resume(store: Path, spec: Path | None, workers: int | None, scheduler: str | None) -> None:
-    """Compute what STORE lacks: what was interrupted, what failed, what was lost.
+@BLOCK_TIMEOUT
+@DURABLE
+def resume(
+    store: Path,
+    spec: Path | None,
+    retry_failed: bool,
+    workers: int | None,
+    scheduler: str | None,
+    block_timeout: float | None,
+    durable: bool,
+) -> None:
+    """Compute what STORE lacks: what was interrupted, what was lost.
+
+    Blocks that failed twice are left out, lest they cost every later run a worker, until
+    --retry-failed asks for them; sweep status lists them with their errors.
 
     \b
       sweep resume results/range_angle.zarr
@@ -139,7 +173,13 @@ def resume(store: Path, spec: Path | None, workers: int | None, scheduler: str |
     from sweep.tasks import driver
 
     outcome = driver.resume(
-        store, spec=load(spec) if spec else None, workers=workers, scheduler=scheduler
+        store,
+        spec=load(spec) if spec else None,
+        retry_failed=retry_failed,
+        workers=workers,
+        scheduler=scheduler,
+        block_timeout=block_timeout,
+        durable=durable,
     )
     conclude(outcome, store)
 
@@ -169,34 +209,6 @@ def plan(spec: Path, workers: int | None) -> None:
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
     tell_effects(study, _default_store(spec))
-
-
-@main.command()
-@STORE
-def status(store: Path) -> None:
-    """Say how far STORE is, also while it runs somewhere else.
-
-    Where it draws, a table says at how many points accuracy.tolerance is met.
-    """
-    from sweep.tasks.progress import duration
-    from sweep.tasks.status import status as read
-
-    s = read(store)
-    left = duration((s.points - s.points_done) / s.rate) if s.rate else "unknown"
-    click.echo(f"{s.title or store}\nstudy {s.study_id}")
-    click.echo(
-        f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
-    )
-    if s.holder_lives and s.holder:
-        click.echo(f"running: process {s.holder.pid} on {s.holder.host}, {left} left")
-    elif s.complete:
-        click.echo("complete")
-    else:
-        click.echo(f"not running; sweep resume {store}  goes on.")
-    for block, failure in sorted(s.failures.items()):
-        click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
-    if s.blocks_done:
-        tell_accuracy(store)
 
 
 @main.command()

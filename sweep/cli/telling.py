@@ -25,7 +25,7 @@ def conclude(outcome: Outcome, store: Path) -> None:
     """Say what a run has come to, and leave with its exit code."""
     from sweep.tasks.progress import duration
 
-    if outcome.blocks_done:
+    if outcome.blocks_done and outcome.store.exists():
         _print_summary(store)
         tell_accuracy(store)
     for scanner, rays in outcome.rays.items():
@@ -42,12 +42,13 @@ def conclude(outcome: Outcome, store: Path) -> None:
     for failure in outcome.failures[:5]:
         click.echo(f"block {failure.block} failed: {failure.error}", err=True)
     left = outcome.blocks - outcome.blocks_done
-    why = outcome.stopped or f"{len(outcome.failures)} blocks failed"
-    click.echo(
-        f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.\n"
-        f"sweep resume {store}  goes on.",
-        err=True,
-    )
+    failed = len(outcome.failures) + outcome.left_out
+    why = outcome.stopped or f"{failed:,} failed; sweep status {store}  tells why"
+    click.echo(f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.", err=True)
+    if left > failed:
+        click.echo(f"sweep resume {store}  goes on.", err=True)
+    if failed:
+        click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.", err=True)
     sys.exit(INCOMPLETE)
 
 

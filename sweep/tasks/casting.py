@@ -13,13 +13,25 @@ from sweep.tasks.journal import Journal, committed
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Pool
 from sweep.tasks.progress import Progress
-from sweep.tasks.recipe import write_recipe
+from sweep.tasks.recipe import read_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import create
+from sweep.tasks.template import refuse_damaged
+
+
+def eyepoints_are_sound(study: FlightStudy) -> bool:
+    """Whether no block is missing of the eyepoints that are there; all of them may be gone."""
+    paths = {eyepoints_path(study.path, e.id): e for e in study.eyepoint_studies()}
+    return all(_is_whole(path, e) for path, e in paths.items() if path.exists())
 
 
 def cast(
-    study: FlightStudy, *, pool: Pool, told: Progress, interrupts: Interrupts
+    study: FlightStudy,
+    *,
+    pool: Pool,
+    told: Progress,
+    interrupts: Interrupts,
+    retry_failed: bool = False,
 ) -> tuple[dict[str, int], str]:
     """Cast what is missing of a study's eyepoints.
 
@@ -45,7 +57,7 @@ def cast(
             continue
         _ = eyepoints.world  # what is wrong with the scene is the user's to mend, not a block's
         told.say(f"casting {eyepoints.rays:,} rays through the scanner '{eyepoints.scanner}'")
-        outcome = _fill(path, eyepoints, pool, told, interrupts)
+        outcome = _fill(path, eyepoints, pool, told, interrupts, retry_failed)
         rays[eyepoints.scanner] = eyepoints.rays_in(outcome.points_computed)
         if not outcome.complete:
             return rays, f"eyepoints of '{eyepoints.scanner}': {_why(outcome)}"
@@ -60,11 +72,17 @@ def _is_whole(path: Path, eyepoints: EyepointStudy) -> bool:
     if attributes["study_id"] != eyepoints.id:
         raise StoreError(f"{path} holds other eyepoints than its name says: remove it")
     identity.refuse_other_versions(path, attributes, where="this machine")
-    return bool(committed(path, eyepoints).all())
+    refuse_damaged(path)
+    return bool(read_recipe(path)) and bool(committed(path, eyepoints).all())
 
 
 def _fill(
-    path: Path, eyepoints: EyepointStudy, pool: Pool, told: Progress, interrupts: Interrupts
+    path: Path,
+    eyepoints: EyepointStudy,
+    pool: Pool,
+    told: Progress,
+    interrupts: Interrupts,
+    retry_failed: bool,
 ) -> Outcome:
     if not path.exists():
         create(path, eyepoints)
@@ -76,21 +94,20 @@ def _fill(
             base=str(eyepoints.spec.base.absolute()),
             scanner=eyepoints.scanner,
         )
-        journal = Journal(path)
-        try:
-            session = Session(
-                path, eyepoints, pool=pool, progress=told, interrupts=interrupts,
-                journal=journal, lock=lock,
-            )  # fmt: skip
-            return session.to_its_end()
-        finally:
-            journal.close()
+        session = Session(
+            path, eyepoints, pool=pool, progress=told, interrupts=interrupts,
+            journal=Journal(path, durable=pool.terms.durable), lock=lock,
+            retry_failed=retry_failed,
+        )  # fmt: skip
+        return session.to_its_end()
     finally:
         lock.release()
 
 
 def _why(outcome: Outcome) -> str:
     """Why a session ended before its blocks did."""
-    if outcome.stopped or not outcome.failures:
+    if outcome.stopped:
         return outcome.stopped
+    if not outcome.failures:
+        return f"{outcome.left_out} blocks failed before; --retry-failed tries them again"
     return f"{len(outcome.failures)} blocks failed, the first with {outcome.failures[0].error}"

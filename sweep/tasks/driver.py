@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.tasks import identity, studies
-from sweep.tasks.casting import cast
+from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
@@ -18,10 +18,12 @@ from sweep.tasks.journal import Journal, committed
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.recipe import write_recipe
-from sweep.tasks.session import Outcome, Session
-from sweep.tasks.store import create, remove
+from sweep.tasks.recipe import refuse_damaged_recipe, write_recipe
+from sweep.tasks.session import Outcome, Session, unwritable
+from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate
+from sweep.tasks.template import refuse_damaged
+from sweep.tasks.worker import Terms
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -41,6 +43,8 @@ def run(
     processes: bool = True,
     overwrite: bool = False,
     progress: bool | Progress = True,
+    block_timeout: float | None = None,
+    durable: bool = False,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
     """Compute a study into a new store.
@@ -59,6 +63,11 @@ def run(
         Whether to put the new store in the place of one that is there.
     progress
         True for a bar or lines on standard error, False for none, or a `Progress`.
+    block_timeout
+        Seconds that a block may take; beyond, it is tried once more and then given up.
+    durable
+        Whether blocks are on the disk, and not only with the operating system, once committed: a
+        power failure then loses none of them.
     evaluate
         What computes a block in place of the model, with the same results; for instrumenting.
 
@@ -75,9 +84,12 @@ def run(
     path, told = Path(store).absolute(), chosen(progress)
     study = studies.study_of(spec, path)
     place = Place(
-        client=client, workers=workers, scheduler=scheduler, processes=processes, evaluate=evaluate
-    )
+        client=client, workers=workers, scheduler=scheduler, processes=processes,
+        terms=Terms(evaluate, block_timeout, durable),
+    )  # fmt: skip
     _make(path, study, overwrite, told)
+    if durable:
+        sync(path)
     try:
         return _go_on(path, study, place.for_spec(spec), told)
     except ClusterError:
@@ -93,7 +105,10 @@ def resume(
     workers: int | None = None,
     scheduler: str | None = None,
     processes: bool = True,
+    retry_failed: bool = False,
     progress: bool | Progress = True,
+    block_timeout: float | None = None,
+    durable: bool = False,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
     """Compute what a store lacks.
@@ -104,14 +119,17 @@ def resume(
         Path of a store that `run` made.
     spec
         The study that the store is expected to hold; without it, whatever it holds.
-    client, workers, scheduler, processes, progress, evaluate
+    retry_failed
+        Whether to try blocks again that were given up, for their errors, in an earlier run.
+    client, workers, scheduler, processes, progress, block_timeout, durable, evaluate
         As in `run`.
 
     Raises
     ------
     StoreError
-        Where the store is not sweep's, holds another study, was begun with other versions, or is
-        being written by someone else. Nothing is touched.
+        Where the store is not sweep's, holds another study, was begun with other versions, is
+        damaged in what it held before there were results, or is being written by someone else.
+        Nothing is touched.
     ClusterError
         Where there is no scheduler or worker to be had.
     """
@@ -122,10 +140,15 @@ def resume(
     identity.refuse_other_versions(path, attributes, where="this machine")
     identity.refuse_altered(path, attributes, study.spec)
     asked = study if spec is None else studies.study_of(spec, path)  # it knows where its files are
+    refuse_damaged(path)
+    if spec is None:
+        refuse_damaged_recipe(path)
     place = Place(
-        client=client, workers=workers, scheduler=scheduler, processes=processes, evaluate=evaluate
-    )
-    return _go_on(path, asked, place.for_spec(spec or study.spec), chosen(progress))
+        client=client, workers=workers, scheduler=scheduler, processes=processes,
+        terms=Terms(evaluate, block_timeout, durable),
+    )  # fmt: skip
+    place = place.for_spec(spec or study.spec)
+    return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
 
 
 def _held(path: Path) -> tuple[dict[str, object], GridStudy | FlightStudy]:
@@ -158,25 +181,37 @@ def _make(path: Path, study: GridStudy | FlightStudy, overwrite: bool, told: Pro
     create(path, study)
 
 
-def _go_on(path: Path, study: GridStudy | FlightStudy, place: Place, told: Progress) -> Outcome:
-    lock = Lock(path)
+def _go_on(
+    path: Path,
+    study: GridStudy | FlightStudy,
+    place: Place,
+    told: Progress,
+    *,
+    retry_failed: bool = False,
+) -> Outcome:
+    lock, most = Lock(path), study.n_blocks
     try:
-        journal = Journal(path)
-        try:
-            most = study.n_blocks
-            with Interrupts() as interrupts, Pool(place, most=most, say=told.say) as pool:
-                session = Session(
-                    path, study, pool=pool, progress=told, interrupts=interrupts,
-                    journal=journal, lock=lock,
-                )  # fmt: skip
-                if isinstance(study, GridStudy):
-                    return session.to_its_end()
-                write_recipe(path, base=str(study.spec.base.absolute()))
-                if committed(path, study).all():
-                    return session.to_its_end()
-                rays, why = cast(study, pool=pool, told=told, interrupts=interrupts)
-                return session.to_its_end(before=why, rays=rays)
-        finally:
-            journal.close()
+        journal = _journal(path, place.terms.durable)
+        with Interrupts() as interrupts, Pool(place, most=most, say=told.say) as pool:
+            session = Session(
+                path, study, pool=pool, progress=told, interrupts=interrupts,
+                journal=journal, lock=lock, retry_failed=retry_failed,
+            )  # fmt: skip
+            if isinstance(study, GridStudy):
+                return session.to_its_end()
+            write_recipe(path, base=str(study.spec.base.absolute()))
+            if committed(path, study).all() and eyepoints_are_sound(study):
+                return session.to_its_end()
+            rays, why = cast(
+                study, pool=pool, told=told, interrupts=interrupts, retry_failed=retry_failed
+            )
+            return session.to_its_end(before=why, rays=rays)
     finally:
         lock.release()
+
+
+def _journal(path: Path, durable: bool) -> Journal:
+    try:
+        return Journal(path, durable=durable)
+    except OSError as error:
+        raise StoreError(unwritable(path, error)) from error

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.store import LAYOUT
+from sweep.tasks.store import JOURNAL, LAYOUT, MANIFEST
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -48,7 +48,22 @@ def read_attributes(path: Path) -> dict[str, Any]:
         document = json.loads((path / "zarr.json").read_text())
         attributes = document["attributes"]
     except (OSError, ValueError, KeyError, TypeError):
+        if (path / JOURNAL / MANIFEST).exists():
+            raise StoreError(
+                f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair` puts it back"
+            ) from None
         raise StoreError(f"{path} is not a Zarr store of sweep's") from None
+    return recognised(path, attributes)
+
+
+def recognised(path: Path, attributes: Any) -> dict[str, Any]:
+    """Attributes of a store, where they are those of one of this program's.
+
+    Raises
+    ------
+    StoreError
+        Where they are not.
+    """
     if not isinstance(attributes, dict) or "study_id" not in attributes:
         raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
     if attributes.get("layout") != LAYOUT:

@@ -126,8 +126,8 @@ class Lock:
 
     def _beat(self) -> None:
         while not self._released.wait(HEARTBEAT):
-            if self.is_mine():
-                with suppress(OSError):
+            with suppress(OSError):
+                if self.is_mine():
                     os.utime(self._path)
 
     def is_mine(self) -> bool:
@@ -139,8 +139,8 @@ class Lock:
         """Give the lock up, if it is still ours."""
         self._released.set()
         self._beating.join()
-        if self.is_mine():
-            with suppress(OSError):
+        with suppress(OSError):
+            if self.is_mine():
                 self._path.unlink(missing_ok=True)
 
 

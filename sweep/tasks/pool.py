@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from sweep.tasks import cluster
-from sweep.tasks.study import Evaluate
 from sweep.tasks.todo import Todo
 from sweep.tasks.window import Job, Window, plain
-from sweep.tasks.worker import Answer
+from sweep.tasks.worker import Answer, Terms
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -29,7 +28,7 @@ class Place:
     scheduler: str | None = None
     threads: int = 1
     processes: bool = True
-    evaluate: Evaluate | None = None
+    terms: Terms = field(default_factory=Terms)
 
     def for_spec(self, spec: Spec | SceneSpec) -> Place:
         """The same place, with what it leaves open taken from the spec's `execution`."""
@@ -74,9 +73,9 @@ class Pool:
         self._stack.__exit__(kind, error, trace)
 
     @property
-    def evaluate(self) -> Evaluate | None:
-        """What computes blocks in place of their study."""
-        return self._place.evaluate
+    def terms(self) -> Terms:
+        """How blocks are computed."""
+        return self._place.terms
 
     def answers(self, job: Job, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers of a study's blocks as they arrive.

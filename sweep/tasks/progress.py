@@ -52,6 +52,47 @@ class Silent:
         """Nothing."""
 
 
+class Late:
+    """Progress of what may be over before anybody looks: nothing is shown of the first seconds.
+
+    Parameters
+    ----------
+    shown
+        Where it is shown then.
+    after
+        Seconds.
+    """
+
+    def __init__(self, shown: Progress, after: float = 2.0) -> None:
+        self._shown, self._after = shown, after
+        self._total, self._done, self._unit = 0, 0, "points"
+        self._begun = time.monotonic()
+        self._showing = False
+
+    def begin(self, *, points: int, done: int, unit: str) -> None:
+        """The run begins, unseen."""
+        self._total, self._done, self._unit = points, done, unit
+        self._begun, self._showing = time.monotonic(), False
+
+    def advance(self, *, points: int, failed: int) -> None:
+        """Shown from the first time that it is late."""
+        self._done += points
+        if self._showing:
+            self._shown.advance(points=points, failed=failed)
+        elif time.monotonic() - self._begun > self._after:
+            self._showing = True
+            self._shown.begin(points=self._total, done=self._done, unit=self._unit)
+
+    def say(self, text: str) -> None:
+        """Shown at once."""
+        self._shown.say(text)
+
+    def end(self) -> None:
+        """The run is over."""
+        if self._showing:
+            self._shown.end()
+
+
 class Lines:
     """One line at the start, every 30 s and at the end, for logs.
 

@@ -6,11 +6,12 @@ written anew by whoever runs the study from its spec.
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
 
+from sweep.tasks.errors import StoreError
+from sweep.tasks.sealing import damaged_lines, read_sealed, sealed
 from sweep.tasks.store import JOURNAL
 
 RECIPE = "recipe.json"
@@ -21,14 +22,27 @@ def write_recipe(store_path: Path, **facts: Any) -> None:
     path = store_path / JOURNAL / RECIPE
     path.parent.mkdir(exist_ok=True)
     draft = path.with_name(f"{RECIPE}.{os.getpid()}")
-    draft.write_text(json.dumps(facts))
+    draft.write_bytes(sealed(facts))
     os.replace(draft, path)
 
 
 def read_recipe(store_path: Path) -> dict[str, Any]:
-    """What was put down; empty where nothing was."""
-    try:
-        facts = json.loads((store_path / JOURNAL / RECIPE).read_text())
-    except (FileNotFoundError, ValueError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
+    """What was put down; empty where nothing was, or where it is damaged."""
+    records = [record for _, record in read_sealed(store_path / JOURNAL / RECIPE)]
+    return records[0] or {} if len(records) == 1 else {}
+
+
+def refuse_damaged_recipe(store_path: Path) -> None:
+    """Refuse a store that no longer says where the files of its study are.
+
+    Raises
+    ------
+    StoreError
+        With what to do.
+    """
+    path = store_path / JOURNAL / RECIPE
+    if damaged_lines(path):
+        raise StoreError(
+            f"{path} is damaged, and with it where the files of the study are: "
+            f"`sweep resume {store_path} --spec FILE` puts it down anew"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -10,13 +11,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sweep.tasks import store, versions
-from sweep.tasks.errors import SchedulerLost
+from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Failure, Journal, Receipt, committed
+from sweep.tasks.journal import Failure, Journal, Receipt, committed, given_up
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Pool
 from sweep.tasks.progress import Progress
@@ -27,6 +29,15 @@ from sweep.tasks.worker import Answer
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
 HOPELESS = 20
+
+#: What to do where a store can't be written, by the number of the error.
+REMEDIES = {
+    errno.ENOSPC: "make room on its disk",
+    errno.EDQUOT: "make room in your quota",
+    errno.EROFS: "have its disk mounted for writing",
+    errno.EACCES: "have the permission to write there",
+    errno.EPERM: "have the permission to write there",
+}
 
 #: Seconds after which the kernels are being compiled and not read.
 COMPILING = 2.0
@@ -45,6 +56,7 @@ class Outcome:
     points_computed: int  # in this run
     blocks_computed: int
     failures: tuple[Failure, ...]
+    left_out: int  # blocks that were given up before and not tried again
     stopped: str  # why the run ended before its blocks did; empty where it didn't
     seconds: float  # wall time of this run
     work_seconds: float  # evaluating and writing, summed over workers
@@ -90,6 +102,8 @@ class Session:
         Whether to stop.
     journal, lock
         The store's, held by this process.
+    retry_failed
+        Whether to try blocks again that an earlier run has given up.
     """
 
     def __init__(
@@ -102,10 +116,12 @@ class Session:
         interrupts: Interrupts,
         journal: Journal,
         lock: Lock,
+        retry_failed: bool = False,
     ) -> None:
         self._path, self._study, self._pool = path, study, pool
         self._progress, self._interrupts = progress, interrupts
         self._journal, self._lock = journal, lock
+        self._retry_failed = retry_failed
         self._tally = Tally()
 
     def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
@@ -121,18 +137,36 @@ class Session:
         begun = time.monotonic()
         done = committed(self._path, self._study)
         had = int(np.count_nonzero(done)), self._study.points_in(done)
-        self._journal.record_session("begun", host=socket.gethostname(), pid=os.getpid())
-        stopped = before
-        if had[0] < done.size and not before:
-            stopped = self._compute(Todo(done), had[1])
-        outcome = self._outcome(had, stopped, time.monotonic() - begun, rays or {})
-        self._journal.record_session(
+        settled = done.copy()
+        if not self._retry_failed:
+            settled[list(given_up(self._path, done.size))] = True
+        stopped = self._record("begun", host=socket.gethostname(), pid=os.getpid()) or before
+        if not (settled.all() or stopped):
+            stopped = self._compute(Todo(settled), had[1])
+        left_out = int(np.count_nonzero(settled & ~done))
+        outcome = self._outcome(had, left_out, stopped, time.monotonic() - begun, rays or {})
+        if outcome.complete:
+            store.remove_partials(self._path)
+        self._record(
             "ended", blocks=outcome.blocks_computed, failed=len(outcome.failures), stopped=stopped
         )
         return outcome
 
+    def _record(self, event: str, **facts: Any) -> str:
+        """Put down what happened to the run; why that can't be, where it can't."""
+        try:
+            self._journal.record_session(event, **facts)
+        except OSError as error:
+            return unwritable(self._path, error)
+        return ""
+
     def _outcome(
-        self, before: tuple[int, int], stopped: str, seconds: float, rays: Mapping[str, int]
+        self,
+        before: tuple[int, int],
+        left_out: int,
+        stopped: str,
+        seconds: float,
+        rays: Mapping[str, int],
     ) -> Outcome:
         tally = self._tally
         return Outcome(
@@ -145,6 +179,7 @@ class Session:
             points_computed=tally.points,
             blocks_computed=tally.blocks,
             failures=tuple(tally.failures),
+            left_out=left_out,
             stopped=stopped,
             seconds=seconds,
             work_seconds=tally.seconds,
@@ -158,7 +193,7 @@ class Session:
             try:
                 compiling = threading.Thread(target=self._compile, daemon=True)
                 compiling.start()  # beside the workers' start, which is mostly waiting
-                job = Job(str(self._path), self._study.id, versions.model(), self._pool.evaluate)
+                job = Job(str(self._path), self._study.id, versions.model(), self._pool.terms)
                 answers = self._pool.answers(job, todo, lambda: self._interrupts.stopping)
                 self._await(compiling)
                 self._progress.begin(
@@ -171,7 +206,11 @@ class Session:
             except KeyboardInterrupt:
                 return "stopped at once"
             except OSError as error:
-                return f"the store can't be written: {error}"
+                return unwritable(self._path, error)
+            except StoreError:
+                if self._path.exists():
+                    raise
+                return unwritable(self._path, FileNotFoundError())
 
     def _compile(self) -> None:
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
@@ -188,6 +227,8 @@ class Session:
         told, interrupts = False, self._interrupts
         for answer in answers:
             if not self._lock.is_mine():
+                if not self._path.exists():
+                    raise FileNotFoundError(self._path)
                 return "another process took the store's lock"
             self._commit(answer, todo)
             if interrupts.stopping and not told:
@@ -215,6 +256,14 @@ class Session:
         if not todo.again(failure.block):
             self._journal.record_failure(failure)
             self._tally.failures.append(failure)
+
+
+def unwritable(path: Path, error: OSError) -> str:
+    """Why a run stops that can't write, and what to do about it."""
+    if not path.exists():
+        return f"{path} is no longer there: have its disk back, or its folder"
+    remedy = REMEDIES.get(error.errno or 0, "see to its disk")
+    return f"the store can't be written ({error.strerror or error}): {remedy}"
 
 
 def _unseen(receipt: Receipt) -> Failure:

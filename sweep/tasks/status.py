@@ -55,7 +55,7 @@ def status(store: str | Path) -> Status:
         points_done=study.points_in(done),
         blocks=study.n_blocks,
         blocks_done=int(np.count_nonzero(done)),
-        failures={b: f for b, f in journal.failures(path).items() if b < done.size and not done[b]},
+        failures=journal.given_up(path, done.size),
         holder=holder,
         holder_lives=holder is not None and lock.is_live(path, holder),
         rate=_rate(path),

@@ -7,6 +7,7 @@ follows from the study.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
 import os
@@ -20,6 +21,7 @@ import numpy as np
 
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
+from sweep.tasks.sealing import sealed
 from sweep.tasks.study import ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
@@ -29,8 +31,13 @@ if TYPE_CHECKING:
 #: Directory of the journal inside a store.
 JOURNAL = ".sweep"
 
+#: What a store is made of before there are results, and the digest of each object, in the journal.
+MANIFEST = "template.jsonl"
+
 #: Version of the layout of stores.
-LAYOUT = 3
+LAYOUT = 4
+
+_libc = ctypes.CDLL(None, use_errno=True)
 
 WRITTEN_WHOLE: ArrayConfigLike = {
     "write_empty_chunks": True
@@ -52,7 +59,7 @@ def create(path: str | Path, study: Content) -> Path:
     building = path.with_name(f".{path.name}.creating-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _build(building, study)
+        build(building, study, new_attributes(study))
         os.rename(building, path)
     except OSError as error:
         raise StoreError(f"{path} can't be made: {error.strerror or error}") from error
@@ -68,19 +75,30 @@ def remove(path: Path) -> None:
     shutil.rmtree(aside)
 
 
-def _build(path: Path, study: Content) -> None:
+def build(path: Path, study: Content, attributes: dict[str, Any]) -> None:
+    """Make a store without results, in a place of its own.
+
+    Parameters
+    ----------
+    path
+        Where; nothing is there.
+    study, attributes
+        What it is to hold, and what its group is to say of it.
+    """
     import zarr
 
-    group = zarr.create_group(path, zarr_format=3, attributes=_attributes(study))
-    for name, attributes in study.groups().items():
-        group.create_group(name, attributes=attributes)
+    group = zarr.create_group(path, zarr_format=3, attributes=attributes)
+    for name, own in study.groups().items():
+        group.create_group(name, attributes=own)
     for layout in study.arrays():
         _add(group, layout)
     (path / JOURNAL).mkdir()
     _consolidate(path)
+    _list(path, attributes)
 
 
-def _attributes(study: Content) -> dict[str, Any]:
+def new_attributes(study: Content) -> dict[str, Any]:
+    """What the group of a new store says of it: the study's own, and versions."""
     return study.attributes() | {
         "study_id": study.id,
         "model_version": versions.model(),
@@ -88,6 +106,18 @@ def _attributes(study: Content) -> dict[str, Any]:
         "processor": versions.processor(),
         "layout": LAYOUT,
     }
+
+
+def _list(path: Path, attributes: dict[str, Any]) -> None:
+    """Put down what the template is made of; the attributes, too, which all of it follows from."""
+    objects = sorted(
+        str(file.relative_to(path))
+        for file in path.rglob("*")
+        if file.is_file() and JOURNAL not in file.relative_to(path).parts
+    )
+    lines = [sealed({"attributes": attributes, "objects": len(objects)})]
+    lines += [sealed({"object": name, "digest": digest(path, [name])}) for name in objects]
+    (path / JOURNAL / MANIFEST).write_bytes(b"".join(lines))
 
 
 def _codecs() -> dict[str, Any]:
@@ -195,6 +225,34 @@ def block_objects(study: Study, block: int) -> list[str]:
     return [
         "/".join([name, "c", *map(str, position)]) for name, position in study.chunks(block).items()
     ]
+
+
+def sync(path: Path) -> None:
+    """Have everything written to a store so far on its disk, not only with the operating system.
+
+    One call for the whole file system, which costs as much as syncing the files one by one costs
+    for a few of them.
+
+    Raises
+    ------
+    OSError
+        Where the disk did not take it.
+    """
+    place = os.open(path, os.O_RDONLY)
+    try:
+        if not hasattr(_libc, "syncfs"):  # not Linux
+            os.sync()
+        elif _libc.syncfs(place):
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(path))
+    finally:
+        os.close(place)
+
+
+def remove_partials(path: Path) -> None:
+    """Remove what writers that were killed in the midst of a file have left."""
+    for file in path.rglob("*.partial"):
+        file.unlink(missing_ok=True)
 
 
 def is_whole(path: Path, objects: list[str]) -> bool:

@@ -48,13 +48,25 @@ def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
     StoreError
         Where there is no store, or not one of this program's, or one it can't read.
     """
-    attributes, recipe = read_attributes(path), read_recipe(path)
+    attributes = read_attributes(path)
     if attributes["kind"] == ACCURACY:
         raise StoreError(f"{path} holds what accuracy costs, no study: sweep figures draws it")
+    return attributes, described(path, attributes)
+
+
+def described(path: Path, attributes: dict[str, Any]) -> AnyStudy:
+    """The study that a store's attributes tell of.
+
+    Raises
+    ------
+    StoreError
+        Where this program can't read it.
+    """
+    recipe = read_recipe(path)
     base = Path(recipe["base"]) if "base" in recipe else None
     if attributes["kind"] == "eyepoints":
-        return attributes, _eyepoints(path, recipe, base)
-    return attributes, study_of(read_spec(path, attributes["spec"], base), path)
+        return _eyepoints(path, recipe, base)
+    return study_of(read_spec(path, attributes["spec"], base), path)
 
 
 def _eyepoints(path: Path, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:

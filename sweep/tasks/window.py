@@ -13,12 +13,11 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sweep.tasks.errors import SchedulerLost, StoreError
-from sweep.tasks.study import Evaluate
 from sweep.tasks.todo import Todo
-from sweep.tasks.worker import STORAGE_ERRORS, Answer, failure, work
+from sweep.tasks.worker import STORAGE_ERRORS, Answer, Terms, failure, work
 
 if TYPE_CHECKING:
     from dask.typing import Key
@@ -41,13 +40,13 @@ class Job:
     path: str
     study_id: str
     code_version: str
-    evaluate: Evaluate | None = None
+    terms: Terms = field(default_factory=Terms)
 
 
 def plain(job: Job, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Answer]:
     """Answers of a study computed here, one block after the other: what defines its bytes."""
     while not stopping() and (blocks := todo.take(1)):
-        yield work(job.path, job.study_id, blocks, job.evaluate)
+        yield work(job.path, job.study_id, blocks, job.terms)
 
 
 @dataclass
@@ -76,12 +75,14 @@ class Slots:
 
     client: Client
     count: int = 1
+    addresses: tuple[str, ...] = ()  # of the workers
     asked: float = field(default=-1e9)
 
     def now(self) -> int:
         """Worker threads, at least 1."""
         if time.monotonic() - self.asked > SLOTS_AGE:
-            self.count = max(1, sum(self.client.nthreads().values()))
+            threads = self.client.nthreads()
+            self.count, self.addresses = max(1, sum(threads.values())), tuple(threads)
             self.asked = time.monotonic()
         return self.count
 
@@ -104,6 +105,7 @@ class Window:
         self._flying: dict[Key, tuple[Future, list[int]]] = {}
         self._arrived: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._pace, self._slots = Pace(), Slots(client)
+        self._failed_at: dict[int, str] = {}  # address of the worker by block
 
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers as they arrive; an empty one every `TICK` while none does.
@@ -153,12 +155,19 @@ class Window:
             job.path,
             job.study_id,
             blocks,
-            job.evaluate,
+            job.terms,
             key=task_key(job, blocks, self._todo.attempt(blocks[0])),
             retries=0,
+            **self._elsewhere(blocks[0]),
         )
         self._flying[future.key] = (future, blocks)
         future.add_done_callback(self._arrived.put)
+
+    def _elsewhere(self, block: int) -> dict[str, Any]:
+        """Where to send a block: not where it failed before, if there is anywhere else."""
+        before = self._failed_at.get(block)
+        others = [address for address in self._slots.addresses if address != before]
+        return {"workers": others, "allow_other_workers": True} if before and others else {}
 
     def _next(self) -> Answer:
         try:
@@ -169,6 +178,7 @@ class Window:
         _, blocks = self._flying.pop(future.key)
         answer = self._answer(future, blocks)
         self._pace.learn(answer)
+        self._failed_at.update((failure.block, answer.worker) for failure in answer.failures)
         return answer
 
     def _answer(self, future: Future, blocks: list[int]) -> Answer:

@@ -15,10 +15,12 @@ from sweep.tasks import store, versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import Failure, Receipt
 from sweep.tasks.study import Evaluate, Study
+from sweep.tasks.time_limit import time_limit, worker_address
 
 #: Errors of the place that results go to: every further block would meet them too.
-STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM}
-
+STORAGE_ERRORS = {
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
+}  # fmt: skip
 
 #: Studies that a worker holds open at once.
 STUDIES_OPEN = 4
@@ -30,6 +32,7 @@ class Answer:
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
+    worker: str = ""  # address of the one that computed them, where there is one
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,16 @@ def _refuse_another(path: str, study_id: str) -> None:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
 
 
-def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None) -> Answer:
+@dataclass(frozen=True)
+class Terms:
+    """How blocks are computed; nothing of it shows in the results."""
+
+    evaluate: Evaluate | None = None  # in place of the study, with the same results
+    seconds: float | None = None  # that one block may take
+    durable: bool = False  # whether its chunks are on the disk before its receipt
+
+
+def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
     """Evaluate and write blocks, each on its own: one that raises does not stop the next.
 
     Parameters
@@ -88,32 +100,35 @@ def work(path: str, study_id: str, blocks: list[int], evaluate: Evaluate | None)
         The store and the study that it must hold.
     blocks
         Numbers of the blocks.
-    evaluate
-        What computes a block in place of the study, with the same results.
+    terms
+        How.
 
     Raises
     ------
     StoreError, OSError
         Where the store can't be written at all.
     """
-    answer = Answer()
+    answer = Answer(worker=worker_address())
     opened = study(path, study_id)
     for block in blocks:
         try:
-            answer.receipts.append(_one(opened, block, evaluate))
+            answer.receipts.append(_one(opened, block, terms))
         except StoreError:
             raise
         except Exception as error:
             if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
                 raise
             answer.failures.append(failure(block, error))
+    if terms.durable and answer.receipts:
+        store.sync(opened.arrays.path)
     return answer
 
 
-def _one(opened: Opened, block: int, evaluate: Evaluate | None) -> Receipt:
+def _one(opened: Opened, block: int, terms: Terms) -> Receipt:
     held = opened.study
     begun = time.perf_counter()
-    results = evaluate(held, block) if evaluate else held.evaluate(block)
+    with time_limit(terms.seconds):
+        results = terms.evaluate(held, block) if terms.evaluate else held.evaluate(block)
     evaluated = time.perf_counter()
     _refuse_another(str(opened.arrays.path), held.id)  # its driver may be long dead
     digest = opened.arrays.write(block, results)

@@ -19,7 +19,7 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.status import status
 from sweep.tasks.store import Arrays
-from sweep.tasks.worker import work
+from sweep.tasks.worker import Terms, work
 
 
 def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
@@ -210,7 +210,10 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     recorded = status(path).failures
     assert recorded[2]["error"] == "ValueError: nothing good comes of block 2"
     assert "Traceback" in recorded[7]["traceback"]
-    assert resume(path, progress=False, scheduler="none").complete
+    again = resume(path, progress=False, scheduler="none")
+    assert not again.complete and again.left_out == 2 and again.blocks_computed == 0
+    assert set(status(path).failures) == {2, 7}
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert status(path).failures == {}
     assert tree(path) == tree(undisturbed)
 
@@ -222,7 +225,7 @@ def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undistu
     assert [failure.block for failure in outcome.failures] == [4]
     assert outcome.failures[0].error.startswith("KilledWorker")
     assert outcome.blocks_done == 11
-    assert resume(path, progress=False, scheduler="none").complete
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert tree(path) == tree(undisturbed)
 
 
@@ -266,7 +269,7 @@ def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(t
         return study.evaluate(block)
 
     with pytest.raises(StoreError, match=f"now holds study {small(seed=6).id}, not {old.id}"):
-        work(str(path), old.id, [0], replaced_meanwhile)
+        work(str(path), old.id, [0], Terms(replaced_meanwhile))
     assert not list(path.glob("*/c/0/0/0"))
 
 
@@ -289,7 +292,7 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     assert receipts(path).count(3) == (1 if times == 1 else 0)
     assert outcome.complete == (times == 1)
     assert all("not in the store here" in failure.error for failure in outcome.failures)
-    assert resume(path, progress=False, scheduler="none").complete
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert tree(path) == tree(undisturbed)
 
 

@@ -1,9 +1,11 @@
 import json
+import os
 
 import pytest
 
 from sweep.tasks import journal
 from sweep.tasks.journal import Failure, Journal, Receipt
+from sweep.tasks.sealing import damaged_lines, sealed, unsealed
 
 
 def receipt(block: int) -> Receipt:
@@ -24,7 +26,6 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
         opened = Journal(tmp_path)
         for block in blocks:
             opened.commit(receipt(block))
-        opened.close()
     records = list(journal.read_lines(journal.receipts_path(tmp_path)))
     assert [record["block"] for record in records] == [4, 2, 7]
     assert records[0]["digest"] == "ab"
@@ -36,36 +37,83 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
 def test_a_torn_last_line_is_cut_and_what_stands_before_it_stays(tmp_path, tail):
     opened = Journal(tmp_path)
     opened.commit(receipt(1))
-    opened.close()
     path = journal.receipts_path(tmp_path)
     whole = path.read_bytes()
     path.write_bytes(whole + tail.encode("latin-1"))
     assert [record["block"] for record in journal.read_lines(path)] == [1]
-    Journal(tmp_path).close()
+    Journal(tmp_path)
     assert path.read_bytes() == whole
 
 
 def test_a_log_that_is_one_torn_line_becomes_empty(tmp_path):
     log = tmp_path / "log"
     log.write_bytes(b'{"block"')
-    journal.cut_torn_line(log)
+    journal.drop_damaged(log)
     assert log.read_bytes() == b""
-    journal.cut_torn_line(log)
-    journal.cut_torn_line(tmp_path / "absent")
+    journal.drop_damaged(log)
+    journal.drop_damaged(tmp_path / "absent")
     assert log.read_bytes() == b""
 
 
-def test_lines_that_are_no_records_are_passed_over(tmp_path):
+def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp_path):
     log = tmp_path / "log"
-    log.write_text('{"block":1}\nnonsense\n[3]\n{"block":2}\n')
-    assert [record["block"] for record in journal.read_lines(log)] == [1, 2]
+    one, two, three = (sealed({"block": block}) for block in (1, 2, 3))
+    log.write_bytes(one + b'nonsense\n[3]\n{"block":4}\n' + two.replace(b"2", b"5", 1) + three)
+    assert [record["block"] for record in journal.read_lines(log)] == [1, 3]
+    assert damaged_lines(log) == [2, 3, 4, 5]
+    journal.drop_damaged(log)
+    assert log.read_bytes() == one + three
+
+
+def test_no_byte_of_a_line_can_change_unseen():
+    line = sealed({"block": 12, "digest": "ab", "time": 1.5})
+    assert unsealed(line) == {"block": 12, "digest": "ab", "time": 1.5}
+    for place in range(len(line)):
+        for bit in range(8):
+            flipped = bytearray(line)
+            flipped[place] ^= 1 << bit
+            assert unsealed(bytes(flipped)) is None
+        assert unsealed(line[:place]) is None
+        assert unsealed(line[:place] + line[place + 1 :]) is None
+        assert unsealed(line[:place] + b"x" + line[place:]) is None
+
+
+def test_a_receipt_that_was_withdrawn_leaves_its_block_to_be_done_again(tmp_path):
+    opened = Journal(tmp_path)
+    opened.commit(receipt(1))
+    opened.commit(receipt(2))
+    opened.withdraw(1, "a chunk is damaged")
+    assert journal.digests(tmp_path, 4).tolist() == [b"", b"", b"ab", b""]
+    opened.commit(receipt(1))
+    assert journal.digests(tmp_path, 4).tolist() == [b"", b"ab", b"ab", b""]
+
+
+def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
+    opened = Journal(tmp_path)
+    for block in (1, 2):
+        opened.record_failure(Failure(block=block, error="e", traceback="t", host="h", pid=1))
+    opened.commit(receipt(1))
+    assert list(journal.given_up(tmp_path, 4)) == [2]
+    assert list(journal.given_up(tmp_path, 2)) == []
+    opened.withdraw(1, "a chunk is damaged")
+    assert list(journal.given_up(tmp_path, 4)) == [2]
+
+
+def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch):
+    opened = Journal(tmp_path)
+    opened.commit(receipt(1))
+    before = journal.receipts_path(tmp_path).read_bytes()
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda log, line: write(log, line[:20]))
+    with pytest.raises(OSError, match="No space left"):
+        opened.commit(receipt(2))
+    assert journal.receipts_path(tmp_path).read_bytes() == before
 
 
 def test_failures_keep_the_last_error_of_a_block_with_its_traceback(tmp_path):
     opened = Journal(tmp_path)
     for text in ("first", "second"):
         opened.record_failure(Failure(block=3, error=text, traceback="trace", host="h", pid=1))
-    opened.close()
     assert journal.failures(tmp_path)[3]["error"] == "second"
     assert journal.failures(tmp_path)[3]["traceback"] == "trace"
 
@@ -73,7 +121,6 @@ def test_failures_keep_the_last_error_of_a_block_with_its_traceback(tmp_path):
 def test_sessions_are_recorded_with_their_times(tmp_path):
     opened = Journal(tmp_path)
     opened.record_session("begun", pid=5)
-    opened.close()
     (session,) = journal.sessions(tmp_path)
     assert session["event"] == "begun" and session["pid"] == 5 and session["time"] > 0
     assert json.dumps(session)

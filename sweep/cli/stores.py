@@ -1,0 +1,117 @@
+"""Commands that look at stores: how far one is, and whether every byte is as it was written."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sweep.cli.telling import INCOMPLETE, tell_accuracy
+
+if TYPE_CHECKING:
+    from sweep.tasks.verify import Report
+
+DAMAGED = 1
+
+#: Damaged objects of one store that are listed.
+MOST_LISTED = 20
+
+STORE = click.argument("store", type=click.Path(path_type=Path))
+
+
+@click.command()
+@STORE
+def status(store: Path) -> None:
+    """Say how far STORE is, also while it runs somewhere else.
+
+    Where it draws, a table says at how many points accuracy.tolerance is met.
+    """
+    from sweep.tasks.progress import duration
+    from sweep.tasks.status import status as read
+
+    s = read(store)
+    left = duration((s.points - s.points_done) / s.rate) if s.rate else "unknown"
+    click.echo(f"{s.title or store}\nstudy {s.study_id}")
+    click.echo(
+        f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
+    )
+    if s.holder_lives and s.holder:
+        click.echo(f"running: process {s.holder.pid} on {s.holder.host}, {left} left")
+    elif s.complete:
+        click.echo("complete")
+    elif s.blocks - s.blocks_done == len(s.failures):
+        click.echo("not running; all that is left has failed")
+    else:
+        click.echo(f"not running; sweep resume {store}  goes on.")
+    for block, failure in sorted(s.failures.items()):
+        click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
+    if s.failures:
+        click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.")
+    if s.blocks_done:
+        tell_accuracy(store)
+
+
+@click.command()
+@STORE
+@click.option(
+    "--repair",
+    is_flag=True,
+    help="Put back metadata, coordinates and spec; blocks are resume's to compute.",
+)
+def verify(store: Path, repair: bool) -> None:
+    """Check every byte of STORE against the digests taken as it was written.
+
+    Names every object that has a flipped, missing or surplus byte: results block by block,
+    metadata, coordinates, the spec, the journal; of a flight the eyepoints, too. Damaged blocks
+    are marked, so that sweep resume computes just them, to the same bytes as before.
+
+    \b
+      sweep verify results/range_angle.zarr
+      sweep verify results/range_angle.zarr --repair
+
+    Exit codes: 0 all there and undamaged, 1 damage was found, 2 a mistake in what was asked or
+    nothing of sweep's there, 3 undamaged but incomplete (resume goes on).
+    """  # noqa: D301
+    from sweep.tasks.verify import verify as check
+
+    reports = check(store, repair=repair)
+    for report in reports:
+        _tell(report)
+    if not all(report.sound for report in reports):
+        _say_what_to_do(store, reports)
+        sys.exit(DAMAGED)
+    if not all(report.complete for report in reports):
+        click.echo(f"sweep resume {store}  goes on.", err=True)
+        sys.exit(INCOMPLETE)
+
+
+def _tell(report: Report) -> None:
+    here = Path.cwd()
+    store = report.store.relative_to(here) if report.store.is_relative_to(here) else report.store
+    for name in report.restored:
+        click.echo(f"{store}: {name} put back")
+    for damage in report.damages[:MOST_LISTED]:
+        block = f"block {damage.block}: " if damage.block >= 0 else ""
+        click.echo(f"{store}: {block}{damage.object} {damage.what}", err=True)
+    if len(report.damages) > MOST_LISTED:
+        click.echo(f"and {len(report.damages) - MOST_LISTED:,} more", err=True)
+    if report.blocks:
+        click.echo(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
+
+
+def _say_what_to_do(store: Path, reports: list[Report]) -> None:
+    """What mends what was found."""
+    for report in reports:
+        if report.unmarked:
+            click.echo(
+                f"Damaged blocks are not marked for resume: {report.unmarked}. "
+                "Verify again when that is settled.",
+                err=True,
+            )
+    damages = [damage for report in reports for damage in report.damages]
+    if any(damage.of_template for damage in damages):
+        click.echo(f"sweep verify {store} --repair  puts back what is not results.", err=True)
+    if any(not damage.of_template for damage in damages):
+        click.echo(f"sweep resume {store}  computes what is lost and mends the journal.", err=True)

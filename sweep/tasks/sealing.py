@@ -1,0 +1,48 @@
+"""Lines that tell whether they are as they were written: JSON with its own digest at the end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+_SUM = b',"sum":"'
+_END = b'"}\n'
+
+
+def sealed(record: dict[str, Any]) -> bytes:
+    """A record, not empty, as one line of JSON whose last field is a digest of the others."""
+    body = json.dumps(record, separators=(",", ":")).encode()[:-1]
+    return body + _SUM + _digest(body) + _END
+
+
+def unsealed(line: bytes) -> dict[str, Any] | None:
+    """The record of a line; None where any byte of it is not as it was written."""
+    body, found, end = line.rpartition(_SUM)
+    if not found or end != _digest(body) + _END:
+        return None
+    record: dict[str, Any] = json.loads(body + b"}")
+    return record
+
+
+def _digest(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=8).hexdigest().encode()
+
+
+def read_sealed(path: Path) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
+    """Lines of a file and their records, None where damaged or cut short; nothing if it is absent.
+
+    A line end that was damaged joins two lines into one that is damaged.
+    """
+    if not path.exists():
+        return
+    with open(path, "rb") as lines:
+        for line in lines:
+            yield line, unsealed(line)
+
+
+def damaged_lines(path: Path) -> list[int]:
+    """Numbers, from 1, of the lines of a file that are damaged or cut short."""
+    return [n for n, (_, record) in enumerate(read_sealed(path), start=1) if record is None]

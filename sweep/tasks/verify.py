@@ -1,0 +1,215 @@
+"""Every byte of a store held against the digests that were taken as it was written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+
+from sweep.tasks import identity, journal, lock, store, studies, template
+from sweep.tasks.errors import StoreError
+from sweep.tasks.eyepoint_study import eyepoints_path
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.journal import Journal
+from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.recipe import RECIPE, read_recipe
+from sweep.tasks.sealing import damaged_lines, read_sealed
+from sweep.tasks.studies import AnyStudy
+from sweep.tasks.study import Study
+from sweep.tasks.template import Damage
+
+#: Blocks that are read at a time, and by how many threads: reading is waiting.
+BATCH = 256
+THREADS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a store was found to be."""
+
+    store: Path
+    blocks: int
+    whole: int  # blocks that are committed and undamaged
+    damages: tuple[Damage, ...]
+    restored: tuple[str, ...]  # objects of the template that were put back
+    unmarked: str  # why damaged blocks could not be marked for `resume`; empty where they are
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.damages
+
+    @property
+    def complete(self) -> bool:
+        """Whether every block is committed and undamaged."""
+        return self.whole == self.blocks
+
+
+def verify(
+    path: str | Path, *, repair: bool = False, progress: bool | Progress = True
+) -> list[Report]:
+    """Check every byte of a store, and of the eyepoints that its study looks with.
+
+    Receipts of damaged blocks are withdrawn, so that `resume` computes them again, where nobody
+    writes to the store. Whole lines that are missing at the end of a log are not seen as such: the
+    blocks of missing receipts count as not done.
+
+    Parameters
+    ----------
+    path
+        The store.
+    repair
+        Whether to put back what was in the store before there were results: metadata,
+        coordinates, the spec.
+    progress
+        As in `run`; shown after two seconds.
+
+    Returns
+    -------
+    list of Report
+        Of the store, and of each eyepoint store that is there.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or not one of this program's; where it can't be repaired.
+    """
+    path, told = Path(path).absolute(), Late(chosen(progress))
+    study = _study(path, template.attributes(path))
+    stores: dict[Path, AnyStudy | None] = {path: study}
+    if isinstance(study, FlightStudy):
+        stores |= {eyepoints_path(path, each.id): each for each in study.eyepoint_studies()}
+    return [_verify(each, held, repair, told) for each, held in stores.items() if each.exists()]
+
+
+def _study(path: Path, attributes: dict[str, Any]) -> AnyStudy | None:
+    """The study in a store; None where it holds none, or only who made it could tell."""
+    if attributes["kind"] == studies.ACCURACY or (
+        attributes["kind"] == "eyepoints" and not read_recipe(path)
+    ):
+        return None
+    return studies.described(path, attributes)
+
+
+def _verify(path: Path, study: AnyStudy | None, repair: bool, told: Progress) -> Report:
+    found, restored = template.damages(path), []
+    if found and study and repair:
+        found, restored = [], _restore(path, study)
+    logs = _of_logs(path)
+    blocks = list(_of_blocks(path, study, told)) if study else []
+    return Report(
+        store=path,
+        blocks=study.n_blocks if study else 0,
+        whole=_whole(path, study, blocks) if study else 0,
+        damages=(*found, *logs, *blocks),
+        restored=tuple(restored),
+        unmarked=_mark(path, blocks) if logs or blocks else "",
+    )
+
+
+def _whole(path: Path, study: Study, damages: list[Damage]) -> int:
+    done = journal.committed(path, study)
+    done[[damage.block for damage in damages]] = False
+    return int(np.count_nonzero(done))
+
+
+def _restore(path: Path, study: AnyStudy) -> list[str]:
+    attributes = template.attributes(path)
+    identity.refuse_other_versions(path, attributes, where="this machine")
+    held = lock.Lock(path)
+    try:
+        return template.restore(path, study)
+    finally:
+        held.release()
+
+
+def _of_logs(path: Path) -> list[Damage]:
+    """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
+    holder = lock.holder(path)
+    alive = holder is not None and lock.is_live(path, holder)
+    found = []
+    for name in (*journal.LOGS, RECIPE):
+        file = path / store.JOURNAL / name
+        unfinished = _unfinished(file) if alive else 0
+        found += [
+            Damage(f"{store.JOURNAL}/{name} line {number}", "is damaged or cut short")
+            for number in damaged_lines(file)
+            if number != unfinished
+        ]
+    return found
+
+
+def _unfinished(log: Path) -> int:
+    """Number of a log's last line where it has no end, else 0."""
+    number = 0
+    for number, (line, _) in enumerate(read_sealed(log), start=1):
+        if not line.endswith(b"\n"):
+            return number
+    return 0
+
+
+def _of_blocks(path: Path, study: Study, told: Progress) -> Iterator[Damage]:
+    """Damages of the blocks that were committed."""
+    digests = journal.digests(path, study.n_blocks)
+    blocks = np.flatnonzero(digests != b"")
+    told.begin(points=len(blocks), done=0, unit="blocks")
+    try:
+        with ThreadPoolExecutor(THREADS) as pool:
+            for start in range(0, len(blocks), BATCH):
+                batch = [int(block) for block in blocks[start : start + BATCH]]
+                for found in pool.map(
+                    lambda b: _of_block(path, study, b, bytes(digests[b])), batch
+                ):
+                    yield from found
+                told.advance(points=len(batch), failed=0)
+    finally:
+        told.end()
+
+
+def _of_block(path: Path, study: Study, block: int, digest: bytes) -> list[Damage]:
+    objects = store.block_objects(study, block)
+    try:
+        if store.digest(path, objects) == digest.decode():
+            return []
+    except OSError:
+        pass  # told below, object by object
+    found = [Damage(name, what, block) for name in objects if (what := _wrong(path / name))]
+    count = f"one of its {len(objects)} chunks"
+    return found or [Damage(count, "is whole but not the one that was committed", block)]
+
+
+def _wrong(chunk: Path) -> str:
+    """What is wrong with a chunk, by the checksum that Zarr's codec put at its end."""
+    try:
+        content = chunk.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing"
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
+    if not content:
+        return "is empty"
+    checksum = google_crc32c.value(content[:-4]).to_bytes(4, "little")
+    return "" if content[-4:] == checksum else "fails its checksum"
+
+
+def _mark(path: Path, damages: list[Damage]) -> str:
+    """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
+    try:
+        held = lock.Lock(path)
+    except StoreError as error:
+        return str(error)
+    try:
+        log = Journal(path)
+        for block in sorted({damage.block for damage in damages}):
+            named = [f"{d.object} {d.what}" for d in damages if d.block == block]
+            log.withdraw(block, "; ".join(named))
+    except OSError as error:
+        return f"{path} can't be written: {error.strerror or error}"
+    finally:
+        held.release()
+    return ""
