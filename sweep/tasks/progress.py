@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 #: Seconds between lines without a terminal.
 LINE_EVERY = 30.0
 
+#: Seconds before anything is shown of what is most often over by then.
+LATE = 2.0
+
 
 class Progress(Protocol):
     """What a run tells of itself while it goes on."""
@@ -59,12 +62,10 @@ class Late:
     ----------
     shown
         Where it is shown then.
-    after
-        Seconds.
     """
 
-    def __init__(self, shown: Progress, after: float = 2.0) -> None:
-        self._shown, self._after = shown, after
+    def __init__(self, shown: Progress) -> None:
+        self._shown = shown
         self._total, self._done, self._unit = 0, 0, "points"
         self._begun = time.monotonic()
         self._showing = False
@@ -79,7 +80,7 @@ class Late:
         self._done += points
         if self._showing:
             self._shown.advance(points=points, failed=failed)
-        elif time.monotonic() - self._begun > self._after:
+        elif time.monotonic() - self._begun > LATE:
             self._showing = True
             self._shown.begin(points=self._total, done=self._done, unit=self._unit)
 

@@ -1,0 +1,292 @@
+"""Every byte of a store that is not as it was written is found, and mended."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from small import copied, evaluated, everything, failing, logged, quiet, small, tree
+from small_flights import small_scene
+
+from sweep.cli import main
+from sweep.tasks import journal, studies
+from sweep.tasks.driver import resume
+from sweep.tasks.errors import StoreError
+from sweep.tasks.eyepoint_study import eyepoints_path
+from sweep.tasks.lock import Lock
+from sweep.tasks.verify import verify
+
+TINY = {"axes": {"target.range": ["1 km", "2 km"]}, "storage": {"block_points": 1}}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A store of two points in two blocks, with a failure in its past; not to be changed."""
+    directory = tmp_path_factory.mktemp("tiny")
+    path = directory / "tiny.zarr"
+    quiet(small(**TINY), path, scheduler="none", evaluate=failing({1}, directory / "log"))
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
+    return path
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    path = tmp_path_factory.mktemp("flight") / "scene.zarr"
+    assert quiet(small_scene(), path).complete
+    return path
+
+
+def damages(store: Path, **options) -> list[str]:
+    """Objects that are found damaged; a number of a line and a count of chunks are left out."""
+    reports = verify(store, progress=False, **options)
+    return [damage.object for report in reports for damage in report.damages]
+
+
+def files(store: Path) -> list[Path]:
+    return sorted(file for file in store.rglob("*") if file.is_file() and file.stat().st_size)
+
+
+def flips(store: Path, places):
+    """Flip a bit at each of some places over all files, one after the other: where, each time."""
+    for file in files(store):
+        content = file.read_bytes()
+        for place in places(content):
+            flipped = bytearray(content)
+            flipped[place] ^= 1 << place % 8
+            file.write_bytes(flipped)
+            yield file, place
+        file.write_bytes(content)
+
+
+def found_where(store: Path, file: Path) -> bool:
+    """Whether the one damaged file is found, and nothing else."""
+    name = str(file.relative_to(store))
+    found = unmarked(store)
+    return len(found) >= 1 and all(f.startswith(name) for f in found)
+
+
+def look_only(store: Path, monkeypatch) -> None:
+    """Have the one store verified quickly, without withdrawing anything."""
+    _, study = studies.read(store)
+    monkeypatch.setattr("sweep.tasks.verify._study", lambda path, attributes: study)
+    monkeypatch.setattr("sweep.tasks.verify._mark", lambda path, blocks: "only looking")
+
+
+def unmarked(store: Path) -> list[str]:
+    """What is found damaged in the one store."""
+    (report,) = verify(store, progress=False)
+    return [damage.object for damage in report.damages]
+
+
+@pytest.mark.parametrize(
+    "step", [pytest.param(1, marks=pytest.mark.slow), 397], ids=["every byte", "a sample"]
+)
+def test_a_flipped_bit_in_any_byte_of_a_small_store_is_found(tiny, tmp_path, monkeypatch, step):
+    store = copied(tiny, tmp_path)
+    look_only(store, monkeypatch)
+    assert unmarked(store) == []
+    number = 0
+    for file, place in flips(
+        store, lambda content: range(place_of(content, step), len(content), step)
+    ):
+        assert found_where(store, file), (file, place)
+        number += 1
+    assert number > (60_000 if step == 1 else 180)
+    assert unmarked(store) == []
+
+
+def place_of(content: bytes, step: int) -> int:
+    """First place of a sample: another for each file, and one that each has."""
+    return len(content) % min(step, len(content))
+
+
+def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch):
+    store = copied(tiny, tmp_path)
+    look_only(store, monkeypatch)
+    for file in files(store):
+        content = file.read_bytes()
+        for wrong in (content[:-1], content[1:], content[: len(content) // 2 + 1], content + b"\0"):
+            file.write_bytes(wrong)
+            assert found_where(store, file), file
+        file.unlink()
+        assert file.name in journal.LOGS or found_where(store, file), file
+        file.write_bytes(content)
+
+
+def test_whole_lines_cut_off_the_receipts_leave_their_blocks_to_be_done(tiny, tmp_path):
+    store = copied(tiny, tmp_path)
+    receipts = store / ".sweep" / "receipts.jsonl"
+    receipts.write_bytes(receipts.read_bytes().splitlines(keepends=True)[0])
+    (report,) = verify(store, progress=False)
+    assert report.sound and not report.complete and report.whole == 1
+    receipts.unlink()
+    (report,) = verify(store, progress=False)
+    assert report.sound and report.whole == 0
+
+
+def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, tmp_path):
+    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    flip(store / "pd_up" / "c" / "0" / "5" / "0")
+    flip(store / "pd_shot" / "c" / "0" / "6" / "0")
+    (store / "pd_shot" / "c" / "0" / "2" / "0").unlink()
+    (store / "pd_up" / "c" / "0" / "2" / "0").write_bytes(b"")
+    (report,) = verify(store, progress=False)
+    assert [(d.block, d.object, d.what) for d in report.damages] == [
+        (2, "pd_shot/c/0/2/0", "is missing"),
+        (2, "pd_up/c/0/2/0", "is empty"),
+        (5, "pd_up/c/0/5/0", "fails its checksum"),
+        (6, "pd_shot/c/0/6/0", "fails its checksum"),
+    ]
+    assert (report.whole, report.blocks, report.unmarked) == (9, 12, "")
+    (again,) = verify(store, progress=False)
+    assert again.sound and again.whole == 9
+    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
+    assert evaluated(log) == [2, 5, 6]
+    assert tree(store) == tree(undisturbed)
+    (mended,) = verify(store, progress=False)
+    assert mended.sound and mended.complete
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    chunks = store / "pd_shot" / "c" / "0"
+    shutil.copy(chunks / "2" / "0", chunks / "5" / "0")
+    (report,) = verify(store, progress=False)
+    assert [damage.block for damage in report.damages] == [5]
+    assert "not the one that was committed" in report.damages[0].what
+
+
+def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp_path):
+    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    receipts = store / ".sweep" / "receipts.jsonl"
+    receipts.write_bytes(receipts.read_bytes().replace(b'"block":7,', b'"block":8,'))
+    assert damages(store) == [".sweep/receipts.jsonl line 8"]
+    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
+    assert evaluated(log) == [7]
+    assert damages(store) == [] and tree(store) == tree(undisturbed)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["zarr.json", "pd_shot/zarr.json", "range/zarr.json", "range/c/0", ".sweep/template.jsonl"],
+)
+@pytest.mark.parametrize("damage", ["flipped", "missing"])
+def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, damage):
+    store = copied(undisturbed, tmp_path)
+    before = everything(store)
+    flip(store / name) if damage == "flipped" else (store / name).unlink()
+    with pytest.raises(StoreError, match=r"sweep verify .* --repair"):
+        resume(store, progress=False, scheduler="none")
+    (report,) = verify(store, progress=False, repair=True)
+    assert report.sound and report.complete and list(report.restored) == [name]
+    assert everything(store) == before
+    assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
+
+
+def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
+    undisturbed, tmp_path, monkeypatch
+):
+    store = copied(undisturbed, tmp_path)
+    flip(store / "range" / "c" / "0")
+    before = everything(store)
+    monkeypatch.setattr("sweep.tasks.store.WRITTEN_WHOLE", {})
+    monkeypatch.setattr("sweep.tasks.store._codecs", dict)
+    with pytest.raises(StoreError, match="can't be made again as it was on this machine"):
+        verify(store, progress=False, repair=True)
+    assert everything(store) == before
+
+
+def test_a_store_that_is_being_written_is_looked_at_and_not_touched(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    flip(store / "pd_up" / "c" / "0" / "5" / "0")
+    receipts = store / ".sweep" / "receipts.jsonl"
+    receipts.write_bytes(receipts.read_bytes() + b'{"block":3,')  # about to be written
+    held = Lock(store)
+    before = everything(store)
+    (report,) = verify(store, progress=False)
+    held.release()
+    assert [damage.block for damage in report.damages] == [5]
+    assert "is being written by process" in report.unmarked
+    assert everything(store).items() <= before.items()
+
+
+@pytest.mark.parametrize("whose", ["the flight's", "its eyepoints'"])
+def test_a_flights_store_and_its_eyepoints_are_verified_and_mended(flight, tmp_path, whose):
+    directory = shutil.copytree(flight.parent, tmp_path / "copy")
+    store = directory / flight.name
+    eyepoints = eyepoints_path(store, small_scene().geometry_id("line"))
+    damaged = store if whose == "the flight's" else eyepoints
+    assert [report.sound for report in verify(store, progress=False)] == [True] * 3
+    chunk = next(file for file in files(damaged) if file.parent.parent.name == "c")
+    flip(chunk)
+    flip(damaged / "zarr.json")
+    flip(damaged / ".sweep" / "recipe.json")
+    found = {report.store: report for report in verify(store, progress=False)}
+    assert [path for path, report in found.items() if not report.sound] == [damaged]
+    assert {d.object for d in found[damaged].damages} == {
+        "zarr.json", ".sweep/recipe.json line 1", str(chunk.relative_to(damaged)),
+    }  # fmt: skip
+    verify(store, progress=False, repair=True)
+    outcome = resume(store, spec=small_scene(), progress=False, scheduler="none")
+    assert (outcome.complete and sum(outcome.rays.values()) > 0) or damaged == store
+    assert all(r.sound and r.complete for r in verify(store, progress=False))
+    assert tree(directory) == tree(flight.parent)
+
+
+def test_where_a_flight_s_files_are_is_not_guessed(flight, tmp_path):
+    store = shutil.copytree(flight.parent, tmp_path / "copy") / flight.name
+    flip(store / ".sweep" / "recipe.json")
+    with pytest.raises(StoreError, match=r"sweep resume .* --spec FILE"):
+        resume(store, progress=False, scheduler="none")
+
+
+def test_the_command_tells_what_is_wrong_and_what_to_do(undisturbed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    copied(undisturbed, tmp_path)
+    command = CliRunner()
+    whole = command.invoke(main, ["verify", "copy.zarr"])
+    assert whole.exit_code == 0
+    assert whole.output == "copy.zarr: 12 of 12 blocks committed and undamaged\n"
+    flip(Path("copy.zarr/pd_up/c/0/5/0"))
+    flip(Path("copy.zarr/pd_up/zarr.json"))
+    damaged = command.invoke(main, ["verify", "copy.zarr"])
+    assert damaged.exit_code == 1
+    assert "block 5: pd_up/c/0/5/0 fails its checksum" in damaged.output
+    assert "pd_up/zarr.json is not as it was made" in damaged.output
+    assert "sweep verify copy.zarr --repair" in damaged.output
+    assert "sweep resume copy.zarr" in damaged.output
+    repaired = command.invoke(main, ["verify", "copy.zarr", "--repair"])
+    assert "pd_up/zarr.json put back" in repaired.output
+    assert repaired.exit_code == 3 and "11 of 12 blocks" in repaired.output
+    assert command.invoke(main, ["resume", "copy.zarr", "--scheduler", "none"]).exit_code == 0
+    assert command.invoke(main, ["verify", "copy.zarr"]).exit_code == 0
+    assert command.invoke(main, ["verify", "nowhere.zarr"]).exit_code == 2
+
+
+def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
+    told = []
+
+    class Watching:
+        def begin(self, *, points, done, unit):
+            told.append((points, done, unit))
+
+        def advance(self, *, points, failed):
+            told.append(points)
+
+        def say(self, text): ...
+
+        def end(self):
+            told.append("end")
+
+    verify(undisturbed, progress=Watching())
+    assert told == []
+    monkeypatch.setattr("sweep.tasks.verify.BATCH", 5)
+    monkeypatch.setattr("sweep.tasks.progress.LATE", 0.0)
+    verify(undisturbed, progress=Watching())
+    assert told == [(12, 5, "blocks"), 5, 2, "end"]
