@@ -48,6 +48,7 @@ _PREFIXED = {
     "W/Hz^0.5": "fW/rtHz pW/rtHz nW/rtHz W/rtHz",
     "W/m^3": "W/m^2/nm mW/m^2/nm W/m^2/um",
     "V": "uV mV V",
+    "byte": "MB GB TB MiB GiB",
     "1/m": "1/cm 1/m 1/km",
     PER_HERTZ: "1/Hz dB/Hz",
     DECIBEL: "dB",

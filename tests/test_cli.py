@@ -367,8 +367,11 @@ def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(h
         {**_mapping(), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
     assert pool.Place().for_spec(spec).scheduler == "none"
-    assert pool.Place(workers=2).for_spec(spec) == pool.Place(workers=2)
-    assert pool.Place().for_spec(spec).workers == 3
+    here_with_two = pool.Place(workers=2).for_spec(spec)
+    assert here_with_two.scheduler is None
+    assert here_with_two.cluster.workers == (2, 2)
+    spec = Spec.from_mapping({**_mapping(), "execution": {"workers": 3}}, base=here)
+    assert pool.Place().for_spec(spec).cluster.workers == (3, 3)
 
 
 def _mapping() -> dict:

@@ -23,10 +23,17 @@ MISTAKE = 2
 SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 STORE = click.argument("store", type=click.Path(path_type=Path))
 WORKERS = click.option(
-    "--workers", type=click.IntRange(min=1), help="Workers to start on this machine [all cores]."
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Workers to start [all cores here; those of --cluster].",
 )
 SCHEDULER = click.option(
     "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
+)
+CLUSTER = click.option(
+    "--cluster",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A file that describes a cluster: deploy/ has one of each kind.",
 )
 
 BLOCK_TIMEOUT = click.option(
@@ -95,6 +102,7 @@ def main() -> None:
 )
 @WORKERS
 @SCHEDULER
+@CLUSTER
 @click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
 @BLOCK_TIMEOUT
 @DURABLE
@@ -103,6 +111,7 @@ def run(
     store: Path | None,
     workers: int | None,
     scheduler: str | None,
+    cluster: Path | None,
     overwrite: bool,
     block_timeout: float | None,
     durable: bool,
@@ -116,6 +125,7 @@ def run(
       sweep run experiments/quickstart.yaml
       sweep run experiments/range_angle.yaml --store /data/range_angle.zarr --workers 8
       sweep run experiments/range_angle.yaml --scheduler tcp://10.0.0.5:8786
+      sweep run experiments/range_angle.yaml --cluster deploy/slurm.yaml --workers 200
       sweep run experiments/quickstart.yaml --scheduler none --overwrite
     """  # noqa: D301
     from sweep.spec import load
@@ -128,6 +138,7 @@ def run(
         store=path,
         workers=workers,
         scheduler=scheduler,
+        cluster=cluster,
         overwrite=overwrite,
         block_timeout=block_timeout,
         durable=durable,
@@ -149,6 +160,7 @@ def _default_store(spec: Path) -> Path:
 @click.option("--retry-failed", is_flag=True, help="Also try again what failed before.")
 @WORKERS
 @SCHEDULER
+@CLUSTER
 @BLOCK_TIMEOUT
 @DURABLE
 def resume(
@@ -157,6 +169,7 @@ def resume(
     retry_failed: bool,
     workers: int | None,
     scheduler: str | None,
+    cluster: Path | None,
     block_timeout: float | None,
     durable: bool,
 ) -> None:
@@ -178,6 +191,7 @@ def resume(
         retry_failed=retry_failed,
         workers=workers,
         scheduler=scheduler,
+        cluster=cluster,
         block_timeout=block_timeout,
         durable=durable,
     )

@@ -1,6 +1,7 @@
 """The declarative experiment: YAML in, checked values out, every mistake at once."""
 
 from sweep.spec.axes import Axis, Member
+from sweep.spec.clusters import AnyCluster, cluster_of, load_cluster
 from sweep.spec.experiment import Spec
 from sweep.spec.figures import (
     FalseAlarmTable,
@@ -29,6 +30,7 @@ from sweep.spec.sections import (
 
 __all__ = [
     "Accuracy",
+    "AnyCluster",
     "Atmosphere",
     "Axis",
     "Chirp",
@@ -54,8 +56,10 @@ __all__ = [
     "Target",
     "Telescope",
     "ThresholdTable",
+    "cluster_of",
     "difference",
     "from_stored",
     "json_schema",
     "load",
+    "load_cluster",
 ]

@@ -1,12 +1,25 @@
-"""Where tasks run: a cluster of this machine's cores, a scheduler elsewhere, or a given client."""
+"""Where tasks run: the workers of a cluster that is described, started and ended with the run."""
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from sweep.spec.cluster_fields import Bounds
+from sweep.spec.clusters import (
+    SSH,
+    Address,
+    AnyCluster,
+    Batch,
+    Cluster,
+    Kubernetes,
+    Local,
+    cluster_of,
+    load_cluster,
+)
+from sweep.tasks.clusters import common, local, ssh
 from sweep.tasks.errors import ClusterError
 
 if TYPE_CHECKING:
@@ -15,17 +28,14 @@ if TYPE_CHECKING:
 #: Scheduler "address" of the plain loop.
 NONE = "none"
 
-DASHBOARD_PORT = 8787
 CONNECT_TIMEOUT = 15.0
-LEAST_MEMORY = 1 << 30
 
-#: One thread a worker slot in every library that would start its own.
-ONE_THREAD = {
-    "OMP_NUM_THREADS": 1,
-    "MKL_NUM_THREADS": 1,
-    "OPENBLAS_NUM_THREADS": 1,
-    "NUMBA_NUM_THREADS": 1,
-}
+
+class Reached(NamedTuple):
+    """A cluster in use."""
+
+    client: Client
+    slots: int  # worker threads that it may come to have; 0 where that is unknown
 
 
 def cores() -> int:
@@ -35,29 +45,52 @@ def cores() -> int:
     return int(CPU_COUNT)
 
 
+def declared(given: str | Path | Mapping[str, Any] | AnyCluster) -> AnyCluster:
+    """Cluster from its file, from plain data, or as it is.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in it.
+    """
+    if isinstance(given, Cluster):
+        return given
+    return cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
+
+
+def of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
+    """The same cluster with a fixed number of workers, where one is given.
+
+    Raises
+    ------
+    ClusterError
+        Where its workers are not ours to start.
+    """
+    if workers is None:
+        return cluster
+    if isinstance(cluster, Address):
+        raise ClusterError(
+            f"the workers of {cluster.address} are there already: leave out their number"
+        )
+    return cluster.model_copy(update={"workers": Bounds(workers, workers)})
+
+
 @contextmanager
 def connected(
-    *,
-    scheduler: str | None,
-    workers: int,
-    threads: int,
-    processes: bool,
-    say: Callable[[str], None],
-) -> Iterator[Client]:
-    """A client of a scheduler, or of a cluster started here that ends with it.
+    cluster: AnyCluster, *, most: int, processes: bool, say: Callable[[str], None]
+) -> Iterator[Reached]:
+    """A client of a cluster; where it is started here it ends with it.
 
     Parameters
     ----------
-    scheduler
-        Address of a scheduler; None starts workers on this machine.
-    workers
-        Number of workers to start.
-    threads
-        Threads of each.
+    cluster
+        The cluster.
+    most
+        Tasks that there can be at once: for more workers than that there is nothing to do.
     processes
-        Whether they are processes or threads of this one.
+        Whether workers on this machine are processes or threads of this one.
     say
-        Takes the dashboard's address.
+        Takes where the cluster is, and its dashboard's address.
 
     Raises
     ------
@@ -66,61 +99,73 @@ def connected(
     """
     from distributed import Client
 
-    if scheduler is not None:
-        with _reached(scheduler) as client:
-            say(f"scheduler {scheduler}: dashboard {client.dashboard_link}")
-            yield client
+    if isinstance(cluster, Address):
+        with _reached(cluster) as client:
+            say(f"scheduler {cluster.address}: dashboard {client.dashboard_link}")
+            yield Reached(client, 0)
         return
-    with _local(workers, threads, processes) as cluster, Client(cluster) as client:
-        count = f"{workers} worker{'s' if workers > 1 else ''}"
-        say(f"{count} on this machine: dashboard {cluster.dashboard_link}")
-        yield client
+    bounds = _bounds(cluster, most)
+    with _started(cluster, bounds, processes) as started, Client(started) as client:
+        _keep(started, cluster, bounds)
+        say(f"{_described(cluster, bounds)}: dashboard {started.dashboard_link}")
+        yield Reached(client, bounds.most * cluster.worker.threads)
 
 
-def _reached(address: str) -> Client:
+def _bounds(cluster: Any, most: int) -> Bounds:
+    """Bounds of the number of workers, none of which shall have nothing to do."""
+    wanted = cluster.workers or Bounds(cores(), cores())
+    return Bounds(*(min(number, max(1, most)) for number in wanted))
+
+
+def _reached(cluster: Address) -> Client:
     from distributed import Client
 
     try:
-        return Client(address, timeout=CONNECT_TIMEOUT)
+        return Client(
+            cluster.address, timeout=CONNECT_TIMEOUT, security=common.security_of(cluster)
+        )
     except (OSError, ValueError) as error:
-        raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
+        raise ClusterError(f"no Dask scheduler answers at {cluster.address}: {error}") from error
 
 
-def _local(workers: int, threads: int, processes: bool) -> Any:
-    import dask
-    from distributed import LocalCluster
+def _started(cluster: AnyCluster, bounds: Bounds, processes: bool) -> Any:
+    try:
+        if isinstance(cluster, Local):
+            return local.start(cluster, bounds, processes=processes)
+        if isinstance(cluster, Batch):
+            from sweep.tasks.clusters import batch
 
-    options = {
-        "n_workers": workers,
-        "threads_per_worker": threads,
-        "processes": processes,
-        "host": "127.0.0.1" if processes else None,
-        "memory_limit": memory_limit(workers) if processes else 0,
-        "preload": ["sweep.tasks.preload"],
-    }
-    environment = {**dask.config.get("distributed.nanny.pre-spawn-environ"), **ONE_THREAD}
-    with dask.config.set({"distributed.nanny.pre-spawn-environ": environment}):
-        try:
-            return LocalCluster(dashboard_address=_dashboard(), **options)
-        except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
-            try:
-                return LocalCluster(dashboard_address=None, **options)
-            except (OSError, RuntimeError) as error:
-                raise ClusterError(f"no workers could be started: {error}") from error
+            return batch.start(cluster, bounds)
+        if isinstance(cluster, SSH):
+            return ssh.start(cluster, bounds)
+        raise TypeError(f"{cluster} starts no workers")
+    except (OSError, RuntimeError, ImportError) as error:
+        raise ClusterError(f"no workers could be started: {error}") from error
 
 
-def _dashboard() -> str:
-    """Loopback address for a dashboard: its usual port, or any where that is taken."""
-    with socket.socket() as probe:
-        try:
-            probe.bind(("127.0.0.1", DASHBOARD_PORT))
-        except OSError:
-            return "127.0.0.1:0"
-    return f"127.0.0.1:{DASHBOARD_PORT}"
+def _keep(started: Any, cluster: AnyCluster, bounds: Bounds) -> None:
+    """Keep the number of workers within bounds, in the place of those that leave.
+
+    Jobs end with their time, so that theirs is kept even where it is fixed.
+    """
+    if isinstance(cluster, Batch):
+        from sweep.tasks.clusters import batch
+
+        batch.keep(started, cluster, bounds)
+    elif bounds.least < bounds.most:
+        least, most = bounds
+        started.adapt(minimum=least, maximum=most, target_duration=common.WORK_AHEAD)
 
 
-def memory_limit(workers: int) -> int:
-    """Bytes that a worker may take before Dask restarts it: its share of 90 % of the memory."""
-    from distributed.system import MEMORY_LIMIT
-
-    return max(LEAST_MEMORY, int(0.9 * MEMORY_LIMIT / workers))
+def _described(cluster: AnyCluster, bounds: Bounds) -> str:
+    count = f"{bounds.least} to {bounds.most}" if bounds.least < bounds.most else f"{bounds.most}"
+    workers = f"{count} worker{'s' if bounds.most > 1 else ''}"
+    if isinstance(cluster, Batch):
+        held = cluster.job.workers
+        each = f" of {held}" if held > 1 else ""
+        return f"{workers} in {cluster.kind.upper()} jobs{each}"
+    if isinstance(cluster, SSH):
+        return f"{workers} on {', '.join(cluster.hosts)}"
+    if isinstance(cluster, Kubernetes):
+        return f"{workers} in pods of {cluster.namespace}"
+    return f"{workers} on this machine"

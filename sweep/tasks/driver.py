@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.tasks import identity, studies
 from sweep.tasks.casting import cast, eyepoints_are_sound
+from sweep.tasks.cluster import declared
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
@@ -28,9 +30,10 @@ from sweep.tasks.worker import Terms
 if TYPE_CHECKING:
     from distributed import Client
 
-    from sweep.spec import SceneSpec, Spec
+    from sweep.spec import AnyCluster, SceneSpec, Spec
 
     Declared = Spec | SceneSpec
+    Declaration = str | Path | Mapping[str, Any] | AnyCluster
 
 
 def run(
@@ -40,6 +43,7 @@ def run(
     client: Client | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: Declaration | None = None,
     processes: bool = True,
     overwrite: bool = False,
     progress: bool | Progress = True,
@@ -59,6 +63,8 @@ def run(
         Workers to start on this machine, default all cores, as processes or as threads.
     scheduler
         Address of a Dask scheduler, or "none" for a plain loop in this process.
+    cluster
+        The file that describes a cluster, or what such a file holds; `workers` fixes how many.
     overwrite
         Whether to put the new store in the place of one that is there.
     progress
@@ -84,14 +90,14 @@ def run(
     path, told = Path(store).absolute(), chosen(progress)
     study = studies.study_of(spec, path)
     place = Place(
-        client=client, workers=workers, scheduler=scheduler, processes=processes,
-        terms=Terms(evaluate, block_timeout, durable),
-    )  # fmt: skip
+        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
+        processes=processes, terms=Terms(evaluate, block_timeout, durable),
+    ).for_spec(spec)  # fmt: skip
     _make(path, study, overwrite, told)
     if durable:
         sync(path)
     try:
-        return _go_on(path, study, place.for_spec(spec), told)
+        return _go_on(path, study, place, told)
     except ClusterError:
         remove(path)  # nothing was computed, and the next try should not meet it
         raise
@@ -104,6 +110,7 @@ def resume(
     client: Client | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: Declaration | None = None,
     processes: bool = True,
     retry_failed: bool = False,
     progress: bool | Progress = True,
@@ -121,7 +128,7 @@ def resume(
         The study that the store is expected to hold; without it, whatever it holds.
     retry_failed
         Whether to try blocks again that were given up, for their errors, in an earlier run.
-    client, workers, scheduler, processes, progress, block_timeout, durable, evaluate
+    client, workers, scheduler, cluster, processes, progress, block_timeout, durable, evaluate
         As in `run`.
 
     Raises
@@ -144,11 +151,14 @@ def resume(
     if spec is None:
         refuse_damaged_recipe(path)
     place = Place(
-        client=client, workers=workers, scheduler=scheduler, processes=processes,
-        terms=Terms(evaluate, block_timeout, durable),
-    )  # fmt: skip
-    place = place.for_spec(spec or study.spec)
+        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
+        processes=processes, terms=Terms(evaluate, block_timeout, durable),
+    ).for_spec(spec or study.spec)  # fmt: skip
     return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
+
+
+def _declared(cluster: Declaration | None) -> AnyCluster | None:
+    return None if cluster is None else declared(cluster)
 
 
 def _held(path: Path) -> tuple[dict[str, object], GridStudy | FlightStudy]:

@@ -8,7 +8,10 @@ from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from sweep.spec.clusters import Address, AnyCluster, Local, LocalWorker
 from sweep.tasks import cluster
+from sweep.tasks.cluster import Reached
+from sweep.tasks.errors import ClusterError
 from sweep.tasks.todo import Todo
 from sweep.tasks.window import Job, Window, plain
 from sweep.tasks.worker import Answer, Terms
@@ -26,21 +29,31 @@ class Place:
     client: Client | None = None
     workers: int | None = None
     scheduler: str | None = None
-    threads: int = 1
+    cluster: AnyCluster | None = None
     processes: bool = True
     terms: Terms = field(default_factory=Terms)
 
     def for_spec(self, spec: Spec | SceneSpec) -> Place:
-        """The same place, with what it leaves open taken from the spec's `execution`."""
-        workers, scheduler = self.workers, self.scheduler
-        if scheduler is None and workers is None:
-            scheduler = spec.execution.scheduler or None
-        return replace(
-            self,
-            workers=workers or spec.execution.workers or None,
-            threads=spec.execution.threads,
-            scheduler=scheduler,
-        )
+        """The same place, with what it leaves open taken from the spec's `execution`.
+
+        Raises
+        ------
+        ClusterError
+            Where both a scheduler and a cluster are named, or workers that are not ours to start.
+        """
+        if self.cluster is not None:
+            if self.scheduler is not None:
+                raise ClusterError("a scheduler and a cluster are both named: leave out one")
+            return replace(self, cluster=cluster.of_workers(self.cluster, self.workers))
+        scheduler, execution = self.scheduler, spec.execution
+        if scheduler is None and self.workers is None:
+            scheduler = execution.scheduler or None
+        if scheduler is not None:
+            address = Address.model_construct(kind="scheduler", address=scheduler, security=None)
+            return replace(self, scheduler=scheduler, cluster=address)
+        here = Local(kind="local", worker=LocalWorker(threads=execution.threads))
+        workers = self.workers or execution.workers or None
+        return replace(self, cluster=cluster.of_workers(here, workers))
 
 
 class Pool:
@@ -59,7 +72,7 @@ class Pool:
     def __init__(self, place: Place, *, most: int, say: Callable[[str], None]) -> None:
         self._place, self._most, self._say = place, most, say
         self._stack = ExitStack()
-        self._client = place.client
+        self._reached = Reached(place.client, 0) if place.client is not None else None
 
     def __enter__(self) -> Self:
         return self
@@ -85,20 +98,19 @@ class Pool:
         ClusterError
             Where there is no scheduler or worker to be had.
         """
-        if self._client is None and self._place.scheduler == cluster.NONE:
+        if self._reached is None and self._place.scheduler == cluster.NONE:
             return plain(job, todo, stopping)
-        return Window(self._connected(), job, todo).answers(stopping)
+        return Window(*self._connected(), job, todo).answers(stopping)
 
-    def _connected(self) -> Client:
-        place = self._place
-        if self._client is None:
-            self._client = self._stack.enter_context(
+    def _connected(self) -> Reached:
+        if self._reached is None:
+            assert self._place.cluster is not None  # for_spec saw to it
+            self._reached = self._stack.enter_context(
                 cluster.connected(
-                    scheduler=place.scheduler,
-                    workers=min(place.workers or cluster.cores(), max(1, self._most)),
-                    threads=place.threads,
-                    processes=place.processes,
+                    self._place.cluster,
+                    most=self._most,
+                    processes=self._place.processes,
                     say=self._say,
                 )
             )
-        return self._client
+        return self._reached

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 TASK_SECONDS = 2.0
 MOST_BLOCKS = 1000
 
+#: Tasks that a scheduler is given in a second: a third of what it can take. On more than 200
+#: worker threads tasks are longer for it.
+TASKS_A_SECOND = 100.0
+
 #: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
 TICK = 0.5
 SLOTS_AGE = 2.0
@@ -65,15 +69,20 @@ class Pace:
         """Blocks for the next task; fewer near the end, so that all workers end together."""
         if not self.blocks:
             return 1
-        fitting = int(TASK_SECONDS * self.blocks / max(self.seconds, 1e-9))
+        wanted = max(TASK_SECONDS, slots / TASKS_A_SECOND)
+        fitting = int(wanted * self.blocks / max(self.seconds, 1e-9))
         return max(1, min(fitting, MOST_BLOCKS, left // (4 * slots)))
 
 
 @dataclass
 class Slots:
-    """Worker threads of a cluster, asked for anew every few seconds: workers come and go."""
+    """Worker threads of a cluster, asked for anew every few seconds: workers come and go.
+
+    Those that may come count as well: a cluster between bounds grows with the work it sees.
+    """
 
     client: Client
+    hoped: int = 0
     count: int = 1
     addresses: tuple[str, ...] = ()  # of the workers
     asked: float = field(default=-1e9)
@@ -82,7 +91,8 @@ class Slots:
         """Worker threads, at least 1."""
         if time.monotonic() - self.asked > SLOTS_AGE:
             threads = self.client.nthreads()
-            self.count, self.addresses = max(1, sum(threads.values())), tuple(threads)
+            self.count = max(1, self.hoped, sum(threads.values()))
+            self.addresses = tuple(threads)
             self.asked = time.monotonic()
         return self.count
 
@@ -94,17 +104,19 @@ class Window:
     ----------
     client
         The cluster.
+    hoped
+        Worker threads that it may come to have.
     job
         The study.
     todo
         Its blocks.
     """
 
-    def __init__(self, client: Client, job: Job, todo: Todo) -> None:
+    def __init__(self, client: Client, hoped: int, job: Job, todo: Todo) -> None:
         self._client, self._job, self._todo = client, job, todo
         self._flying: dict[Key, tuple[Future, list[int]]] = {}
         self._arrived: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._pace, self._slots = Pace(), Slots(client)
+        self._pace, self._slots = Pace(), Slots(client, hoped)
         self._failed_at: dict[int, str] = {}  # address of the worker by block
 
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:

@@ -1,0 +1,70 @@
+"""What all kinds of clusters start their workers with."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from sweep.spec.clusters import Cluster, Scheduler
+
+if TYPE_CHECKING:
+    from distributed import Security
+
+#: What a worker runs as it starts.
+PRELOAD = "sweep.tasks.preload"
+
+#: One thread a worker slot in every library that would start its own.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+#: Seconds of work ahead for which a cluster between bounds takes another worker thread.
+WORK_AHEAD = "1s"
+
+
+def environment(given: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables of workers: one thread a slot, and those given."""
+    return {**ONE_THREAD, **given}
+
+
+def security_of(cluster: Cluster) -> Security | None:
+    """Certificates of client, scheduler and workers, which then refuse whoever has none."""
+    from distributed import Security
+
+    settings = security_settings(cluster)
+    return Security(**settings) if settings else None
+
+
+def security_settings(cluster: Cluster) -> dict[str, Any]:
+    """Settings of `distributed.Security`; empty without certificates."""
+    paths = cluster.certificates()
+    if paths is None:
+        return {}
+    ca, certificate, key = paths
+    parts: dict[str, str] = {}
+    for role in ("client", "scheduler", "worker"):
+        parts |= {f"tls_{role}_cert": certificate, f"tls_{role}_key": key}
+    return {"require_encryption": True, "tls_ca_file": ca, **parts}
+
+
+def scheduler_options(section: Scheduler) -> dict[str, Any]:
+    """Where a scheduler of this process listens, and its dashboard."""
+    options: dict[str, Any] = {"port": section.port, "dashboard_address": dashboard(section)}
+    if section.interface:
+        return options | {"interface": section.interface}
+    return options | {"host": section.host or "127.0.0.1"}
+
+
+def dashboard(section: Scheduler) -> str:
+    """Address for a dashboard: the one asked for, or any port where that is taken."""
+    host, _, port = section.dashboard.rpartition(":")
+    with socket.socket() as probe:
+        try:
+            probe.bind((host, int(port)))
+        except (OSError, ValueError):
+            return f"{host}:0"
+    return section.dashboard

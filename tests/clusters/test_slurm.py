@@ -1,0 +1,112 @@
+"""A study on SLURM itself: a job killed, the driver killed, the same bytes as in a plain loop."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+
+import pytest
+import yaml
+from slurm_daemons import command, jobs, missing, slurm
+from small import STUDY, receipts, tree
+
+from sweep.tasks.driver import run
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+
+#: Blocks of about a tenth of a second: time enough to kill something in their midst.
+SLOW = {
+    **STUDY,
+    "footprint": {"beamlets": 109},
+    "draws": {"number": 3000, "method": "noise", "batch": 1000},
+    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 160}},
+    "storage": {"block_points": 1},
+}
+BLOCKS = 160
+WAIT = 120.0
+
+
+@pytest.fixture(scope="module")
+def environment():
+    with slurm() as environment:
+        yield environment | {"DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "1s"}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A directory with a study and a cluster of two jobs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "slow.yaml").write_text(yaml.safe_dump(SLOW))
+    cluster = {
+        "kind": "slurm",
+        "workers": 2,
+        "worker": {"memory": "1 GB"},
+        "job": {"walltime": "10 min", "directives": ["--no-requeue"]},
+        "scheduler": {"host": "127.0.0.1", "dashboard": "127.0.0.1:0"},
+    }
+    (tmp_path / "slurm.yaml").write_text(yaml.safe_dump(cluster))
+    return tmp_path
+
+
+@contextmanager
+def sweep(environment, *words: str):
+    """The command in a process of its own, gone at the end."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", "from sweep.cli import main; main()", *words],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        yield child
+    finally:
+        with suppress(ProcessLookupError):
+            child.kill()
+        child.communicate()
+
+
+def wait_for(condition, child) -> None:
+    deadline = time.monotonic() + WAIT
+    while not condition():
+        assert child.poll() is None, child.stdout.read()
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environment):
+    store = here / "slow.zarr"
+    asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
+    with sweep(environment, "run", "slow.yaml", *asked) as child:
+        wait_for(lambda: len(receipts(store)) >= 5, child)
+        before = jobs(environment)
+        command(environment, "scancel", "-s", "KILL", before[0])
+        wait_for(lambda: set(jobs(environment)) - set(before), child)  # another in its place
+        os.kill(child.pid, signal.SIGKILL)
+    committed = receipts(store)
+    assert 5 <= len(committed) < BLOCKS
+    with sweep(environment, "resume", "slow.zarr", "--cluster", "slurm.yaml") as child:
+        output, _ = child.communicate(timeout=WAIT)
+        assert child.returncode == 0, output
+    assert f"computed {BLOCKS - len(committed)} of {BLOCKS} blocks" in output
+    assert sorted(receipts(store)) == list(range(BLOCKS))
+    from sweep.spec import load
+
+    outcome = run(load("slow.yaml"), store="plain.zarr", scheduler="none", progress=False)
+    assert outcome.complete
+    assert tree(store) == tree(here / "plain.zarr")
+
+
+def test_jobs_that_the_batch_system_refuses_are_told_at_once(here, environment):
+    cluster = yaml.safe_load((here / "slurm.yaml").read_text())
+    cluster["job"]["queue"] = "absent"
+    (here / "slurm.yaml").write_text(yaml.safe_dump(cluster))
+    with sweep(environment, "run", "slow.yaml", "--cluster", "slurm.yaml") as child:
+        output, _ = child.communicate(timeout=WAIT)
+    assert child.returncode == 2
+    assert "no workers could be started" in output
+    assert "invalid partition" in output
+    assert "Traceback" not in output
+    assert not (here / "results" / "slow.zarr").exists()
