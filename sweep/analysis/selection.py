@@ -97,7 +97,7 @@ class Points:
 def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:
     """Whether each value is one of those wanted, to the last digits of a float."""
     if values.dtype.kind not in "fiu":
-        return np.isin(values.astype(str), [str(w) for w in wanted])
+        return np.isin([str(v) for v in values], [str(w) for w in wanted])
     matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted]  # type: ignore[arg-type]
     return np.logical_or.reduce(matches)
 

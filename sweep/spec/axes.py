@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.spec.fields import parameter_rules, parameter_suggestion
+from sweep.spec.fields import parameter_rules, parameter_suggestion, short_name
 from sweep.spec.generators import MOST_VALUES, Rejected
 from sweep.spec.mistakes import ABSENT, Finding, Location
 from sweep.spec.rules import Rule
@@ -102,7 +102,7 @@ def member_of(path: str, pieces: list[Any], location: Location) -> Member:
     Rejected
         Where there are too many values.
     """
-    name = path.rsplit(".", 1)[-1]
+    name = short_name(path)
     if isinstance(pieces[0], str):
         return Member(path, name, tuple(pieces), np.array(pieces), "")
     size = sum(len(piece.si) for piece in pieces)

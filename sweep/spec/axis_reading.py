@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sweep.spec.axes import Axis, Member, member_of, rule_at
-from sweep.spec.fields import parameter_rules
+from sweep.spec.fields import parameter_rules, short_name
 from sweep.spec.generators import Rejected, read_pieces
 from sweep.spec.mistakes import ABSENT, Finding, Location
 from sweep.spec.zips import is_zip, read_zip, zip_items
@@ -86,7 +86,7 @@ def _without_duplicates(member: Member, location: Location) -> None:
 def _named(axes: list[Axis]) -> list[Axis]:
     """Axes whose coordinates have the shortest names that tell them apart."""
     paths = [member.path for axis in axes for member in axis.members]
-    taken = Counter(path.rsplit(".", 1)[-1] for path in paths)
+    taken = Counter(map(short_name, paths))
     named = []
     for axis in axes:
         members = tuple(

@@ -12,6 +12,7 @@ from pydantic import Field, ValidationError
 
 from sweep.model import VERSION
 from sweep.spec.axes import Axis
+from sweep.spec.detector_check import is_method, spectra_findings
 from sweep.spec.effect_check import without_draws, written_modes
 from sweep.spec.fields import SECTIONS, values_of
 from sweep.spec.figure_check import figure_findings
@@ -50,9 +51,9 @@ class Spec(Study):
         """Figures of what the study lacks, random effects without draws, draws without an end."""
         findings = figure_findings(written, axes) if axes_are_whole else []
         with suppress(ValidationError):
-            draws = Draws.model_validate(written.get("draws", {}))
+            draws, values = Draws.model_validate(written.get("draws", {})), readable(written, axes)
+            findings += spectra_findings(draws, values, axes)
             if not draws.any:
-                values = readable(written, axes)
                 findings += without_draws(values, axes, written_modes(written))
             if draws.number and draws.adaptive:
                 findings.append(_two_numbers(draws))
@@ -70,11 +71,17 @@ class Spec(Study):
         """Content that makes the study this one, in SI values.
 
         Title, question, figures and execution are no part of it, nor are values that an axis
-        overrides. The order of the axes is: it lays out the arrays.
+        overrides, nor is what looks at whole spectra where none are drawn. The order of the axes
+        is: it lays out the arrays.
         """
+        looked_at = self.draws.whole_spectra
         return {
             "model": VERSION,
-            "parameters": self.parameters_off_axes(),
+            "parameters": {
+                path: value
+                for path, value in self.parameters_off_axes().items()
+                if looked_at or not is_method(path)
+            },
             "axes": [axis_identity(axis) for axis in self.axes],
             "draws": values_of(self.draws, ""),
             "effects": self.modes(),

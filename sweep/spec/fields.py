@@ -108,14 +108,20 @@ def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
     return lacking
 
 
+def short_name(path: str) -> str:
+    """Last part of a parameter's path; of what a part is, the part's own name."""
+    *parts, last = path.split(".")
+    return parts[-1] if last == "kind" and parts else last
+
+
 def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
     """Suggestion for a path that names no parameter; of those known, all by default."""
     rules = list(parameter_rules() if known is None else known)
-    tail = path.rsplit(".", 1)[-1]
-    same_tail = [known for known in rules if known.rsplit(".", 1)[-1] == tail]
+    tail = short_name(path)
+    same_tail = [known for known in rules if short_name(known) == tail]
     if len(same_tail) == 1:
         return f"did you mean '{same_tail[0]}'?"
-    by_tail = {known.rsplit(".", 1)[-1]: known for known in rules}
+    by_tail = {short_name(known): known for known in rules}
     suggestion = near_miss(path, rules) or near_miss(tail, by_tail)
     for short, known in by_tail.items():
         suggestion = suggestion.replace(f"'{short}'", f"'{known}'")

@@ -9,10 +9,12 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
 from sweep.spec.axes import Axis
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure
 from sweep.spec.mistakes import ABSENT, Finding, Location, near_miss
+from sweep.spec.sections import SPECTRA
 from sweep.units import QuantityError
 
 _FIGURE: TypeAdapter[Figure] = TypeAdapter(Figure)
@@ -33,7 +35,10 @@ def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[
     stems: set[str] = set()
     for i, figure in _readable(written.get("figures")):
         findings += _coordinate_findings(figure, axes, i)
-        findings += _variable_findings(figure, with_draws, i)
+        if _has_spectra(written.get("draws")):
+            findings += _spectra_findings(figure, i)
+        else:
+            findings += _variable_findings(figure, with_draws, i)
         if figure.stem in stems:
             rule = f"makes the same picture file as another, {figure.stem}"
             findings.append(Finding(("figures", i), rule, "give it a name", ABSENT))
@@ -45,6 +50,11 @@ def _has_draws(draws: object) -> bool:
     """Whether a section of draws, as written, asks for any."""
     asked = ("number", "limit") if isinstance(draws, Mapping) else ()
     return any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
+
+
+def _has_spectra(draws: object) -> bool:
+    """Whether a section of draws, as written, asks for whole spectra."""
+    return isinstance(draws, Mapping) and draws.get("method") == SPECTRA
 
 
 def _readable(written: object) -> Iterator[tuple[int, Figure]]:
@@ -93,3 +103,18 @@ def _variable_findings(figure: Figure, with_draws: bool, index: int) -> list[Fin
         ]
     stored = [*OUTPUTS, *drawn]
     return [Finding(location, "is no stored quantity", near_miss(variable, stored), variable)]
+
+
+def _spectra_findings(figure: Figure, index: int) -> list[Finding]:
+    """Closed forms that a study of whole spectra does not store."""
+    stored = SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
+    variable = getattr(figure, "variable", None)
+    if variable is None:
+        rule = "shows closed forms, which a study of whole spectra does not store"
+        remedy = "take surface, slices or table"
+        return [Finding(("figures", index, "kind"), rule, remedy, figure.kind)]
+    if variable in stored:
+        return []
+    location: Location = ("figures", index, "variable")
+    rule = "is nothing that a study of whole spectra stores"
+    return [Finding(location, rule, near_miss(variable, list(stored)), variable)]

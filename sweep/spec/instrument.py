@@ -7,7 +7,10 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
 
+from sweep.model.detectors import DETECTORS, FIXED
+from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.spec.effect_fields import with_parameters
+from sweep.spec.method_rule import Method
 from sweep.spec.rules import Choice, Numeric
 from sweep.spec.window_rule import Window
 
@@ -266,6 +269,62 @@ class Receiver(Part):
     ] = 290.0
 
 
+class Detector(Part):
+    """What flags bins of a spectrum, where whole spectra are drawn."""
+
+    kind: Annotated[
+        str, Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS))
+    ] = FIXED
+    training: Annotated[
+        int,
+        Numeric(
+            about="Training cells of a CFAR detector, half of them on either side; even",
+            example="32",
+            at_least="2",
+            at_most="100000",
+            whole=True,
+        ),
+    ] = 32
+    guard: Annotated[
+        int,
+        Numeric(
+            about="Guard cells on either side of the bin, which train nothing",
+            example="4",
+            at_least="0",
+            at_most="100000",
+            whole=True,
+        ),
+    ] = 4
+    rank: Annotated[
+        int,
+        Numeric(
+            about="Rank of OS-CFAR's training cell, 1 for the least; auto: three quarters of them",
+            example="24",
+            at_least="1",
+            at_most="100000",
+            whole=True,
+            words=(("auto", 0),),
+        ),
+    ] = 0
+    pfa: Annotated[
+        float,
+        Numeric(
+            about="Design probability of a false alarm in a bin of noise, of CFAR detectors",
+            example="1e-6",
+            at_least="1e-30",
+            at_most="0.5",
+        ),
+    ] = 1e-6
+
+
+class Estimator(Part):
+    """What places a detected peak between bins, where whole spectra are drawn."""
+
+    kind: Annotated[
+        str, Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS))
+    ] = PEAK_BIN
+
+
 @with_parameters("instrument.processing")
 class Processing(Part):
     """Sampling, transform and threshold."""
@@ -315,6 +374,8 @@ class Processing(Part):
             options=("half", "all"),
         ),
     ] = "half"
+    detector: Detector = Detector()
+    estimator: Estimator = Estimator()
 
 
 class Instrument(Part):

@@ -24,10 +24,13 @@ STORED = frozenset(
 """Names of a store's arrays and dimensions."""
 
 _OTHER = "make another study of it"
+_SPECTRA = ("looks at whole spectra, which flights do not draw", "study a flat target")
 _REASONS = {
     "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
     DIVERGENCE: ("moves the beamlets, and a study casts its rays once", _OTHER),
     "footprint.": ("moves the beamlets, and a study casts its rays once", _OTHER),
+    "instrument.processing.detector.": _SPECTRA,
+    "instrument.processing.estimator.": _SPECTRA,
     "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER),
 }
 

@@ -13,6 +13,7 @@ from sweep.model import VERSION
 from sweep.model.resolution import BEAMLETS, PATTERN, THESIS
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
+from sweep.spec.detector_check import is_method, not_on_flights
 from sweep.spec.effect_check import not_in_flights, written_modes
 from sweep.spec.fields import values_of
 from sweep.spec.files import Files, named_files
@@ -105,7 +106,9 @@ class SceneSpec(Study):
     ) -> list[Finding]:
         """What is wrong with scene, flight, files, random effects and figures."""
         findings = scene_findings(written, base) + axis_findings(written, axes)
-        findings += not_in_flights(readable(written, axes), axes, written_modes(written))
+        values = readable(written, axes)
+        findings += not_in_flights(values, axes, written_modes(written))
+        findings += not_on_flights(values, axes)
         return findings + scene_figure_findings(written, axes if axes_are_whole else None)
 
     @classmethod
@@ -133,6 +136,7 @@ class SceneSpec(Study):
             path: value
             for section in SECTIONS
             for path, value in values_of(getattr(self, section), section).items()
+            if not is_method(path)
         }
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,

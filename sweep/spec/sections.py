@@ -155,6 +155,10 @@ class Accuracy(Part):
     ] = 0.1
 
 
+SPECTRA = "spectra"
+"""Method of draws that are whole spectra."""
+
+
 class Draws(Part):
     """Random realisations of each point."""
 
@@ -178,8 +182,9 @@ class Draws(Part):
     method: Annotated[
         str,
         Choice(
-            about="Draw against the probabilities, or add noise to the bins",
-            options=("probabilities", "noise"),
+            about="Draw against the probabilities, add noise to the bins that matter, or draw "
+            "whole spectra for instrument.processing.detector and .estimator to look at",
+            options=("probabilities", "noise", SPECTRA),
         ),
     ] = "probabilities"
     interval: Annotated[
@@ -195,6 +200,11 @@ class Draws(Part):
     def any(self) -> bool:
         """Whether anything is drawn."""
         return self.number > 0 or self.adaptive
+
+    @property
+    def whole_spectra(self) -> bool:
+        """Whether a detector and an estimator look at whole spectra."""
+        return self.method == SPECTRA
 
     @property
     def adaptive(self) -> bool:

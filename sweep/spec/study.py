@@ -22,6 +22,7 @@ from sweep.spec.fields import (
     leaves,
     parameter_rules,
     parameter_suggestion,
+    short_name,
     values_of,
 )
 from sweep.spec.identity import digest
@@ -288,7 +289,7 @@ class Study(Part, ABC):
 def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None]:
     """Dotted path and rule of a parameter, by its path or its last part."""
     rules = parameter_rules()
-    paths = [path for path in known if name in (path, path.rsplit(".", 1)[-1])]
+    paths = [path for path in known if name in (path, short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 

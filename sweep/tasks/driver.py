@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.tasks import identity, studies
+from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
 from sweep.tasks.errors import ClusterError, StoreError
@@ -84,10 +84,12 @@ def run(
 
     Raises
     ------
-    StoreError, ClusterError
-        Where a store is in the way or can't be written; where no scheduler or worker is to be had.
+    StoreError, ClusterError, CodeError
+        Where a store is in the way or can't be written; where no scheduler or worker is to be had;
+        where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
     path, told = Path(store).absolute(), chosen(progress)
+    user_code.check(spec)
     study = studies.study_of(spec, path)
     place = Place(
         client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
@@ -146,6 +148,7 @@ def resume(
         identity.refuse_other_study(path, attributes, study.spec, spec)
     identity.refuse_other_versions(path, attributes, where="this machine")
     identity.refuse_altered(path, attributes, study.spec)
+    user_code.check(study.spec)
     asked = study if spec is None else studies.study_of(spec, path)  # it knows where its files are
     refuse_damaged(path)
     if spec is None:

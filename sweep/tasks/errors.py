@@ -15,5 +15,9 @@ class ClusterError(TaskError):
     """A scheduler or workers that can't be had."""
 
 
+class CodeError(TaskError):
+    """A function of the user's that may not run, can't be imported, or answers wrongly."""
+
+
 class SchedulerLost(Exception):
     """A scheduler that went away with work still out; what was committed stays."""

@@ -12,6 +12,7 @@ from sweep.tasks.grid import Grid, Value, canonical_rows
 from sweep.tasks.study import Results
 
 if TYPE_CHECKING:
+    from sweep.model.sampling import Promise
     from sweep.spec import Spec
 
 #: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
@@ -20,6 +21,11 @@ SUB_BATCH = 1 << 16
 
 #: Counts of draws held at once; many batches make a point larger.
 SUB_BATCH_COUNTS = 1 << 19
+
+#: Parameters that change how draws are looked at, and not what is drawn.
+NOT_PHYSICAL = (
+    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator."
+)  # fmt: skip
 
 #: Domain of the keys of draws, so that no other use of the same seed meets their streams.
 DOMAIN = "sweep.draws"
@@ -113,11 +119,13 @@ def _drawn(
     from sweep.model.philox import point_keys
     from sweep.model.sampling import Promise, simulate, simulate_until
 
-    # The same draws however closely they are looked at.
-    physical = {path: v for path, v in parameters.items() if not path.startswith("accuracy.")}
+    # The same draws however closely they are looked at, and by whatever method.
+    physical = {path: v for path, v in parameters.items() if not path.startswith(NOT_PHYSICAL)}
     keys = point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed)
     draws, tolerance = spec.draws, parameters["accuracy.tolerance"]
     promise = Promise(tolerance, parameters["accuracy.confidence"], draws.interval)  # type: ignore[arg-type]
+    if draws.whole_spectra:
+        return _in_spectra(spec, parameters, effects, keys, promise)
     if draws.adaptive:
         return simulate_until(
             parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit,
@@ -126,6 +134,29 @@ def _drawn(
     return simulate(
         parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), method=draws.method,
         promise=promise,
+    )  # fmt: skip
+
+
+def _in_spectra(
+    spec: Spec,
+    parameters: Mapping[str, Value],
+    effects: Collection[str],
+    keys: np.ndarray,
+    promise: Promise,
+) -> Results:
+    """Results of whole spectra, looked at by detectors and estimators."""
+    from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
+    from sweep.tasks.user_code import methods
+
+    draws, known = spec.draws, methods(parameters)
+    if draws.adaptive:
+        return simulate_spectra_until(
+            parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit, promise=promise,
+            methods=known,
+        )  # fmt: skip
+    return simulate_spectra(
+        parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), promise=promise,
+        methods=known,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from sweep.tasks.grid import Grid
 from sweep.tasks.study import ArrayLayout, Results
 
 if TYPE_CHECKING:
+    from sweep.model.outputs import Output
     from sweep.spec import Axis, Member, Spec
 
 #: Dimension of the batches of draws.
@@ -21,12 +22,21 @@ BATCH = "batch"
 NO_COUNT = -1
 
 
+def outputs_of(spec: Spec) -> dict[str, Output]:
+    """What the model yields for each point of a study, by name."""
+    from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+    from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+
+    if spec.draws.whole_spectra:
+        return SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
+    return OUTPUTS | (
+        ERROR_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS if spec.draws.any else {}
+    )  # fmt: skip
+
+
 def output_names(spec: Spec) -> list[str]:
     """Names of the arrays that blocks write, sorted."""
-    from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-
-    drawn = (*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS) if spec.draws.any else ()
-    return sorted([*OUTPUTS, *drawn, EFFECTS, ERROR])
+    return sorted([*outputs_of(spec), EFFECTS, ERROR])
 
 
 class GridStudy:
@@ -96,9 +106,9 @@ class GridStudy:
         return arrays + [self._output(n) for n in self._names if n not in (EFFECTS, ERROR)]
 
     def _output(self, name: str) -> ArrayLayout:
-        from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+        from sweep.model.outputs import ACCURACY_OUTPUTS
 
-        output = (OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS)[name]
+        output = outputs_of(self.spec)[name]
         batches = (len(batch_sizes(self.spec)),) if self._in_batches(name) else ()
         promise = self._promise() if name in ACCURACY_OUTPUTS and not output.whole else {}
         return ArrayLayout(

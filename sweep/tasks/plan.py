@@ -26,6 +26,9 @@ PLACES = 16
 #: Draws of a point while measuring.
 MOST_DRAWS = 1000
 
+#: The same, of whole spectra.
+MOST_SPECTRA = 10
+
 #: What a worker takes to start [s], and to write a chunk [s].
 START = 3.0
 WRITE_CHUNK = 2e-3
@@ -127,5 +130,6 @@ def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple
     parameters = grid.parameters(block)
     for members, effects in calling.of_block(block).some(chosen).groups():
         part = select(parameters, chosen[members])
-        left_out += timed(spec, part, len(members), effects, most_draws=MOST_DRAWS).left_out
+        most = MOST_SPECTRA if spec.draws.whole_spectra else MOST_DRAWS
+        left_out += timed(spec, part, len(members), effects, most_draws=most).left_out
     return len(chosen), left_out

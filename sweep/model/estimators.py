@@ -1,0 +1,250 @@
+"""Estimators of a peak's frequency, from the complex spectrum around the bin that was detected.
+
+All take spectra of real records, windowed and transformed, and give frequencies in bins; where a
+window matters, what they need of it comes from its own samples, so that any window and any padding
+will do. With Z_j the bins about the peak, turned so that a lone tone's are real and even in its
+distance (the phase of half a record a bin taken off):
+
+- ``peak_bin``: the largest bin, off by up to half a bin.
+- ``parabolic``, ``parabolic_log``: the vertex of a parabola through three magnitudes, or through
+  their logarithms [Smith and Serra, PARSHL, 1987]; biased between bins.
+- ``jacobsen``: Q Re[(Z_+ - Z_-) / (2 Z_0 - Z_- - Z_+)] for tapered windows, and
+  Re[(Z_+ - Z_-) / (2 Z_0 + Z_- + Z_+)] where the neighbours of a tone on a bin vanish [Jacobsen and
+  Kootsookos, IEEE Signal Process. Mag. 24(3), 123, 2007], Q the window's factor, by least squares
+  over half a bin (that of the published table within its digits); biased between bins.
+- ``candan``: the second form for every window, its bias taken out: Candan's factor [IEEE Signal
+  Process. Lett. 18, 351, 2011, and 20, 913, 2013; Signal Process. 114, 245, 2015, for windows] is
+  the slope at the bin, here the whole curve is inverted.
+- ``centroid``: centre of the power, less the noise's, within two resolution cells; biased by
+  what noise is left.
+- ``chirp_z``: the largest value of the windowed record's spectrum, on a grid of 1/32 bin by a
+  chirp-z transform [Rabiner, Schafer and Rader, Bell Syst. Tech. J. 48, 1249, 1969], and a
+  parabola; it reaches :func:`sweep.model.cramer_rao.windowed_deviation`.
+- ``maximum_likelihood``: the window is divided out of the record again, and the largest value of
+  the unwindowed spectrum found by Newton's method, once more without the tone's image at negative
+  frequency: for a lone tone in white noise the most likely one [Rife and Boorstyn, IEEE Trans.
+  Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+from scipy import fft, signal
+
+from sweep.model.processing import Setting, taper
+from sweep.model.window import Window
+
+Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
+"""From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
+setting to frequencies (m,) [bins], float64."""
+
+PEAK_BIN = "peak_bin"
+
+_STEPS = 512
+"""Places between -1 and 1 bin at which curves are known."""
+_VANISHING = 0.25
+"""Height of the neighbours of a tone on a bin, over its own, under which they count as none."""
+_CELLS = 2
+"""Resolution cells fs/L to either side over which a centroid is taken."""
+_ZOOM = 32
+"""Places a bin of the chirp-z transform."""
+_LEAST_WEIGHT = 1e-3
+"""Samples where the window is less than that, of its largest, are left out when it is undone."""
+_NEWTON = 6
+_FARTHEST = 0.5
+"""Steps of Newton's method, and bins that they may go in all."""
+
+
+def peak_bin(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """The bin itself."""
+    return peak.astype(float)
+
+
+def parabolic(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Vertex of the parabola through three magnitudes."""
+    return peak + _vertex(np.abs(_three(spectrum, peak)))
+
+
+def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Vertex of the parabola through the logarithms of three magnitudes."""
+    with np.errstate(divide="ignore"):
+        return peak + _vertex(np.log(np.abs(_three(spectrum, peak))))
+
+
+def jacobsen(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Jacobsen's ratio with the window's factor."""
+    sign, factor = jacobsen_form(setting.window, setting.fft_size)
+    return peak + factor * _ratio(_turned(spectrum, peak, setting), sign)
+
+
+def candan(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Jacobsen's ratio, as a lone tone in this window has it, inverted."""
+    delta, tone = _lone_tones(setting.window, setting.fft_size)
+    known = np.maximum.accumulate(_ratio(tone, 1))
+    return peak + np.interp(_ratio(_turned(spectrum, peak, setting), 1), known, delta)
+
+
+def centroid(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Centre of the power about the peak, less that of the noise."""
+    reach = math.ceil(_CELLS * setting.fft_size / setting.window.length)
+    apart = np.arange(-reach, reach + 1)
+    bins = np.clip(peak[:, None] + apart, 0, setting.fft_size // 2)
+    power = np.abs(np.take_along_axis(spectrum, bins, axis=1)) ** 2 - setting.noise_power
+    weight = np.where(apart == 0, np.maximum(power, setting.noise_power), np.maximum(power, 0.0))
+    return peak + (weight * (bins - peak[:, None])).sum(axis=1) / weight.sum(axis=1)
+
+
+def chirp_z(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Largest value of the spectrum between bins, by a chirp-z transform."""
+    zoom, found = _zoom(setting.window.length, setting.fft_size), np.empty(peak.size)
+    places = np.arange(2 * _ZOOM + 1)
+    for row, bin_ in enumerate(peak):  # one by one, so that bits do not depend on the others
+        magnitude = np.abs(zoom(_at_rest(_record(spectrum[row], setting), int(bin_), setting)))
+        top = int(np.clip(np.argmax(magnitude), 1, places[-2]))
+        vertex = _vertex(magnitude[None, top - 1 : top + 2])[0]
+        found[row] = bin_ + (top + vertex) / _ZOOM - 1.0
+    return found
+
+
+def maximum_likelihood(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """Most likely frequency of a lone tone in white noise."""
+    w = setting.taper
+    used = np.abs(w) > _LEAST_WEIGHT * np.abs(w).max()
+    weight = np.where(used, 1.0 / np.where(used, w, 1.0), 0.0)
+    start = candan(spectrum, peak, setting)
+    size, number, found = float(setting.fft_size), float(used.sum()), start.copy()
+    for row in range(peak.size):
+        record = (_record(spectrum[row], setting) * weight).astype(complex)
+        found[row] = _climb(record, start[row], size)
+        _without_image(record, found[row], size, number)
+        found[row] = _climb(record, found[row], size)
+    return found
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    PEAK_BIN: peak_bin,
+    "parabolic": parabolic,
+    "parabolic_log": parabolic_log,
+    "jacobsen": jacobsen,
+    "candan": candan,
+    "centroid": centroid,
+    "chirp_z": chirp_z,
+    "maximum_likelihood": maximum_likelihood,
+}
+
+
+def _three(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
+    """Bins below, at and above each peak, (m, 3)."""
+    return np.take_along_axis(spectrum, peak[:, None] + np.array([-1, 0, 1]), axis=1)
+
+
+def _turned(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+    """The same, as a tone in the middle of the record would have them."""
+    turn = 0.5 * setting.window.length / setting.fft_size
+    return _three(spectrum, peak) * np.exp(2j * np.pi * turn * np.array([-1, 0, 1]))
+
+
+def _vertex(values: np.ndarray) -> np.ndarray:
+    """Vertex of the parabola through (m, 3), -1/2..1/2 from the middle; 0 where there is none."""
+    below, middle, above = values.T
+    bend = 2 * middle - below - above
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = 0.5 * (above - below) / bend
+    return np.where(np.isfinite(place) & (bend > 0), np.clip(place, -0.5, 0.5), 0.0)
+
+
+def _ratio(turned: np.ndarray, sign: int) -> np.ndarray:
+    """Re[(Z_+ - Z_-) / (2 Z_0 +- (Z_- + Z_+))] of (m, 3), within -1..1."""
+    below, middle, above = turned.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = ((above - below) / (2 * middle + sign * (below + above))).real
+    return np.clip(np.nan_to_num(ratio), -1.0, 1.0)
+
+
+@lru_cache(maxsize=16)
+def _lone_tones(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [bins] from -1 to 1, and the turned bins of tones that far above one, (k, 3)."""
+    steps = np.arange(-_STEPS, _STEPS + 1)
+    half_turn = 0.5 * window.length / fft_size
+    y = np.arange(2 * _STEPS + 1) / _STEPS
+    far = signal.zoom_fft(taper(window), [0.0, 2.0 / fft_size], y.size, fs=1.0, endpoint=True)
+    real = (far * np.exp(2j * np.pi * half_turn * y)).real
+    tone = real[np.abs(_STEPS * np.array([-1, 0, 1]) - steps[:, None])]
+    return steps / _STEPS, tone.astype(complex)
+
+
+@lru_cache(maxsize=16)
+def jacobsen_form(window: Window, fft_size: int) -> tuple[int, float]:
+    """Sign of the neighbours in Jacobsen's denominator, and the factor of his ratio."""
+    delta, tone = _lone_tones(window, fft_size)
+    middle = tone[_STEPS].real
+    if abs(middle[2]) < _VANISHING * middle[1]:
+        return 1, 1.0
+    near = np.abs(delta) <= 0.5
+    ratio = _ratio(tone[near], -1)
+    return -1, float((ratio * delta[near]).sum() / (ratio**2).sum())
+
+
+@lru_cache(maxsize=4)
+def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
+    """Chirp-z transform of a record at rest, from -1 to 1 bin."""
+    edge = 1.0 / fft_size
+    return signal.ZoomFFT(length, [-edge, edge], 2 * _ZOOM + 1, fs=1.0, endpoint=True)
+
+
+def _record(spectrum: np.ndarray, setting: Setting) -> np.ndarray:
+    """The windowed record (L,) of a spectrum."""
+    return np.asarray(fft.irfft(spectrum, setting.fft_size))[: setting.window.length]
+
+
+def _at_rest(record: np.ndarray, bin_: int, setting: Setting) -> np.ndarray:
+    """A record with a bin moved to zero frequency."""
+    turns = np.arange(record.size) * bin_ % setting.fft_size / setting.fft_size
+    return np.asarray(record * np.exp(-2j * np.pi * turns))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _without_image(record, place, fft_size, number):
+    """Takes a tone's half at negative frequency off a record, which else moves the maximum."""
+    angle, total = -2.0 * math.pi * place / fft_size, 0j
+    step, turn = complex(math.cos(angle), math.sin(angle)), complex(1.0, 0.0)
+    for i in range(record.size):
+        total += record[i] * turn
+        turn *= step
+    image, turn = (total / number).conjugate(), complex(1.0, 0.0)
+    for i in range(record.size):
+        if record[i] != 0:  # where the window was not undone there is no tone
+            record[i] -= image * turn
+        turn *= step
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _climb(record, start, fft_size):
+    """Place [bins] of the nearest maximum of |sum x e^{-2 pi i n f / N}|^2, from a start."""
+    middle = 0.5 * (record.size - 1)
+    place = start
+    for _ in range(_NEWTON):
+        angle = -2.0 * math.pi * place / fft_size
+        step, turn = complex(math.cos(angle), math.sin(angle)), complex(1.0, 0.0)
+        s0, s1, s2 = 0j, 0j, 0j
+        for i in range(record.size):
+            value, n = record[i] * turn, i - middle
+            s0 += value
+            s1 += n * value
+            s2 += n * n * value
+            turn *= step
+        # of |S|^2 by the angle
+        slope = 2.0 * (1j * s1 * s0.conjugate()).real
+        bend = 2.0 * (abs(s1) ** 2 - (s2 * s0.conjugate()).real)
+        if not bend < 0.0:
+            break
+        moved = slope / bend * fft_size / (2.0 * math.pi)
+        place += moved
+        if abs(place - start) > _FARTHEST:
+            return start
+        if abs(moved) < 1e-9:
+            break
+    return place

@@ -1,0 +1,212 @@
+"""Points sampled by whole spectra: a detector and an estimator of frequency at work in noise.
+
+What is looked at in each draw says :mod:`sweep.model.spectra_look`.
+
+Draws are addressed, and added up one after the other: blocks, workers and how draws are cut into
+pieces change no bit. A detector sees the draws of one point and segment together, in pieces that
+depend on the FFT size and on numbers of draws alone.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from sweep.model.chain import prepare
+from sweep.model.intervals import COUNTED, half_width
+from sweep.model.outputs import DRAW_OUTPUTS, PROMISED
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.realisations import Means, random_effects, realise
+from sweep.model.sampling import Promise, looks, settle
+from sweep.model.shot import statistics
+from sweep.model.spectra_look import DEFAULTS, VALUES, Methods, View, counted, view_of
+from sweep.model.spectra_outputs import KEPT, WIDTHS
+
+SAMPLES = 1 << 18
+"""Samples of the spectra that are held at once."""
+
+_COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
+
+
+def simulate_spectra(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    batch_sizes: Sequence[int],
+    promise: Promise = Promise(),  # noqa: B008  # a tuple
+    methods: Methods = Methods(),  # noqa: B008  # a tuple
+) -> dict[str, np.ndarray]:
+    """Outputs of n points, each drawn so many times.
+
+    Parameters
+    ----------
+    parameters, effects, keys, batch_sizes, promise
+        As of :func:`sweep.model.sampling.simulate`; among the parameters those of :data:`DEFAULTS`.
+    methods : Methods
+        What the names in the parameters mean.
+
+    Returns
+    -------
+    dict of ndarray
+        (n,) by the names of SPECTRA_OUTPUTS and ACCURACY_OUTPUTS, (n, batches) int64 by those of
+        DRAW_OUTPUTS.
+    """
+    sample = SpectraSample(parameters, effects, keys=keys, methods=methods)
+    counts = sample.take(np.arange(len(keys)), 0, batch_sizes)
+    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
+
+
+def simulate_spectra_until(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    batch: int,
+    limit: int,
+    promise: Promise,
+    methods: Methods = Methods(),  # noqa: B008  # a tuple
+) -> dict[str, np.ndarray]:
+    """The same with as many draws as keep a promise on pd, or ``limit``; looks by ``batch``."""
+    sample = SpectraSample(parameters, effects, keys=keys, methods=methods)
+    settle(sample, np.arange(len(keys)), looks(batch, limit), promise)
+    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
+
+
+class SpectraSample:
+    """What has been drawn of n points so far, added up.
+
+    Parameters
+    ----------
+    parameters, effects, keys, methods
+        As of :func:`simulate_spectra`.
+    """
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
+        methods: Methods,
+    ) -> None:  # fmt: skip
+        size = len(keys)
+        self._parameters: dict[str, Any] = {**DEFAULTS, **parameters}
+        self._effects = effects
+        self._keys, self._methods = keys, methods
+        self.counts = np.zeros((len(DRAW_OUTPUTS), size), np.int64)
+        self.number = np.zeros(size, np.int64)
+        self._moments = np.zeros((3, len(VALUES), size))  # number, mean, sum of squares about it
+        self._fixed = Means(size)
+        self._prepared: dict[int, tuple[Shots, int]] = {}
+        if not random_effects(effects):
+            everywhere = np.broadcast_to(np.asarray(parameters["target.range"]), size)
+            whole: dict[str, Any] = {**parameters, "target.range": everywhere}
+            for index, shots in prepare(whole, effects):
+                self._fixed.add(index, statistics(shots))
+                self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
+
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
+        """Draw some of the points, from draw `first` on.
+
+        Returns
+        -------
+        (names, points, batches) int64 ndarray
+            Counts of these draws, in the order of DRAW_OUTPUTS.
+        """
+        ends = first + np.cumsum([0, *batch_sizes])
+        counts = np.zeros((len(DRAW_OUTPUTS), points.size, len(batch_sizes)), np.int64)
+        for place, point in enumerate(points):
+            for view, draws in self._views(int(point), int(ends[0]), int(ends[-1])):
+                batch = np.searchsorted(ends, draws, "right") - 1
+                found, values = counted(view, draws)
+                np.add.at(counts[:, place].T, batch, found.T)
+                _add(values, self._moments[:, :, point])
+        self.counts[:, points] += counts.sum(axis=-1)
+        self.number[points] += ends[-1] - ends[0]
+        return counts
+
+    def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
+        """What is looked at of a point, with the numbers of draws that are looked at together."""
+        p = self._at(point)
+        if self._prepared:
+            view = view_of(*self._prepared[point], p, self._keys[point], self._methods)
+            step = max(1, SAMPLES // view.setting.fft_size)
+            for start in range(first, last, step):
+                yield view, np.arange(start, min(start + step, last))
+            return
+        for stretch in realise(
+            p, self._effects, keys=self._keys[[point]], first_draw=first, draws=last - first
+        ):
+            self._fixed.add(np.full(stretch.draw.size, point), statistics(stretch.shots))
+            for i, draw in enumerate(stretch.draw):
+                view = view_of(stretch.shots, i, p, self._keys[point], self._methods)
+                yield view, np.array([draw])
+
+    def _at(self, point: int) -> dict[str, float | int | str | np.ndarray]:
+        """Parameters of a point."""
+        return {
+            path: v[point] if isinstance(v, np.ndarray) and v.ndim else v
+            for path, v in self._parameters.items()
+        }
+
+    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
+        widths = self._widths(points, promise)
+        over = widths - promise.of(points, self.number.size).tolerance
+        return np.fmax.reduce(over, axis=0, initial=0.0)
+
+    def _shares(self, points: np.ndarray) -> np.ndarray:
+        """Shares of draws with a detection, (4, points), by the names of PROMISED."""
+        shares = self.counts[_COUNT_OF][:, points] / self.number[points]
+        segments = np.asarray(self._parameters["instrument.receiver.architecture"]) != "direct"
+        there = np.broadcast_to(segments, self.number.shape)[points]
+        shares[PROMISED.index("pd_doppler")] += np.where(there, 0.0, np.nan)
+        return shares
+
+    def _widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """Half-widths of the shares' intervals, (4, points)."""
+        confidence = promise.of(points, self.number.size).confidence
+        interval = COUNTED[promise.interval](
+            successes=self.counts[_COUNT_OF][:, points], trials=self.number[points],
+            confidence=confidence,
+        )  # fmt: skip
+        return half_width(self._shares(points), interval)
+
+    def results(self, promise: Promise) -> dict[str, np.ndarray]:
+        """Outputs and their accuracy, (n,) each."""
+        points = np.arange(self.number.size)
+        n, mean, square = (dict(zip(VALUES, part, strict=True)) for part in self._moments)
+        fixed = self._fixed.results()
+        outputs = {name: fixed[name] for name in KEPT}
+        outputs |= dict(zip(PROMISED, self._shares(points), strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = {name: np.sqrt(square[name] / (n[name] * (n[name] - 1))) for name in VALUES}
+            for name in ("pfa_bin", "false_alarms"):
+                outputs |= {name: mean[name], f"{name}_error": error[name]}
+            for name in ("range", "radial_velocity"):
+                some = np.where(n[name] > 0, 0.0, np.nan)
+                outputs |= {
+                    f"{name}_bias": mean[name] + some,
+                    f"{name}_bias_error": error[name] + some,
+                    f"{name}_rmse": np.sqrt(mean[name] ** 2 + square[name] / n[name]),
+                    f"{name}_bound": np.sqrt(mean[f"{name}_2"]),
+                }
+        return outputs | {
+            "n_draws": self.number,
+            **dict(zip(WIDTHS, self._widths(points, promise)[_WIDTH_ORDER], strict=True)),
+            "accuracy_missed": self.missed(points, promise),
+        }
+
+
+_WIDTH_ORDER = [PROMISED.index(name.removesuffix("_half_width")) for name in WIDTHS]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add(values, moments):
+    """Draws into running numbers, means and sums of squared deviations; nan is no draw."""
+    for name in range(values.shape[0]):
+        for x in values[name]:
+            if np.isnan(x):
+                continue
+            moments[0, name] += 1.0
+            apart = x - moments[1, name]
+            moments[1, name] += apart / moments[0, name]
+            moments[2, name] += apart * (x - moments[1, name])

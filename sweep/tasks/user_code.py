@@ -1,0 +1,179 @@
+"""Detectors and estimators that are functions of the user's: allowed, imported, held to their word.
+
+A spec names them as ``module:function``. Reading a spec or a store imports nothing. What a study
+computes is imported by the processes that compute it, and only from modules that whoever started
+them has allowed: by ``--allow-code MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``,
+which workers on this machine inherit and others need set where they run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.tasks.errors import CodeError
+
+if TYPE_CHECKING:
+    from sweep.model.processing import Setting
+    from sweep.model.spectra_look import Methods
+    from sweep.spec import SceneSpec, Spec
+
+ALLOWED = "SWEEP_ALLOW_CODE"
+
+DETECTOR, ESTIMATOR = "detector", "estimator"
+_PATHS = {
+    DETECTOR: "instrument.processing.detector.kind",
+    ESTIMATOR: "instrument.processing.estimator.kind",
+}
+
+
+def allow(modules: Iterable[str]) -> None:
+    """Allow this process and the workers that it starts to import modules, also from here.
+
+    Parameters
+    ----------
+    modules
+        Their names, as they stand before the colon in a spec.
+    """
+    allowed = {*_allowed(), *modules}
+    if allowed:
+        os.environ[ALLOWED] = ",".join(sorted(allowed))
+        here = os.getcwd()
+        if here not in sys.path:
+            sys.path.insert(0, here)  # handed on to workers that are spawned
+
+
+def _allowed() -> set[str]:
+    return set(filter(None, os.environ.get(ALLOWED, "").split(",")))
+
+
+def check(spec: Spec | SceneSpec) -> None:
+    """Import the functions that a study names, and try each on a small known spectrum.
+
+    Raises
+    ------
+    CodeError
+        Where one may not run, can't be imported, or does not answer as it must.
+    """
+    draws = getattr(spec, "draws", None)
+    if not getattr(draws, "whole_spectra", False):
+        return
+    for role, path in _PATHS.items():
+        on_axes = [m.values for axis in spec.axes for m in axis.members if m.path == path]
+        names = on_axes[0] if on_axes else [spec.parameters()[path]]
+        for name in dict.fromkeys(map(str, names)):
+            if ":" in name:
+                _try(role, name)
+
+
+def methods(parameters: Mapping[str, Any]) -> Methods:
+    """What the names of detectors and estimators in the parameters of some points mean.
+
+    Raises
+    ------
+    CodeError
+        As of :func:`check`.
+    """
+    from sweep.model.detectors import DETECTORS
+    from sweep.model.estimators import ESTIMATORS
+    from sweep.model.spectra_look import Methods
+
+    own = {
+        role: {
+            name: guarded(role, name)
+            for name in map(str, np.unique(np.asarray(parameters[path])))
+            if ":" in name
+        }
+        for role, path in _PATHS.items()
+    }
+    return Methods({**DETECTORS, **own[DETECTOR]}, {**ESTIMATORS, **own[ESTIMATOR]})
+
+
+@lru_cache(maxsize=64)
+def guarded(role: str, name: str) -> Callable[..., np.ndarray]:
+    """A function of the user's, given arrays that it can't write to, its answers checked.
+
+    Parameters
+    ----------
+    role, name
+        ``detector`` or ``estimator``; ``module:function``.
+    """
+    function = _imported(name)
+
+    def detect(power: np.ndarray, setting: Setting) -> np.ndarray:
+        answer = function(_read_only(power), setting)
+        return _whole(name, answer, power.shape, np.dtype(bool))
+
+    def estimate(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
+        answer = function(_read_only(spectrum), _read_only(peak), setting)
+        return _whole(name, answer, peak.shape, np.dtype(float))
+
+    return detect if role == DETECTOR else estimate
+
+
+def _imported(name: str) -> Callable[..., Any]:
+    module, _, attribute = name.partition(":")
+    if module not in _allowed():
+        raise CodeError(
+            f"{name} is code that this study would run, and its module is not allowed: look at it, "
+            f"then say --allow-code {module} (or put it into {ALLOWED} where workers start)"
+        )
+    try:
+        function = getattr(import_module(module), attribute)
+    except ImportError as error:
+        raise CodeError(f"{name}: its module can't be imported: {error}") from error
+    except AttributeError:
+        raise CodeError(f"{name}: the module has nothing called {attribute}") from None
+    if not callable(function):
+        raise CodeError(f"{name} is a {type(function).__name__}, and no function")
+    found: Callable[..., Any] = function
+    return found
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _whole(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An answer of the right kind."""
+    if not isinstance(answer, np.ndarray):
+        raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
+    if answer.shape != shape or answer.dtype != dtype:
+        raise CodeError(
+            f"{name} gives {answer.dtype} of shape {answer.shape}, and must give {dtype} of {shape}"
+        )
+    if not np.isfinite(answer).all():
+        raise CodeError(f"{name} gives values that are not finite")
+    return answer
+
+
+def _try(role: str, name: str) -> None:
+    """One call on three spectra of a tone at bin 40.25 of 128, in a little noise."""
+    from sweep.model.processing import Setting
+    from sweep.model.window import window
+
+    size, rng = 256, np.random.default_rng(1)
+    setting = Setting(
+        fft_size=size, sample_rate=1e6, window=window("hann", size), noise_power=0.375 * size,
+        threshold=50.0, training=16, guard=2, rank=12, pfa=1e-3,
+    )  # fmt: skip
+    record = 20 * np.cos(2 * np.pi * 40.25 * np.arange(size) / size) + rng.normal(size=(3, size))
+    spectrum, function = np.fft.rfft(record * setting.taper), guarded(role, name)
+    try:
+        if role == DETECTOR:
+            function(np.abs(spectrum) ** 2, setting)
+        else:
+            function(spectrum, np.full(3, 40), setting)
+    except CodeError:
+        raise
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}"
+        raise CodeError(f"{name} fails on a small known spectrum with {told}") from error
