@@ -120,9 +120,9 @@ class Accuracy(Part):
     tolerance: Annotated[
         float,
         Numeric(
-            about="How far a probability may be off: by effects left out, all together, "
-            "and where it is drawn by the half-width of its interval; 0 simulates all that the "
-            "scene has",
+            about="How far a probability of detection, log10 of one of a false alarm or a relative "
+            "magnitude may be off by effects left out, all together, and where it is drawn a "
+            "probability by the half-width of its interval; 0 simulates all that the scene has",
             example="1e-3",
             at_least="0",
             at_most="1",

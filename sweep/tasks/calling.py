@@ -172,7 +172,10 @@ def layouts(
     shape: tuple[int, ...], chunks: tuple[int, ...], dims: tuple[str, ...]
 ) -> list[ArrayLayout]:
     """Arrays that say what was simulated at each point."""
-    comment = "sum over the three segments of what the effects left out may change of pd"
+    comment = (
+        "sum over the effects left out of what each may change: of pd in all three segments, of "
+        "log10 of the probability of a false alarm, or of a relative magnitude, whichever is most"
+    )
     return [
         ArrayLayout(
             name=EFFECTS, shape=shape, chunks=chunks, dims=dims, dtype="uint32", fill=0,
@@ -182,7 +185,7 @@ def layouts(
             name=ERROR, shape=shape, chunks=chunks, dims=dims, dtype="float64", fill=float("nan"),
             attributes={
                 "units": "1",
-                "long_name": "largest change of a probability by effects that were left out",
+                "long_name": "largest change by effects that were left out",
                 "comment": comment,
             },
         ),

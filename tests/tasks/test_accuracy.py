@@ -270,15 +270,24 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives():
     assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
 
 
-def test_what_sees_nothing_detects_nothing():
-    def seen(pd):
-        pd = np.array([pd])
-        return Seen(pd, np.array([[-np.inf, -3.0]]), np.array([[1.0]]), np.array([np.nan]))
+def seen(pd, magnitude=1.0):
+    """A point of given probabilities and magnitude, sigma 0.5."""
+    alarms = np.array([[-np.inf, -3.0]])
+    return Seen(
+        np.array([pd]), alarms, np.array([[magnitude]]), np.array([np.nan]), np.array([0.5])
+    )
 
+
+def test_what_sees_nothing_detects_nothing():
     pd, pfa, magnitude = measure.apart(
         seen([0.5, np.nan, 0.2, np.nan]), seen([0.4, 0.3, 0.2, np.nan])
     )
     assert (pd, pfa, magnitude) == (pytest.approx([0.3]), [0.0], [0.0])
+
+
+@pytest.mark.parametrize(("true", "found", "error"), [(2.0, 2.2, 0.1), (0.1, 0.2, 0.2)])
+def test_magnitudes_are_off_by_so_much_of_themselves_or_of_sigma(true, found, error):
+    assert measure.apart(seen([1.0], found), seen([1.0], true))[2] == pytest.approx([error])
 
 
 def test_a_store_in_the_way_is_refused_and_left_alone(tmp_path, undisturbed):

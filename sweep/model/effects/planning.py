@@ -1,9 +1,10 @@
-"""Which effects are simulated where: in each tile those that pass the tolerance on pd together.
+"""Which effects are simulated where: in each tile those that pass the tolerance together.
 
 Effects' bounds are intervals on one magnitude. When several effects are left out and others kept,
 the magnitude from which one of them counts lies anywhere in the product of all the others'
 intervals, each with 1 in it (:mod:`sweep.model.effects.probability_bounds`). What is left out then
-changes pd by no more than the sum of these changes, whichever of the others are there.
+changes pd, log10 of a false alarm's probability and the magnitude by no more than the sum of these
+changes, whichever of the others are there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ class Plan(NamedTuple):
     kept: np.ndarray
     """(effects, tiles) bool: whether it is simulated."""
     change: np.ndarray
-    """(effects, tiles): largest change of a probability that it may make, 0..1."""
+    """(effects, tiles): largest change that it may make, 0..1."""
     error: np.ndarray
     """(tiles,): sum of what is left out may change; above the tolerance only by what is off."""
 
@@ -53,7 +54,8 @@ def plan(
         Name to ``auto`` (by default), ``on`` or ``off``. An effect that the scene has nothing of
         is left out in ``auto``. With one that is off go those that are within it.
     tolerance : float
-        On the sum of the changes of pd in the three segments by all that is left out, 0..1.
+        On the sum of the changes by all that is left out, 0..1: of pd in the three segments
+        together, of log10 of a false alarm's probability, of a relative magnitude.
     effects : sequence of Effect, optional
         Those to choose from, all by default.
 
@@ -76,7 +78,6 @@ def plan(
             list(bounds.values()),
             amplitude=rest.amplitude,
             threshold=block.threshold,
-            fft_size=block.fft_size,
         )
     chosen = [i for i in there if names[i] not in decided]
     out = _left_out(

@@ -11,7 +11,15 @@ change from one end of the interval to the other. What is added to a magnitude c
     dQ_1/da = b I_1(a b) e^{-(a^2 + b^2)/2} <= min(1/2, 0.22 b e^{-(a - b)^2 / 2}).
 
 Noise that the threshold does not follow changes the false alarms too, whose probability in a
-segment is P = 1 - (1 - p)^N, p = e^{-b^2/2}, with -dP/d ln b = N p (1 - p)^(N-1) b^2.
+segment is P = 1 - (1 - p)^N, p = e^{-b^2/2}, in a shot P^2. ln P rises with ln p no faster than
+this, so that the largest of their changes is
+
+    |d log10 P^2| <= |d b^2| / ln 10,
+
+for P itself, with dP = N p (1 - p)^(N-1) d ln p, has no more than |d b^2| / 4 from two bins on.
+
+Where pd is 1 whatever happens, bins still have magnitudes: |X| a sigma, changed by a factor f and
+by a further c, is off by no more than |f - 1| a + c, of a or of sigma, whichever is larger.
 """
 
 import math
@@ -26,18 +34,21 @@ from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1_pair
 
 _HUGE = 1e12
-_WEAK, _STRONG, _DOWN, _UP, _ADDED, _FIELDS = range(6)
+_LN_10 = math.log(10.0)
+_WEAK, _STRONG, _DOWN, _UP, _ADDED, _SHARE, _FIELDS = range(7)
 _NEGLIGIBLE = 1e-12
 """A change of a probability that needs no closer look."""
 
 
 def probability_changes(
-    bounds: Sequence[Change | np.ndarray], *, amplitude: Span, threshold: Span, fft_size: int
+    bounds: Sequence[Change | np.ndarray], *, amplitude: Span, threshold: Span
 ) -> np.ndarray:
-    """Largest change of a probability by each effect, (effects, tiles), 0..1.
+    """Largest change of a probability or of a magnitude by each effect, (effects, tiles), 0..1.
 
-    For a :class:`Change` the sum of the changes of pd in the three segments, which bounds that of
-    their product; or that of a false alarm in a segment, or its shift in bins, if larger.
+    For a :class:`Change` the largest of these: the sum of the changes of pd in the three segments,
+    which bounds that of their product; the change of log10 of the probability of a false alarm in
+    a shot; that of the largest bin's magnitude in any segment, in relation to it or to sigma,
+    whichever is larger; its shift in bins.
 
     Parameters
     ----------
@@ -48,8 +59,6 @@ def probability_changes(
         Magnitude of the detecting bin without any of the effects over sigma, (3, tiles).
     threshold : Span
         Threshold over sigma, (tiles,) or a scalar.
-    fft_size : int
-        N, of the bins that may raise a false alarm.
     """
     tiles = np.shape(amplitude.low)[1]
     factors = [bound for bound in bounds if isinstance(bound, Change)]
@@ -60,7 +69,7 @@ def probability_changes(
     ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
         amplitude.low, amplitude.high, threshold.low, threshold.high,
     )  # fmt: skip
-    found = iter(_changes(table, ends, float(fft_size)))
+    found = iter(_changes(table, ends))
     out = np.empty((len(bounds), tiles))
     for row, bound in zip(out, bounds, strict=True):
         if isinstance(bound, Change):
@@ -94,13 +103,14 @@ def pd_change_within(
 
 
 def _fill(entry: np.ndarray, change: Change) -> None:
-    """Least and largest factor on amplitude and threshold over sigma, and what is added."""
+    """Factors on amplitude and threshold over sigma; what is added; change of |X| by its factor."""
     weak, strong = change.signal
     quiet, loud = (1 / np.sqrt(value) for value in change.noise)
     entry[_WEAK], entry[_STRONG] = np.multiply(weak, loud), np.multiply(strong, quiet)
     entry[_DOWN] = 1.0 if change.threshold_follows else loud
     entry[_UP] = 1.0 if change.threshold_follows else quiet
     entry[_ADDED] = change.added
+    entry[_SHARE] = np.maximum(np.subtract(strong, 1), np.subtract(1, weak))
     np.minimum(entry, _HUGE, out=entry)
 
 
@@ -114,22 +124,23 @@ def _each_within(entry, ends):
 
 
 @njit(cache=True, error_model="numpy")
-def _changes(table, ends, bins):
-    """Changes of pd, summed over segments, or of a segment's false alarms, (effects, tiles)."""
+def _changes(table, ends):
+    """Changes of pd, summed over segments, of false alarms or of magnitudes, (effects, tiles)."""
     effects, _, segments, tiles = table.shape
     out = np.zeros((effects, tiles))
     for i in range(effects):
         for t in range(tiles):
-            total, alarm = 0.0, 0.0
+            total, other = 0.0, 0.0
             for s in range(segments):
                 own = table[i, :, s, t]
                 if not _does_anything(own):
                     continue
                 low, high, lower, upper = _with_others(table, ends, i, s, t)
                 total += _within(own, low, high, lower, upper)
+                other = max(other, _magnitude_change(own, low, high))
                 if own[_DOWN] != 1.0 or own[_UP] != 1.0:
-                    alarm = max(alarm, _alarm_change(own, lower, upper, bins))
-            out[i, t] = min(max(total, alarm), 1.0)
+                    other = max(other, _alarm_change(own, upper))
+            out[i, t] = min(max(total, other), 1.0)
     return out
 
 
@@ -161,9 +172,16 @@ def _with_others(table, ends, i, s, t):
 
 
 @njit(cache=True, error_model="numpy")
+def _magnitude_change(own, low, high):
+    """Largest change of a magnitude from within an interval, over it or 1, whichever is larger."""
+    more = own[_ADDED] * high / max(low, 1.0) if own[_ADDED] > 0.0 else 0.0
+    return min(own[_SHARE], _HUGE) * min(high, 1.0) + more
+
+
+@njit(cache=True, error_model="numpy")
 def _within(own, low, high, lower, upper):
     """Largest change of pd by one effect from anywhere within intervals."""
-    weak, strong, down, up, added = own
+    weak, strong, down, up, added, _ = own
     low, high = min(low, _HUGE), min(high, _HUGE)
     if low == high and lower == upper and added == 0.0:
         without = marcum_q1_pair(low, lower)[0]
@@ -232,22 +250,7 @@ def _steepest_threshold(low, high, smallest, biggest):
 
 
 @njit(cache=True, error_model="numpy")
-def _false_alarm(threshold, bins):
-    """Chance of a false alarm in a segment, every bin counted."""
-    bin_alarm = math.exp(-0.5 * threshold * threshold)
-    return -math.expm1(bins * math.log1p(-bin_alarm)) if bin_alarm < 1.0 else 1.0
-
-
-@njit(cache=True, error_model="numpy")
-def _alarm_change(own, lower, upper, bins):
-    """Largest change of a segment's chance of a false alarm from anywhere within thresholds."""
+def _alarm_change(own, upper):
+    """Largest change of log10 of a shot's chance of a false alarm from thresholds up to one."""
     down, up = own[_DOWN], own[_UP]
-    if lower == upper:
-        without = _false_alarm(lower, bins)
-        most = _false_alarm(lower * down, bins) - without
-        return max(most, without - _false_alarm(upper * up, bins))
-    down, up = min(down, 1.0), max(up, 1.0)
-    least, largest = lower * down, upper * up
-    ends = _false_alarm(least, bins) - _false_alarm(largest, bins)
-    slope = largest**2 * min(bins * math.exp(-0.5 * least * least), 0.5)
-    return min(ends, slope * max(math.log(up), -math.log(down)))
+    return upper * upper * max(1.0 - down * down, up * up - 1.0) / _LN_10

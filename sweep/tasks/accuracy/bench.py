@@ -37,6 +37,8 @@ class Seen(NamedTuple):
     """(n, k): |X| of the peak bins, in a unit of all rungs."""
     standard_error: np.ndarray
     """(n,): of the worst of pd, where it is a mean over draws."""
+    sigma: np.ndarray
+    """(n,): noise of a bin, per quadrature, in the magnitudes' unit."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         pd = np.stack(counts, axis=1) / draws
         nothing = np.full((len(pd), 3), np.nan)
         error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / draws)
-        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1))
+        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1), nothing[:, 0])
     pd = np.stack([outputs[name] for name in names], axis=1)
     alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
     magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]
@@ -122,4 +124,5 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         np.stack(alarms, axis=1),
         np.stack(magnitude, axis=1),
         np.fmax.reduce(errors) if errors else np.full(len(pd), np.nan),
+        np.sqrt(outputs["noise_variance"] / 2),
     )

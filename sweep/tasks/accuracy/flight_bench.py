@@ -282,4 +282,5 @@ def _found(
 
 
 def _nothing(shots: int) -> Seen:
-    return Seen(*(np.full(size, np.nan) for size in ((shots, 4), (shots, 2), (shots, 3), shots)))
+    sizes = ((shots, 4), (shots, 2), (shots, 3), shots, shots)
+    return Seen(*(np.full(size, np.nan) for size in sizes))

@@ -269,13 +269,17 @@ ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error")
 
 
 def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Largest differences of pd, of log10 pfa, and of magnitudes in relation, (n,) each."""
+    """Largest differences of pd, of log10 pfa and of magnitudes from others, (n,) each.
+
+    Magnitudes in relation to the other, or to sigma where it is below that.
+    """
     either = np.isfinite(seen.pd) | np.isfinite(other.pd)
     # What sees nothing detects nothing.
     pd = np.where(either, np.abs(np.nan_to_num(seen.pd) - np.nan_to_num(other.pd)), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         pfa = np.abs(seen.log10_pfa - other.log10_pfa)
-        magnitude = np.abs(seen.magnitude / other.magnitude - 1)
+        least = np.maximum(other.magnitude, other.sigma[:, None])
+        magnitude = np.abs(seen.magnitude - other.magnitude) / least
     same = seen.log10_pfa == other.log10_pfa
     pfa = np.where(same, 0.0, pfa)
     return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, magnitude))  # type: ignore[return-value]

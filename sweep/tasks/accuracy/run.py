@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _ABOUT = {
     "pd_error": ("1", "largest error of a probability of detection, of segments and shot"),
     "log10_pfa_error": ("1", "error of log10 of a probability of false alarm"),
-    "magnitude_error": ("1", "relative error of the magnitude of the peak bins"),
+    "magnitude_error": ("1", "error of the magnitude of the peak bins, over it or sigma if larger"),
     "standard_error": ("1", "standard error that the setting itself tells, where it draws"),
 }
 

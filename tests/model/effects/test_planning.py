@@ -8,6 +8,7 @@ from effect_points import scene, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sweep.model.chances import log_at_least_one
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.change import Change, pd_change
@@ -23,12 +24,12 @@ TILES = 40
 class Tiles:
     """What a plan needs of a block, given outright."""
 
-    def __init__(self, amplitude, threshold, fft_size=1024):
+    def __init__(self, amplitude, threshold):
         low, high = amplitude if isinstance(amplitude, tuple) else (amplitude, amplitude)
         self.amplitude = Span(
             *(np.broadcast_to(end, (3, np.shape(end)[-1])) for end in (low, high))
         )
-        self.threshold, self.fft_size = Span.of(threshold), fft_size
+        self.threshold = Span.of(threshold)
         self.size = self.amplitude.low.shape[1]
 
 
@@ -75,7 +76,7 @@ def test_what_is_left_out_changes_pd_by_no_more_than_the_tolerance(seed, toleran
     names = [f"effect {i}" for i in range(5)]
     bounds = random_bounds(rng, names, TILES)
     a, b = 10 ** rng.uniform(-1, 2, TILES), rng.uniform(0.5, 8, TILES)
-    made = plan(Tiles(a, b, 1), {}, tolerance, catalogue(bounds))
+    made = plan(Tiles(a, b), {}, tolerance, catalogue(bounds))
     assert (made.error <= tolerance).all() and made.names == tuple(names)
     for _ in range(20):
         # every effect does something within its bound; the truth has all, the plan what it kept
@@ -114,9 +115,8 @@ def test_no_effect_changes_more_whichever_of_the_others_there_are(seed):
     a, b = np.sort(10 ** rng.uniform(-1, 2, (2, TILES)), axis=0), rng.uniform(0.5, 8, TILES)
     a[0] = np.where(rng.random(TILES) < 0.5, a[1], a[0])
     found = probability_changes(
-        list(bounds.values()), amplitude=Tiles(tuple(a), b).amplitude, threshold=Span.of(b),
-        fft_size=1,
-    )  # fmt: skip
+        list(bounds.values()), amplitude=Tiles(tuple(a), b).amplitude, threshold=Span.of(b)
+    )
     for _ in range(20):
         chosen = {n: inside_of(rng, c) for n, c in bounds.items() if rng.random() < 0.5}
         level = a[0] + rng.random(TILES) * (a[1] - a[0])
@@ -156,11 +156,14 @@ def test_small_changes_cost_little_over_a_wide_interval():
     assert 0.4e-3 <= more <= 0.5e-3 * (1 + 1e-9)
 
 
-def test_where_the_signal_is_drowned_or_overwhelming_anything_may_go():
+def test_where_the_signal_is_drowned_anything_may_go_and_where_it_is_overwhelming_nothing():
     phases = catalogue({"phases": Change(signal=(0.5, 10.4))})
-    made = plan(Tiles(np.array([1e-3, 7.0, 1e3]), 6.55), {}, 1e-3, phases)
-    assert made.kept.tolist() == [[False, True, False]] and made.error.max() < 1e-8
+    made = plan(Tiles(np.array([1e-4, 7.0, 1e3]), 6.55), {}, 1e-3, phases)
+    assert made.kept.tolist() == [[False, True, True]] and made.error.max() < 1e-3
     assert made.effects(1) == ("phases",) and made.effects(0) == ()
+    # pd is 1 there all the same, which is what the noise's side of it tells
+    louder = catalogue({"louder": Change(noise=(1.0, 1.1))})
+    assert not plan(Tiles(np.array([1e-4, 1e3]), 6.55), {}, 1e-3, louder).kept.any()
 
 
 def test_nothing_is_certain_of_a_sum_that_may_cancel():
@@ -220,10 +223,10 @@ def test_an_effect_s_segments_add_up_and_a_shift_counts_as_a_chance_does():
     change = Change(signal=(np.full((3, 3), 0.9), 1.0))
     all_three = probability_changes(
         [change, change._replace(shift=np.full((3, 3), 0.8)), np.full((3, 3), 0.2)],
-        amplitude=Tiles(a, 6.5).amplitude, threshold=Span.of(6.5), fft_size=2,
+        amplitude=Tiles(a, 6.5).amplitude, threshold=Span.of(6.5),
     )  # fmt: skip
     single = probability_changes(
-        [change], amplitude=Tiles(a, 6.5).amplitude, threshold=Span.of(6.5), fft_size=2
+        [change], amplitude=Tiles(a, 6.5).amplitude, threshold=Span.of(6.5)
     )
     apart = pd_change(Change(signal=(0.9, 1.0)), amplitude=a, threshold=6.5)
     assert single[0] == pytest.approx(apart.sum(axis=0))
@@ -231,19 +234,42 @@ def test_an_effect_s_segments_add_up_and_a_shift_counts_as_a_chance_does():
 
 
 def test_noise_that_the_threshold_does_not_follow_changes_false_alarms():
-    b = np.array([4.0, 5.0, 6.0, 7.0])
-    change = Change(noise=(1.0, 1.03), threshold_follows=False)
+    b, bins = np.array([3.0, 5.0, 6.0, 20.0]), 1024
+    change = Change(noise=(1.0, 1.003), threshold_follows=False)
     tiles = Tiles(np.full(4, 1e-6), b)
-    found = probability_changes(
-        [change], amplitude=tiles.amplitude, threshold=tiles.threshold, fft_size=1024
-    )[0]
-    p = np.exp(-(b**2) / 2 / np.array([[1.0], [1.03]]))
-    alarm = 1 - (1 - p) ** 1024
-    assert found == pytest.approx(alarm[1] - alarm[0], rel=1e-9)
+    found = probability_changes([change], amplitude=tiles.amplitude, threshold=tiles.threshold)[0]
+    log_p = -(b**2) / 2 / np.array([[1.0], [1.003]])
+    segment = log_at_least_one(log_p, np.full_like(log_p, bins))
+    moved = 2 * np.diff(segment, axis=0)[0] / np.log(10)
+    assert found[1:] == pytest.approx(moved[1:], rel=0.01)
+    assert moved[0] < found[0] and np.diff(np.exp(segment), axis=0)[0, 0] < found[0]
     wide = probability_changes(
-        [change], amplitude=tiles.amplitude, threshold=Span(b * 0.999, b * 1.001), fft_size=1024
+        [change], amplitude=tiles.amplitude, threshold=Span(b * 0.9, b * 1.1)
     )[0]
-    assert (wide >= found).all() and (wide < 4 * found).all()
+    assert wide == pytest.approx(found * 1.1**2)
+
+
+@given(st.integers(0, 2**32))
+def test_a_magnitude_keeps_the_tolerance_wherever_pd_does_not_tell(seed):
+    rng = np.random.default_rng(seed)
+    bounds = random_bounds(rng, "ab", TILES, added=True)
+    a = np.sort(10 ** rng.uniform(-2, 4, (2, TILES)), axis=0)
+    a[0] = np.where(rng.random(TILES) < 0.5, a[1], a[0])
+    tiles = Tiles(tuple(a), np.full(TILES, 1e-3))  # always detected
+    found = probability_changes(
+        list(bounds.values()), amplitude=tiles.amplitude, threshold=tiles.threshold
+    )[0]
+    (_, change), (_, other) = bounds.items()
+    for _ in range(20):
+        level = a[0] + rng.random(TILES) * (a[1] - a[0])
+        most = a[1]
+        if rng.random() < 0.5:
+            f, _ = inside_of(rng, other._replace(noise=(1.0, 1.0)))
+            level, most = level * f, most * np.maximum(other.signal[1], 1.0)
+        f, _ = inside_of(rng, change._replace(noise=(1.0, 1.0)))
+        with_it = abs(level * f + most * change.added * rng.uniform(-1, 1, TILES))
+        moved = abs(with_it - level) / np.maximum(level, 1.0)
+        assert (np.minimum(moved, 1) <= found * (1 + 1e-9) + 1e-12).all()
 
 
 @pytest.mark.parametrize(

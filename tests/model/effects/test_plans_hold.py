@@ -52,6 +52,11 @@ def changed(on, off):
     return np.nansum(abs(on[:, 0] - off[:, 0]), axis=0)
 
 
+def magnitudes_moved(on, off, sigma):
+    """Largest change of a segment's |X|, in relation to it or to sigma if that is larger."""
+    return np.nanmax(abs(on[:, 2] - off[:, 2]) / np.maximum(off[:, 2], sigma), axis=0)
+
+
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 @pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
 def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1, kind, tiles):
@@ -71,15 +76,16 @@ def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1,
             most = dict(zip(CORE, changes, strict=True))
             on, off = found(inner, others | {name}), found(inner, others)
             assert (np.minimum(changed(on, off), 1) <= most[name] + ROUNDING).all(), (name, others)
+            moved = magnitudes_moved(on, off, shots_of(inner, others).bin_deviation)
+            assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all(), (name, others)
             if name == "leakage":
                 extra = np.nansum(on[:, 5], axis=0)
                 assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
-                alarms = [
-                    shot.statistics(shots_of(inner, e))["pfa_segment"]
-                    for e in (others | {name}, others)
-                ]
-                assert (abs(alarms[0] - alarms[1]) <= most[name] + ROUNDING).all()
+                seen = [shot.statistics(shots_of(inner, e)) for e in (others | {name}, others)]
+                for alarm in ("pfa_segment", "log10_pfa_segment", "log10_pfa_shot"):
+                    moved = abs(seen[0][alarm] - seen[1][alarm])
+                    assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all()
             noticed += (most[name] < 1).sum()
     assert noticed > 500
 
@@ -106,11 +112,26 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
                 of_kept = shot.evaluate(inner, names)
                 error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
                 assert (error <= tolerance + ROUNDING).all(), names
+                whole, part = shots_of(inner, CORE), shots_of(inner, names)
+                moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
+                assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
                 if "leakage" not in names:
                     extra = truth["p_leakage_up"] + truth["p_leakage_down"]
                     assert (extra[here] <= tolerance).all()
             kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
     assert kept > 100 and dropped > 100
+
+
+def test_the_image_of_a_still_target_is_kept_for_the_magnitude_s_sake(table_4_1):
+    parameters = DEFAULTS | table_4_1(
+        range=np.geomspace(20, 300, 8), radial_velocity=0.0, phases="incoherent", beamlets=19
+    )
+    made = plan(point_block(parameters), {}, 1e-3, CHOICE)
+    with_it, without = (found(parameters, names) for names in ({"image"}, set()))
+    assert (with_it[:, 1] == 0).all() and (without[:, 1] == 0).all()  # no miss: pd is 1
+    image = np.sqrt(2)  # power of the line at DC, and of its image there
+    assert with_it[1, 2] == pytest.approx(image * without[1, 2])
+    assert made.kept[made.names.index("image")].all()
 
 
 def cast_scene(rng, shots, beamlets, beside_chance):
