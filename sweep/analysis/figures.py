@@ -94,7 +94,7 @@ def _made(study: Study, figure: Figure, directory: Path) -> list[Path]:
     if isinstance(figure, Surface | Slices):
         sheet = _sheet(study, figure)
         return [canvas.save(sheet, directory / f"{figure.stem}.png")]
-    return _page(study, figure).save(directory, figure.stem)
+    return made_page(study, figure).save(directory, figure.stem)
 
 
 def _sheet(study: Study, figure: Surface | Slices) -> canvas.Sheet:
@@ -118,7 +118,8 @@ def _sheet(study: Study, figure: Surface | Slices) -> canvas.Sheet:
     return slices.draw(found, by=figure.by, **options)
 
 
-def _page(study: Study, figure: Table | FalseAlarmTable | ThresholdTable) -> Page:
+def made_page(study: Study, figure: Table | FalseAlarmTable | ThresholdTable) -> Page:
+    """Tables of one that a study asks for."""
     title = figure.title or study.spec.title
     if isinstance(figure, Table):
         return mean_table.mean_page(

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from sweep.cli.accuracy import conclude_accuracy
+from sweep.cli.report import report
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
@@ -84,6 +85,7 @@ def main() -> None:
       sweep resume results/quickstart.zarr        go on after an interruption
       sweep verify results/quickstart.zarr        is every byte as it was written?
       sweep figures results/quickstart.zarr       draw it
+      sweep report results/quickstart.zarr        one page with all of it, for a browser
       sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
 
     A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
@@ -353,6 +355,9 @@ def figures(store: Path, output: Path | None) -> None:
     from sweep.analysis.figures import draw
 
     _list(draw(store, output))
+
+
+main.add_command(report)
 
 
 @main.command()

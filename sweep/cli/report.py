@@ -1,0 +1,38 @@
+"""`sweep report`: a study as one page for a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("store", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The page [NAME-report.html beside NAME.zarr].",
+)
+def report(store: Path, output: Path | None) -> None:
+    """Write the study in STORE as one page that needs no network.
+
+    It says what was asked and simulated, has the figures to turn, cut and save, tables to sort and
+    download, and how to cite and repeat the study. Any current browser opens it, from a disk or an
+    e-mail. Large studies are reduced first, and the page says by how much.
+
+    \b
+      sweep report results/range_angle.zarr
+      sweep report results/forest_scan.zarr -o forest.html
+    """  # noqa: D301
+    from rich.console import Console
+
+    from sweep.report.writing import write
+    from sweep.tasks.studies import read
+
+    read(store)
+    file = output or store.with_name(f"{store.name.removesuffix('.zarr')}-report.html")
+    with Console(stderr=True).status("opening the store") as status:
+        write(store, file, lambda text: status.update(f"making: {text}"))
+    click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

@@ -1,0 +1,1 @@
+"""A study as one page that is read in a browser, without a network."""

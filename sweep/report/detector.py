@@ -1,0 +1,335 @@
+"""What the detector trades: receiver operating characteristic, noise by source, false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import dask
+import numpy as np
+import plotly.graph_objects as go
+
+from sweep.analysis import labels, noise_only
+from sweep.analysis.cuts import RANGE, coordinate_of
+from sweep.analysis.figures import Study
+from sweep.model.chain import prepare
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.flags import names_of
+from sweep.model.shot import evaluate
+from sweep.report import looks, wording
+from sweep.report.cells import HIGHEST, MEAN, Side, reduced
+from sweep.report.choosing import Part, parts
+from sweep.report.lines import STRETCHES
+from sweep.report.page import Chart, Control, when
+from sweep.spec import Spec
+
+TNR = "instrument.processing.tnr"
+
+PLACES = 24
+"""Places along a coordinate at which the noise is told by source."""
+
+CHANCES = (0.999, 0.9, 0.5, 0.1, 0.01)
+"""Probabilities of detection near which points are taken whose characteristic is drawn."""
+
+THRESHOLDS = np.sqrt(4 / (4 - np.pi) * np.log(10) * np.linspace(0.05, 16, 90))
+"""TNR at which a bin of noise crosses with probabilities from 0.9 to 1e-16."""
+
+ALARMS = ("pfa_bin", "pfa_segment", "pfa_shot", "p_leakage_up", "p_leakage_down")
+
+_RANDOM = {effect.name for effect in EFFECTS if effect.is_random}
+
+
+@dataclass(frozen=True)
+class Track:
+    """Points of one part of a study along its main coordinate, or its only point."""
+
+    words: str
+    part: Part
+    side: Side | None
+
+    def places(self, most: int) -> np.ndarray:
+        """Some of its places, spread over all."""
+        if self.side is None:
+            return np.zeros(1, int)
+        size = self.side.values.size
+        return np.unique(np.linspace(0, size - 1, min(most, size)).round().astype(int))
+
+    def position(self, place: int) -> dict[str, int]:
+        """Position along every axis of one of its places."""
+        if self.side is None:
+            return self.part.at()
+        return self.part.at(self.side) | {self.side.dim: int(self.side.positions[place])}
+
+
+def main_coordinate(spec: Spec) -> str:
+    """Range where it varies, else the longest of the numeric coordinates; empty where none is."""
+    if member := coordinate_of(spec, RANGE):
+        return member.name
+    numeric = [m for axis in spec.axes for m in axis.members if not isinstance(m.values, tuple)]
+    longest = max(numeric, key=lambda m: np.unique(m.display).size, default=None)
+    return longest.name if longest else ""
+
+
+def tracks(study: Study) -> tuple[list[Track], int]:
+    """Tracks along the main coordinate, and how many are left out."""
+    name = main_coordinate(study.spec)
+    found, fewer = parts(study.spec, [name] if name else [], {})
+    return [Track(p.words, p, p.side(study.spec, name) if name else None) for p in found], fewer
+
+
+def parameters_at(spec: Spec, position: Mapping[str, int]) -> dict[str, Any]:
+    """SI values of all parameters at a position along the axes."""
+    return spec.parameters() | {
+        member.path: np.asarray(member.values)[position[axis.name]].item()
+        for axis in spec.axes
+        for member in axis.members
+    }
+
+
+def effects_at(study: Study, track: Track, places: np.ndarray) -> list[list[str]]:
+    """Effects that were simulated at places along a track, but for random ones."""
+    flags = np.ravel(_values_at(study, "effects", track, places))
+    return [[n for n in names_of(int(flag)) if n not in _RANDOM] for flag in flags]
+
+
+def _values_at(study: Study, variable: str, track: Track, places: np.ndarray) -> np.ndarray:
+    """A variable at places along a track."""
+    if track.side is None:
+        return np.asarray(study.dataset[variable].isel(track.part.at()).values)
+    array = study.dataset[variable].isel(track.part.at(track.side))
+    return np.asarray(array.isel({track.side.dim: track.side.positions[places]}).values)
+
+
+def roc(study: Study, found: list[Track], fewer: int) -> Chart:
+    """Probability of detection over that of a false alarm, as the threshold moves."""
+    traces: list[go.Scatter] = []
+    told: list[str] = []
+    for track in found:
+        places = _places_of_interest(study, track)
+        effects = effects_at(study, track, places)
+        for number, (place, own) in enumerate(zip(places, effects, strict=True)):
+            name = _named(study, track, place)
+            curve = _characteristic(study.spec, track.position(place), own)
+            traces += _roc_traces(track, name, number, *curve)
+            if track is found[0]:
+                told.append(name)
+    return Chart(
+        heading="Receiver operating characteristic",
+        alt=(
+            "Lines of the probability of detection of a shot over the probability of a false "
+            f"alarm, as the threshold moves, {'; '.join(told) or 'at the point'}."
+        ),
+        caption=wording.sentences(
+            ["Simulated for this page, with the effects that the study simulates at each point"
+             + (" but for the random ones" if _draws(study) else ""),
+             "Dots: the study's own threshold",
+             "Points: those whose probability of detection comes nearest to "
+             + ", ".join(f"{chance:g}" for chance in CHANCES),
+             wording.left_out(fewer)]
+        ),
+        figure=go.Figure(
+            traces,
+            looks.layout(
+                xaxis=looks.axis("probability of a false alarm", type="log"),
+                yaxis=looks.upright("probability of detection, shot", range=[-0.03, 1.03]),
+            ),
+        ),
+        controls=[
+            Control("part", "Shown for", [track.words for track in found]),
+            Control("alarm", "False alarm", list(_ALARM_OF)),
+        ],
+    )  # fmt: skip
+
+
+_ALARM_OF = {"in a segment": "pfa_segment", "in a bin": "pfa_bin", "in both chirps": "pfa_shot"}
+
+
+def _draws(study: Study) -> bool:
+    return bool(study.spec.draws.any)
+
+
+def _named(study: Study, track: Track, place: int) -> str:
+    if track.side is None:
+        return ""
+    name = main_coordinate(study.spec)
+    ruler = wording.Ruler.of(study, name, track.side.values)
+    value = ruler.shown(track.side.values[place : place + 1])[0]
+    return f"{labels.coordinate(name)} {labels.quantity(value, ruler.units)}"
+
+
+def _places_of_interest(study: Study, track: Track) -> np.ndarray:
+    """Places along a track whose probability of detection is near to those looked for."""
+    chosen = track.places(4 * STRETCHES)
+    pd = np.ravel(_values_at(study, "pd_shot", track, chosen))
+    if not np.isfinite(pd).any():
+        return np.zeros(0, int)
+    nearest = [int(chosen[np.nanargmin(np.abs(pd - chance))]) for chance in CHANCES]
+    return np.unique(nearest)
+
+
+def _characteristic(
+    spec: Spec, position: Mapping[str, int], effects: list[str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Outputs over the threshold, and at the study's own."""
+    parameters = parameters_at(spec, position)
+    over = evaluate(parameters | {TNR: THRESHOLDS}, effects)
+    return over, evaluate(parameters, effects)
+
+
+def _roc_traces(
+    track: Track, name: str, number: int, over: dict[str, np.ndarray], own: dict[str, np.ndarray]
+) -> list[go.Scatter]:
+    """Line and dot of one point, for each kind of false alarm."""
+    traces = []
+    for alarm, variable in _ALARM_OF.items():
+        meta = when(number, part=track.words, alarm=alarm)
+        line = {"dash": looks.DASHES[number % len(looks.DASHES)], "width": 2}
+        traces += [
+            go.Scatter(
+                x=over[variable].astype(np.float32), y=over["pd_shot"].astype(np.float32),
+                text=[f"TNR {t:.3g}" for t in THRESHOLDS],
+                name=name, legendgroup=name, showlegend=bool(name), meta=meta, line=line,
+                mode="lines",
+            ),
+            go.Scatter(
+                x=own[variable], y=own["pd_shot"], name=f"{name}, as studied", legendgroup=name,
+                showlegend=False, meta=meta, mode="markers", marker={"size": 9},
+            ),
+        ]  # fmt: skip
+    return traces
+
+
+def noise_budget(study: Study, found: list[Track], fewer: int) -> Chart:
+    """Share of each source in the noise at the ADC, along the main coordinate."""
+    traces: list[go.Bar | go.Scatter] = []
+    told = ""
+    for track in found:
+        places = track.places(PLACES)
+        budgets = [
+            _sources(study, track.position(place), own)
+            for place, own in zip(places, effects_at(study, track, places), strict=True)
+        ]
+        names = sorted({n for b in budgets for n in b}, key=lambda n: -budgets[0].get(n, 0.0))
+        total = np.array([sum(budget.values()) for budget in budgets])
+        told = told or _budget_words(budgets[0])
+        for number, name in enumerate(names):
+            variance = np.array([budget.get(name, 0.0) for budget in budgets])
+            traces.append(_source_trace(study, track, places, number, name, variance, total))
+    name = main_coordinate(study.spec)
+    across = looks.axis("") if not name else wording.Ruler.of(study, name, _values(found)).axis
+    return Chart(
+        heading="Noise by source",
+        alt=f"Shares of noise sources in the noise variance at the ADC. {told}.",
+        caption=wording.sentences(
+            ["Shares of the variance at the ADC, simulated for this page with the effects that the "
+             "study simulates at each point; the standard deviation is shown on hovering",
+             wording.left_out(fewer)]
+        ),
+        figure=go.Figure(
+            traces,
+            looks.layout(
+                xaxis=across,
+                yaxis=looks.upright("share of the noise variance (%)", range=[0, 100]),
+                barmode="stack", hovermode="x unified" if name else "closest",
+            ),
+        ),
+        controls=[Control("part", "Shown for", [track.words for track in found])],
+    )  # fmt: skip
+
+
+def _values(found: list[Track]) -> np.ndarray:
+    return max((t.side.values for t in found if t.side), key=np.size)
+
+
+def _sources(study: Study, position: Mapping[str, int], effects: list[str]) -> dict[str, float]:
+    """Variance of each source of noise at the ADC [V^2], those that make any."""
+    parameters = parameters_at(study.spec, position)
+    ((_, shots),) = prepare(parameters, effects)
+    found = {name: float(np.ravel(v)[0]) for name, v in shots.noise_sources.items()}
+    return {name.replace("_", " "): value for name, value in found.items() if value > 0}
+
+
+def _budget_words(budget: Mapping[str, float]) -> str:
+    total = sum(budget.values())
+    largest = sorted(budget.items(), key=lambda item: -item[1])
+    return ", ".join(f"{name} {100 * value / total:.3g} %" for name, value in largest)
+
+
+def _source_trace(
+    study: Study, track: Track, places: np.ndarray, number: int, name: str,
+    variance: np.ndarray, total: np.ndarray,
+) -> go.Bar | go.Scatter:  # fmt: skip
+    """One source: an area along a coordinate, a bar where there is a single point or words."""
+    share = 100 * variance / np.where(total > 0, total, 1.0)
+    told = [f"{1e3 * np.sqrt(v):.3g} mV rms" for v in variance]
+    common: dict[str, Any] = {
+        "y": share, "name": name, "text": told, "meta": when(number, part=track.words),
+        "hovertemplate": "%{y:.3g} %, %{text}",
+    }  # fmt: skip
+    if track.side is None:
+        return go.Bar(x=["the point"], textposition="none", **common)
+    coordinate = main_coordinate(study.spec)
+    ruler = wording.Ruler.of(study, coordinate, track.side.values)
+    return go.Scatter(
+        x=ruler.shown(track.side.values[places]), stackgroup=track.words or "all", mode="lines",
+        **common,
+    )  # fmt: skip
+
+
+def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
+    """False alarms of noise and of leakage along the main coordinate; none without one."""
+    if found[0].side is None:
+        return None
+    packed = max(t.side.together(STRETCHES) for t in found if t.side)
+    kinds = (MEAN, HIGHEST) if packed > 1 else (MEAN,)
+    wanted = [(t, v, k) for t in found for v in ALARMS for k in kinds]
+    lazy = [
+        reduced(study.dataset[v], [(t.side, STRETCHES)], t.part.at(t.side), k).data
+        for t, v, k in wanted
+        if t.side is not None
+    ]
+    values = [np.asarray(value, np.float32) for value in dask.compute(*lazy)]
+    ruler = wording.Ruler.of(study, main_coordinate(study.spec), _values(found))
+    traces = [
+        go.Scatter(
+            x=ruler.shown(t.side.middles(STRETCHES)), y=np.where(value > 0, value, np.nan),
+            name=_short(study, v), meta=when(ALARMS.index(v), part=t.words, cell=k), mode="lines",
+            line={"dash": looks.DASHES[ALARMS.index(v)], "width": 2},
+        )
+        for (t, v, k), value in zip(wanted, values, strict=True)
+        if t.side is not None
+    ]  # fmt: skip
+    own = [f"{_short(study, v)}: {wording.spread(y)}" for (_, v, k), y in zip(wanted, values,
+           strict=True) if k == MEAN][: len(ALARMS)]  # fmt: skip
+    closed = noise_only.bin_probability(float(study.spec.parameters()[TNR]))
+    return Chart(
+        heading="False alarms",
+        alt=f"Lines of probabilities of false alarms and leakage over {ruler.words}. "
+        f"{'; '.join(own)}.",
+        caption=wording.sentences(
+            [f"A bin of noise alone crosses with probability {closed:.3g} in closed form"
+             if "tnr" not in study.dataset.coords else "",
+             f"Each stretch of a line stands for {packed} neighbouring points" * (packed > 1),
+             "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
+             wording.left_out(fewer)]
+        ),
+        figure=go.Figure(
+            traces,
+            looks.layout(xaxis=ruler.axis,
+                         yaxis=looks.upright("probability", type="log")),
+        ),
+        controls=[
+            Control("part", "Shown for", [track.words for track in found]),
+            Control("cell", "Each stretch shows the", kinds),
+        ],
+    )  # fmt: skip
+
+
+def _short(study: Study, variable: str) -> str:
+    """A variable in as few words as a legend has room for."""
+    return {
+        "pfa_bin": "noise, one bin", "pfa_segment": "noise, a segment",
+        "pfa_shot": "noise, both chirps", "p_leakage_up": "leakage, up-chirp",
+        "p_leakage_down": "leakage, down-chirp",
+    }[variable]  # fmt: skip

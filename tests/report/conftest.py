@@ -1,0 +1,84 @@
+"""Small studies, their pages, and a browser without a network to read them in."""
+
+import shutil
+
+import pytest
+from reported import EXPERIMENTS, GRID, SCENE
+
+from sweep.report.writing import write
+from sweep.spec import SceneSpec, Spec
+from sweep.tasks import driver
+
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def grid_store(tmp_path_factory):
+    """Two powers, 1201 ranges and three angles; not to be changed."""
+    store = tmp_path_factory.mktemp("grid") / "grid.zarr"
+    spec = Spec.from_mapping(GRID, base=EXPERIMENTS)
+    assert driver.run(spec, store=store, scheduler="none", progress=False).complete
+    return store
+
+
+@pytest.fixture(scope="session")
+def scene_store(tmp_path_factory):
+    """Four beams over hills, in full light and in dim; not to be changed."""
+    store = tmp_path_factory.mktemp("scene") / "scene.zarr"
+    spec = SceneSpec.from_mapping(SCENE, base=EXPERIMENTS)
+    assert driver.run(spec, store=store, scheduler="none", progress=False).complete
+    return store
+
+
+@pytest.fixture(scope="session")
+def grid_page(grid_store):
+    return write(grid_store, grid_store.with_name("grid.html"))
+
+
+@pytest.fixture(scope="session")
+def scene_page(scene_store):
+    return write(scene_store, scene_store.with_name("scene.html"))
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A headless browser; skipped where there is none."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None:
+        pytest.skip("no chromium on the path")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as run:
+        browser = run.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium):
+    """Opens a page, all charts drawn, in a context of its own: ``opened(file, width=390)``.
+
+    At the end it must have said nothing wrong, and asked nothing of any network.
+    """
+    wrong, asked, contexts = [], [], []
+
+    def opened(file, *, width=1200, scheme="light"):
+        context = chromium.new_context(
+            viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(file.as_uri())
+        page.wait_for_selector("html[data-drawn=all]", timeout=60_000)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert not wrong
+    assert not [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]

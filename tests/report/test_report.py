@@ -1,0 +1,183 @@
+"""What a report holds: reduced figures against whole ones, the spec again, and what is refused."""
+
+import json
+import re
+import subprocess
+import sys
+
+import dask.array
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from reported import EXPERIMENTS, GRID
+
+from sweep.analysis.opening import NotAStoreError
+from sweep.cli import main
+from sweep.report import looks
+from sweep.report.cells import HIGHEST, LOWEST, MEAN, Side, reduced
+from sweep.report.choosing import parts
+from sweep.report.writing import write
+from sweep.spec import Spec
+from sweep.tasks import driver
+
+BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
+
+
+@given(
+    shape=st.tuples(st.integers(1, 40), st.integers(1, 90)),
+    most=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    chunks=st.integers(1, 30),
+    kind=st.sampled_from(list(BY_HAND)),
+    seed=st.integers(0, 99),
+)
+def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, seed):
+    rng = np.random.default_rng(seed)
+    values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
+    array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
+    sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
+    found = reduced(array, list(zip(sides, most, strict=True)), {}, kind).values
+    up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
+    assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
+    assert all(size <= number for size, number in zip(found.shape, most, strict=True))
+    for (i, j), cell in np.ndenumerate(found):
+        own = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
+        own = own[np.isfinite(own)]
+        assert cell == pytest.approx(BY_HAND[kind](own), rel=1e-14) if own.size else np.isnan(cell)
+    middle = np.mean(sides[1].values[:across])
+    assert sides[1].middles(most[1])[0] == pytest.approx(middle, rel=1e-14)
+
+
+def test_parts_of_zipped_axes_are_told_apart():
+    cut = {"zip": [
+        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "15 deg"},
+        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
+    ]}  # fmt: skip
+    axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
+    spec = Spec.from_mapping(GRID | {"axes": axes, "figures": []}, base=EXPERIMENTS)
+    found, left_out = parts(spec, ["range", "power"], {})
+    assert left_out == 0
+    assert [part.words for part in found] == ["grazing angle 15°", "grazing angle 85°"]
+    assert found[1].side(spec, "range").positions.tolist() == [3, 4, 5]
+    (held,), _ = parts(spec, ["range", "power"], {"grazing_angle": "85 deg"})
+    assert held.side(spec, "range").values.tolist() == [1, 2, 3]
+    assert parts(spec, ["range"], {"grazing_angle": "86 deg"}) == ([], 0)
+
+
+def _contrast(one, other):
+    """Ratio of luminances as WCAG 2 has it."""
+
+    def luminance(colour):
+        parts = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+        linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+        return linear @ [0.2126, 0.7152, 0.0722]
+
+    low, high = sorted([luminance(one), luminance(other)])
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize(("scheme", "paper"), [("light", "#ffffff"), ("dark", "#111417")])
+def test_lines_stand_out_from_the_page_and_differ_in_more_than_colour(scheme, paper):
+    assert min(_contrast(colour, paper) for colour in looks.LINES[scheme]) >= 4.5
+    assert len(set(looks.DASHES)) == len(looks.DASHES) == len(looks.LINES[scheme])
+    ends = [stop[1] for stop in looks.themes()[scheme]["scale"]]
+    assert min(_contrast(colour, paper) for colour in ends) >= 2
+
+
+def _spec_in(page):
+    text = re.search(r"<pre[^>]*>(title:.*?)</pre>", page.read_text(), re.S).group(1)
+    for written, meant in (("&lt;", "<"), ("&gt;", ">"), ("&#39;", "'"), ("&#34;", '"')):
+        text = text.replace(written, meant)
+    return yaml.safe_load(text.replace("&amp;", "&"))
+
+
+def test_the_spec_on_the_page_is_the_study_s_own(grid_page, grid_store):
+    spec = Spec.from_mapping(_spec_in(grid_page))
+    assert spec.id == json.loads((grid_store / "zarr.json").read_text())["attributes"]["study_id"]
+    assert spec.id in grid_page.read_text()
+
+
+def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_page):
+    text = grid_page.read_text()
+    assert "each cell stands for 3 neighbouring points of 3,603" in text
+    assert re.search(r"[0-9]+ of 7,206 points, spread over all: reduced for this page", text)
+    own = re.sub(r"<script>.*?</script>", "", text, flags=re.S)
+    assert not re.findall(r"(?:src|href)=[\"']?(?:https?:)?//(?!itables\.org)", own)
+    assert "default-src 'none'" in own
+    assert grid_page.stat().st_size < 9e6
+
+
+def test_an_incomplete_store_says_so(tmp_path):
+    axes = {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["45 deg"]}
+    spec = Spec.from_mapping(
+        GRID | {"axes": axes, "figures": [], "storage": {"block_points": 1}}, base=EXPERIMENTS
+    )
+    store = tmp_path / "half.zarr"
+    driver.run(spec, store=store, scheduler="none", progress=False)
+    receipts = store / ".sweep" / "receipts.jsonl"
+    receipts.write_text(receipts.read_text().splitlines(keepends=True)[0])
+    page = write(store, tmp_path / "half.html")
+    assert "The study is not complete: 1 of 2 points are computed." in page.read_text()
+
+
+@pytest.mark.parametrize("axes", [{}, {"instrument.processing.window": ["hann", "hamming"]}])
+def test_studies_without_a_numeric_axis_have_a_page(tmp_path, axes):
+    target = GRID["target"] | {"range": "2 km", "grazing_angle": "60 deg"}
+    spec = Spec.from_mapping(GRID | {"axes": axes, "target": target, "figures": []},
+                             base=EXPERIMENTS)  # fmt: skip
+    store = tmp_path / "point.zarr"
+    driver.run(spec, store=store, scheduler="none", progress=False)
+    text = write(store, tmp_path / "point.html").read_text()
+    assert "Receiver operating characteristic" in text and "Noise by source" in text
+
+
+def test_the_command_writes_the_page_beside_the_store(grid_store):
+    ran = CliRunner().invoke(main, ["report", str(grid_store)], catch_exceptions=False)
+    page = grid_store.with_name("grid-report.html")
+    assert ran.exit_code == 0 and ran.stdout.startswith(f"{page}: ")
+    assert page.stat().st_size > 5e6
+    page.unlink()
+
+
+def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
+    missing = CliRunner().invoke(main, ["report", str(tmp_path / "none.zarr")])
+    assert missing.exit_code == 2 and "there is no store at" in missing.stderr
+    (eyepoints,) = (scene_store.parent / "eyepoints").glob("*.zarr")
+    with pytest.raises(NotAStoreError, match="holds the eyepoints of a flight"):
+        write(eyepoints, tmp_path / "page.html")
+    assert not list(tmp_path.glob("*.html"))
+
+
+MEMORY = """
+import resource, sys
+from sweep.report.writing import write
+from sweep.spec import Spec
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.store import create
+
+spec = Spec.from_mapping({mapping!r}, base={base!r})
+create(sys.argv[1], GridStudy(spec))
+write(sys.argv[1], sys.argv[1] + ".html")
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+def test_a_hundred_million_points_take_little_more_memory_than_a_million(tmp_path):
+    peaks = []
+    for number in (10_000, 1_000_000):
+        axes = {
+            "target.range": {"linear": ["1 m", "12 km"], "number": number},
+            "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100},
+        }
+        mapping = GRID | {"axes": axes, "figures": GRID["figures"][:1]}
+        code = MEMORY.format(mapping=mapping, base=str(EXPERIMENTS))
+        store = tmp_path / f"{number}.zarr"
+        ran = subprocess.run(
+            [sys.executable, "-c", code, str(store)], check=True, capture_output=True, text=True
+        )
+        peaks.append(int(ran.stdout))
+    assert peaks[1] < peaks[0] + 400_000, peaks  # an array of all points alone has 800 MB
