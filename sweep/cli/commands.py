@@ -9,7 +9,9 @@ from typing import Any
 import click
 
 from sweep.cli.accuracy import conclude_accuracy
+from sweep.cli.assignments import assignments
 from sweep.cli.report import report
+from sweep.cli.spectra import ALLOW_CODE, spectra
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
@@ -106,6 +108,7 @@ def main() -> None:
 @SCHEDULER
 @CLUSTER
 @click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+@ALLOW_CODE
 @BLOCK_TIMEOUT
 @DURABLE
 def run(
@@ -163,6 +166,7 @@ def _default_store(spec: Path) -> Path:
 @WORKERS
 @SCHEDULER
 @CLUSTER
+@ALLOW_CODE
 @BLOCK_TIMEOUT
 @DURABLE
 def resume(
@@ -208,6 +212,7 @@ def _shown(path: Path) -> Path:
 @main.command()
 @SPEC
 @WORKERS
+@ALLOW_CODE
 def plan(spec: Path, workers: int | None) -> None:
     """Say what SPEC would take, and which effects it calls for. Nothing is written.
 
@@ -262,25 +267,13 @@ def shot(
         )
     text, files = report(
         study,
-        at=_assignments(at),
+        at=assignments(at),
         directory=output or Path("results") / spec.stem,
         noise=noise,
         seed=study.seed if seed is None else seed,
     )
     click.echo(text)
     _list(files)
-
-
-def _assignments(texts: tuple[str, ...]) -> dict[str, str]:
-    assignments = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not (name.strip() and equals and value.strip()):
-            raise click.BadParameter(
-                f"{text!r} is not NAME=VALUE, as in range=2km", param_hint="--at"
-            )
-        assignments[name.strip()] = value.strip()
-    return assignments
 
 
 def _list(files: list[Path]) -> None:
@@ -389,7 +382,7 @@ def export(
     """  # noqa: D301
     from sweep.analysis.export import export as write
 
-    points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=_assignments(at))
+    points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=assignments(at))
     click.echo(f"{_shown(file.absolute())}: {points:,} points")
 
 
@@ -401,3 +394,6 @@ def schema() -> None:
     from sweep.spec import json_schema
 
     click.echo(json.dumps(json_schema(), indent=2))
+
+
+main.add_command(spectra)

@@ -185,9 +185,10 @@ def _judge(flags, power, places, detected, alarms, flagged, peak):
             if k < bins - 1 and flags[row, k]:
                 number += 1
                 inside |= first <= k <= last
-                flagged[row] += not first <= k <= last
             elif number:
-                alarms[row] += not inside
+                if not inside:
+                    alarms[row] += 1
+                    flagged[row] += number
                 inside, number = False, 0
 
 

@@ -6,7 +6,7 @@ KEPT = ("snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "nois
 """Of :data:`sweep.model.outputs.OUTPUTS`, what does not depend on the detector."""
 
 _FOUND = "over draws in which every segment has a detection; nan with none"
-_AT_FAULT = "bins that are flagged outside those that the signal occupies"
+_AT_FAULT = "adjacent flagged bins, none of them among those that the signal occupies"
 
 
 def _share(segment: str, comment: str = "") -> Output:
@@ -38,7 +38,7 @@ SPECTRA_OUTPUTS: dict[str, Output] = {
     "pd_down": _share("down-chirp"),
     "pd_doppler": _share("Doppler segment", NO_DOPPLER),
     "pd_shot": _share("shot", "Up- and down-chirp both detected"),
-    "pfa_bin": Output("1", "share of bins with a false alarm", _AT_FAULT),
+    "pfa_bin": Output("1", "share of bins with a false alarm", f"those in groups of {_AT_FAULT}"),
     "pfa_bin_error": Output("1", "standard error of pfa_bin over draws"),
     "false_alarms": Output(
         "1", "mean number of false alarms in a shot", f"groups of {_AT_FAULT}, of all segments"

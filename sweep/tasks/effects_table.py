@@ -223,4 +223,7 @@ def _some_points(calling: Calling, tile: int) -> tuple[np.ndarray, tuple[str, ..
 
 def _timed(spec: Spec, calling: Calling, numbers: np.ndarray, effects: tuple[str, ...]) -> float:
     parameters = calling.tiles.grid.parameters_at(numbers)
+    if spec.draws.whole_spectra:  # what an effect costs does not go by what looks at spectra
+        draws = spec.draws.model_copy(update={"method": "probabilities"})
+        spec = spec.model_copy(update={"draws": draws})
     return sum(timed(spec, parameters, len(numbers), effects, most_draws=COST_DRAWS))

@@ -113,15 +113,23 @@ def batch_sizes(spec: Spec) -> list[int]:
     return [min(batch, number - first) for first in range(0, number, batch)]
 
 
+def draw_keys(spec: Spec, parameters: Mapping[str, Value], count: int) -> np.ndarray:
+    """Random keys (count, 2) uint64 of points, by what they are.
+
+    The same however closely draws are looked at, and by whatever method.
+    """
+    from sweep.model.philox import point_keys
+
+    physical = {path: v for path, v in parameters.items() if not path.startswith(NOT_PHYSICAL)}
+    return point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed)
+
+
 def _drawn(
     spec: Spec, parameters: Mapping[str, Value], count: int, effects: Collection[str]
 ) -> Results:
-    from sweep.model.philox import point_keys
     from sweep.model.sampling import Promise, simulate, simulate_until
 
-    # The same draws however closely they are looked at, and by whatever method.
-    physical = {path: v for path, v in parameters.items() if not path.startswith(NOT_PHYSICAL)}
-    keys = point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed)
+    keys = draw_keys(spec, parameters, count)
     draws, tolerance = spec.draws, parameters["accuracy.tolerance"]
     promise = Promise(tolerance, parameters["accuracy.confidence"], draws.interval)  # type: ignore[arg-type]
     if draws.whole_spectra:

@@ -1,0 +1,93 @@
+"""`sweep spectra`: spectra for code of one's own; and leave for a study to run such code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+
+
+def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:
+    from sweep.tasks.user_code import allow
+
+    allow(modules)
+
+
+ALLOW_CODE = click.option(
+    "--allow-code",
+    multiple=True,
+    metavar="MODULE",
+    expose_value=False,
+    callback=_allow,
+    help="Let the study run detectors and estimators of this Python module; as often as needed.",
+)
+
+
+def declared(path: Path) -> Spec:
+    """The study of a flat target in a spec's file or in a store.
+
+    Raises
+    ------
+    UsageError
+        Where it flies over a scene.
+    """
+    from sweep.spec import SceneSpec, Spec, load
+
+    if path.is_dir():
+        from sweep.tasks.studies import read
+
+        study: object = read(path)[1].spec
+    else:
+        study = load(path)
+    if isinstance(study, SceneSpec) or not isinstance(study, Spec):
+        raise click.UsageError(f"{path} is a study of a scene: spectra are those of a flat target")
+    return study
+
+
+@click.command()
+@click.argument("study", type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "--at",
+    "at",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A parameter's value; as often as needed. Axes that are not named take their first value.",
+)
+@click.option("--draws", type=click.IntRange(min=1), default=1, help="Number of draws [1].")
+@click.option("--first", type=click.IntRange(min=0), default=0, help="Number of the first [0].")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="File to write: .zarr (opens with xarray) or .npz (with numpy).",
+)
+@click.option("--overwrite", is_flag=True, help="Put the new file in the place of an old one.")
+def spectra(
+    study: Path, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
+) -> None:
+    """Write spectra of a shot of STUDY, a spec or a store, with noise in every bin.
+
+    For trying detectors and estimators of one's own: complex spectra, draw by draw, with
+    frequencies, noise level, threshold, window, and what is true: lines, range and velocity.
+    The draws are those that a study with draws.method: spectra looks at.
+
+    \b
+      sweep spectra experiments/cfar.yaml --at range=2km --draws 100 -o spectra.npz
+      sweep spectra results/cfar.zarr --at range=2km --at window=hann -o spectra.zarr
+    """  # noqa: D301
+    from sweep.analysis.shot_figure import chosen
+    from sweep.cli.assignments import assignments
+    from sweep.tasks.spectra_export import spectra as drawn
+    from sweep.tasks.spectra_export import write
+
+    spec = declared(study)
+    _, parameters = chosen(spec, assignments(at))[0]
+    dataset = drawn(spec, parameters, draws=draws, first=first)
+    write(dataset, output, overwrite=overwrite)
+    sizes = ", ".join(f"{size:,} {name}" for name, size in dataset.spectrum.sizes.items())
+    click.echo(f"{output}: {sizes}")

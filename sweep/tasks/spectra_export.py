@@ -1,0 +1,181 @@
+"""Spectra of a shot, draw by draw, for code of one's own: with noise, its level, and the truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.tasks.errors import StoreError
+from sweep.tasks.evaluate import draw_keys
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from sweep.model.preparation import Shots
+    from sweep.spec import Spec
+
+SEGMENTS = ("up", "doppler", "down")
+SUFFIXES = (".zarr", ".npz")
+
+
+def spectra(
+    spec: Spec, parameters: Mapping[str, float | int | str], *, draws: int, first: int = 0
+) -> xr.Dataset:
+    """Spectra of one point of a study.
+
+    Parameters
+    ----------
+    spec, parameters
+        The study, and the SI values of all parameters of the point.
+    draws, first
+        Number of draws and of the first one: noise and random effects are those that the study
+        itself draws there.
+
+    Returns
+    -------
+    Dataset
+        Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
+        Every effect is there that is not off and that the point has anything of.
+    """
+    from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+    from sweep.model.noisy_spectra import noisy_spectra, signal_of
+    from sweep.model.realisations import random_effects, realise
+
+    modes, key = spec.modes(), draw_keys(spec, parameters, 1)
+    arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}
+    effects = [
+        e.name for e in EFFECTS
+        if modes[e.name] != "off"
+        and not (e.is_random and modes[e.name] == "auto" and e.absent(arrays).all())
+    ]  # fmt: skip
+    numbers, random = np.arange(first, first + draws), bool(random_effects(effects))
+    stretches = realise(
+        parameters, effects, keys=key, first_draw=first, draws=draws if random else 1
+    )
+    drawn, found, shots = [], [], None
+    for stretch in stretches:
+        shots = stretch.shots
+        for i, draw in enumerate(stretch.draw):
+            there = list(map(int, np.flatnonzero(shots.segments)))
+            signals = [signal_of(shots, i, s) for s in there]
+            chosen = np.array([draw]) if random else numbers
+            drawn.append(np.stack([
+                noisy_spectra(shots, i, s, signal, key=key[0], draws=chosen)
+                for s, signal in zip(there, signals, strict=True)
+            ], axis=1))  # fmt: skip
+            found.append(signals)
+    assert shots is not None  # one draw is asked for at least
+    return _dataset(spec, shots, np.concatenate(drawn), found, numbers)
+
+
+def _dataset(
+    spec: Spec, shots: Shots, spectrum: np.ndarray, found: list[list[Any]], numbers: np.ndarray
+) -> xr.Dataset:
+    import xarray as xr
+
+    width = float(shots.sample_rate[0]) / shots.fft_size
+    there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]
+    by_draw = ("draw", "segment") if len(found) > 1 else ("segment",)
+
+    def each(name: str) -> np.ndarray:
+        values = np.array([[getattr(signal, name) for signal in signals] for signals in found])
+        return values if len(found) > 1 else values[0]
+
+    def told(dims: Any, values: Any, units: str, long_name: str) -> tuple[Any, Any, dict[str, str]]:
+        return dims, values, {"units": units, "long_name": long_name}
+
+    whole = (*by_draw, "frequency")
+    lines, amplitude = _lines(shots, width)
+    variables = {
+        "spectrum": told(
+            ("draw", "segment", "frequency"), spectrum, "V", "X[k] with noise, no 1/N"
+        ),
+        "signal": told(whole, each("spectrum"), "V", "X[k] without noise"),
+        "noise_power": told(
+            (), float(shots.window.energy * shots.noise_variance[-1]), "V^2",
+            "mean |X|^2 of a bin of noise alone",
+        ),
+        "threshold": told((), float(shots.threshold[-1]), "V", "fixed threshold on |X|"),
+        "window": told(("sample",), _taper(shots), "1", "samples of the window"),
+        "true_frequency": told(
+            by_draw, each("frequency") * width, "Hz", "place of the signal's peak between bins"
+        ),
+        "first_bin": told(by_draw, each("first"), "1", "first bin that the signal occupies"),
+        "last_bin": told(by_draw, each("last"), "1", "last bin that the signal occupies"),
+        "cnr": told(by_draw, each("cnr"), "1", "signal over noise in the record"),
+        "line_frequency": told(
+            ("segment", "line"), lines, "Hz", "where each beamlet's line appears"
+        ),
+        "line_amplitude": told(
+            ("line",), amplitude, "V", "amplitude of each beamlet's beat at the ADC"
+        ),
+        "range": told((), float(shots.range[-1]), "m", "true range"),
+        "radial_velocity": told(
+            (), float(shots.radial_velocity[-1]), "m s-1", "true, positive when closing"
+        ),
+    }  # fmt: skip
+    frequency = np.arange(shots.fft_size // 2 + 1) * width
+    return xr.Dataset(
+        variables,
+        coords={
+            "draw": told(("draw",), numbers, "1", "number of the draw"),
+            "segment": ("segment", np.array(there, dtype=object)),
+            "frequency": told(("frequency",), frequency, "Hz", "frequency of the bin"),
+        },
+        attrs={
+            "title": spec.title, "spec": spec.to_json(), "fft_size": shots.fft_size,
+            "sample_rate": float(shots.sample_rate[0]), "window_name": shots.window.name,
+        },
+    )  # fmt: skip
+
+
+def _taper(shots: Shots) -> np.ndarray:
+    from sweep.model.processing import taper
+
+    return taper(shots.window)
+
+
+def _lines(shots: Shots, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the beamlets' lines appear [Hz], (segments, lines), and their amplitudes [V]."""
+    from sweep.model.pairing import beamlet_lines
+
+    row = int(shots.row[-1])
+    amplitude = shots.amplitude[row]
+    lines = np.empty((3, amplitude.size))
+    beamlet_lines(
+        np.ascontiguousarray(shots.point_table()[:, -1]), shots.fft_size, shots.footprint, row,
+        lines,
+    )  # fmt: skip
+    scale = np.broadcast_to(shots.beat_scale, shots.size)[-1]
+    return lines[shots.segments] * width, amplitude * scale
+
+
+def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
+    """Write spectra as a Zarr store or as a numpy archive, by the path's suffix.
+
+    Raises
+    ------
+    StoreError
+        Where the suffix is another, or something is in the way.
+    """
+    if path.suffix not in SUFFIXES:
+        raise StoreError(f"{path} ends in neither {' nor '.join(SUFFIXES)}")
+    if path.exists() and not overwrite:
+        raise StoreError(f"{path} is there already: --overwrite puts the new one in its place")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.stem}.writing{path.suffix}")
+    if path.suffix == ".npz":
+        arrays = {str(name): value.values for name, value in dataset.variables.items()}
+        arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
+        np.savez_compressed(draft, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
+        draft.replace(path)
+        return
+    dataset.to_zarr(draft, mode="w", zarr_format=3, consolidated=False)
+    if path.exists():
+        shutil.rmtree(path)
+    draft.rename(path)
