@@ -1,0 +1,139 @@
+"""Certificates: all parts talk TLS with them on, and whoever has none is refused."""
+
+import ssl
+import stat
+from contextlib import suppress
+
+import pytest
+from click.testing import CliRunner
+from cryptography import x509
+from small import quiet, small, tree
+
+from sweep.cli import main
+from sweep.spec import cluster_of
+from sweep.tasks import cluster
+from sweep.tasks.clusters import certificates, common
+from sweep.tasks.errors import ClusterError
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return certificates.make(tmp_path_factory.mktemp("tls") / "new", 30)
+
+
+@pytest.fixture(scope="module")
+def security(files):
+    return {name: str(path) for name, path in files._asdict().items()}
+
+
+def local(**sections):
+    return cluster_of({"kind": "local", "workers": 1, **sections})
+
+
+def test_certificates_are_signed_and_their_owners_alone(files):
+    authority, certificate = (
+        x509.load_pem_x509_certificate(path.read_bytes()) for path in (files.ca, files.certificate)
+    )
+    certificate.verify_directly_issued_by(authority)
+    assert (certificate.not_valid_after_utc - certificate.not_valid_before_utc).days == 30
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in files)
+    assert stat.S_IMODE(files.key.parent.stat().st_mode) == 0o700
+    shake_hands(files)
+
+
+def shake_hands(files) -> None:
+    """A handshake in memory, either side checking the other's certificate in the strictest way."""
+    here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
+    sides = []
+    for server, incoming, outgoing in ((False, here, there), (True, there, here)):
+        purpose = ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT
+        context = ssl.SSLContext(purpose)
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.verify_flags |= ssl.VERIFY_X509_STRICT
+        context.load_verify_locations(files.ca)
+        context.load_cert_chain(files.certificate, files.key)
+        sides.append(context.wrap_bio(incoming, outgoing, server_side=server))
+    done = [False, False]
+    for _ in range(10):
+        for i, side in enumerate(sides):
+            with suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+                done[i] = True
+    assert all(done)
+
+
+def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
+    made = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
+    assert made.exit_code == 0
+    import yaml
+
+    assert local(**yaml.safe_load(made.output)).certificates() is not None
+    again = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
+    assert again.exit_code == 2
+    assert "is there already" in again.output
+
+
+def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
+    security, undisturbed, tmp_path, monkeypatch
+):
+    from distributed import Client, Security
+
+    described = local(security=security, scheduler={"dashboard": "127.0.0.1:0"})
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 2.0)
+    with cluster.connected(described, most=9, processes=True, say=lambda _: None) as reached:
+        client, address = reached.client, reached.client.scheduler.address
+        workers = client.scheduler_info()["workers"]
+        assert address.startswith("tls://127.0.0.1:")
+        assert workers and all(worker.startswith("tls://127.0.0.1:") for worker in workers)
+        assert all(w["nanny"].startswith("tls://127.0.0.1:") for w in workers.values())
+
+        outcome = quiet(small(), tmp_path / "tls.zarr", cluster=address_of(address, security))
+        assert outcome.complete
+        assert tree(outcome.store) == tree(undisturbed)
+
+        plain = address.replace("tls://", "tcp://")
+        with pytest.raises(ClusterError, match="no Dask scheduler answers"):
+            quiet(small(), tmp_path / "plain.zarr", scheduler=plain)
+        others = certificates.make(tmp_path / "others", 1)
+        stranger = address_of(address, {k: str(v) for k, v in others._asdict().items()})
+        with pytest.raises(ClusterError, match="no Dask scheduler answers"):
+            quiet(small(), tmp_path / "stranger.zarr", cluster=stranger)
+        with pytest.raises((OSError, TypeError)):
+            Client(address, timeout=2, security=Security(require_encryption=True))
+    assert not (tmp_path / "plain.zarr").exists()
+
+
+def address_of(address: str, security: dict[str, str]) -> dict:
+    return {"kind": "scheduler", "address": address, "security": security}
+
+
+def test_without_certificates_nothing_listens_beyond_this_machine():
+    import psutil
+
+    own = psutil.Process()
+    before = listening([own])
+    described = local(scheduler={"dashboard": "127.0.0.1:0"})
+    with cluster.connected(described, most=9, processes=True, say=lambda _: None) as reached:
+        reached.client.wait_for_workers(1)
+        found = listening([own, *own.children(recursive=True)]) - before
+    assert len(found) >= 3  # scheduler, dashboard, nanny, worker
+    assert {host for host, _ in found} == {"127.0.0.1"}
+
+
+def listening(processes) -> set[tuple[str, int]]:
+    """Addresses that processes listen at."""
+    return {
+        (connection.laddr.ip, connection.laddr.port)
+        for process in processes
+        for connection in process.net_connections(kind="inet")
+        if connection.status == "LISTEN"
+    }
+
+
+def test_certificates_reach_every_role(security):
+    settings = common.security_settings(local(security=security))
+    for role in ("client", "scheduler", "worker"):
+        assert settings[f"tls_{role}_cert"] == security["certificate"]
+        assert settings[f"tls_{role}_key"] == security["key"]
+    assert settings["require_encryption"] is True
