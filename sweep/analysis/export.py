@@ -17,10 +17,11 @@ from sweep.analysis.scenes.quantities import INTERPOLATED, QUANTISED
 from sweep.model.pairing import FLAGS
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
+from sweep.storage.locations import Location
 
 
 def export(
-    store: str | Path,
+    store: str | Location,
     file: str | Path,
     *,
     scanner: str | None = None,

@@ -15,6 +15,7 @@ from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points, confined, points
 from sweep.analysis.tabular import Page
 from sweep.spec import FalseAlarmTable, Figure, Slices, Spec, Surface, Table, ThresholdTable
+from sweep.storage.locations import Location, beside, located
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Study:
     spec: Spec
 
     @classmethod
-    def of(cls, store_path: str | Path) -> Study:
+    def of(cls, store_path: str | Location) -> Study:
         """The study in a store."""
         dataset = open_store(store_path)
         return cls(dataset, Spec.from_stored(dataset.attrs["spec"]))
@@ -51,7 +52,7 @@ class Study:
         return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
 
 
-def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Path]:
+def draw(store_path: str | Location, directory: str | Path | None = None) -> list[Path]:
     """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
 
     Parameters
@@ -59,7 +60,8 @@ def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Pa
     store_path
         The store, complete or not.
     directory
-        Where to; by default beside the store, ``NAME-figures`` for ``NAME.zarr``.
+        Where to; by default ``NAME-figures`` for ``NAME.zarr``: beside the store, or in the folder
+        that one is in where the store is an object store's.
 
     Returns
     -------
@@ -71,13 +73,13 @@ def draw(store_path: str | Path, directory: str | Path | None = None) -> list[Pa
     NotAStoreError
         Where there is no store of a grid of points, of a scene or of what accuracy costs.
     """
-    store_path = Path(store_path)
+    store_path = located(store_path)
     if kind_of(read_attributes(store_path)) == ACCURACY:
         from sweep.analysis.accuracy import report
 
         return report.draw(store_path, None if directory is None else Path(directory))
-    beside = store_path.with_name(f"{store_path.name.removesuffix('.zarr')}-figures")
-    directory = beside if directory is None else Path(directory)
+    stem = store_path.name.removesuffix(".zarr")
+    directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
     if kind_of(read_attributes(store_path)) == SCENE:
         from sweep.analysis.scenes import figures as of_scenes
 

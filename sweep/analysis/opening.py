@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import xarray as xr
+
+from sweep.storage.locations import JOURNAL, Location, located, zarr_store
+from sweep.storage.objects import ObjectStoreError
+from sweep.storage.sealing import read_lines
 
 BATCH = "batch"
 NOT_COUNTED = -1
@@ -29,7 +31,7 @@ class NotAStoreError(ValueError):
     """A path at which there is no store of a study."""
 
 
-def open(path: str | Path) -> xr.Dataset:
+def open(path: str | Location) -> xr.Dataset:
     """The store of a study as a dataset.
 
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
@@ -53,9 +55,11 @@ def open(path: str | Path) -> xr.Dataset:
     NotAStoreError
         Where there is no store of a study.
     """
-    path = Path(path)
+    path = located(path)
     attributes = read_attributes(path, GRID)
-    dataset = xr.open_zarr(path, consolidated="consolidated_metadata" in _document(path))
+    dataset = xr.open_zarr(
+        zarr_store(path), consolidated="consolidated_metadata" in _document(path)
+    )
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
@@ -64,7 +68,7 @@ def open(path: str | Path) -> xr.Dataset:
     return dataset.assign_attrs(progress(path, math.prod(shape), math.prod(blocks)))
 
 
-def read_attributes(path: Path, kind: str = "") -> dict[str, Any]:
+def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:
     """Attributes of a store, from its group's metadata.
 
     Parameters
@@ -79,11 +83,13 @@ def read_attributes(path: Path, kind: str = "") -> dict[str, Any]:
     NotAStoreError
         Where there is none, with the stores that are near, or one of another kind.
     """
-    if not path.exists():
-        raise NotAStoreError(f"there is no store at {path}{_near(path)}")
     try:
         attributes = _document(path)["attributes"]
+    except ObjectStoreError:
+        raise
     except (OSError, ValueError, KeyError, TypeError):
+        if not path.exists():
+            raise NotAStoreError(f"there is no store at {path}{_near(path)}") from None
         raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}") from None
     if not isinstance(attributes, dict) or not {"study_id", "model_version"} <= set(attributes):
         raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
@@ -98,11 +104,11 @@ def kind_of(attributes: dict[str, Any]) -> str:
     return str(attributes.get("kind", GRID))
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _document(path: Location) -> dict[str, Any]:
     return json.loads((path / "zarr.json").read_text())
 
 
-def _near(path: Path) -> str:
+def _near(path: Location) -> str:
     """Remark on the stores in a directory or beside a path; empty where there are none."""
     directory = path if path.is_dir() else path.parent
     names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
@@ -122,7 +128,7 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.drop_dims(BATCH).assign(sums)
 
 
-def progress(path: Path, points: int, blocks: int) -> dict[str, Any]:
+def progress(path: Location, points: int, blocks: int) -> dict[str, Any]:
     """Times and amount of what is committed, as attributes.
 
     Parameters
@@ -132,8 +138,10 @@ def progress(path: Path, points: int, blocks: int) -> dict[str, Any]:
     points, blocks
         How many there are in all: points of a grid, or shots times draws of a flight.
     """
-    receipts = {r["block"]: r for r in _records(path / ".sweep" / "receipts.jsonl") if "block" in r}
-    sessions = list(_records(path / ".sweep" / "sessions.jsonl"))
+    receipts = {
+        r["block"]: r for r in read_lines(path / JOURNAL / "receipts.jsonl") if "block" in r
+    }
+    sessions = list(read_lines(path / JOURNAL / "sessions.jsonl"))
     times = [r["time"] for r in receipts.values() if "time" in r]
     started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s] or times
     complete = len(receipts) >= blocks
@@ -151,20 +159,6 @@ def _points(dataset: xr.Dataset, attributes: dict[str, Any]) -> tuple[int, ...]:
     """Shape of the grid, as long as the shape of a block."""
     rank = len(attributes["block_shape"])
     return next(array.shape for name, array in dataset.data_vars.items() if len(array.dims) == rank)
-
-
-def _records(path: Path) -> Iterator[dict[str, Any]]:
-    """Whole lines of a log, in order."""
-    if not path.exists():
-        return
-    with path.open(encoding="utf-8", errors="replace") as log:
-        for line in log:
-            try:
-                record = json.loads(line)
-            except json.JSONDecodeError:
-                continue
-            if isinstance(record, dict):
-                yield record
 
 
 def _utc(time: float) -> str:

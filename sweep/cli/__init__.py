@@ -1,9 +1,12 @@
 """The `sweep` command."""
 
 from sweep.cli.commands import main
+from sweep.cli.files import certificates, schema
+from sweep.cli.report import report
+from sweep.cli.spectra import spectra
 from sweep.cli.stores import status, verify
 
-main.add_command(status)
-main.add_command(verify)
+for command in (status, verify, report, spectra, certificates, schema):
+    main.add_command(command)
 
 __all__ = ["main"]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import click
 
 from sweep.cli.telling import INCOMPLETE, print_table
+from sweep.storage.locations import Location
 
 
-def conclude_accuracy(store: Path, *, measured: bool) -> tuple[list[Path], bool]:
+def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location], bool]:
     """Print what settings came to, and draw it: the files, and whether it was not interrupted.
 
     Leaves with the exit code of what is incomplete where nothing was measured.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import click
 
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.assignments import assignments
-from sweep.cli.report import report
-from sweep.cli.spectra import ALLOW_CODE, spectra
+from sweep.cli.places import StorePath, shown
+from sweep.cli.spectra import ALLOW_CODE
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
@@ -20,11 +21,12 @@ from sweep.cli.telling import (
     tell_effects,
     warn_before,
 )
+from sweep.storage.locations import Location
 
 MISTAKE = 2
 
 SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-STORE = click.argument("store", type=click.Path(path_type=Path))
+STORE = click.argument("store", type=StorePath())
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(min=1),
@@ -64,12 +66,16 @@ class Commands(click.Group):
             from sweep.model.unsupported import UnsupportedShot
             from sweep.scenes.errors import SceneError
             from sweep.spec import SpecError
+            from sweep.storage.objects import ObjectStoreError, worded
             from sweep.tasks.errors import TaskError
 
-            told = (NotAStoreError, SceneError, SpecError, TaskError, UnsupportedShot)
-            if not isinstance(error, told):
+            told = (
+                NotAStoreError, ObjectStoreError, SceneError, SpecError, TaskError, UnsupportedShot,
+            )  # fmt: skip
+            said = worded(error)
+            if not isinstance(said, told):
                 raise
-            click.echo(str(error), err=True)
+            click.echo(str(said), err=True)
             ctx.exit(MISTAKE)
 
 
@@ -102,7 +108,9 @@ def main() -> None:
 @main.command()
 @SPEC
 @click.option(
-    "--store", type=click.Path(path_type=Path), help="Where to [results/<name of the spec>.zarr]."
+    "--store",
+    type=StorePath(),
+    help="Where to, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
 )
 @WORKERS
 @SCHEDULER
@@ -113,7 +121,7 @@ def main() -> None:
 @DURABLE
 def run(
     spec: Path,
-    store: Path | None,
+    store: Location | None,
     workers: int | None,
     scheduler: str | None,
     cluster: Path | None,
@@ -148,7 +156,7 @@ def run(
         block_timeout=block_timeout,
         durable=durable,
     )
-    conclude(outcome, _shown(outcome.store))
+    conclude(outcome, shown(outcome.store))
 
 
 def _default_store(spec: Path) -> Path:
@@ -170,7 +178,7 @@ def _default_store(spec: Path) -> Path:
 @BLOCK_TIMEOUT
 @DURABLE
 def resume(
-    store: Path,
+    store: Location,
     spec: Path | None,
     retry_failed: bool,
     workers: int | None,
@@ -202,11 +210,6 @@ def resume(
         durable=durable,
     )
     conclude(outcome, store)
-
-
-def _shown(path: Path) -> Path:
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 @main.command()
@@ -276,16 +279,16 @@ def shot(
     _list(files)
 
 
-def _list(files: list[Path]) -> None:
+def _list(files: Sequence[Location]) -> None:
     for file in files:
-        click.echo(_shown(file))
+        click.echo(shown(file))
 
 
 @main.command()
 @SPEC
 @click.option(
     "--store",
-    type=click.Path(path_type=Path),
+    type=StorePath(),
     help="Where to [results/<name of the spec>_accuracy.zarr].",
 )
 @click.option(
@@ -300,7 +303,7 @@ def _list(files: list[Path]) -> None:
 )
 @click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
 def accuracy(
-    spec: Path, store: Path | None, points: int, time_limit: float, overwrite: bool
+    spec: Path, store: Location | None, points: int, time_limit: float, overwrite: bool
 ) -> None:
     """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
 
@@ -340,7 +343,7 @@ def accuracy(
     type=click.Path(file_okay=False, path_type=Path),
     help="Directory of the figures [NAME-figures beside NAME.zarr].",
 )
-def figures(store: Path, output: Path | None) -> None:
+def figures(store: Location, output: Path | None) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
     from sweep.tasks.studies import check
 
@@ -348,9 +351,6 @@ def figures(store: Path, output: Path | None) -> None:
     from sweep.analysis.figures import draw
 
     _list(draw(store, output))
-
-
-main.add_command(report)
 
 
 @main.command()
@@ -371,7 +371,7 @@ main.add_command(report)
     help="Value of a coordinate, where the study has axes; as often as needed.",
 )
 def export(
-    store: Path, file: Path, scanner: str | None, draw: int, ranges: str, at: tuple[str, ...]
+    store: Location, file: Path, scanner: str | None, draw: int, ranges: str, at: tuple[str, ...]
 ) -> None:
     """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
 
@@ -383,35 +383,4 @@ def export(
     from sweep.analysis.export import export as write
 
     points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=assignments(at))
-    click.echo(f"{_shown(file.absolute())}: {points:,} points")
-
-
-@main.command()
-@click.argument("directory", type=click.Path(file_okay=False, path_type=Path))
-@click.option("--days", type=click.IntRange(min=1), default=365, help="How long they hold [365].")
-def certificates(directory: Path, days: int) -> None:
-    """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
-
-    What is printed goes into the cluster's file: scheduler, workers and client then talk TLS, and
-    refuse whoever has no such certificate. Keep the directory to yourself, where all machines of
-    the cluster see it.
-    """
-    from sweep.tasks.clusters.certificates import make
-
-    files = make(directory.absolute(), days)
-    click.echo("security:")
-    for name, file in files._asdict().items():
-        click.echo(f"  {name}: {file}")
-
-
-@main.command()
-def schema() -> None:
-    """Print the JSON Schema of specs, for editors that check while one types."""
-    import json
-
-    from sweep.spec import json_schema
-
-    click.echo(json.dumps(json_schema(), indent=2))
-
-
-main.add_command(spectra)
+    click.echo(f"{shown(file.absolute())}: {points:,} points")

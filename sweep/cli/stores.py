@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from sweep.cli.places import StorePath, shown
 from sweep.cli.telling import INCOMPLETE, tell_accuracy
+from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.tasks.verify import Report
@@ -18,12 +19,12 @@ DAMAGED = 1
 #: Damaged objects of one store that are listed.
 MOST_LISTED = 20
 
-STORE = click.argument("store", type=click.Path(path_type=Path))
+STORE = click.argument("store", type=StorePath())
 
 
 @click.command()
 @STORE
-def status(store: Path) -> None:
+def status(store: Location) -> None:
     """Say how far STORE is, also while it runs somewhere else.
 
     Where it draws, a table says at how many points accuracy.tolerance is met.
@@ -60,7 +61,7 @@ def status(store: Path) -> None:
     is_flag=True,
     help="Put back metadata, coordinates and spec; blocks are resume's to compute.",
 )
-def verify(store: Path, repair: bool) -> None:
+def verify(store: Location, repair: bool) -> None:
     """Check every byte of STORE against the digests taken as it was written.
 
     Names every object that has a flipped, missing or surplus byte: results block by block,
@@ -88,8 +89,7 @@ def verify(store: Path, repair: bool) -> None:
 
 
 def _tell(report: Report) -> None:
-    here = Path.cwd()
-    store = report.store.relative_to(here) if report.store.is_relative_to(here) else report.store
+    store = shown(report.store)
     for name in report.restored:
         click.echo(f"{store}: {name} put back")
     for damage in report.damages[:MOST_LISTED]:
@@ -101,7 +101,7 @@ def _tell(report: Report) -> None:
         click.echo(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
 
 
-def _say_what_to_do(store: Path, reports: list[Report]) -> None:
+def _say_what_to_do(store: Location, reports: list[Report]) -> None:
     """What mends what was found."""
     for report in reports:
         if report.unmarked:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -21,7 +22,7 @@ LOOKED_AT = 1024
 """Shots of each scanner whose effects are planned before a run."""
 
 
-def conclude(outcome: Outcome, store: Path) -> None:
+def conclude(outcome: Outcome, store: Location) -> None:
     """Say what a run has come to, and leave with its exit code."""
     from sweep.tasks.progress import duration
 
@@ -52,13 +53,13 @@ def conclude(outcome: Outcome, store: Path) -> None:
     sys.exit(INCOMPLETE)
 
 
-def _print_summary(store: Path) -> None:
+def _print_summary(store: Location) -> None:
     from sweep.tasks.identity import read_attributes
 
     print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
 
 
-def _grid_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
+def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
     """Title, headings and rows of a grid's summary."""
     from sweep.tasks.summary import DETECTED, summary
 
@@ -80,7 +81,7 @@ def _grid_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
     )
 
 
-def tell_accuracy(store: Path) -> None:
+def tell_accuracy(store: Location) -> None:
     """Print how well what is drawn is known, where anything is."""
     from sweep.tasks.accuracy_table import accuracy_table
 
@@ -105,7 +106,7 @@ def _accuracy_cells(row: AccuracyRow) -> list[str]:
     ]
 
 
-def _scene_rows(store: Path) -> tuple[str, list[str], list[list[str]]]:
+def _scene_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
     """Title, headings and rows of a scene's summary."""
     from sweep.tasks.scene_summary import scene_summary
 
@@ -162,7 +163,7 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
     yield "memory", f"about {_bytes(p.worker_memory)} a worker"
 
 
-def scene_plan(study: SceneSpec, store: Path, workers: int | None) -> Iterator[tuple[str, str]]:
+def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a scene will take."""
     from sweep.tasks.progress import duration
     from sweep.tasks.scene_plan import scene_plan as planned
@@ -184,7 +185,7 @@ def scene_plan(study: SceneSpec, store: Path, workers: int | None) -> Iterator[t
     yield "memory", f"about {_bytes(p.worker_memory)} a worker"
 
 
-def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
+def tell_effects(study: Spec | SceneSpec, store: Location) -> None:
     """Print which effects a study calls for, where, and what they cost; warn of what is off."""
     table = _effects(study, store, costs=True)
     there = [row for row in table.rows if row.bound > 0 or row.share > 0]
@@ -200,13 +201,13 @@ def tell_effects(study: Spec | SceneSpec, store: Path) -> None:
     warn(table)
 
 
-def warn_before(study: Spec | SceneSpec, store: Path) -> None:
+def warn_before(study: Spec | SceneSpec, store: Location) -> None:
     """Before a run: which effects are forced off though they matter."""
     if "off" in study.modes().values():
         warn(_effects(study, store, costs=False))
 
 
-def _effects(study: Spec | SceneSpec, store: Path, *, costs: bool) -> EffectsTable:
+def _effects(study: Spec | SceneSpec, store: Location, *, costs: bool) -> EffectsTable:
     from sweep.spec import SceneSpec
     from sweep.tasks.effects_table import effects_table, flight_effects_table
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.storage.locations import Location, located, read_array
 from sweep.tasks import studies
 from sweep.tasks.grid_study import GridStudy
 
@@ -36,7 +36,7 @@ class AccuracyRow:
         return max(0.0, self.half_width - self.tolerance)
 
 
-def accuracy_table(store: str | Path) -> list[AccuracyRow]:
+def accuracy_table(store: str | Location) -> list[AccuracyRow]:
     """A row for each probability that is promised; none where nothing is drawn or computed.
 
     Raises
@@ -44,19 +44,17 @@ def accuracy_table(store: str | Path) -> list[AccuracyRow]:
     StoreError
         Where there is no store of sweep's.
     """
-    _, study = studies.read(Path(store))
+    _, study = studies.read(located(store))
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
         return []
-    return list(_rows(Path(store), study.spec))
+    return list(_rows(located(store), study.spec))
 
 
-def _rows(store: Path, spec: Spec) -> Iterator[AccuracyRow]:
-    import zarr
-
+def _rows(store: Location, spec: Spec) -> Iterator[AccuracyRow]:
     from sweep.model.outputs import PROMISED
 
     def read(name: str) -> np.ndarray:
-        return np.asarray(zarr.open_array(store / name, mode="r")[...])
+        return np.asarray(read_array(store / name)[...])
 
     draws = read("n_draws")
     tolerance = _tolerance(spec)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from sweep.storage.locations import Location
 from sweep.tasks import identity
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
@@ -64,7 +63,7 @@ def cast(
     return rays, ""
 
 
-def _is_whole(path: Path, eyepoints: EyepointStudy) -> bool:
+def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
     """Whether an eyepoint store is there with all of its blocks."""
     if not path.exists():
         return False
@@ -77,7 +76,7 @@ def _is_whole(path: Path, eyepoints: EyepointStudy) -> bool:
 
 
 def _fill(
-    path: Path,
+    path: Location,
     eyepoints: EyepointStudy,
     pool: Pool,
     told: Progress,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.locations import Location, located
 from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 def run(
     spec: Declared,
     *,
-    store: str | Path,
+    store: str | Location,
     client: Client | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -56,7 +57,7 @@ def run(
     Parameters
     ----------
     spec, store
-        The study, and the path of the store to make.
+        The study, and the path of the store to make: on disk, or `s3://bucket/key.zarr` (gs, az).
     client
         Dask client to compute with; without one, `scheduler` and `workers` say what to use.
     workers, processes
@@ -88,7 +89,7 @@ def run(
         Where a store is in the way or can't be written; where no scheduler or worker is to be had;
         where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
-    path, told = Path(store).absolute(), chosen(progress)
+    path, told = located(store).absolute(), chosen(progress)
     user_code.check(spec)
     study = studies.study_of(spec, path)
     place = Place(
@@ -106,7 +107,7 @@ def run(
 
 
 def resume(
-    store: str | Path,
+    store: str | Location,
     *,
     spec: Declared | None = None,
     client: Client | None = None,
@@ -125,7 +126,7 @@ def resume(
     Parameters
     ----------
     store
-        Path of a store that `run` made.
+        Where a store is that `run` made.
     spec
         The study that the store is expected to hold; without it, whatever it holds.
     retry_failed
@@ -142,7 +143,7 @@ def resume(
     ClusterError
         Where there is no scheduler or worker to be had.
     """
-    path = Path(store).absolute()
+    path = located(store).absolute()
     attributes, study = _held(path)
     if spec is not None:
         identity.refuse_other_study(path, attributes, study.spec, spec)
@@ -164,7 +165,7 @@ def _declared(cluster: Declaration | None) -> AnyCluster | None:
     return None if cluster is None else declared(cluster)
 
 
-def _held(path: Path) -> tuple[dict[str, object], GridStudy | FlightStudy]:
+def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
     attributes, study = studies.read(path)
     if isinstance(study, EyepointStudy):
         raise StoreError(
@@ -173,7 +174,7 @@ def _held(path: Path) -> tuple[dict[str, object], GridStudy | FlightStudy]:
     return attributes, study
 
 
-def _make(path: Path, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:
+def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:
     if path.exists() and overwrite:
         identity.read_attributes(path)  # what is not a store of ours is not ours to remove
         lock = Lock(path)  # refuses where someone writes to it
@@ -195,7 +196,7 @@ def _make(path: Path, study: GridStudy | FlightStudy, overwrite: bool, told: Pro
 
 
 def _go_on(
-    path: Path,
+    path: Location,
     study: GridStudy | FlightStudy,
     place: Place,
     told: Progress,
@@ -223,7 +224,7 @@ def _go_on(
         lock.release()
 
 
-def _journal(path: Path, durable: bool) -> Journal:
+def _journal(path: Location, durable: bool) -> Journal:
     try:
         return Journal(path, durable=durable)
     except OSError as error:

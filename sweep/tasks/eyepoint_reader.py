@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS
+from sweep.storage.locations import Location, read_array
 from sweep.tasks.study import Results
 
 if TYPE_CHECKING:
@@ -24,14 +24,12 @@ class EyepointReader:
         The store.
     """
 
-    def __init__(self, path: Path) -> None:
-        import zarr
-
+    def __init__(self, path: Location) -> None:
         def opened(names: Iterable[str]) -> dict[str, Any]:
-            return {name: zarr.open_array(path / name, mode="r") for name in names}
+            return {name: read_array(path / name) for name in names}
 
         self._shots, self._beamlets, self._cycles = map(opened, (SHOTS, BEAMLETS, CYCLES))
-        self._weight = np.asarray(zarr.open_array(path / "weight", mode="r")[...])
+        self._weight = np.asarray(read_array(path / "weight")[...])
 
     def shots(self, first: int, stop: int) -> tuple[Results, Eyepoints]:
         """Arrays of the shots from `first` to before `stop`, and their eyepoints."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, SceneOutput
+from sweep.storage.locations import Location
 from sweep.tasks.grid_study import described
 from sweep.tasks.study import ArrayLayout, Results
 
@@ -36,7 +36,7 @@ CAST_BEAMLETS = 1 << 18
 SIZES = {"xyz": 3, "xyz_again": 3}
 
 
-def eyepoints_path(study_path: Path, geometry_id: str) -> Path:
+def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
     """Eyepoint store of a geometry, for the study stored at a path."""
     return study_path.parent / EYEPOINTS / f"{geometry_id}.zarr"
 

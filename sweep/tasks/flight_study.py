@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from sweep.model.scene_outputs import (
     STATISTICS,
     SceneOutput,
 )
+from sweep.storage.locations import Location
 from sweep.tasks.calling import EFFECTS, TILE_SHOTS, Called, ShotsPlan, plan_shots
 from sweep.tasks.eyepoint_reader import EyepointReader
 from sweep.tasks.eyepoint_study import (
@@ -56,7 +56,7 @@ class FlightStudy:
 
     unit = "shots"
 
-    def __init__(self, spec: SceneSpec, path: Path) -> None:
+    def __init__(self, spec: SceneSpec, path: Location) -> None:
         self.spec, self.path = spec, path
         self._stretches = [Stretches(spec, scanner) for scanner in spec.scanners]
         self._readers: dict[str, EyepointReader] = {}

@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.storage.locations import JOURNAL, Location
+from sweep.storage.objects import ObjectStoreError
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.store import JOURNAL, LAYOUT, MANIFEST
+from sweep.tasks.store import LAYOUT, MANIFEST
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 REQUIRED = ("kind", "study_id", "model_version", "software", "layout")
 
 
-def read_spec(path: Path, text: str, base: Path | None = None) -> Spec | SceneSpec:
+def read_spec(path: Location, text: str, base: Path | None = None) -> Spec | SceneSpec:
     """A spec that a store holds.
 
     Raises
@@ -34,7 +36,7 @@ def read_spec(path: Path, text: str, base: Path | None = None) -> Spec | SceneSp
         ) from error
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
+def read_attributes(path: Location) -> dict[str, Any]:
     """Attributes of a store, by its group's metadata alone.
 
     Raises
@@ -42,12 +44,14 @@ def read_attributes(path: Path) -> dict[str, Any]:
     StoreError
         Where there is no store, or not one of this program's.
     """
-    if not path.exists():
-        raise StoreError(f"there is no store at {path}")
     try:
         document = json.loads((path / "zarr.json").read_text())
         attributes = document["attributes"]
+    except ObjectStoreError:
+        raise
     except (OSError, ValueError, KeyError, TypeError):
+        if not path.exists():
+            raise StoreError(f"there is no store at {path}") from None
         if (path / JOURNAL / MANIFEST).exists():
             raise StoreError(
                 f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair` puts it back"
@@ -56,7 +60,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     return recognised(path, attributes)
 
 
-def recognised(path: Path, attributes: Any) -> dict[str, Any]:
+def recognised(path: Location, attributes: Any) -> dict[str, Any]:
     """Attributes of a store, where they are those of one of this program's.
 
     Raises
@@ -76,7 +80,7 @@ def recognised(path: Path, attributes: Any) -> dict[str, Any]:
 
 
 def refuse_other_study(
-    path: Path, attributes: dict[str, Any], held: Spec | SceneSpec, asked: Spec | SceneSpec
+    path: Location, attributes: dict[str, Any], held: Spec | SceneSpec, asked: Spec | SceneSpec
 ) -> None:
     """Refuse a store that holds another study than the one asked for.
 
@@ -97,7 +101,7 @@ def refuse_other_study(
     )
 
 
-def refuse_other_versions(path: str | Path, attributes: dict[str, Any], *, where: str) -> None:
+def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, where: str) -> None:
     """Refuse a store begun with another model or other software: the bits could differ.
 
     Raises
@@ -119,7 +123,7 @@ def refuse_other_versions(path: str | Path, attributes: dict[str, Any], *, where
         )
 
 
-def refuse_altered(path: Path, attributes: dict[str, Any], held: Spec | SceneSpec) -> None:
+def refuse_altered(path: Location, attributes: dict[str, Any], held: Spec | SceneSpec) -> None:
     """Refuse a store whose spec no longer is the one that its id was made from.
 
     Raises

@@ -8,19 +8,17 @@ line carries its own digest, and one that is damaged counts for nothing.
 
 from __future__ import annotations
 
-import errno
-import os
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sweep.storage.locations import Location
+from sweep.storage.logs import open_log
+from sweep.storage.sealing import read_lines, sealed, unsealed
 from sweep.tasks import store
-from sweep.tasks.sealing import damaged_lines, read_sealed, sealed
 from sweep.tasks.study import Study
 
 RECEIPTS = "receipts.jsonl"
@@ -54,15 +52,13 @@ class Failure:
     pid: int
 
 
-def receipts_path(store_path: Path) -> Path:
+def receipts_path(store_path: Location) -> Location:
     """The log of receipts of a store."""
     return store_path / store.JOURNAL / RECEIPTS
 
 
 class Journal:
     """Logs of a store, to append to; on opening, lines that are damaged or cut short are dropped.
-
-    No file stays open: a log in a directory that went away takes nothing more.
 
     Parameters
     ----------
@@ -72,69 +68,60 @@ class Journal:
         Whether a receipt is on the disk, and not only with the operating system, once committed.
     """
 
-    def __init__(self, store_path: Path, *, durable: bool = False) -> None:
-        self._directory, self._durable = store_path / store.JOURNAL, durable
-        self._directory.mkdir(exist_ok=True)
+    def __init__(self, store_path: Location, *, durable: bool = False) -> None:
+        directory = store_path / store.JOURNAL
+        self._logs = {name: open_log(directory / name, durable=durable) for name in LOGS}
         for name in LOGS:
-            drop_damaged(self._directory / name)
+            drop_damaged(directory / name)
 
-    def commit(self, receipt: Receipt) -> None:
-        """Append a receipt: from here on its block is done."""
-        self._append(RECEIPTS, {**asdict(receipt), "time": round(time.time(), 3)})
+    def commit(self, *receipts: Receipt) -> None:
+        """Append receipts: from here on their blocks are done.
+
+        In an object store that is so some seconds later (`flush`): till then they are gathered.
+        """
+        now = round(time.time(), 3)
+        self._append(RECEIPTS, *({**asdict(receipt), "time": now} for receipt in receipts))
 
     def withdraw(self, block: int, why: str) -> None:
         """Take back the receipt of a block: from here on it is to be computed again."""
         self._append(RECEIPTS, {"block": block, "withdrawn": why, "time": round(time.time(), 3)})
+
+    def flush(self, *, now: bool = False) -> bool:
+        """Write what was gathered, if it is time to; whether nothing is left to write."""
+        written = [log.flush(now=now) for log in self._logs.values()]
+        return all(written)
 
     def record_failure(self, failure: Failure) -> None:
         """Append the error of a block that was given up."""
         self._append(FAILURES, asdict(failure))
 
     def record_session(self, event: str, **facts: Any) -> None:
-        """Append what happened to a run: begun, ended, by whom and when."""
+        """Append what happened to a run: begun, ended, by whom and when; all else is written."""
         self._append(SESSIONS, {"event": event, "time": time.time(), "utc": _now(), **facts})
+        self.flush(now=True)
 
-    def _append(self, name: str, record: dict[str, Any]) -> None:
-        """Append one line, whole or not at all.
+    def _append(self, name: str, *records: dict[str, Any]) -> None:
+        """Append lines, whole or not at all.
 
         Raises
         ------
         OSError
-            Where it can't be written.
+            Where they can't be written.
         """
-        line = sealed(record)
-        log = os.open(self._directory / name, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-        try:
-            size = os.fstat(log).st_size
-            if os.write(log, line) < len(line):  # the disk is full
-                os.ftruncate(log, size)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory / name))
-            if self._durable:
-                os.fsync(log)
-        finally:
-            os.close(log)
+        if records:
+            self._logs[name].append(b"".join(map(sealed, records)))
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def drop_damaged(path: Path) -> None:
+def drop_damaged(path: Location) -> None:
     """Take lines out of a log that are damaged, or cut short by their writer's death."""
-    if not damaged_lines(path):
-        return
-    draft = path.with_name(f"{path.name}.{os.getpid()}")
-    with open(draft, "wb") as whole:
-        whole.writelines(line for line, record in read_sealed(path) if record is not None)
-    os.replace(draft, path)
+    open_log(path).keep(lambda line: unsealed(line) is not None)
 
 
-def read_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Records of a log, in order; a line that is damaged or cut short is passed over."""
-    return (record for _, record in read_sealed(path) if record is not None)
-
-
-def digests(store_path: Path, n_blocks: int) -> np.ndarray:
+def digests(store_path: Location, n_blocks: int) -> np.ndarray:
     """Digests of the blocks that were committed, (blocks,) of bytes, empty where there is none."""
     found = np.zeros(n_blocks, dtype="S32")
     for record in read_lines(receipts_path(store_path)):
@@ -143,7 +130,7 @@ def digests(store_path: Path, n_blocks: int) -> np.ndarray:
     return found
 
 
-def committed(store_path: Path, study: Study) -> np.ndarray:
+def committed(store_path: Location, study: Study) -> np.ndarray:
     """Which blocks are done.
 
     Returns
@@ -160,13 +147,13 @@ def committed(store_path: Path, study: Study) -> np.ndarray:
     return done
 
 
-def failures(store_path: Path) -> dict[int, dict[str, Any]]:
+def failures(store_path: Location) -> dict[int, dict[str, Any]]:
     """Last recorded failure of each block that was given up."""
     records = read_lines(store_path / store.JOURNAL / FAILURES)
     return {record["block"]: record for record in records}
 
 
-def given_up(store_path: Path, n_blocks: int) -> dict[int, dict[str, Any]]:
+def given_up(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
     """Last failure of each block that was given up and never done since."""
     found = failures(store_path)
     if found:
@@ -175,6 +162,6 @@ def given_up(store_path: Path, n_blocks: int) -> dict[int, dict[str, Any]]:
     return {block: failure for block, failure in found.items() if block < n_blocks}
 
 
-def sessions(store_path: Path) -> list[dict[str, Any]]:
+def sessions(store_path: Location) -> list[dict[str, Any]]:
     """Runs of a store, in order: when each began and how it ended."""
     return list(read_lines(store_path / store.JOURNAL / SESSIONS))

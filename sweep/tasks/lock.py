@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
 import threading
-import time
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
 import psutil
 
+from sweep.storage.claims import Claim, claim
+from sweep.storage.locations import JOURNAL, Location
 from sweep.tasks.errors import StoreError
-from sweep.tasks.store import JOURNAL
 
 LOCK = "lock"
 
@@ -34,13 +33,18 @@ class Holder:
     pid: int
     started: float  # of the process [s since the epoch]: a number is used again, a start is not
     token: str
+    machine: str = ""  # hosts of one name may be many, where a store is seen from everywhere
 
     @classmethod
     def myself(cls) -> Holder:
         """The running process, with a token of its own."""
         pid = os.getpid()
         return cls(
-            host=socket.gethostname(), pid=pid, started=_start_of(pid), token=uuid.uuid4().hex
+            host=socket.gethostname(),
+            pid=pid,
+            started=_start_of(pid),
+            token=uuid.uuid4().hex,
+            machine=machine(),
         )
 
 
@@ -51,40 +55,45 @@ def _start_of(pid: int) -> float:
         return 0.0
 
 
-def holder(store_path: Path) -> Holder | None:
-    """Who holds the lock of a store, living or dead; None where nobody does."""
+@cache
+def machine() -> str:
+    """What tells where a process number has a meaning: the boot, and the numbers' namespace."""
     try:
-        return Holder(**json.loads((store_path / JOURNAL / LOCK).read_text()))
-    except FileNotFoundError:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""
+
+
+def _claim(store_path: Location) -> Claim:
+    return claim(store_path / JOURNAL / LOCK)
+
+
+def holder(store_path: Location) -> Holder | None:
+    """Who holds the lock of a store, living or dead; None where nobody does."""
+    text = _claim(store_path).read()
+    if text is None:
         return None
+    try:
+        return Holder(**json.loads(text))
     except (ValueError, TypeError):
         return Holder(host="unknown", pid=0, started=0.0, token="")
 
 
-def is_live(store_path: Path, who: Holder) -> bool:
+def is_live(store_path: Location, who: Holder) -> bool:
     """Whether the holder of a lock still runs.
 
     On this host the process itself is asked for. Elsewhere the heartbeat decides, its age taken by
-    the clock of the file system that both write to.
+    the clock of the file system, or object store, that both write to.
     """
-    if who.host == socket.gethostname():
+    if who.host == socket.gethostname() and who.machine in ("", machine()):
         return abs(_start_of(who.pid) - who.started) < 1.0
     return heartbeat_age(store_path) < EXPIRY
 
 
-def heartbeat_age(store_path: Path) -> float:
+def heartbeat_age(store_path: Location) -> float:
     """Age of a lock's last heartbeat [s]; infinite where there is no lock."""
-    probe = store_path / JOURNAL / f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    try:
-        probe.touch()
-        return probe.stat().st_mtime - (store_path / JOURNAL / LOCK).stat().st_mtime
-    except FileNotFoundError:
-        return float("inf")
-    except PermissionError:  # a reader of a store that it can't write to
-        return time.time() - (store_path / JOURNAL / LOCK).stat().st_mtime
-    finally:
-        with suppress(OSError):
-            probe.unlink()
+    return _claim(store_path).age()
 
 
 class Lock:
@@ -96,39 +105,30 @@ class Lock:
         Where a living driver holds it, or the store can't be written.
     """
 
-    def __init__(self, store_path: Path) -> None:
-        self._store, self._path = store_path, store_path / JOURNAL / LOCK
+    def __init__(self, store_path: Location) -> None:
+        self._store, self._claim = store_path, _claim(store_path)
         self._me = Holder.myself()
         self._released = threading.Event()
         try:
-            self._acquire()
+            self._claim.take(json.dumps(asdict(self._me)), self._refuse_a_living_one)
         except OSError as error:
             raise StoreError(f"{store_path} can't be locked: {error.strerror or error}") from error
         self._beating = threading.Thread(target=self._beat, name="lock-heartbeat", daemon=True)
         self._beating.start()
 
-    def _acquire(self) -> None:
-        self._path.parent.mkdir(exist_ok=True)
-        with _guard(self._path.with_name("lock.guard")):
-            other = holder(self._store)
-            if other and is_live(self._store, other):
-                raise StoreError(
-                    f"{self._store} is being written by process {other.pid} on {other.host}: "
-                    "wait for it, or stop it; `sweep status` shows how far it is"
-                )
-            self._path.unlink(missing_ok=True)
-            mine = self._path.with_name(f"lock.{self._me.token}")
-            mine.write_text(json.dumps(asdict(self._me)))
-            try:
-                os.link(mine, self._path)  # fails where somebody was quicker, on NFS too
-            finally:
-                mine.unlink()
+    def _refuse_a_living_one(self) -> None:
+        other = holder(self._store)
+        if other and is_live(self._store, other):
+            raise StoreError(
+                f"{self._store} is being written by process {other.pid} on {other.host}: "
+                "wait for it, or stop it; `sweep status` shows how far it is"
+            )
 
     def _beat(self) -> None:
         while not self._released.wait(HEARTBEAT):
             with suppress(OSError):
                 if self.is_mine():
-                    os.utime(self._path)
+                    self._claim.beat()
 
     def is_mine(self) -> bool:
         """Whether the lock is still this driver's."""
@@ -141,12 +141,4 @@ class Lock:
         self._beating.join()
         with suppress(OSError):
             if self.is_mine():
-                self._path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _guard(path: Path) -> Iterator[None]:
-    """Only one process at a time judges whether a lock is dead and takes its place."""
-    with open(path, "a") as guard:
-        fcntl.flock(guard, fcntl.LOCK_EX)
-        yield
+                self._claim.leave()

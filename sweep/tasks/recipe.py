@@ -6,33 +6,27 @@ written anew by whoever runs the study from its spec.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
+from sweep.storage.locations import JOURNAL, Location, put_whole
+from sweep.storage.sealing import damaged_lines, read_sealed, sealed
 from sweep.tasks.errors import StoreError
-from sweep.tasks.sealing import damaged_lines, read_sealed, sealed
-from sweep.tasks.store import JOURNAL
 
 RECIPE = "recipe.json"
 
 
-def write_recipe(store_path: Path, **facts: Any) -> None:
+def write_recipe(store_path: Location, **facts: Any) -> None:
     """Put down where a study's files are, in one step."""
-    path = store_path / JOURNAL / RECIPE
-    path.parent.mkdir(exist_ok=True)
-    draft = path.with_name(f"{RECIPE}.{os.getpid()}")
-    draft.write_bytes(sealed(facts))
-    os.replace(draft, path)
+    put_whole(store_path / JOURNAL / RECIPE, sealed(facts))
 
 
-def read_recipe(store_path: Path) -> dict[str, Any]:
+def read_recipe(store_path: Location) -> dict[str, Any]:
     """What was put down; empty where nothing was, or where it is damaged."""
     records = [record for _, record in read_sealed(store_path / JOURNAL / RECIPE)]
     return records[0] or {} if len(records) == 1 else {}
 
 
-def refuse_damaged_recipe(store_path: Path) -> None:
+def refuse_damaged_recipe(store_path: Location) -> None:
     """Refuse a store that no longer says where the files of its study are.
 
     Raises

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
 
+from sweep.storage.locations import Location
 from sweep.tasks import cluster
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
@@ -53,7 +53,7 @@ class ScenePlan:
     reports: tuple[str, ...]  # what was mended as the scene was loaded
 
 
-def scene_plan(spec: SceneSpec, *, store: Path, workers: int | None = None) -> ScenePlan:
+def scene_plan(spec: SceneSpec, *, store: Location, workers: int | None = None) -> ScenePlan:
     """What a study of a scene will take, from its size and from measuring some of its own shots.
 
     Parameters

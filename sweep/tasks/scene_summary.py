@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sweep.storage.locations import Location, located, read_array
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import FlightStudy
@@ -38,7 +38,7 @@ class SceneRow:
         return float(seen.mean()) if seen.size else float("nan")
 
 
-def scene_summary(store: str | Path) -> list[SceneRow]:
+def scene_summary(store: str | Location) -> list[SceneRow]:
     """A row for each scanner and each place along the axes, or for each scanner where there are
     many.
 
@@ -47,14 +47,14 @@ def scene_summary(store: str | Path) -> list[SceneRow]:
     StoreError
         Where there is no store of a scene.
     """
-    path = Path(store)
+    path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, FlightStudy):
         raise StoreError(f"{path} holds no study of a scene")
     return [row for stretches in study.scanners.values() for row in _rows(path, study, stretches)]
 
 
-def _rows(path: Path, study: FlightStudy, stretches: Stretches) -> Iterator[SceneRow]:
+def _rows(path: Location, study: FlightStudy, stretches: Stretches) -> Iterator[SceneRow]:
     places = list(product(*map(range, stretches.axes)))
     told = len(places) <= MOST_PLACES
     if not told:
@@ -73,15 +73,15 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _row(path: Path, stretches: Stretches, part: str, places: list[tuple[int, ...]]) -> SceneRow:
-    import zarr
-
+def _row(
+    path: Location, stretches: Stretches, part: str, places: list[tuple[int, ...]]
+) -> SceneRow:
     from sweep.model.navigation_screening import EXCLUDED
     from sweep.model.pairing import TRUE
 
     group = path / stretches.scanner
-    flags, pd = (zarr.open_array(group / name, mode="r") for name in ("flags", "pd_shot"))
-    status = zarr.open_array(group / "velocity_status", mode="r") if stretches.navigates else None
+    flags, pd = (read_array(group / name) for name in ("flags", "pd_shot"))
+    status = read_array(group / "velocity_status") if stretches.navigates else None
     row = SceneRow(part)
     for place, cycles, draws in _stretches(stretches, places):
         shots = slice(*(stretches.shots_a_cycle * edge for edge in (cycles.start, cycles.stop)))
@@ -121,7 +121,7 @@ def _stretches(
 
 
 def _is_there(
-    array: Path, stretches: Stretches, place: tuple[int, ...], cycles: slice, draws: slice
+    array: Location, stretches: Stretches, place: tuple[int, ...], cycles: slice, draws: slice
 ) -> bool:
     position = (
         *place, cycles.start // stretches.block_cycles, draws.start // stretches.block_draws, 0,

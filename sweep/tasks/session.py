@@ -10,11 +10,13 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
+from sweep.storage.locations import Location
+from sweep.storage.objects import ObjectStoreError
 from sweep.tasks import store, versions
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.interrupt import Interrupts
@@ -47,7 +49,7 @@ COMPILING = 2.0
 class Outcome:
     """What a run has come to."""
 
-    store: Path
+    store: Location
     unit: str  # what the points are called
     points: int  # of the whole study
     blocks: int
@@ -108,7 +110,7 @@ class Session:
 
     def __init__(
         self,
-        path: Path,
+        path: Location,
         study: Study,
         *,
         pool: Pool,
@@ -123,6 +125,7 @@ class Session:
         self._journal, self._lock = journal, lock
         self._retry_failed = retry_failed
         self._tally = Tally()
+        self._gathered: list[Receipt] = []  # committed as soon as the journal has written them
 
     def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
         """Compute all that is left, or as much as can be.
@@ -236,21 +239,35 @@ class Session:
                 told = True
             if not self._tally.blocks and len(self._tally.failures) >= HOPELESS:
                 return f"the first {HOPELESS} blocks all failed"
+        before = self._tally.points
+        self._count(now=True)
+        self._progress.advance(points=self._tally.points - before, failed=0)
         return "interrupted" if interrupts.stopping else ""
 
     def _commit(self, answer: Answer, todo: Todo) -> None:
         before = self._tally.points, len(self._tally.failures)
-        for receipt in answer.receipts:
-            if store.is_whole(self._path, store.block_objects(self._study, receipt.block)):
-                self._journal.commit(receipt)
-                self._tally.add(receipt)
-            else:
+        seen = [
+            store.is_seen(self._path, store.block_objects(self._study, receipt.block))
+            for receipt in answer.receipts
+        ]
+        self._journal.commit(*compress(answer.receipts, seen))
+        self._gathered += compress(answer.receipts, seen)
+        for receipt, is_seen in zip(answer.receipts, seen, strict=True):
+            if not is_seen:
                 self._fail(_unseen(receipt), todo)
         for failure in answer.failures:
             self._fail(failure, todo)
+        self._count()
         self._progress.advance(
             points=self._tally.points - before[0], failed=len(self._tally.failures) - before[1]
         )
+
+    def _count(self, *, now: bool = False) -> None:
+        """Count the blocks whose receipts are written."""
+        if self._journal.flush(now=now):
+            for receipt in self._gathered:
+                self._tally.add(receipt)
+            self._gathered.clear()
 
     def _fail(self, failure: Failure, todo: Todo) -> None:
         if not todo.again(failure.block):
@@ -258,8 +275,10 @@ class Session:
             self._tally.failures.append(failure)
 
 
-def unwritable(path: Path, error: OSError) -> str:
+def unwritable(path: Location, error: OSError) -> str:
     """Why a run stops that can't write, and what to do about it."""
+    if isinstance(error, ObjectStoreError):
+        return f"the store can't be written: {error.strerror}"
     if not path.exists():
         return f"{path} is no longer there: have its disk back, or its folder"
     remedy = REMEDIES.get(error.errno or 0, "see to its disk")

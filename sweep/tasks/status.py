@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sweep.storage.locations import Location, located
 from sweep.tasks import journal, lock, studies
 
 
@@ -15,7 +15,7 @@ from sweep.tasks import journal, lock, studies
 class Status:
     """How far a store is."""
 
-    store: Path
+    store: Location
     title: str
     study_id: str
     unit: str  # what the points are called
@@ -34,7 +34,7 @@ class Status:
         return self.blocks_done == self.blocks
 
 
-def status(store: str | Path) -> Status:
+def status(store: str | Location) -> Status:
     """How far a store is.
 
     Raises
@@ -42,7 +42,7 @@ def status(store: str | Path) -> Status:
     StoreError
         Where there is no store of sweep's.
     """
-    path = Path(store)
+    path = located(store)
     attributes, study = studies.read(path)
     done = journal.committed(path, study)
     holder = lock.holder(path)
@@ -62,7 +62,7 @@ def status(store: str | Path) -> Status:
     )
 
 
-def _rate(path: Path) -> float:
+def _rate(path: Location) -> float:
     begun = [s["time"] for s in journal.sessions(path) if s.get("event") == "begun"]
     if not begun:
         return 0.0

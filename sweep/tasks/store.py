@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,17 +20,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.tasks import versions
+from sweep.storage.locations import JOURNAL, Location, each, located, zarr_store
+from sweep.storage.objects import in_words
+from sweep.storage.sealing import sealed
+from sweep.tasks import remote, versions
 from sweep.tasks.errors import StoreError
-from sweep.tasks.sealing import sealed
 from sweep.tasks.study import ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
     import zarr
     from zarr.core.array_spec import ArrayConfigLike
-
-#: Directory of the journal inside a store.
-JOURNAL = ".sweep"
 
 #: What a store is made of before there are results, and the digest of each object, in the journal.
 MANIFEST = "template.jsonl"
@@ -44,18 +44,22 @@ WRITTEN_WHOLE: ArrayConfigLike = {
 }  # else a chunk equal to the fill looks undone
 
 
-def create(path: str | Path, study: Content) -> Path:
+def create(path: str | Location, study: Content) -> Location:
     """A new store without results: every array's metadata, what is known beforehand, and the spec.
 
     It is built beside its place and renamed into it, so that a creation cut short leaves nothing
-    that looks like a store.
+    that looks like a store; one in an object store is built here and sent, its root last.
 
     Raises
     ------
     StoreError
         Where something is in its place, or the place can't be written.
     """
-    path = Path(path)
+    path = located(path)
+    if not isinstance(path, Path):
+        with tempfile.TemporaryDirectory() as here:
+            build(Path(here) / path.name, study, new_attributes(study))
+            return remote.send(Path(here) / path.name, path)
     building = path.with_name(f".{path.name}.creating-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,8 +72,11 @@ def create(path: str | Path, study: Content) -> Path:
     return path
 
 
-def remove(path: Path) -> None:
+def remove(path: Location) -> None:
     """Take a store away, out of its place in one step."""
+    if not isinstance(path, Path):
+        remote.remove(path)
+        return
     aside = path.with_name(f".{path.name}.removing-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     os.rename(path, aside)
     shutil.rmtree(aside)
@@ -173,8 +180,8 @@ class Arrays:
         The study that it holds.
     """
 
-    def __init__(self, path: str | Path, study: Study) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Location, study: Study) -> None:
+        self.path = located(path)
         self._study = study
         self._arrays: dict[str, zarr.Array[Any]] = {}
 
@@ -196,26 +203,33 @@ class Arrays:
         if results.keys() != chunks.keys():
             odd = sorted(results.keys() ^ chunks.keys())
             raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
-        for name, position in chunks.items():
-            array = self._array(name)
-            slices = tuple(
-                slice(p * chunk, min((p + 1) * chunk, size))
-                for p, chunk, size in zip(position, array.chunks, array.shape, strict=True)
-            )
-            whole = tuple(s.stop - s.start for s in slices)
-            if results[name].shape != whole:
-                raise ValueError(
-                    f"{name} of block {block} has shape {results[name].shape}, its chunk {whole}: "
-                    "blocks write whole chunks only"
-                )
-            array[slices or ...] = results[name]
+
+        def put(name: str) -> None:
+            self._put(name, chunks[name], results[name])
+
+        with in_words(self.path):
+            each(self.path, put, chunks)
         return digest(self.path, block_objects(self._study, block))
+
+    def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> None:
+        array = self._array(name)
+        slices = tuple(
+            slice(p * chunk, min((p + 1) * chunk, size))
+            for p, chunk, size in zip(position, array.chunks, array.shape, strict=True)
+        )
+        whole = tuple(s.stop - s.start for s in slices)
+        if values.shape != whole:
+            raise ValueError(
+                f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
+                "blocks write whole chunks only"
+            )
+        array[slices or ...] = values
 
     def _array(self, name: str) -> zarr.Array[Any]:
         if name not in self._arrays:
             import zarr
 
-            opened = zarr.open_array(self.path / name, mode="r+")
+            opened = zarr.open_array(zarr_store(self.path / name), mode="r+")
             self._arrays[name] = opened.with_config(WRITTEN_WHOLE)
         return self._arrays[name]
 
@@ -227,17 +241,19 @@ def block_objects(study: Study, block: int) -> list[str]:
     ]
 
 
-def sync(path: Path) -> None:
+def sync(path: Location) -> None:
     """Have everything written to a store so far on its disk, not only with the operating system.
 
     One call for the whole file system, which costs as much as syncing the files one by one costs
-    for a few of them.
+    for a few of them. What an object store has taken it keeps.
 
     Raises
     ------
     OSError
         Where the disk did not take it.
     """
+    if not isinstance(path, Path):
+        return
     place = os.open(path, os.O_RDONLY)
     try:
         if not hasattr(_libc, "syncfs"):  # not Linux
@@ -249,25 +265,36 @@ def sync(path: Path) -> None:
         os.close(place)
 
 
-def remove_partials(path: Path) -> None:
+def remove_partials(path: Location) -> None:
     """Remove what writers that were killed in the midst of a file have left."""
-    for file in path.rglob("*.partial"):
-        file.unlink(missing_ok=True)
+    if isinstance(path, Path):
+        for file in path.rglob("*.partial"):
+            file.unlink(missing_ok=True)
 
 
-def is_whole(path: Path, objects: list[str]) -> bool:
+def is_whole(path: Location, objects: list[str]) -> bool:
     """Whether every object of a block is there and has bytes."""
+    if not isinstance(path, Path):
+        return all(size > 0 for size in each(path, lambda name: (path / name).size(), objects))
     try:
         return all(os.stat(path / name).st_size > 0 for name in objects)
     except (FileNotFoundError, NotADirectoryError):
         return False
 
 
-def digest(path: Path, objects: list[str]) -> str:
+def is_seen(path: Location, objects: list[str]) -> bool:
+    """Whether a block that a worker has written is here, too: it is, but in another place.
+
+    An object store shows what is written, whole, to everyone at once: one object tells.
+    """
+    return is_whole(path, objects if isinstance(path, Path) else objects[-1:])
+
+
+def digest(path: Location, objects: list[str]) -> str:
     """blake2b-128 of names and bytes of stored objects, in hex."""
     sum_ = hashlib.blake2b(digest_size=16)
-    for name in objects:
-        content = (path / name).read_bytes()
+    contents = each(path, lambda name: (path / name).read_bytes(), objects)
+    for name, content in zip(objects, contents, strict=True):
         sum_.update(f"{name}\0{len(content)}\0".encode())
         sum_.update(content)
     return sum_.hexdigest()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.storage.locations import Location
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
@@ -21,14 +22,14 @@ ACCURACY = "accuracy"
 AnyStudy = GridStudy | EyepointStudy | FlightStudy
 
 
-def study_of(spec: Spec | SceneSpec, path: Path) -> GridStudy | FlightStudy:
+def study_of(spec: Spec | SceneSpec, path: Location) -> GridStudy | FlightStudy:
     """The study that a spec declares, to be stored at a path."""
     from sweep.spec import SceneSpec
 
     return FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
 
 
-def check(path: Path) -> None:
+def check(path: Location) -> None:
     """See that a path holds what `sweep figures` can draw.
 
     Raises
@@ -40,7 +41,7 @@ def check(path: Path) -> None:
         read(path)
 
 
-def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
+def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
     """Attributes of a store and the study that it holds.
 
     Raises
@@ -54,7 +55,7 @@ def read(path: Path) -> tuple[dict[str, Any], AnyStudy]:
     return attributes, described(path, attributes)
 
 
-def described(path: Path, attributes: dict[str, Any]) -> AnyStudy:
+def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
     """The study that a store's attributes tell of.
 
     Raises
@@ -69,7 +70,7 @@ def described(path: Path, attributes: dict[str, Any]) -> AnyStudy:
     return study_of(read_spec(path, attributes["spec"], base), path)
 
 
-def _eyepoints(path: Path, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:
+def _eyepoints(path: Location, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:
     if "spec" not in recipe:
         raise StoreError(f"{path} does not say how its eyepoints were made: run their study again")
     return EyepointStudy(read_spec(path, recipe["spec"], base), recipe["scanner"])  # type: ignore[arg-type]

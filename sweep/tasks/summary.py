@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.storage.locations import Location, located, read_array
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
@@ -35,7 +35,7 @@ class Row:
     pd_doppler: float
 
 
-def summary(store: str | Path) -> tuple[str, list[Row]]:
+def summary(store: str | Location) -> tuple[str, list[Row]]:
     """Heading and rows of the table.
 
     Returns
@@ -50,17 +50,12 @@ def summary(store: str | Path) -> tuple[str, list[Row]]:
     StoreError
         Where there is no store of sweep's.
     """
-    import zarr
-
-    path = Path(store)
+    path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         raise StoreError(f"{path} holds no study over a grid")
     spec, grid = study.spec, study.grid
-    shot, doppler = (
-        np.asarray(zarr.open_array(path / name, mode="r")[...])
-        for name in ("pd_shot", "pd_doppler")
-    )
+    shot, doppler = (np.asarray(read_array(path / name)[...]) for name in ("pd_shot", "pd_doppler"))
     rows = [
         _row(name, shot[part], doppler[part])
         for name, part in (_parts(spec.axes[0]) if grid.shape else ())

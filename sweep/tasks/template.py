@@ -6,15 +6,14 @@ follow from the study, so that any of them can be made again, to the same bytes.
 
 from __future__ import annotations
 
-import os
-import shutil
-import uuid
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sweep.storage.locations import Location, put_whole
+from sweep.storage.sealing import read_sealed
 from sweep.tasks import identity, store
 from sweep.tasks.errors import StoreError
-from sweep.tasks.sealing import read_sealed
 from sweep.tasks.study import Content
 
 LIST = f"{store.JOURNAL}/{store.MANIFEST}"
@@ -29,7 +28,7 @@ class Damage(NamedTuple):
     of_template: bool = False  # whether it was there before there were results
 
 
-def attributes(path: Path) -> dict[str, Any]:
+def attributes(path: Location) -> dict[str, Any]:
     """Attributes that a store was made with, from its list, else from its group.
 
     Raises
@@ -43,7 +42,7 @@ def attributes(path: Path) -> dict[str, Any]:
     return identity.read_attributes(path)
 
 
-def damages(path: Path) -> list[Damage]:
+def damages(path: Location) -> list[Damage]:
     """What of a template, or of its list, is not as it was made."""
     lines = [record for _, record in read_sealed(path / LIST)]
     if not lines:
@@ -63,7 +62,7 @@ def damages(path: Path) -> list[Damage]:
     ]
 
 
-def _wrong(path: Path, name: str, digest: str) -> str:
+def _wrong(path: Location, name: str, digest: str) -> str:
     try:
         return "" if store.digest(path, [name]) == digest else "is not as it was made"
     except (FileNotFoundError, NotADirectoryError):
@@ -72,7 +71,7 @@ def _wrong(path: Path, name: str, digest: str) -> str:
         return f"can't be read: {error.strerror}"
 
 
-def refuse_damaged(path: Path) -> None:
+def refuse_damaged(path: Location) -> None:
     """Refuse a store whose template is not as it was made: what is added might not fit it.
 
     Raises
@@ -88,7 +87,7 @@ def refuse_damaged(path: Path) -> None:
         )
 
 
-def restore(path: Path, study: Content) -> list[str]:
+def restore(path: Location, study: Content) -> list[str]:
     """Put a template back as it was made.
 
     Parameters
@@ -108,23 +107,21 @@ def restore(path: Path, study: Content) -> list[str]:
     StoreError
         Where this machine can't make the same again. Nothing is touched.
     """
-    aside = path.with_name(f".{path.name}.restoring-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     try:
-        store.build(aside, study, attributes(path))
-        _refuse_different(path, aside)
-        names = [str(file.relative_to(aside)) for file in aside.rglob("*") if file.is_file()]
-        wrong = [name for name in sorted(names) if not _same(path / name, aside / name)]
-        for name in wrong:
-            (path / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(aside / name, path / name)
+        with tempfile.TemporaryDirectory() as directory:
+            aside = Path(directory) / path.name
+            store.build(aside, study, attributes(path))
+            _refuse_different(path, aside)
+            names = [str(file.relative_to(aside)) for file in aside.rglob("*") if file.is_file()]
+            wrong = [name for name in sorted(names) if not _same(path / name, aside / name)]
+            for name in wrong:
+                put_whole(path / name, (aside / name).read_bytes())
     except OSError as error:
         raise StoreError(f"{path} can't be mended: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return wrong
 
 
-def _refuse_different(path: Path, aside: Path) -> None:
+def _refuse_different(path: Location, aside: Path) -> None:
     """Refuse to put back what an undamaged line of the list says is not what was there."""
     for _, record in read_sealed(path / LIST):
         if record and "object" in record and _wrong(aside, record["object"], record["digest"]):
@@ -134,5 +131,8 @@ def _refuse_different(path: Path, aside: Path) -> None:
             )
 
 
-def _same(one: Path, other: Path) -> bool:
-    return one.is_file() and one.read_bytes() == other.read_bytes()
+def _same(one: Location, other: Path) -> bool:
+    try:
+        return one.read_bytes() == other.read_bytes()
+    except OSError:
+        return False

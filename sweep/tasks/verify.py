@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import google_crc32c
 import numpy as np
 
+from sweep.storage.locations import Location, located
+from sweep.storage.sealing import damaged_lines, read_sealed
 from sweep.tasks import identity, journal, lock, store, studies, template
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import eyepoints_path
@@ -18,7 +19,6 @@ from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import Journal
 from sweep.tasks.progress import Late, Progress, chosen
 from sweep.tasks.recipe import RECIPE, read_recipe
-from sweep.tasks.sealing import damaged_lines, read_sealed
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
 from sweep.tasks.template import Damage
@@ -32,7 +32,7 @@ THREADS = 4
 class Report:
     """What a store was found to be."""
 
-    store: Path
+    store: Location
     blocks: int
     whole: int  # blocks that are committed and undamaged
     damages: tuple[Damage, ...]
@@ -51,7 +51,7 @@ class Report:
 
 
 def verify(
-    path: str | Path, *, repair: bool = False, progress: bool | Progress = True
+    path: str | Location, *, repair: bool = False, progress: bool | Progress = True
 ) -> list[Report]:
     """Check every byte of a store, and of the eyepoints that its study looks with.
 
@@ -79,15 +79,15 @@ def verify(
     StoreError
         Where there is no store, or not one of this program's; where it can't be repaired.
     """
-    path, told = Path(path).absolute(), Late(chosen(progress))
+    path, told = located(path).absolute(), Late(chosen(progress))
     study = _study(path, template.attributes(path))
-    stores: dict[Path, AnyStudy | None] = {path: study}
+    stores: dict[Location, AnyStudy | None] = {path: study}
     if isinstance(study, FlightStudy):
         stores |= {eyepoints_path(path, each.id): each for each in study.eyepoint_studies()}
     return [_verify(each, held, repair, told) for each, held in stores.items() if each.exists()]
 
 
-def _study(path: Path, attributes: dict[str, Any]) -> AnyStudy | None:
+def _study(path: Location, attributes: dict[str, Any]) -> AnyStudy | None:
     """The study in a store; None where it holds none, or only who made it could tell."""
     if attributes["kind"] == studies.ACCURACY or (
         attributes["kind"] == "eyepoints" and not read_recipe(path)
@@ -96,7 +96,7 @@ def _study(path: Path, attributes: dict[str, Any]) -> AnyStudy | None:
     return studies.described(path, attributes)
 
 
-def _verify(path: Path, study: AnyStudy | None, repair: bool, told: Progress) -> Report:
+def _verify(path: Location, study: AnyStudy | None, repair: bool, told: Progress) -> Report:
     found, restored = template.damages(path), []
     if found and study and repair:
         found, restored = [], _restore(path, study)
@@ -112,13 +112,13 @@ def _verify(path: Path, study: AnyStudy | None, repair: bool, told: Progress) ->
     )
 
 
-def _whole(path: Path, study: Study, damages: list[Damage]) -> int:
+def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
     done = journal.committed(path, study)
     done[[damage.block for damage in damages]] = False
     return int(np.count_nonzero(done))
 
 
-def _restore(path: Path, study: AnyStudy) -> list[str]:
+def _restore(path: Location, study: AnyStudy) -> list[str]:
     attributes = template.attributes(path)
     identity.refuse_other_versions(path, attributes, where="this machine")
     held = lock.Lock(path)
@@ -128,7 +128,7 @@ def _restore(path: Path, study: AnyStudy) -> list[str]:
         held.release()
 
 
-def _of_logs(path: Path) -> list[Damage]:
+def _of_logs(path: Location) -> list[Damage]:
     """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
     holder = lock.holder(path)
     alive = holder is not None and lock.is_live(path, holder)
@@ -144,7 +144,7 @@ def _of_logs(path: Path) -> list[Damage]:
     return found
 
 
-def _unfinished(log: Path) -> int:
+def _unfinished(log: Location) -> int:
     """Number of a log's last line where it has no end, else 0."""
     number = 0
     for number, (line, _) in enumerate(read_sealed(log), start=1):
@@ -153,7 +153,7 @@ def _unfinished(log: Path) -> int:
     return 0
 
 
-def _of_blocks(path: Path, study: Study, told: Progress) -> Iterator[Damage]:
+def _of_blocks(path: Location, study: Study, told: Progress) -> Iterator[Damage]:
     """Damages of the blocks that were committed."""
     digests = journal.digests(path, study.n_blocks)
     blocks = np.flatnonzero(digests != b"")
@@ -171,7 +171,7 @@ def _of_blocks(path: Path, study: Study, told: Progress) -> Iterator[Damage]:
         told.end()
 
 
-def _of_block(path: Path, study: Study, block: int, digest: bytes) -> list[Damage]:
+def _of_block(path: Location, study: Study, block: int, digest: bytes) -> list[Damage]:
     objects = store.block_objects(study, block)
     try:
         if store.digest(path, objects) == digest.decode():
@@ -183,7 +183,7 @@ def _of_block(path: Path, study: Study, block: int, digest: bytes) -> list[Damag
     return found or [Damage(count, "is whole but not the one that was committed", block)]
 
 
-def _wrong(chunk: Path) -> str:
+def _wrong(chunk: Location) -> str:
     """What is wrong with a chunk, by the checksum that Zarr's codec put at its end."""
     try:
         content = chunk.read_bytes()
@@ -197,7 +197,7 @@ def _wrong(chunk: Path) -> str:
     return "" if content[-4:] == checksum else "fails its checksum"
 
 
-def _mark(path: Path, damages: list[Damage]) -> str:
+def _mark(path: Location, damages: list[Damage]) -> str:
     """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
     try:
         held = lock.Lock(path)
@@ -208,6 +208,7 @@ def _mark(path: Path, damages: list[Damage]) -> str:
         for block in sorted({damage.block for damage in damages}):
             named = [f"{d.object} {d.what}" for d in damages if d.block == block]
             log.withdraw(block, "; ".join(named))
+        log.flush(now=True)
     except OSError as error:
         return f"{path} can't be written: {error.strerror or error}"
     finally:

@@ -9,8 +9,8 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from sweep.storage.locations import located
 from sweep.tasks import store, versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import Failure, Receipt
@@ -20,6 +20,7 @@ from sweep.tasks.time_limit import time_limit, worker_address
 #: Errors of the place that results go to: every further block would meet them too.
 STORAGE_ERRORS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
+    errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
 
 #: Studies that a worker holds open at once.
@@ -67,7 +68,7 @@ def _open(path: str, study_id: str) -> Opened:
     from sweep.tasks.identity import refuse_other_versions
     from sweep.tasks.studies import read
 
-    attributes, held = read(Path(path))
+    attributes, held = read(located(path))
     _refuse_another(path, study_id)
     refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
     return Opened(held, store.Arrays(path, held))
@@ -77,7 +78,7 @@ def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
     from sweep.tasks.identity import read_attributes
 
-    held = read_attributes(Path(path))["study_id"]
+    held = read_attributes(located(path))["study_id"]
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
 

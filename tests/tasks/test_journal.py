@@ -3,9 +3,9 @@ import os
 
 import pytest
 
+from sweep.storage.sealing import damaged_lines, sealed, unsealed
 from sweep.tasks import journal
 from sweep.tasks.journal import Failure, Journal, Receipt
-from sweep.tasks.sealing import damaged_lines, sealed, unsealed
 
 
 def receipt(block: int) -> Receipt:

@@ -10,9 +10,10 @@ from sweep.analysis import canvas
 from sweep.analysis.accuracy import figure, text
 from sweep.analysis.accuracy.settings import Setting, settings_in
 from sweep.analysis.opening import ACCURACY, read_attributes
+from sweep.storage.locations import Location, beside, zarr_store
 
 
-def opened(store: Path) -> tuple[xr.Dataset, list[Setting]]:
+def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
     """The store as a dataset, read whole, and its settings.
 
     Raises
@@ -21,16 +22,16 @@ def opened(store: Path) -> tuple[xr.Dataset, list[Setting]]:
         Where there is no such store.
     """
     read_attributes(store, ACCURACY)
-    with xr.open_zarr(store) as dataset:
+    with xr.open_zarr(zarr_store(store)) as dataset:
         whole = dataset.load()
     return whole, settings_in(whole)
 
 
-def draw(store: Path, directory: Path | None = None) -> list[Path]:
+def draw(store: Location, directory: Path | None = None) -> list[Path]:
     """The figure as NAME.png and the tables as NAME.txt, beside NAME.zarr or in a directory."""
     dataset, settings = opened(store)
     stem = store.name.removesuffix(".zarr")
-    place = store.parent if directory is None else directory
+    place = beside(store) if directory is None else directory
     file = place / f"{stem}.txt"
     drawn = canvas.save(figure.draw(dataset, settings), place / f"{stem}.png")
     file.write_text(text.page(dataset, settings).text(), encoding="utf-8")

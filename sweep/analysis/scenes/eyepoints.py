@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import xarray as xr
 
@@ -11,17 +9,18 @@ from sweep.analysis.opening import NotAStoreError
 from sweep.model.eyepoints import Eyepoints
 from sweep.model.scene_outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.storage.locations import Location, zarr_store
 
 FOLDER = "eyepoints"
 """Folder of the eyepoints of all studies whose stores lie beside it."""
 
 
-def eyepoints_of(store_path: Path, scanner: xr.Dataset) -> Path:
+def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
     """Store of the eyepoints that a scanner's clouds were made of."""
     return store_path.parent / FOLDER / f"{scanner.attrs['geometry_id']}.zarr"
 
 
-def read_eyepoints(path: Path, index: np.ndarray) -> Eyepoints:
+def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
     """Eyepoints of some shots.
 
     Parameters
@@ -41,7 +40,7 @@ def read_eyepoints(path: Path, index: np.ndarray) -> Eyepoints:
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
             "running the study again casts them anew"
         )
-    dataset = xr.open_dataset(path, engine="zarr", chunks=None)
+    dataset = xr.open_dataset(zarr_store(path), engine="zarr", chunks=None)
     chosen = dataset.isel(shot=np.asarray(index))
     arrays = {name: np.asarray(chosen[name].values) for name in (*SHOTS, *BEAMLETS)}
     return from_arrays(arrays, np.asarray(dataset["weight"].values))

@@ -38,21 +38,22 @@ from sweep.spec.scene_figures import (
     SceneFigure,
     ShotSpectra,
 )
+from sweep.storage.locations import Location, located
 
 
 @dataclass(frozen=True)
 class SceneStudy:
     """A store of point clouds opened, with the spec that it holds."""
 
-    path: Path
+    path: Location
     tree: xr.DataTree
     spec: SceneSpec
 
     @classmethod
-    def of(cls, store_path: str | Path) -> SceneStudy:
+    def of(cls, store_path: str | Location) -> SceneStudy:
         """The study in a store."""
-        tree = opened(Path(store_path))
-        return cls(Path(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
+        tree = opened(located(store_path))
+        return cls(located(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
 
     @property
     def scanners(self) -> list[str]:
@@ -80,7 +81,7 @@ class SceneStudy:
         return "\n".join([self.spec.title, figure.title or otherwise])
 
 
-def draw(store_path: str | Path, directory: Path) -> list[Path]:
+def draw(store_path: str | Location, directory: Path) -> list[Path]:
     """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
 
     Parameters

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
 from sweep.analysis.opening import SCENE, progress, read_attributes
+from sweep.storage.locations import Location, located, zarr_store
 
 STRETCH = 8192
 """Shots, times draws, that are read at a time."""
 
 
-def open_scene(path: str | Path) -> xr.DataTree:
+def open_scene(path: str | Location) -> xr.DataTree:
     """The store of a scene's point clouds as a tree: a group for each scanner.
 
     Arrays are read when they are needed, as Dask arrays in the chunks of the store. What is not
@@ -37,13 +37,14 @@ def open_scene(path: str | Path) -> xr.DataTree:
     NotAStoreError
         Where there is no store of a scene.
     """
-    return opened(Path(path), chunks={})
+    return opened(located(path), chunks={})
 
 
-def opened(path: Path, chunks: dict[str, int] | None = None) -> xr.DataTree:
+def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
     """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
     attributes = read_attributes(path, SCENE)
-    tree = xr.open_datatree(path, engine="zarr", chunks=chunks)
+    tree = xr.open_datatree(zarr_store(path), engine="zarr", chunks=chunks)
+    tree.encoding["source"] = str(path)
     tree.attrs |= progress(path, *_extent(tree, attributes))
     return tree
 

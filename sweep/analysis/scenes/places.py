@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +14,7 @@ from sweep.analysis.scenes.recording import Recording
 from sweep.analysis.selection import is_any
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
+from sweep.storage.locations import located
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Place:
     def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """What a scanner recorded there."""
         group = tree.children[scanner].to_dataset(inherit=False)
-        points = Path(str(tree.encoding["source"])) / scanner / "flags" / "c"
+        points = located(str(tree.encoding["source"])) / scanner / "flags" / "c"
         return Recording(
             scanner, group.isel(self.index), points.joinpath(*map(str, self.index.values()))
         )

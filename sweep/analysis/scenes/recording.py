@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from sweep.analysis.scenes.opening import chunk, stretches
 from sweep.analysis.scenes.quantities import QUANTISED, QUANTITIES, stored_name
+from sweep.storage.locations import Location
 
 Table = dict[str, np.ndarray]
 
@@ -37,13 +37,13 @@ class Recording:
         Its name.
     dataset : xarray.Dataset
         Arrays of the scanner's group, without the study's axes.
-    chunks : Path or None
+    chunks : Location or None
         Folder of the chunks of its flags; none where all is computed whose time is known.
     """
 
     scanner: str
     dataset: xr.Dataset
-    chunks: Path | None = None
+    chunks: Location | None = None
 
     @property
     def shots(self) -> int:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.locations import Location
 from sweep.tasks import identity, store, versions
 from sweep.tasks.accuracy.bench import Bench
 from sweep.tasks.accuracy.measure import (
@@ -39,7 +39,7 @@ _ABOUT = {
 def measure(
     spec: Declared,
     *,
-    store_path: Path,
+    store_path: Location,
     points: int = POINTS,
     time_limit: float = TIME_LIMIT,
     overwrite: bool = False,
@@ -92,7 +92,7 @@ def measure(
     return True
 
 
-def _refuse_in_the_way(path: Path, overwrite: bool) -> None:
+def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
     if not path.exists():
         return
     if identity.read_attributes(path)["kind"] != ACCURACY:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
+
+from sweep.storage.locations import Location
+from sweep.storage.logs import raw_lines
 
 _SUM = b',"sum":"'
 _END = b'"}\n'
@@ -31,18 +33,20 @@ def _digest(body: bytes) -> bytes:
     return hashlib.blake2b(body, digest_size=8).hexdigest().encode()
 
 
-def read_sealed(path: Path) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
-    """Lines of a file and their records, None where damaged or cut short; nothing if it is absent.
+def read_sealed(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
+    """Lines of a log and their records, None where damaged or cut short; nothing if it is absent.
 
     A line end that was damaged joins two lines into one that is damaged.
     """
-    if not path.exists():
-        return
-    with open(path, "rb") as lines:
-        for line in lines:
-            yield line, unsealed(line)
+    for line in raw_lines(path):
+        yield line, unsealed(line)
 
 
-def damaged_lines(path: Path) -> list[int]:
-    """Numbers, from 1, of the lines of a file that are damaged or cut short."""
+def read_lines(path: Location) -> Iterator[dict[str, Any]]:
+    """Records of a log, in order; a line that is damaged or cut short is passed over."""
+    return (record for _, record in read_sealed(path) if record is not None)
+
+
+def damaged_lines(path: Location) -> list[int]:
+    """Numbers, from 1, of the lines of a log that are damaged or cut short."""
     return [n for n, (_, record) in enumerate(read_sealed(path), start=1) if record is None]
