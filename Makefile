@@ -54,7 +54,7 @@ clean:
 
 lock:
 	$(PYTHON) -m venv .venv-lock
-	.venv-lock/bin/pip install --quiet --editable '.[test]'
+	.venv-lock/bin/pip install --quiet --editable '.[test,docs]'
 	(echo '# Exact versions of every dependency, tests and linters included; `make lock` renews it.'; \
 	 .venv-lock/bin/pip freeze --exclude-editable) > requirements.lock
 	rm -rf .venv-lock
