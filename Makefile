@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -42,6 +42,9 @@ effects: $(READY)
 
 stopping: $(READY)
 	$(BIN)/python benchmarks/stopping.py
+
+promise: $(READY)
+	$(BIN)/python benchmarks/promise.py
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py

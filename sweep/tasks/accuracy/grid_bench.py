@@ -29,15 +29,21 @@ class GridBench:
         The study.
     points
         Points of the sample, fewer where the grid has fewer.
+    seed
+        Draws the points by chance; None spreads them evenly.
     """
 
     unit = "points"
     most_times = 64
 
-    def __init__(self, spec: Spec, points: int) -> None:
+    def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
         self.spec = spec
         self._grid = Grid(spec)
         self._numbers = spread(self._grid.shape, points)
+        if seed is not None:
+            total = self._grid.points
+            random = np.random.default_rng(seed)
+            self._numbers = np.sort(random.choice(total, min(points, total), replace=False))
         self._calling: dict[str, Calling] = {}
         self._names: dict[str, frozenset[str]] = {}
 
