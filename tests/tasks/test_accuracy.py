@@ -16,7 +16,7 @@ from sweep.tasks.accuracy.bench import Seen
 from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.grid_bench import GridBench
 from sweep.tasks.accuracy.run import measure as measured
-from sweep.tasks.accuracy.sample import neighbours, spread
+from sweep.tasks.accuracy.sample import by_chance, neighbours, spread
 from sweep.tasks.errors import StoreError
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}
@@ -43,6 +43,15 @@ def test_a_sample_has_no_point_twice_and_all_where_there_are_few(shape, number):
     assert len(found) == len(set(found.tolist())) == min(number, total)
     assert (found >= 0).all() and (found < total).all()
     assert np.array_equal(found, spread(shape, number))
+
+
+def test_points_are_drawn_without_repetition_and_each_as_likely():
+    assert by_chance((3, 4), 50, 1).tolist() == list(range(12))
+    found = np.concatenate([by_chance((20, 5), 30, seed) for seed in range(1000)])
+    counts = np.bincount(found, minlength=100)
+    # each of 100 points has a chance of 0.3, a thousand times: 5 sigma
+    assert (abs(counts - 300) <= 5 * np.sqrt(1000 * 0.3 * 0.7)).all()
+    assert np.array_equal(by_chance((20, 5), 30, 7), by_chance((20, 5), 30, 7))
 
 
 def test_any_stretch_of_a_sample_reaches_along_every_axis():

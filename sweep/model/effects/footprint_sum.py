@@ -49,8 +49,8 @@ class Sum(NamedTuple):
 def footprint_sum(block: "Block") -> Sum:
     """Sums of the footprints of a block's tiles."""
     ratio = np.maximum(block.echo_ratio.high, 1.0)
-    alone = (ratio if block.architecture == "direct" else np.sqrt(ratio)) + np.zeros(
-        (3, block.size)
+    alone = np.zeros((3, block.size)) + (
+        ratio if block.architecture == "direct" else np.sqrt(ratio)
     )
     if not block.adds_amplitudes:
         return Sum(alone, alone, np.zeros_like(alone))
@@ -106,7 +106,8 @@ def _at_points(block: "Block", points: np.ndarray) -> tuple[np.ndarray, np.ndarr
             turns, beat, error = _phases(sign, carrier, offset, doppler, scene)
             found = abs((amplitude * np.exp(2j * np.pi * turns)).sum(axis=1))
             most[s] = np.maximum(most[s], found + (amplitude * error).sum(axis=1))
-            lean[s] = np.maximum(lean[s], (amplitude * abs(beat)).sum(axis=1) / scene["bin"][:, 0])
+            apart = (amplitude * abs(beat)).sum(axis=1) / scene["bin"][:, 0]
+            lean[s] = np.maximum(lean[s], apart * (1 + abs(scene["beta"][:, 0])))
     # what the receiver's poles make of a beat's difference, in size and in phase
     poles = 2 * np.broadcast_to(block.lines.tilt, (3, block.size))[:, points] * lean
     return most + poles, lean

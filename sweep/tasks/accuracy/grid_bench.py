@@ -11,7 +11,7 @@ import numpy as np
 from sweep.model.effects.flags import flags_of, names_of
 from sweep.tasks.accuracy.bench import NOT_IN_TRUTH, Seen, Trial, look_of, of_lines, seen_in
 from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
-from sweep.tasks.accuracy.sample import neighbours, spread
+from sweep.tasks.accuracy.sample import by_chance, neighbours, spread
 from sweep.tasks.calling import Calling
 from sweep.tasks.evaluate import evaluate_points
 from sweep.tasks.grid import Grid
@@ -39,11 +39,8 @@ class GridBench:
     def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
         self.spec = spec
         self._grid = Grid(spec)
-        self._numbers = spread(self._grid.shape, points)
-        if seed is not None:
-            total = self._grid.points
-            random = np.random.default_rng(seed)
-            self._numbers = np.sort(random.choice(total, min(points, total), replace=False))
+        shape = self._grid.shape
+        self._numbers = spread(shape, points) if seed is None else by_chance(shape, points, seed)
         self._calling: dict[str, Calling] = {}
         self._names: dict[str, frozenset[str]] = {}
 

@@ -1,4 +1,4 @@
-"""Which points of a study stand for all of it: fixed by its shape alone."""
+"""Which points of a study stand for all of it: fixed by its shape alone, or by a seed."""
 
 from __future__ import annotations
 
@@ -40,6 +40,21 @@ def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
     else:  # some points of small grids are never met
         found |= dict.fromkeys(range(min(total, 2 * number)))
     return np.fromiter(found, np.int64)[:number]
+
+
+def by_chance(shape: tuple[int, ...], number: int, seed: int) -> np.ndarray:
+    """Numbers of points of a grid, drawn without repetition, each as likely; rising.
+
+    Parameters
+    ----------
+    shape, number
+        As of :func:`spread`.
+    seed
+        Of the draw.
+    """
+    total = math.prod(shape)
+    chosen = np.random.default_rng(seed).choice(total, min(number, total), replace=False)
+    return np.sort(chosen)
 
 
 def neighbours(
