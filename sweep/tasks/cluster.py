@@ -19,7 +19,7 @@ from sweep.spec.clusters import (
     cluster_of,
     load_cluster,
 )
-from sweep.tasks.clusters import common, local, ssh
+from sweep.tasks.clusters import common, kubernetes, local, ssh
 from sweep.tasks.errors import ClusterError
 
 if TYPE_CHECKING:
@@ -100,11 +100,16 @@ def connected(
     from distributed import Client
 
     if isinstance(cluster, Address):
-        with _reached(cluster) as client:
+        with _reached(cluster.address, cluster) as client:
             say(f"scheduler {cluster.address}: dashboard {client.dashboard_link}")
             yield Reached(client, 0)
         return
     bounds = _bounds(cluster, most)
+    if isinstance(cluster, Kubernetes):
+        with kubernetes.deployed(cluster, bounds) as address, _reached(address, cluster) as client:
+            say(f"{_described(cluster, bounds)}: scheduler {address}")
+            yield Reached(client, bounds.most * cluster.worker.threads)
+        return
     with _started(cluster, bounds, processes) as started, Client(started) as client:
         _keep(started, cluster, bounds)
         say(f"{_described(cluster, bounds)}: dashboard {started.dashboard_link}")
@@ -117,18 +122,16 @@ def _bounds(cluster: Any, most: int) -> Bounds:
     return Bounds(*(min(number, max(1, most)) for number in wanted))
 
 
-def _reached(cluster: Address) -> Client:
+def _reached(address: str, cluster: AnyCluster) -> Client:
     from distributed import Client
 
     try:
-        return Client(
-            cluster.address, timeout=CONNECT_TIMEOUT, security=common.security_of(cluster)
-        )
+        return Client(address, timeout=CONNECT_TIMEOUT, security=common.security_of(cluster))
     except (OSError, ValueError) as error:
-        raise ClusterError(f"no Dask scheduler answers at {cluster.address}: {error}") from error
+        raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
 
 
-def _started(cluster: AnyCluster, bounds: Bounds, processes: bool) -> Any:
+def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> Any:
     try:
         if isinstance(cluster, Local):
             return local.start(cluster, bounds, processes=processes)
@@ -136,9 +139,7 @@ def _started(cluster: AnyCluster, bounds: Bounds, processes: bool) -> Any:
             from sweep.tasks.clusters import batch
 
             return batch.start(cluster, bounds)
-        if isinstance(cluster, SSH):
-            return ssh.start(cluster, bounds)
-        raise TypeError(f"{cluster} starts no workers")
+        return ssh.start(cluster, bounds)
     except (OSError, RuntimeError, ImportError) as error:
         raise ClusterError(f"no workers could be started: {error}") from error
 

@@ -1,0 +1,199 @@
+"""Workers in pods, which the Dask operator of a Kubernetes cluster starts.
+
+What is asked for is one custom resource, a `DaskCluster`, and where workers are to be kept between
+bounds a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+from sweep.spec.cluster_fields import Bounds
+from sweep.spec.clusters import Kubernetes
+from sweep.tasks.clusters import common
+from sweep.tasks.errors import ClusterError
+
+API = "kubernetes.dask.org/v1"
+PORT = 8786
+
+#: Seconds in which the scheduler's pod must be ready: an image may have to be fetched first.
+READY_SECONDS = 600.0
+
+#: Where certificates are in the pods.
+CERTIFICATES = "/etc/sweep-tls"
+
+#: Pages of the scheduler that the operator asks about workers.
+ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
+
+
+@contextmanager
+def deployed(cluster: Kubernetes, bounds: Bounds) -> Iterator[str]:
+    """Address of the scheduler, while the cluster is there.
+
+    Raises
+    ------
+    ClusterError
+        Where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
+    """
+    try:
+        from httpx import HTTPError
+        from kr8s import APITimeoutError, NotFoundError, ServerError
+        from kr8s.objects import Service, new_class
+    except ImportError as error:
+        raise ClusterError(f"{error}: pip install 'sweep[kubernetes]'") from error
+    refused = (APITimeoutError, HTTPError, NotFoundError, OSError, ServerError, ValueError)
+    with ExitStack() as stack:
+        try:
+            for asked in (resource(cluster, bounds), autoscaler(cluster, bounds)):
+                if asked is not None:
+                    kind = new_class(asked["kind"], API)(asked, namespace=cluster.namespace)
+                    kind.create()
+                    stack.callback(_delete, kind)
+            service = _wait_for(Service, cluster)
+            address = stack.enter_context(_reachable(service, cluster))
+        except refused as error:
+            raise ClusterError(f"Kubernetes starts no workers: {error}") from error
+        yield address
+
+
+def _delete(asked: Any) -> None:
+    with suppress(Exception):  # gone already, or out of reach: the study is stored all the same
+        asked.delete()
+
+
+def _wait_for(kind: Any, cluster: Kubernetes) -> Any:
+    """The scheduler's service, once its pod is ready."""
+    from kr8s import NotFoundError
+
+    deadline = time.monotonic() + READY_SECONDS
+    while time.monotonic() < deadline:
+        with suppress(NotFoundError):
+            service = kind.get(f"{cluster.name}-scheduler", namespace=cluster.namespace)
+            if service.ready_pods():
+                return service
+        time.sleep(1)
+    raise ConnectionError(f"the scheduler's pod is not ready after {READY_SECONDS:.0f} s")
+
+
+@contextmanager
+def _reachable(service: Any, cluster: Kubernetes) -> Iterator[str]:
+    """Address of the service: its own from inside the cluster, a forwarded port from outside."""
+    if _is_known(host(cluster)):
+        yield f"{protocol(cluster)}://{host(cluster)}:{PORT}"
+        return
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    forward = service.portforward(PORT, local_port=port)
+    forward.start()
+    try:
+        yield f"{protocol(cluster)}://127.0.0.1:{port}"
+    finally:
+        forward.stop()
+
+
+def _is_known(name: str) -> bool:
+    try:
+        socket.getaddrinfo(name, PORT)
+    except OSError:
+        return False
+    return True
+
+
+def protocol(cluster: Kubernetes) -> str:
+    """How all parts talk to each other."""
+    return "tls" if cluster.security else "tcp"
+
+
+def host(cluster: Kubernetes) -> str:
+    """Name of the scheduler inside the Kubernetes cluster."""
+    return f"{cluster.name}-scheduler.{cluster.namespace}.svc.cluster.local"
+
+
+def autoscaler(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any] | None:
+    """What keeps the number of workers between bounds; None where it is fixed."""
+    if bounds.least == bounds.most:
+        return None
+    return {
+        "apiVersion": API,
+        "kind": "DaskAutoscaler",
+        "metadata": {"name": cluster.name},
+        "spec": {"cluster": cluster.name, "minimum": bounds.least, "maximum": bounds.most},
+    }
+
+
+def resource(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any]:
+    """The cluster as Kubernetes is asked for it."""
+    try:
+        from dask_kubernetes.operator import make_cluster_spec
+    except ImportError as error:
+        raise ClusterError(f"{error}: pip install 'sweep[kubernetes]'") from error
+    worker = cluster.worker
+    size = {"cpu": str(worker.threads), "memory": str(int(worker.memory))}
+    asked: dict[str, Any] = make_cluster_spec(
+        name=cluster.name,
+        image=cluster.image,
+        n_workers=bounds.least,
+        resources={"requests": size, "limits": size},
+    )
+    scheduler, workers = asked["spec"]["scheduler"]["spec"], asked["spec"]["worker"]["spec"]
+    _fill(scheduler, _scheduler_words(cluster), _scheduler_environment(), cluster)
+    _fill(workers, _worker_words(cluster), _worker_environment(cluster), cluster)
+    workers["containers"][0].pop("ports")  # a worker shows no pages
+    return asked
+
+
+def _fill(
+    pod: dict[str, Any], words: list[str], variables: dict[str, str], cluster: Kubernetes
+) -> None:
+    """Put command, environment and volumes into a pod's only container."""
+    (container,) = pod["containers"]
+    container["args"] = words
+    container["env"] = [{"name": name, "value": value} for name, value in variables.items()]
+    volumes: list[dict[str, Any]] = []
+    mounts: list[dict[str, Any]] = []
+    if cluster.volume:
+        claim = {"claimName": cluster.volume.claim}
+        volumes.append({"name": "studies", "persistentVolumeClaim": claim})
+        mounts.append({"name": "studies", "mountPath": cluster.volume.path})
+    if cluster.secret:
+        volumes.append({"name": "tls", "secret": {"secretName": cluster.secret}})
+        mounts.append({"name": "tls", "mountPath": CERTIFICATES, "readOnly": True})
+    if volumes:
+        pod["volumes"], container["volumeMounts"] = volumes, mounts
+
+
+def _scheduler_words(cluster: Kubernetes) -> list[str]:
+    listening = ["--host", "0.0.0.0", "--port", str(PORT), "--dashboard-address", ":8787"]
+    return ["dask", "scheduler", *listening, *_tls(cluster)]
+
+
+def _worker_words(cluster: Kubernetes) -> list[str]:
+    worker = cluster.worker
+    size = ["--nthreads", str(worker.threads), "--memory-limit", str(int(worker.memory))]
+    name = ["--name", "$(DASK_WORKER_NAME)", "--no-dashboard"]
+    return ["dask", "worker", *name, *size, "--preload", common.PRELOAD, *_tls(cluster)]
+
+
+def _tls(cluster: Kubernetes) -> list[str]:
+    if not cluster.security:
+        return []
+    files = {"ca-file": "ca", "cert": "certificate", "key": "key"}
+    words = [(f"--tls-{option}", f"{CERTIFICATES}/{name}.pem") for option, name in files.items()]
+    return ["--protocol", "tls", *(word for pair in words for word in pair)]
+
+
+def _scheduler_environment() -> dict[str, str]:
+    return {
+        "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": common.WORK_AHEAD,
+        "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": str(ROUTES),
+    }
+
+
+def _worker_environment(cluster: Kubernetes) -> dict[str, str]:
+    address = f"{protocol(cluster)}://{host(cluster)}:{PORT}"
+    return {"DASK_SCHEDULER_ADDRESS": address, **common.environment(cluster.environment)}

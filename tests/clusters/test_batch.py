@@ -1,0 +1,170 @@
+"""Batch systems without one: what is submitted, and a PBS played by two scripts."""
+
+import os
+import shlex
+import subprocess
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from small import quiet, small, tree
+
+from sweep.spec import cluster_of
+from sweep.tasks.clusters import batch
+
+BATCH = {
+    "workers": {"least": 3, "most": 40},
+    "worker": {"memory": "4 GB", "threads": 2},
+    "job": {
+        "workers": 8,
+        "walltime": "2 h",
+        "queue": "normal",
+        "account": "lidar",
+        "directives": ["--exclusive"],
+        "prologue": ["module load python/3.12"],
+    },
+    "scheduler": {"host": "127.0.0.1", "dashboard": "127.0.0.1:0"},
+    "environment": {"SCENES": "/data/my scenes"},
+    "python": "/opt/sweep/bin/python",
+}
+
+
+def described(kind, **changes):
+    return cluster_of({"kind": kind, **BATCH, **changes})
+
+
+def script_of(cluster) -> list[str]:
+    job = {"slurm": batch.SLURMJob, "pbs": batch.PBSJob}[cluster.kind]
+    options = batch.options(cluster)
+    for name in ("n_workers", "scheduler_options"):
+        options.pop(name)
+    return job("tls://10.0.0.5:8786", name="sweep-1", **options).job_script().splitlines()
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_slurm_is_told_what_the_file_says(here):
+    lines = script_of(described("slurm"))
+    for line in (
+        "#SBATCH -p normal", "#SBATCH -A lidar", "#SBATCH -n 1", "#SBATCH --cpus-per-task=16",
+        "#SBATCH --mem=30G", "#SBATCH -t 02:00:00", "#SBATCH --exclusive",
+        "module load python/3.12", "export OMP_NUM_THREADS=1",
+        "export SCENES='/data/my scenes'",
+    ):  # fmt: skip
+        assert line in lines, line
+
+
+def test_pbs_is_told_what_the_file_says(here):
+    lines = script_of(described("pbs"))
+    for line in (
+        "#PBS -q normal", "#PBS -A lidar", "#PBS -l select=1:ncpus=16:mem=30GB",
+        "#PBS -l walltime=02:00:00", "#PBS --exclusive", "module load python/3.12",
+    ):  # fmt: skip
+        assert line in lines, line
+
+
+@pytest.mark.parametrize("kind", ["slurm", "pbs"])
+def test_a_jobs_workers_are_those_of_the_file(here, kind):
+    words = shlex.split(script_of(described(kind))[-1])
+    assert words[0] == "/opt/sweep/bin/python"
+    assert "tls://10.0.0.5:8786" in words
+    options = {a: b for a, b in pairwise(words) if a.startswith("--")}
+    assert (options["--nthreads"], options["--nworkers"]) == ("2", "8")
+    assert options["--preload"] == "sweep.tasks.preload"
+    assert options["--lifetime"] == "6660s"
+    assert options["--lifetime-stagger"] == "180s"
+    assert "--no-dashboard" in words
+
+
+@pytest.mark.parametrize("walltime", [60.0, 600.0, 3600.0, 7200.0, 86400.0, 14 * 86400.0])
+def test_workers_leave_before_their_job_ends_and_not_all_at_once(walltime):
+    lifetime, stagger = batch.lifetime_of(walltime)
+    last, first = lifetime + stagger, lifetime - stagger
+    assert walltime - last >= min(60.0, walltime / 4) - 1e-9
+    assert 0.4 * walltime < first < last < walltime
+    assert last - first >= min(15.0, 0.05 * walltime)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(60, "00:01:00"), (7265.4, "02:01:05"), (360000, "100:00:00")]
+)
+def test_times_are_written_as_batch_systems_read_them(seconds, text):
+    assert batch.clock(seconds) == text
+
+
+@pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (8, 1), (9, 2), (40, 5)])
+def test_workers_come_in_whole_jobs(workers, jobs):
+    assert batch.jobs(described("pbs"), workers) == jobs
+
+
+#: Takes a job, as PBS does, and runs it here; once it has run one it refuses the next.
+QSUB = """\
+#!/bin/sh
+cd "{directory}"
+count=$(($(cat count 2>/dev/null || echo 0) + 1))
+echo $count > count
+if [ $count -eq 2 ]; then echo "qsub: the server is busy" >&2; exit 1; fi
+cp "$1" job-$count.sh
+setsid sh job-$count.sh > job-$count.out 2>&1 < /dev/null &
+echo $! > job-$count.pid
+echo $count.server
+"""
+QDEL = """\
+#!/bin/sh
+job=${{1%%.*}}
+echo $job >> "{directory}/deleted"
+kill -9 -- -$(cat "{directory}/job-$job.pid") 2>/dev/null
+exit 0
+"""
+
+
+@pytest.fixture
+def played_pbs(here, monkeypatch):
+    """A PBS of two scripts, its jobs processes of this machine, none left at the end."""
+    programs = here / "bin"
+    programs.mkdir()
+    for name, text in (("qsub", QSUB), ("qdel", QDEL)):
+        (programs / name).write_text(text.format(directory=here))
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setattr(batch, "PAUSE", 0.2)
+    yield here
+    for pid in here.glob("job-*.pid"):
+        subprocess.run([programs / "qdel", pid.stem.removeprefix("job-")], check=True)
+
+
+def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
+    from dask import config
+
+    def evaluate(study, block):
+        time.sleep(0.4)
+        return study.evaluate(block)
+
+    def kill_the_first() -> None:
+        deadline = time.monotonic() + 60
+        while not list(played_pbs.glob("played.zarr/.sweep/receipts.jsonl")):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        subprocess.run(["qdel", "1.server"], check=True)
+
+    import threading
+
+    killer = threading.Thread(target=kill_the_first)
+    one = {"walltime": "10 min", "logs": str(played_pbs)}
+    cluster = {
+        "kind": "pbs", "workers": 1, "worker": {"memory": "1 GB"}, "job": one,
+        "scheduler": BATCH["scheduler"],
+    }  # fmt: skip
+    killer.start()
+    with config.set({"distributed.deploy.lost-worker-timeout": "200ms"}):
+        outcome = quiet(small(), Path("played.zarr"), cluster=cluster, evaluate=evaluate)
+    killer.join()
+    assert outcome.complete
+    assert tree(outcome.store) == tree(undisturbed)
+    assert int((played_pbs / "count").read_text()) >= 3  # the first, the refused, another
+    assert (played_pbs / "deleted").read_text().split()[-1] == "3"  # none is left in the queue

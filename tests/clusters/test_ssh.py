@@ -1,0 +1,107 @@
+"""Workers over SSH: a server of our own on loopback, with keys of its own."""
+
+import asyncio
+import os
+import shlex
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+import asyncssh
+import pytest
+from small import quiet, small, tree
+
+from sweep.spec import cluster_of
+from sweep.tasks.clusters import certificates, ssh
+from sweep.tasks.errors import ClusterError
+
+SSH = {
+    "kind": "ssh",
+    "hosts": ["127.0.0.1"],
+    "workers": 2,
+    "worker": {"memory": "1 GB"},
+    "scheduler": {"host": "127.0.0.1", "dashboard": "127.0.0.1:0"},
+}
+
+
+def test_workers_are_dealt_out_evenly():
+    hosts = ["a", "b", "c", "d"]
+    cluster = cluster_of({**SSH, "hosts": hosts, "workers": 10})
+    shares = {
+        host: each["options"]["kwargs"]["n_workers"]
+        for host, each in ssh.workers(cluster, 10).items()
+    }
+    assert shares == {"a": 3, "b": 3, "c": 2, "d": 2}
+    assert list(ssh.workers(cluster, 2)) == ["a", "b"]
+
+
+@contextmanager
+def server(directory: Path):
+    """An SSH server that runs commands here: its port, and what was asked of it."""
+    keys = {name: asyncssh.generate_private_key("ssh-ed25519") for name in ("host", "user")}
+    for name, key in keys.items():
+        key.write_private_key(directory / name)
+        key.write_public_key(directory / f"{name}.pub")
+    commands: list[str] = []
+    children: list[subprocess.Popen] = []
+
+    async def serve(process) -> None:
+        commands.append(process.command)
+        child = subprocess.Popen(
+            process.command, shell=True, start_new_session=True, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        children.append(child)
+        await process.redirect(stdout=child.stdout, stderr=child.stderr)
+        process.exit(await asyncio.to_thread(child.wait))
+
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+
+    def call(coroutine):
+        return asyncio.run_coroutine_threadsafe(coroutine, loop).result(20)
+
+    listener = call(
+        asyncssh.listen(
+            "127.0.0.1", 0, server_host_keys=[str(directory / "host")],
+            authorized_client_keys=str(directory / "user.pub"), process_factory=serve,
+        )
+    )  # fmt: skip
+    port = listener.get_port()
+    host_key = (directory / "host.pub").read_text()
+    (directory / "known").write_text(f"[127.0.0.1]:{port} {host_key}")
+    try:
+        yield port, commands
+    finally:
+        listener.close()
+        for child in children:
+            if child.poll() is None:
+                os.killpg(child.pid, 9)
+            child.wait()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
+    files = certificates.make(tmp_path / "tls", 1)
+    with server(tmp_path) as (port, commands):
+        cluster = {
+            **SSH, "port": port, "user": "lidar", "identity": str(tmp_path / "user"),
+            "known_hosts": str(tmp_path / "known"), "python": sys.executable,
+            "security": {name: str(path) for name, path in files._asdict().items()},
+            "environment": {"MARK": "a value"},
+        }  # fmt: skip
+        outcome = quiet(small(), tmp_path / "ssh.zarr", cluster=cluster)
+        assert outcome.complete
+        assert tree(outcome.store) == tree(undisturbed)
+        (started,) = [words for words in map(shlex.split, commands) if len(words) > 1]
+        assert sys.executable in started
+        assert any(word.startswith("tls://127.0.0.1:") for word in started)
+
+        unknown = {**cluster, "known_hosts": str(tmp_path / "user.pub")}
+        with pytest.raises(ClusterError, match="no workers could be started"):
+            quiet(small(), tmp_path / "unknown.zarr", cluster=unknown)

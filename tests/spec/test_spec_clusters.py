@@ -1,0 +1,108 @@
+"""Files of clusters: what they hold, and every mistake in one at once, with its line."""
+
+from pathlib import Path
+
+import pytest
+
+from sweep.spec import SpecError, cluster_of, load_cluster
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+
+SLURM = {
+    "kind": "slurm",
+    "workers": 8,
+    "worker": {"memory": "4 GB"},
+    "job": {"walltime": "2 h"},
+    "scheduler": {"interface": "ib0"},
+}
+
+
+def changed(**changes):
+    return {name: v for name, v in (SLURM | changes).items() if v is not ...}
+
+
+@pytest.mark.parametrize(
+    ("mapping", "told"),
+    [
+        ({}, "kind: is missing; write 'kind:' and one of local, scheduler, ssh"),
+        (changed(kind="slrum"), "kind: must be one of local"),
+        (changed(kind="slrum"), "did you mean 'slurm'?"),
+        (changed(kind=3), "kind: must be one of local"),
+        (changed(workers=...), "workers: is missing"),
+        (changed(workers=0), "workers: must be at least 1 (you wrote 0); write e.g. 8 or {least"),
+        (changed(workers="4 m"), "workers: is a pure number and takes no unit"),
+        (changed(workers={"least": 9, "most": 2}), "workers: has a least above its most"),
+        (changed(workers={"least": 1}), "workers: must have a least and a most"),
+        (changed(workers={"least": 1, "most": 1.5}), "a most that must be a whole number"),
+        (changed(worker={}), "worker.memory: is missing; write e.g. 'memory: 4 GB'"),
+        (changed(worker={"memory": 4}), "worker.memory: needs a unit (you wrote 4)"),
+        (changed(worker={"memory": "4 gb"}), "did you mean 'GB'?"),
+        (changed(worker={"memory": "4 m"}), "worker.memory: needs a unit like byte"),
+        (changed(worker={"memory": "1 MB"}), "worker.memory: must be at least 64 MB"),
+        (changed(worker={"memory": "4 GB", "thread": 2}), "did you mean 'threads'?"),
+        (changed(job={"walltime": "2 GB"}), "job.walltime: needs a unit like s"),
+        (changed(job={"walltime": "5 s"}), "job.walltime: must be at least 1 min"),
+        (changed(job={"walltime": "1 h", "queue": "a; rm"}), "job.queue: is no text that can"),
+        (changed(job={"walltime": "1 h", "prologue": "ls"}), "prologue: must be a list of texts"),
+        (changed(scheduler={}), "scheduler: must say where workers on other machines reach it"),
+        (changed(scheduler={"host": "a", "interface": "b"}), "both a host and an interface"),
+        (changed(scheduler={"host": "a", "prt": 1}), "scheduler.prt: is no field"),
+        (changed(environment={"A B": "1"}), "environment: holds 'A B', which is no name"),
+        (changed(environment={"A": "it's"}), "environment: holds a quote"),
+        (changed(security={"ca": "/no/ca"}), "security.certificate: is missing"),
+        (changed(hosts=["a"]), "hosts: is no field"),
+        ({"kind": "scheduler", "address": "10.0.0.5"}, "write e.g. 'tcp://10.0.0.5:8786'"),
+        ({"kind": "scheduler", "address": "tls://a:1"}, "address: is encrypted, and no certif"),
+        ({"kind": "local", "worker": {"memory": "lots"}}, "worker.memory: must be a number"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_told_with_its_place_and_a_remedy(mapping, told):
+    with pytest.raises(SpecError) as caught:
+        cluster_of(mapping)
+    assert told in str(caught.value)
+
+
+def test_certificates_must_be_there(tmp_path):
+    security = {name: f"{name}.pem" for name in ("ca", "certificate", "key")}
+    with pytest.raises(SpecError) as caught:
+        cluster_of(changed(security=security), base=tmp_path)
+    assert [mistake.path for mistake in caught.value.mistakes] == [
+        "security.ca", "security.certificate", "security.key",
+    ]  # fmt: skip
+    assert "sweep certificates" in str(caught.value)
+    for name in security.values():
+        (tmp_path / name).touch()
+    cluster = cluster_of(changed(security=security), base=tmp_path)
+    assert cluster.certificates() == tuple(str(tmp_path / name) for name in security.values())
+    plain = {"kind": "scheduler", "address": "tcp://a:1", "security": security}
+    with pytest.raises(SpecError, match="is not encrypted"):
+        cluster_of(plain, base=tmp_path)
+
+
+def test_mistakes_come_together_each_with_its_line(tmp_path):
+    file = tmp_path / "slurm.yaml"
+    file.write_text("kind: slurm\nworkers: 0\nworker: {memory: 4}\nscheduler: {interface: ib0}\n")
+    with pytest.raises(SpecError) as caught:
+        load_cluster(file)
+    assert [(m.path, m.line) for m in caught.value.mistakes] == [
+        ("job", 1), ("workers", 2), ("worker.memory", 3),
+    ]  # fmt: skip
+
+
+def test_values_are_bytes_seconds_and_bounds():
+    cluster = cluster_of(changed(workers={"least": 2, "most": 40}))
+    assert cluster.worker.memory == 4e9
+    assert cluster.job.walltime == 7200
+    assert cluster.workers == (2, 40)
+    assert cluster_of(SLURM).workers == (8, 8)
+
+
+@pytest.mark.parametrize("name", ["local", "scheduler", "ssh", "slurm", "pbs", "kubernetes"])
+def test_the_files_that_come_along_can_be_read(name):
+    assert load_cluster(DEPLOY / f"{name}.yaml").kind == name
+
+
+def test_each_kind_has_its_file():
+    assert {file.stem for file in DEPLOY.glob("*.yaml")} == {
+        "local", "scheduler", "ssh", "slurm", "pbs", "kubernetes",
+    }  # fmt: skip
