@@ -3,12 +3,13 @@
 import os
 import shlex
 import subprocess
+import threading
 import time
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from small import quiet, small, tree
+from small import quiet, receipts, small, tree
 
 from sweep.spec import cluster_of
 from sweep.tasks.clusters import batch
@@ -146,13 +147,11 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
         return study.evaluate(block)
 
     def kill_the_first() -> None:
-        deadline = time.monotonic() + 60
-        while not list(played_pbs.glob("played.zarr/.sweep/receipts.jsonl")):
+        deadline = time.monotonic() + 100
+        while not receipts(played_pbs / "played.zarr"):
             assert time.monotonic() < deadline
             time.sleep(0.05)
         subprocess.run(["qdel", "1.server"], check=True)
-
-    import threading
 
     killer = threading.Thread(target=kill_the_first)
     one = {"walltime": "10 min", "logs": str(played_pbs)}

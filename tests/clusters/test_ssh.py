@@ -58,29 +58,32 @@ def server(directory: Path):
         process.exit(await asyncio.to_thread(child.wait))
 
     loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_forever)
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
 
-    def call(coroutine):
-        return asyncio.run_coroutine_threadsafe(coroutine, loop).result(20)
-
-    listener = call(
-        asyncssh.listen(
+    async def listen():
+        return await asyncssh.listen(
             "127.0.0.1", 0, server_host_keys=[str(directory / "host")],
             authorized_client_keys=str(directory / "user.pub"), process_factory=serve,
-        )
-    )  # fmt: skip
+        )  # fmt: skip
+
+    async def end() -> None:
+        listener.close()
+        if rest := asyncio.all_tasks() - {asyncio.current_task()}:
+            await asyncio.wait(rest, timeout=5)
+
+    listener = asyncio.run_coroutine_threadsafe(listen(), loop).result(30)
     port = listener.get_port()
     host_key = (directory / "host.pub").read_text()
     (directory / "known").write_text(f"[127.0.0.1]:{port} {host_key}")
     try:
         yield port, commands
     finally:
-        listener.close()
         for child in children:
             if child.poll() is None:
                 os.killpg(child.pid, 9)
             child.wait()
+        asyncio.run_coroutine_threadsafe(end(), loop).result(30)
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
