@@ -20,6 +20,9 @@ from sweep.tasks.errors import StoreError
 
 LOCK = "lock"
 
+_left: set[str] = set()
+"""Tokens of locks that this process has given up, which a store out of reach may not know."""
+
 #: Seconds between heartbeats, and how old one may be before a holder on another host is dead.
 HEARTBEAT = 10.0
 EXPIRY = 120.0
@@ -118,7 +121,7 @@ class Lock:
 
     def _refuse_a_living_one(self) -> None:
         other = holder(self._store)
-        if other and is_live(self._store, other):
+        if other and other.token not in _left and is_live(self._store, other):
             raise StoreError(
                 f"{self._store} is being written by process {other.pid} on {other.host}: "
                 "wait for it, or stop it; `sweep status` shows how far it is"
@@ -139,6 +142,7 @@ class Lock:
         """Give the lock up, if it is still ours."""
         self._released.set()
         self._beating.join()
+        _left.add(self._me.token)
         with suppress(OSError):
             if self.is_mine():
                 self._claim.leave()

@@ -1,0 +1,266 @@
+"""Studies in an object store, over a real S3 protocol, with faults put in its way."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import asdict, replace
+from datetime import timedelta
+
+import numpy as np
+import pytest
+import xarray as xr
+from click.testing import CliRunner
+from faulty import DENY, DROP, ERROR, PASS, SLOW
+from six_blocks import BLOCKS, six
+from small import evaluated, logged, quiet, tree
+
+import sweep
+from sweep.cli import main
+from sweep.storage import logs, objects
+from sweep.storage.locations import JOURNAL, located
+from sweep.storage.sealing import read_lines
+from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import StoreError
+from sweep.tasks.lock import LOCK, Holder, Lock, holder
+from sweep.tasks.status import status
+from sweep.tasks.verify import verify
+
+
+def remote_tree(place) -> dict[str, str]:
+    """As `tree`, of a store in an object store."""
+    store = located(place)
+    return {
+        name: hashlib.blake2b((store / name).read_bytes()).hexdigest()
+        for name, _ in store.below()
+        if not name.startswith(f"{JOURNAL}/")
+    }
+
+
+def receipts(place) -> list[int]:
+    """Blocks with a receipt, in the order of the log."""
+    return [r["block"] for r in read_lines(located(place) / JOURNAL / "receipts.jsonl")]
+
+
+def troubled(number, method, path):
+    """Of every 20 requests two fail, one is slow, and of one the answer is lost."""
+    return {3: ERROR, 7: SLOW, 12: ERROR, 17: DROP}.get(number % 20, PASS)
+
+
+@pytest.mark.parametrize("workers", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_the_bytes_are_those_of_a_store_on_disk_whatever_the_network_does(
+    faults, place, undisturbed, workers
+):
+    faults.fate = troubled
+    outcome = run(six(), store=place, progress=False, **workers)
+    assert outcome.complete and not outcome.failures
+    faults.fate = lambda *_: PASS
+    assert faults.seen[ERROR] > 20 and faults.seen[DROP] > 10
+    assert remote_tree(place) == tree(undisturbed)
+    assert sorted(receipts(place)) == list(range(BLOCKS))
+    assert holder(located(place)) is None
+    assert all(report.complete and report.sound for report in verify(place, progress=False))
+
+
+def test_what_is_stored_opens_as_from_disk_and_says_how_far_it_is(memory, undisturbed):
+    quiet(six(), memory)
+    here, there = sweep.open(undisturbed), sweep.open(memory)
+    assert there.attrs["points_committed"] == here.attrs["points_committed"] == 12
+    for name in here.data_vars:
+        np.testing.assert_array_equal(there[name].values, here[name].values)
+    assert status(memory).complete
+    told = CliRunner().invoke(main, ["status", memory])
+    assert told.exit_code == 0 and "12 of 12 points" in told.output
+
+
+def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed, tmp_path):
+    script = tmp_path / "client.py"
+    script.write_text(
+        "import sys, time\n"
+        "from six_blocks import six\n"
+        "from sweep.storage import logs\n"
+        "from sweep.tasks.driver import run\n"
+        "logs.WAVE = 0\n"
+        "def evaluate(study, block):\n"
+        "    time.sleep(60 * (block == 3))\n"
+        "    return study.evaluate(block)\n"
+        "run(six(), store=sys.argv[1], scheduler='none', progress=False, evaluate=evaluate)\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, str(script), place],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while len(receipts(place)) < 3:
+            assert time.monotonic() < deadline and child.poll() is None
+            time.sleep(0.1)
+        with pytest.raises(StoreError, match=f"is being written by process {child.pid}"):
+            resume(place, scheduler="none", progress=False)
+        assert status(place).holder_lives
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+        assert not status(place).holder_lives
+        assert receipts(place) == [0, 1, 2]
+        outcome = resume(
+            place, scheduler="none", progress=False, evaluate=logged(tmp_path / "resumed")
+        )
+        assert outcome.complete
+        assert evaluated(tmp_path / "resumed") == [3, 4, 5]
+        assert remote_tree(place) == tree(undisturbed)
+    finally:
+        with suppress(ProcessLookupError):
+            child.kill()
+        child.wait()
+
+
+def test_a_store_that_goes_away_ends_a_run_in_words_and_is_resumed(
+    faults, place, undisturbed, monkeypatch
+):
+    soon = {**objects.RETRIES, "max_retries": 2, "retry_timeout": timedelta(seconds=2)}
+    monkeypatch.setattr(objects, "RETRIES", soon)
+
+    def fails_later(study, block):
+        if block == 3:
+            faults.fate = lambda *_: ERROR
+        return study.evaluate(block)
+
+    outcome = run(six(), store=place, scheduler="none", progress=False, evaluate=fails_later)
+    assert not outcome.complete and "keeps failing (503" in outcome.stopped
+    faults.fate = lambda *_: PASS
+    done = receipts(place)
+    assert outcome.blocks_done == len(done) <= 3
+    assert resume(place, scheduler="none", progress=False).complete
+    assert remote_tree(place) == tree(undisturbed)
+
+
+def test_of_many_that_find_the_lock_of_a_dead_driver_one_gets_it(faults, place):
+    path = located(place)
+    dead = replace(Holder.myself(), pid=2**22 + 1)
+    (path / JOURNAL / LOCK).write_bytes(json.dumps(asdict(dead)).encode())
+    got, refused = [], []
+
+    def try_it():
+        try:
+            got.append(Lock(path))
+        except (StoreError, OSError) as error:
+            refused.append(str(error))
+
+    tries = [threading.Thread(target=try_it) for _ in range(6)]
+    for each in tries:
+        each.start()
+    for each in tries:
+        each.join()
+    assert len(got) == 1 and len(refused) == 5
+    assert got[0].is_mine()
+    got[0].release()
+    assert holder(path) is None
+    Lock(path).release()
+
+
+def test_a_lock_whose_answers_are_lost_is_had_kept_and_left(faults, place):
+    faults.fate = lambda number, method, path: DROP if method == "PUT" and number % 2 else PASS
+    lock = Lock(located(place))
+    assert lock.is_mine()
+    lock._claim.beat()
+    lock._claim.beat()
+    assert lock.is_mine()
+    lock.release()
+    assert holder(located(place)) is None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda f, m: None, "has no bucket 'absent'"),
+        (lambda f, m: m.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9"), "can't be reached"),
+        (lambda f, m: m.delenv("AWS_SECRET_ACCESS_KEY"), "no credentials are set"),
+        (lambda f, m: setattr(f, "fate", lambda *_: DENY), "refuses access"),
+        (lambda f, m: setattr(f, "fate", lambda *_: ERROR), "keeps failing"),
+    ],
+    ids=["no bucket", "nobody there", "no credentials", "refused", "broken"],
+)
+@pytest.mark.parametrize("command", ["status", "resume"])
+def test_what_is_wrong_is_said_in_one_line(faults, monkeypatch, spoil, said, command):
+    few = {**objects.FIRST_RETRIES, "max_retries": 1}
+    monkeypatch.setattr(objects, "FIRST_RETRIES", few)
+    spoil(faults, monkeypatch)
+    told = CliRunner().invoke(main, [command, "s3://absent/x.zarr"])
+    assert told.exit_code == 2 and said in told.output
+    assert told.output.count("\n") == 1 and "Traceback" not in told.output
+
+
+def test_an_address_without_a_key_is_refused():
+    told = CliRunner().invoke(main, ["status", "s3://bucket"])
+    assert told.exit_code == 2 and "write s3://BUCKET/NAME.zarr" in told.output
+
+
+def test_what_is_somebody_elses_is_not_written_over(memory):
+    theirs = located(memory) / "letters" / "one.txt"
+    theirs.write_bytes(b"dear")
+    with pytest.raises(StoreError, match="something else is at"):
+        quiet(six(), memory)
+    assert theirs.read_bytes() == b"dear"
+
+
+def test_a_creation_cut_short_looks_like_no_store_and_is_cleared(
+    faults, place, undisturbed, monkeypatch
+):
+    monkeypatch.setattr(objects, "RETRIES", {**objects.RETRIES, "max_retries": 0})
+    faults.fate = lambda n, method, path: ERROR if path.endswith("range/zarr.json") else PASS
+    with pytest.raises(StoreError, match="can't be made"):
+        quiet(six(seed=4), place)
+    assert not located(place).exists()
+    faults.fate = lambda *_: PASS
+    assert quiet(six(), place).complete
+    assert remote_tree(place) == tree(undisturbed)
+
+
+def test_overwriting_takes_away_everything_of_the_old_store(memory, undisturbed):
+    quiet(six(draws={"number": 20, "batch": 10}), memory)
+    assert "batch_draws/zarr.json" in remote_tree(memory)
+    with pytest.raises(StoreError, match="another study"):
+        quiet(six(), memory)
+    assert quiet(six(), memory, scheduler="none", overwrite=True).complete
+    assert remote_tree(memory) == tree(undisturbed)
+
+
+def test_damage_is_found_and_mended(memory, undisturbed):
+    quiet(six(), memory)
+    chunk = located(memory) / "pd_up" / "c" / "0" / "2"
+    chunk.write_bytes(b"x" + chunk.read_bytes()[1:])
+    (located(memory) / "range" / "zarr.json").unlink()
+    (report,) = verify(memory, repair=True, progress=False)
+    assert report.restored == ("range/zarr.json",)
+    assert {damage.block for damage in report.damages} == {2}
+    outcome = resume(memory, scheduler="none", progress=False)
+    assert outcome.complete and outcome.blocks_computed == 1
+    assert remote_tree(memory) == tree(undisturbed)
+
+
+def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
+    monkeypatch.setattr(logs, "WAVE", 1e9)
+    outcome = quiet(six(), memory)
+    assert outcome.complete and outcome.blocks_computed == BLOCKS
+    log = located(memory) / JOURNAL / "receipts.jsonl"
+    assert len(logs.segments(log)) <= 2  # the first at once, the others at the end
+    assert sorted(receipts(memory)) == list(range(BLOCKS))
+
+
+def test_plain_zarr_libraries_read_it(faults, place, undisturbed):
+    """Without a line of ours between: through obstore and Zarr as anybody uses them."""
+    from obstore.store import S3Store
+    from zarr.storage import ObjectStore
+
+    quiet(six(), place)
+    key = place.removeprefix("s3://bucket/")
+    client = S3Store("bucket", prefix=key, client_options={"allow_http": True})
+    dataset = xr.open_zarr(ObjectStore(client))
+    expected = xr.open_zarr(undisturbed)
+    assert set(dataset.data_vars) == set(expected.data_vars)
+    np.testing.assert_array_equal(dataset.pd_shot.values, expected.pd_shot.values)
