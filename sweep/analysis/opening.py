@@ -11,6 +11,7 @@ import xarray as xr
 
 from sweep.storage.locations import JOURNAL, Location, located, zarr_store
 from sweep.storage.objects import ObjectStoreError
+from sweep.storage.receipts import read_receipts
 from sweep.storage.sealing import read_lines
 
 BATCH = "batch"
@@ -138,20 +139,17 @@ def progress(path: Location, points: int, blocks: int) -> dict[str, Any]:
     points, blocks
         How many there are in all: points of a grid, or shots times draws of a flight.
     """
-    receipts = {
-        r["block"]: r for r in read_lines(path / JOURNAL / "receipts.jsonl") if "block" in r
-    }
-    sessions = list(read_lines(path / JOURNAL / "sessions.jsonl"))
-    times = [r["time"] for r in receipts.values() if "time" in r]
-    started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s] or times
-    complete = len(receipts) >= blocks
+    receipts = read_receipts(path, blocks)
+    sessions = read_lines(path / JOURNAL / "sessions.jsonl")
+    started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
+    started += [receipts.first] if receipts.blocks and not started else []
     return {
         "started": _utc(min(started)) if started else "",
-        "finished": _utc(max(times)) if complete and times else "",
+        "finished": _utc(receipts.last) if receipts.blocks >= blocks else "",
         "points": points,
-        "points_committed": sum(r.get("points", 0) for r in receipts.values()),
+        "points_committed": int(receipts.points.sum()),
         "blocks": blocks,
-        "blocks_committed": len(receipts),
+        "blocks_committed": receipts.blocks,
     }
 
 

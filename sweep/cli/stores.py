@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sweep.cli.places import StorePath, shown
-from sweep.cli.telling import INCOMPLETE, tell_accuracy
+from sweep.cli.telling import INCOMPLETE, in_bytes, tell_accuracy
 from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
@@ -33,13 +33,19 @@ def status(store: Location) -> None:
     from sweep.tasks.status import status as read
 
     s = read(store)
-    left = duration((s.points - s.points_done) / s.rate) if s.rate else "unknown"
+    left = duration(s.left) if s.rate else "unknown"
     click.echo(f"{s.title or store}\nstudy {s.study_id}")
     click.echo(
         f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
+        f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {in_bytes(s.bytes)} stored"
     )
+    if s.rate:
+        click.echo(f"{s.rate:,.3g} {s.unit}/s in the last run, by {s.workers:,} workers")
     if s.holder_lives and s.holder:
-        click.echo(f"running: process {s.holder.pid} on {s.holder.host}, {left} left")
+        click.echo(
+            f"running: process {s.holder.pid} on {s.holder.host}, {left} left, "
+            f"last heartbeat {duration(s.heartbeat)} ago"
+        )
     elif s.complete:
         click.echo("complete")
     elif s.blocks - s.blocks_done == len(s.failures):

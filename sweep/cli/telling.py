@@ -156,11 +156,11 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
     yield "points", f"{p.points:,}"
     yield "blocks", f"{p.blocks:,} of at most {shape}"
     yield "chunks", f"{p.chunks:,} files"
-    yield "bytes", f"{_bytes(p.bytes)} before compression"
+    yield "bytes", f"{in_bytes(p.bytes)} before compression"
     yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
     bound = "at most about" if study.draws.adaptive else "about"
     yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
-    yield "memory", f"about {_bytes(p.worker_memory)} a worker"
+    yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
 
 
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
@@ -180,9 +180,9 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
     yield "draws", f"{p.draws:,}, at {p.places:,} place(s) along the axes"
     yield "blocks", f"{p.blocks:,}"
     yield "chunks", f"{p.chunks:,} files"
-    yield "bytes", f"{_bytes(p.bytes)} before compression"
+    yield "bytes", f"{in_bytes(p.bytes)} before compression"
     yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
-    yield "memory", f"about {_bytes(p.worker_memory)} a worker"
+    yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
 
 
 def tell_effects(study: Spec | SceneSpec, store: Location) -> None:
@@ -235,7 +235,8 @@ def _effect_cells(row: EffectRow) -> list[str]:
     ]
 
 
-def _bytes(count: int) -> str:
+def in_bytes(count: int) -> str:
+    """A number of bytes for a reader: `1.5 MB`."""
     size, unit = float(count), "B"
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":

@@ -22,11 +22,17 @@ def sealed(record: dict[str, Any]) -> bytes:
 
 def unsealed(line: bytes) -> dict[str, Any] | None:
     """The record of a line; None where any byte of it is not as it was written."""
-    body, found, end = line.rpartition(_SUM)
-    if not found or end != _digest(body) + _END:
+    body = body_of(line)
+    if body is None:
         return None
     record: dict[str, Any] = json.loads(body + b"}")
     return record
+
+
+def body_of(line: bytes) -> bytes | None:
+    """The fields of a line, unread, without the last brace; None as of :func:`unsealed`."""
+    body, found, end = line.rpartition(_SUM)
+    return body if found and end == _digest(body) + _END else None
 
 
 def _digest(body: bytes) -> bytes:

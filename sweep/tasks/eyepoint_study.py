@@ -143,6 +143,14 @@ class EyepointStudy:
             name: (block, *(0 for _ in output.dims[1:])) for name, output in self._outputs.items()
         }
 
+    def owners(self) -> dict[str, np.ndarray]:
+        """The blocks along the first dimension of every array."""
+        blocks = np.arange(self.n_blocks)
+        return {
+            name: blocks.reshape(-1, *(1 for _ in output.dims[1:]))
+            for name, output in self._outputs.items()
+        }
+
     def evaluate(self, block: int) -> Results:
         """What the shots of a block see."""
         first, size = block * self.block_cycles * self.shots_a_cycle, self.block_size(block)

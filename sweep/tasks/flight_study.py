@@ -177,6 +177,17 @@ class FlightStudy:
             if _belongs(name, part)
         }
 
+    def owners(self) -> dict[str, np.ndarray]:
+        """The blocks along axes, draws and stretches, as far as an array has these dimensions."""
+        found, first = {}, 0
+        for stretches in self._stretches:
+            blocks = first + np.arange(stretches.number).reshape(stretches.along)
+            first += stretches.number
+            for name, output in self._outputs(stretches).items():
+                own = blocks if _is_radiometric(name) else blocks[(0,) * len(stretches.axes)]
+                found[f"{stretches.scanner}/{name}"] = _along(own, output.dims)
+        return found
+
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
         stretches, part = self._part(block)
@@ -320,6 +331,20 @@ class FlightStudy:
         from sweep.tasks.scene_map import SceneMap
 
         return SceneMap.of(self.spec)
+
+
+def _along(blocks: np.ndarray, dims: tuple[str, ...]) -> np.ndarray:
+    """Blocks (..., draws, cycles) along the dimensions of an array; those of the first draws where
+    it has none.
+    """
+    rank = blocks.ndim - 2
+    if "draw" not in dims:
+        blocks = blocks[..., 0, :]
+    elif dims.index("draw") > 0:
+        blocks = np.swapaxes(blocks, -1, -2)
+    cut = [dim in ("shot", "cycle", "draw") for dim in dims]
+    shape = iter(blocks.shape[rank:])
+    return blocks.reshape(*blocks.shape[:rank], *(next(shape) if is_cut else 1 for is_cut in cut))
 
 
 def _is_radiometric(name: str) -> bool:

@@ -138,6 +138,13 @@ class GridStudy:
         position = self.grid.position(block)
         return {name: position + ((0,) if self._in_batches(name) else ()) for name in self._names}
 
+    def owners(self) -> dict[str, np.ndarray]:
+        """The blocks as they lie along the axes, for every output."""
+        blocks = np.arange(self.n_blocks).reshape(self.grid.blocks_along)
+        return {
+            name: blocks[..., None] if self._in_batches(name) else blocks for name in self._names
+        }
+
     def evaluate(self, block: int) -> Results:
         """Outputs of a block."""
         return evaluate_block(self.spec, self.grid, block, self.calling.of_block(block))

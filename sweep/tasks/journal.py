@@ -17,11 +17,12 @@ import numpy as np
 
 from sweep.storage.locations import Location
 from sweep.storage.logs import open_log
+from sweep.storage.receipts import RECEIPTS, read_receipts
 from sweep.storage.sealing import read_lines, sealed, unsealed
 from sweep.tasks import store
+from sweep.tasks.listing import listed
 from sweep.tasks.study import Study
 
-RECEIPTS = "receipts.jsonl"
 FAILURES = "failures.jsonl"
 SESSIONS = "sessions.jsonl"
 LOGS = (RECEIPTS, FAILURES, SESSIONS)
@@ -138,13 +139,8 @@ def committed(store_path: Location, study: Study) -> np.ndarray:
     ndarray of bool (blocks,)
         True where there is a receipt and every object of the block is in the store.
     """
-    done = np.zeros(study.n_blocks, dtype=bool)
-    for record in read_lines(receipts_path(store_path)):
-        if 0 <= record["block"] < study.n_blocks:
-            done[record["block"]] = "withdrawn" not in record
-    for block in np.flatnonzero(done):
-        done[block] = store.is_whole(store_path, store.block_objects(study, int(block)))
-    return done
+    receipted = read_receipts(store_path, study.n_blocks).points > 0
+    return listed(store_path, study, receipted).whole
 
 
 def failures(store_path: Location) -> dict[int, dict[str, Any]]:

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from sweep.storage.locations import Location, located
+from sweep.storage.receipts import read_receipts
 from sweep.tasks import journal, lock, studies
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.listing import listed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,12 +29,21 @@ class Status:
     failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
     holder: lock.Holder | None  # who writes to it
     holder_lives: bool
+    draws_done: int  # where each point has a fixed number; else 0
+    bytes: int  # of all results, as they are stored
     rate: float  # points a second in the last run, 0 where none committed anything
+    workers: int  # processes that computed in the last run
+    heartbeat: float  # age of its holder's last sign of life [s]; infinite without one
 
     @property
     def complete(self) -> bool:
         """Whether every block is committed."""
         return self.blocks_done == self.blocks
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left at the rate of the last run; infinite where there is none."""
+        return (self.points - self.points_done) / self.rate if self.rate else float("inf")
 
 
 def status(store: str | Location) -> Status:
@@ -44,31 +56,33 @@ def status(store: str | Location) -> Status:
     """
     path = located(store)
     attributes, study = studies.read(path)
-    done = journal.committed(path, study)
+    begun = _begun(path)
+    receipts = read_receipts(path, study.n_blocks, since=begun)
+    found = listed(path, study, receipts.points > 0)
     holder = lock.holder(path)
+    points = study.points_in(found.whole)
+    spent = receipts.last - begun
     return Status(
         store=path,
         title=attributes.get("title", ""),
         study_id=attributes["study_id"],
         unit=study.unit,
         points=study.points,
-        points_done=study.points_in(done),
+        points_done=points,
         blocks=study.n_blocks,
-        blocks_done=int(np.count_nonzero(done)),
-        failures=journal.given_up(path, done.size),
+        blocks_done=int(np.count_nonzero(found.whole)),
+        failures=journal.given_up(path, study.n_blocks),
         holder=holder,
         holder_lives=holder is not None and lock.is_live(path, holder),
-        rate=_rate(path),
+        draws_done=points * int(study.spec.draws.number) if isinstance(study, GridStudy) else 0,
+        bytes=found.bytes,
+        rate=receipts.recent / spent if receipts.recent and spent > 0 else 0.0,
+        workers=len(receipts.workers),
+        heartbeat=lock.heartbeat_age(path) if holder else float("inf"),
     )
 
 
-def _rate(path: Location) -> float:
-    begun = [s["time"] for s in journal.sessions(path) if s.get("event") == "begun"]
-    if not begun:
-        return 0.0
-    points, last = 0, begun[-1]
-    for receipt in journal.read_lines(journal.receipts_path(path)):
-        if receipt.get("time", 0.0) >= begun[-1]:
-            points += receipt["points"]
-            last = max(last, receipt["time"])
-    return points / (last - begun[-1]) if points else 0.0
+def _begun(path: Location) -> float:
+    """When the last run began [s since the epoch]; infinite where there was none."""
+    times = [s["time"] for s in journal.sessions(path) if s.get("event") == "begun"]
+    return float(times[-1]) if times else float("inf")

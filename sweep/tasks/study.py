@@ -87,6 +87,9 @@ class Study(Content, Protocol):
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """Chunks that a block writes, whole: the position of one in each of some arrays."""
 
+    def owners(self) -> dict[str, np.ndarray]:
+        """Block that writes each chunk, in the shape of the grid of chunks, of every such array."""
+
     def evaluate(self, block: int) -> Results:
         """Results of a block by the names of its arrays, each with its chunk's shape."""
 
