@@ -56,7 +56,7 @@ def chromium():
         browser.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def opened(chromium):
     """Opens a page, all charts drawn, in a context of its own: ``opened(file, width=390)``.
 

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 import yaml
 from click.testing import CliRunner
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from reported import EXPERIMENTS, GRID
 
@@ -27,6 +27,7 @@ from sweep.tasks import driver
 BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
 
 
+@settings(max_examples=40)
 @given(
     shape=st.tuples(st.integers(1, 40), st.integers(1, 90)),
     most=st.tuples(st.integers(1, 50), st.integers(1, 50)),
