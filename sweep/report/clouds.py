@@ -128,7 +128,8 @@ def chart(study: SceneStudy, found: list[Seen], fewer: int) -> Chart | None:
         figure=go.Figure(traces, _layout()),
         controls=[
             Control("cloud", "Shown for", [cloud.seen.words for cloud in clouds]),
-            Control("colour", "Colour", [_option(name) for name in COLOURS]),
+            Control("colour", "Colour", [_option(name) for name in COLOURS],
+                    {_option(name): {"title": looks.title(label(name))} for name in COLOURS}),
             Control("view", "View", list(VIEWS),
                     {name: {"scene.camera": _camera(name)} for name in VIEWS}),
             Control("frame", "Frame", ["whole flight", "ground"],
@@ -190,7 +191,7 @@ def _traces(cloud: _Cloud, ground: Ground | None) -> Iterator[go.Scatter3d | go.
                         "symbol": "circle" if kind == "true points" else "diamond-open",
                         "color": values[chosen].astype(np.float32), "cmin": low, "cmax": high,
                         "showscale": kind == "true points" or not true.any(),
-                        "colorbar": looks.colour_bar(label(name)),
+                        "colorbar": looks.COLOUR_BAR,
                     },
                 )  # fmt: skip
 
@@ -248,7 +249,7 @@ def _layout() -> dict[str, object]:
             **{f"{axis}axis": {"title": {"text": f"{axis} (m)"}} | plain for axis in AXES},
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
-        margin={"l": 0, "r": 0, "t": 70, "b": 40},
+        margin={"l": 0, "r": 0, "t": 88, "b": 40},
     )
 
 

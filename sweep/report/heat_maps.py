@@ -64,7 +64,7 @@ def chart(study: Study, figure: Surface, share: float) -> Chart:
             y=up.shown(one.y.middles(most[1])),
             z=scale.shown(layer).astype(np.float32),
             zmin=scale.low, zmax=scale.high, colorscale="Viridis",
-            colorbar=looks.colour_bar(scale.words),
+            colorbar=looks.COLOUR_BAR,
             name=one.part.words, meta=when(part=one.part.words, cell=kind),
         )
         for (one, kind), layer in zip(((m, k) for m in maps for k in kinds), layers, strict=True)
@@ -81,7 +81,13 @@ def chart(study: Study, figure: Surface, share: float) -> Chart:
              wording.gaps(layers)]
         ),
         figure=go.Figure(
-            traces, looks.layout(xaxis=across.axis, yaxis=up.at_side, margin=looks.UNDER_A_BAR)
+            traces,
+            looks.layout(
+                xaxis=across.axis,
+                yaxis=up.at_side,
+                margin=looks.UNDER_A_BAR,
+                title=looks.title(scale.words),
+            ),
         ),
         controls=[
             Control("part", "Shown for", [part.words for part in found]),

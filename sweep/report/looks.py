@@ -34,7 +34,7 @@ _GROUND = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
 CHANCES = {"yaxis.range": [-0.03, 1.03]}
 """What a choice changes of a chart that shows a probability."""
 
-UNDER_A_BAR = {"l": 10, "r": 16, "t": 84, "b": 55}
+UNDER_A_BAR = {"l": 10, "r": 16, "t": 88, "b": 55}
 """Margins of a chart with a colour bar over it."""
 
 
@@ -94,10 +94,16 @@ def upright(words: str, **further: Any) -> dict[str, Any]:
     return axis(broken(words), automargin=True, **further)
 
 
-def colour_bar(title: str, **further: Any) -> dict[str, Any]:
-    """A colour bar over the chart, as wide as it is, which suits narrow screens too."""
+def title(words: str) -> dict[str, Any]:
+    """What colours mean, over their bar."""
     return {
-        "orientation": "h", "x": 0.5, "yref": "container", "y": 0.99, "yanchor": "top", "len": 1.0,
-        "thickness": 12,
-        "title": {"text": broken(title, 34), "side": "top"},
-    } | further  # fmt: skip
+        "text": broken(words, 48), "x": 0.5, "xanchor": "center", "yref": "container", "y": 1,
+        "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
+    }  # fmt: skip
+
+
+COLOUR_BAR: dict[str, Any] = {
+    "orientation": "h", "x": 0.5, "yref": "container", "y": 0.91, "yanchor": "top", "len": 1.0,
+    "thickness": 12,
+}  # fmt: skip
+"""A colour bar over the chart, as wide as it is, which suits narrow screens too."""

@@ -113,7 +113,7 @@ class Cut {
 
   draw() {
     const place = Math.min(Number(this.place.value), Number(this.place.max));
-    const side = this.along.value, [map] = this.maps;
+    const side = this.along.value, [map] = this.maps, layout = this.chart.figure.layout;
     const value = map[this.across][place];
     const told = typeof value === "number" ? Number(value.toPrecision(4)).toString() : value;
     const values = side === "x" ? map.z[place] : map.z.map((row) => row[place]);
@@ -121,9 +121,8 @@ class Cut {
     this.output.textContent = told;
     this.place.setAttribute("aria-valuetext", told);
     this.plot.setAttribute("aria-label",
-      `Line of ${map.colorbar.title.text} over ${this.name(side)} at ${this.name(this.across)} ${told}`);
+      `Line of ${layout.title.text} over ${this.name(side)} at ${this.name(this.across)} ${told}`);
     const trace = dressed({ x: map[side], y: values, type: "scatter", mode: "lines", meta: { series: 0 } });
-    const layout = this.chart.figure.layout;
     const room = 0.03 * (map.zmax - map.zmin);
     Plotly.react(this.plot, [trace], laid({
       margin: { l: 10, r: 16, t: 12, b: 50 }, font: layout.font, paper_bgcolor: layout.paper_bgcolor,
