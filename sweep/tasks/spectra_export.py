@@ -73,71 +73,72 @@ def spectra(
     return _dataset(spec, shots, np.concatenate(drawn), found, numbers)
 
 
+TOLD = {
+    "spectrum": ("V", "X[k] with noise, no 1/N"),
+    "signal": ("V", "X[k] without noise"),
+    "noise_power": ("V^2", "mean |X|^2 of a bin of noise alone"),
+    "threshold": ("V", "fixed threshold on |X|"),
+    "window": ("1", "samples of the window"),
+    "true_frequency": ("Hz", "place of the signal's peak between bins"),
+    "first_bin": ("1", "first bin that the signal occupies"),
+    "last_bin": ("1", "last bin that the signal occupies"),
+    "cnr": ("1", "signal over noise in the record"),
+    "line_frequency": ("Hz", "where each beamlet's line appears"),
+    "line_amplitude": ("V", "amplitude of each beamlet's beat at the ADC"),
+    "range": ("m", "true range"),
+    "radial_velocity": ("m s-1", "true radial velocity, positive when closing"),
+    "draw": ("1", "number of the draw"),
+    "segment": ("", "segment of the waveform"),
+    "frequency": ("Hz", "frequency of the bin"),
+}
+"""Units and meaning of what is written."""
+
+
 def _dataset(
     spec: Spec, shots: Shots, spectrum: np.ndarray, found: list[list[Any]], numbers: np.ndarray
 ) -> xr.Dataset:
     import xarray as xr
 
+    from sweep.model.processing import taper
+
     width = float(shots.sample_rate[0]) / shots.fft_size
     there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]
-    by_draw = ("draw", "segment") if len(found) > 1 else ("segment",)
+    of_signal = ("draw", "segment") if len(found) > 1 else ("segment",)
 
     def each(name: str) -> np.ndarray:
         values = np.array([[getattr(signal, name) for signal in signals] for signals in found])
         return values if len(found) > 1 else values[0]
 
-    def told(dims: Any, values: Any, units: str, long_name: str) -> tuple[Any, Any, dict[str, str]]:
-        return dims, values, {"units": units, "long_name": long_name}
-
-    whole = (*by_draw, "frequency")
     lines, amplitude = _lines(shots, width)
+    content: dict[str, tuple[tuple[str, ...], Any]] = {
+        "spectrum": (("draw", "segment", "frequency"), spectrum),
+        "signal": ((*of_signal, "frequency"), each("spectrum")),
+        "noise_power": ((), float(shots.window.energy * shots.noise_variance[-1])),
+        "threshold": ((), float(shots.threshold[-1])),
+        "window": (("sample",), taper(shots.window)),
+        "true_frequency": (of_signal, each("frequency") * width),
+        "first_bin": (of_signal, each("first")),
+        "last_bin": (of_signal, each("last")),
+        "cnr": (of_signal, each("cnr")),
+        "line_frequency": (("segment", "line"), lines),
+        "line_amplitude": (("line",), amplitude),
+        "range": ((), float(shots.range[-1])),
+        "radial_velocity": ((), float(shots.radial_velocity[-1])),
+        "draw": (("draw",), numbers),
+        "segment": (("segment",), np.array(there, dtype=object)),
+        "frequency": (("frequency",), np.arange(shots.fft_size // 2 + 1) * width),
+    }
     variables = {
-        "spectrum": told(
-            ("draw", "segment", "frequency"), spectrum, "V", "X[k] with noise, no 1/N"
-        ),
-        "signal": told(whole, each("spectrum"), "V", "X[k] without noise"),
-        "noise_power": told(
-            (), float(shots.window.energy * shots.noise_variance[-1]), "V^2",
-            "mean |X|^2 of a bin of noise alone",
-        ),
-        "threshold": told((), float(shots.threshold[-1]), "V", "fixed threshold on |X|"),
-        "window": told(("sample",), _taper(shots), "1", "samples of the window"),
-        "true_frequency": told(
-            by_draw, each("frequency") * width, "Hz", "place of the signal's peak between bins"
-        ),
-        "first_bin": told(by_draw, each("first"), "1", "first bin that the signal occupies"),
-        "last_bin": told(by_draw, each("last"), "1", "last bin that the signal occupies"),
-        "cnr": told(by_draw, each("cnr"), "1", "signal over noise in the record"),
-        "line_frequency": told(
-            ("segment", "line"), lines, "Hz", "where each beamlet's line appears"
-        ),
-        "line_amplitude": told(
-            ("line",), amplitude, "V", "amplitude of each beamlet's beat at the ADC"
-        ),
-        "range": told((), float(shots.range[-1]), "m", "true range"),
-        "radial_velocity": told(
-            (), float(shots.radial_velocity[-1]), "m s-1", "true, positive when closing"
-        ),
-    }  # fmt: skip
-    frequency = np.arange(shots.fft_size // 2 + 1) * width
+        name: (dims, values, dict(zip(("units", "long_name"), TOLD[name], strict=True)))
+        for name, (dims, values) in content.items()
+    }
     return xr.Dataset(
         variables,
-        coords={
-            "draw": told(("draw",), numbers, "1", "number of the draw"),
-            "segment": ("segment", np.array(there, dtype=object)),
-            "frequency": told(("frequency",), frequency, "Hz", "frequency of the bin"),
-        },
         attrs={
             "title": spec.title, "spec": spec.to_json(), "fft_size": shots.fft_size,
             "sample_rate": float(shots.sample_rate[0]), "window_name": shots.window.name,
         },
     )  # fmt: skip
-
-
-def _taper(shots: Shots) -> np.ndarray:
-    from sweep.model.processing import taper
-
-    return taper(shots.window)
 
 
 def _lines(shots: Shots, width: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,98 @@
+"""Estimators of frequency: tones without noise, and errors in noise against the bounds."""
+
+import numpy as np
+import pytest
+
+from sweep.model import cramer_rao
+from sweep.model.estimators import ESTIMATORS, jacobsen_form
+from sweep.model.processing import Setting, taper
+from sweep.model.window import window
+
+SIZE, BIN, DRAWS = 512, 120, 1500
+"""5 standard errors of a root mean square of 1500 normal numbers are 5 / sqrt(3000) = 9 %."""
+
+
+def spectra(name, length, delta, cnr=np.inf, seed=2):
+    """Spectra of tones `delta` bins above BIN, phases at random; what is told of them."""
+    rng, w = np.random.default_rng(seed), window(name, length)
+    turns = np.outer(BIN + np.asarray(delta), np.arange(length)) / SIZE
+    record = np.cos(2 * np.pi * turns + rng.uniform(0, 2 * np.pi, (len(delta), 1)))
+    variance = 0.5 / cnr
+    record += rng.normal(0, np.sqrt(variance), record.shape)
+    setting = Setting(
+        fft_size=SIZE, sample_rate=float(SIZE), window=w, noise_power=w.energy * variance,
+        threshold=1.0, training=32, guard=4, rank=24, pfa=1e-3,
+    )  # fmt: skip
+    spectrum = np.fft.rfft(record * taper(w), SIZE)
+    peak = BIN - 8 + np.argmax(np.abs(spectrum[:, BIN - 8 : BIN + 9]), axis=1)
+    return spectrum, peak, setting
+
+
+WINDOWS = [("rectangular", SIZE), ("hamming", SIZE), ("hann", SIZE), ("hamming", 400)]
+BIASES = {
+    "peak_bin": 0.5, "parabolic": 0.25, "parabolic_log": 0.2, "jacobsen": 0.07, "candan": 4e-3,
+    "centroid": 0.25, "chirp_z": 4e-3, "maximum_likelihood": 1e-5,
+}  # fmt: skip
+"""Largest errors without noise over WINDOWS; of the best three the tone's own image, which in the
+rectangular window stands at 1 / (2 pi 120) of it, and 1e-5 where that is taken off."""
+
+
+@pytest.mark.parametrize("name", BIASES)
+@pytest.mark.parametrize(("shape", "length"), WINDOWS)
+def test_a_tone_without_noise_is_placed_within_the_estimators_bias(name, shape, length):
+    delta = np.linspace(-0.49, 0.49, 41)
+    spectrum, peak, setting = spectra(shape, length, delta)
+    found = ESTIMATORS[name](spectrum, peak, setting)
+    assert found.shape == peak.shape and found.dtype == float
+    assert np.abs(found - BIN - delta).max() <= BIASES[name]
+
+
+def test_every_estimator_is_looked_at():
+    assert set(BIASES) == set(ESTIMATORS)
+
+
+def test_jacobsens_factors_are_those_of_his_table():
+    """Q of Jacobsen and Kootsookos [2007], which they fitted by eye to two digits."""
+    table = {"hamming": 0.60, "hann": 0.55, "blackman": 0.55, "blackmanharris": 0.56}
+    for name, factor in table.items():
+        assert jacobsen_form(window(name, SIZE), SIZE) == (-1, pytest.approx(factor, abs=0.025))
+    assert jacobsen_form(window("rectangular", SIZE), SIZE) == (1, 1.0)
+
+
+def errors(name, shape, length, decibel):
+    """Errors [bins] of tones anywhere between bins, the Cramer-Rao bound, the windowed one."""
+    w = window(shape, length)
+    cnr = cramer_rao.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=w)
+    delta = np.random.default_rng(9).uniform(-0.5, 0.5, DRAWS)
+    spectrum, peak, setting = spectra(shape, length, delta, cnr)
+    error = ESTIMATORS[name](spectrum, peak, setting) - BIN - delta
+    bound = cramer_rao.beat_deviation(cnr=cnr, samples=length, sample_rate=float(SIZE))
+    return error, bound, cramer_rao.windowed_deviation(
+        cnr=cnr, window=w, sample_rate=float(SIZE)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("shape", "length"), WINDOWS)
+@pytest.mark.parametrize("decibel", [20, 30, 40, 60])
+def test_the_most_likely_frequency_reaches_the_bound(shape, length, decibel):
+    """Within 10 %, whatever the window; and without bias, by 5 standard errors."""
+    error, bound, _ = errors("maximum_likelihood", shape, length, decibel)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(bound, rel=0.1)
+    assert abs(error.mean()) < 5 * error.std() / np.sqrt(DRAWS)
+
+
+@pytest.mark.parametrize(("shape", "length"), WINDOWS)
+@pytest.mark.parametrize("decibel", [20, 30])
+def test_the_largest_value_of_the_windowed_spectrum_is_as_good_as_the_window_allows(
+    shape, length, decibel
+):
+    error, _, windowed = errors("chirp_z", shape, length, decibel)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(windowed, rel=0.1)
+
+
+@pytest.mark.parametrize("name", BIASES)
+def test_no_estimator_beats_the_bound(name):
+    """Over 40 dB; 5 standard errors are 9 %, and a biased one may only be worse."""
+    for decibel in (20, 40, 60):
+        error, bound, _ = errors(name, "hamming", SIZE, decibel)
+        assert np.sqrt(np.mean(error**2)) > 0.91 * bound

@@ -1,0 +1,183 @@
+"""Whole spectra: their noise, what is detected in them, and that order and blocks do not matter."""
+
+import numpy as np
+import pytest
+
+from sweep.model import philox
+from sweep.model.chain import prepare
+from sweep.model.interpolation import noise_correlation
+from sweep.model.noisy_spectra import noise_of, signal_of
+from sweep.model.sampling import Promise
+from sweep.model.shot import evaluate
+from sweep.model.spectra_look import DETECTOR, ESTIMATOR, Methods
+from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
+from sweep.model.truth import spectrum
+
+EFFECTS = ("doppler",)
+
+
+def _points(table_4_1, **changes):
+    given = {
+        "instrument.processing.fft_size": 2048,
+        "instrument.processing.tnr": 6.0,
+        "target.range": np.array([1000.0, 2000.0, 3500.0]),
+    }
+    return table_4_1() | given | changes
+
+
+def _keys(n):
+    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=5)
+
+
+def _drawn(parameters, number=400, effects=EFFECTS, **place):
+    size = np.size(parameters["target.range"])
+    return simulate_spectra(parameters, effects, keys=_keys(size), batch_sizes=[number], **place)
+
+
+@pytest.mark.parametrize(("window", "duration"), [("rectangular", 5e-4), ("hamming", 2.5e-6)])
+def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1, window, duration):
+    """2.5 us are 1500 samples in 2048 points. 5 sigma of a mean over 300 spectra of 1000 bins."""
+    changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
+    ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
+    signal = signal_of(shots, 0, 0)
+    noise = np.array([noise_of(shots, 0, 0, signal, _keys(1)[0], d) for d in range(300)])[:, 8:-8]
+    power = 2 * float(shots.bin_deviation[0]) ** 2
+    independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
+    assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
+    turn = np.exp(1j * np.pi * shots.window.length / shots.fft_size)
+    near = np.mean((noise[:, 1:] * noise[:, :-1].conj()).real * turn.real
+                   - (noise[:, 1:] * noise[:, :-1].conj()).imag * turn.imag) / power  # fmt: skip
+    expected, _ = noise_correlation(shots.window, shots.fft_size)
+    assert near == pytest.approx(expected, abs=5 / np.sqrt(independent))
+
+
+def test_the_signal_is_that_of_the_time_domain(table_4_1):
+    """A lone line: magnitudes of the record's own FFT; its place, but for its image."""
+    parameters = _points(table_4_1) | {"target.range": 1000.0, "footprint.beamlets": 1}
+    ((_, shots),) = prepare(parameters, (*EFFECTS, "image"))
+    expected = spectrum(shots, 0, 2, range_walk=False)
+    signal = signal_of(shots, 0, 2)
+    np.testing.assert_allclose(np.abs(signal.spectrum), expected, atol=1e-8 * expected.max())
+    assert signal.strongest == np.argmax(expected)
+    up, down = signal_of(shots, 0, 0).frequency, signal.frequency
+    beat = 2 * 150.0 / 1550e-9 / 600e6 * 2048  # half sum of up and down [bins]
+    assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
+
+
+def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1):
+    """Tones on bins of an untapered record: nothing beside them, where one more look is taken.
+
+    The Doppler beat is on bin 660, and the range beat 30 bins from it.
+    """
+    width = 600e6 / 2048
+    speed = 660 * width * 1550e-9 / 2
+    parameters = _points(
+        table_4_1,
+        **{
+            "instrument.processing.window": "rectangular",
+            "instrument.processing.tnr": 6.5,
+            "instrument.laser.power": np.array([0.01, 0.02, 0.04]),
+            "target.radial_velocity": speed,
+            "target.range": np.full(3, 660.0),
+            "footprint.beamlets": 1,
+        },
+    )
+    closed, drawn = evaluate(parameters, EFFECTS), _drawn(parameters, 2000)
+    pd = closed["pd_doppler"]
+    assert ((pd > 0.02) & (pd < 0.98)).sum() >= 2
+    sigma = np.sqrt(pd * (1 - pd) / 2000)
+    assert (np.abs(drawn["pd_doppler"] - pd) < 5 * sigma + 2.2 * closed["pfa_bin"]).all()
+    assert (np.abs(drawn["pfa_bin"] - closed["pfa_bin"]) < 5 * drawn["pfa_bin_error"]).all()
+    assert (drawn["pfa_bin_error"] < 0.05 * drawn["pfa_bin"]).all()
+
+
+def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1):
+    """Within 10 %, of a lone line; 5 standard errors of 1500 draws are 9 %."""
+    parameters = _points(table_4_1, **{"footprint.beamlets": 1, "target.range": np.array([600.0])})
+    parameters |= {ESTIMATOR + "kind": "maximum_likelihood"}
+    found = _drawn(parameters, 1500)
+    for name in ("range", "radial_velocity"):
+        assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.1)
+        assert np.abs(found[f"{name}_bias"]) < 5 * found[f"{name}_bias_error"]
+    coarse = _drawn(parameters | {ESTIMATOR + "kind": "peak_bin"}, 100)
+    assert coarse["range_rmse"] > 2 * found["range_bound"]
+
+
+@pytest.mark.parametrize("effects", [EFFECTS, (*EFFECTS, "speckle")])
+def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
+    parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
+    parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
+    keys = _keys(3)
+    whole = simulate_spectra(parameters, effects, keys=keys, batch_sizes=[40, 30])
+    other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
+    parts = simulate_spectra(other, effects, keys=keys[::-1], batch_sizes=[13, 7, 50])
+    for name, values in whole.items():
+        if values.ndim == 2:
+            np.testing.assert_array_equal(values.sum(axis=1), parts[name][::-1].sum(axis=1))
+        else:
+            np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
+    alone = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
+    one = simulate_spectra(alone, effects, keys=keys[1:2], batch_sizes=[70])
+    for name in SPECTRA_OUTPUTS:
+        np.testing.assert_array_equal(one[name], whole[name][1:2], err_msg=name)
+
+
+def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
+    parameters, promise = _points(table_4_1), Promise(0.1, 0.95, "wilson")
+    given = {"keys": _keys(3), "promise": promise}
+    found = simulate_spectra_until(parameters, EFFECTS, batch=20, limit=500, **given)
+    assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
+    again = simulate_spectra(
+        parameters, EFFECTS, batch_sizes=[int(found["n_draws"][0])], **given
+    )  # fmt: skip
+    assert again["pd_shot"][0] == found["pd_shot"][0]
+    assert again["n_detected_shot"][0, 0] == found["n_detected_shot"][0]
+
+
+def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
+    """Against the mean over the same draws of their conditional probabilities.
+
+    Twice a sharp threshold's spread, as single draws are counted here and averaged there.
+    """
+    from sweep.model.realisations import evaluate as averaged
+
+    parameters = _points(
+        table_4_1,
+        **{
+            "instrument.processing.window": "rectangular",
+            "target.roughness": 1e-6,
+            "footprint.beamlets": 1,
+            "target.range": np.array([800.0]),
+        },
+    )
+    effects = (*EFFECTS, "speckle")
+    pd = averaged(parameters, effects, keys=_keys(1), draws=600)["pd_down"]
+    found = _drawn(parameters, 600, effects)["pd_down"]
+    assert 0.1 < pd[0] < 0.95
+    assert found == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
+
+
+def test_direct_detection_has_no_doppler_segment(table_4_1):
+    changes = {
+        "instrument.receiver.architecture": "direct",
+        "target.range": np.array([50.0]),
+        "target.radial_velocity": 0.0,
+    }
+    found = _drawn(_points(table_4_1, **changes), 20, ())
+    assert np.isnan(found["pd_doppler"]) and np.isfinite(found["pd_up"])
+
+
+def test_methods_may_be_ones_own(table_4_1):
+    """A detector that flags everything but the signal, and an estimator half a bin too high."""
+
+    def all_but(power, setting):
+        flags = np.ones(power.shape, bool)
+        flags[:, [0, 1, 2, -2, -1]] = False
+        return flags
+
+    methods = Methods({"m:f": all_but}, {"m:g": lambda spectrum, peak, setting: peak + 0.5})
+    parameters = _points(table_4_1) | {DETECTOR + "kind": "m:f", ESTIMATOR + "kind": "m:g"}
+    found = _drawn(parameters, 5, methods=methods)
+    assert (found["pd_shot"] == 1).all()
+    assert (found["false_alarms"] == 0).all()  # one group, and the signal within it

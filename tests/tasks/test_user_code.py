@@ -1,0 +1,160 @@
+"""Functions of the user's: run when allowed, held to their word, never by reading."""
+
+import os
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from small import quiet, small
+
+import sweep
+from sweep.tasks import user_code
+from sweep.tasks.errors import CodeError
+from sweep.tasks.plan import plan
+
+CODE = """
+    import numpy as np
+    from pathlib import Path
+
+    with Path(__file__).with_suffix(".runs").open("a") as file:
+        file.write("x")
+
+    def detect(power, setting):
+        return power > setting.threshold**2
+
+    def written(power, setting):
+        power[:] = 0
+        return power > 1
+
+    def counts(power, setting):
+        return (power > 1).astype(int)
+
+    def short(power, setting):
+        return power[:, 1:] > 1
+
+    def lists(power, setting):
+        return [True]
+
+    def fails(power, setting):
+        raise KeyError("no level")
+
+    def estimate(spectrum, peak, setting):
+        return peak + 0.0
+
+    def endless(spectrum, peak, setting):
+        return peak + np.inf
+
+    number = 3
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A module of the user's in the working directory, not allowed yet."""
+    name = f"mine_{tmp_path.name}".replace("-", "_")
+    (tmp_path / f"{name}.py").write_text(textwrap.dedent(CODE))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(user_code.ALLOWED, "")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    user_code.guarded.cache_clear()
+    yield name
+    sys.modules.pop(name, None)
+    user_code.guarded.cache_clear()
+
+
+def study(detector="fixed", estimator="peak_bin", **changes):
+    processing = {"sample_rate": "600 MHz", "fft_size": "2^9", "tnr": 4}
+    processing |= {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
+    given = small(draws={"method": "spectra", "number": 3}, axes={})
+    mapping = given.to_yaml_mapping()
+    mapping["instrument"]["processing"] |= processing
+    mapping["axes"] = {"target.range": {"linear": ["500 m", "4 km"], "number": 3}} | changes
+    return type(given).from_mapping(mapping | {"storage": {"block_points": 2}})
+
+
+def runs(name, tmp_path):
+    file = tmp_path / f"{name}.runs"
+    return file.read_text() if file.exists() else ""
+
+
+def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
+    spec = study(f"{mine}:detect", f"{mine}:estimate")
+    for ask in (lambda: quiet(spec, tmp_path / "a.zarr"), lambda: plan(spec)):
+        with pytest.raises(CodeError, match=f"--allow-code {mine}"):
+            ask()
+    assert not (tmp_path / "a.zarr").exists() and not runs(mine, tmp_path)
+    user_code.allow([mine])
+    assert quiet(spec, tmp_path / "a.zarr").complete
+    assert quiet(study(), tmp_path / "b.zarr").complete
+    own, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
+    np.testing.assert_array_equal(own.pd_shot, built_in.pd_shot)
+    np.testing.assert_array_equal(own.range_rmse, built_in.range_rmse)
+
+
+def test_opening_a_store_runs_nothing(mine, tmp_path):
+    user_code.allow([mine])
+    assert quiet(study(f"{mine}:detect"), tmp_path / "a.zarr").complete
+    del os.environ[user_code.ALLOWED], sys.modules[mine]
+    ran = runs(mine, tmp_path)
+    sweep.open(tmp_path / "a.zarr")
+    from sweep.tasks.status import status
+    from sweep.tasks.studies import read
+
+    assert status(tmp_path / "a.zarr").complete
+    assert read(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
+    assert runs(mine, tmp_path) == ran and mine not in sys.modules
+    user_code.guarded.cache_clear()
+    with pytest.raises(CodeError, match="not allowed"):
+        sweep.resume(tmp_path / "a.zarr", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("role", "function", "words"),
+    [
+        ("detector", "written", "read-only"),
+        ("detector", "counts", "gives int64 of shape"),
+        ("detector", "short", "must give bool of"),
+        ("detector", "lists", "must give a numpy array"),
+        ("detector", "fails", "fails on a small known spectrum with KeyError: 'no level'"),
+        ("detector", "number", "is a int, and no function"),
+        ("detector", "missing", "the module has nothing called missing"),
+        ("estimator", "endless", "not finite"),
+        ("estimator", "detect", "fails on a small known spectrum with TypeError"),
+    ],
+)
+def test_a_function_is_held_to_its_word_before_anything_runs(mine, tmp_path, role, function, words):
+    user_code.allow([mine])
+    with pytest.raises(CodeError, match=words):
+        quiet(study(**{role: f"{mine}:{function}"}), tmp_path / "a.zarr")
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_a_module_that_is_not_there_is_named(mine, tmp_path):
+    user_code.allow(["no_such_module"])
+    with pytest.raises(CodeError, match="no_such_module"):
+        user_code.check(study("no_such_module:f"))
+
+
+def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
+    """And whatever looks at them, the same noise: common draws of all detectors."""
+    axes = {
+        "instrument.processing.detector.kind": ["fixed", "goca_cfar"],
+        "instrument.processing.estimator.kind": ["peak_bin", "candan"],
+    }
+    mapping = study(**axes).to_yaml_mapping()
+    stores = []
+    for points in (3, 64):
+        spec = small().from_mapping(mapping | {"storage": {"block_points": points}})
+        quiet(spec, tmp_path / f"{points}.zarr")
+        stores.append(sweep.open(tmp_path / f"{points}.zarr").load())
+    for name, values in stores[0].data_vars.items():
+        np.testing.assert_array_equal(values, stores[1][name], err_msg=name)
+    pd = stores[0].pd_shot
+    np.testing.assert_array_equal(pd.sel(estimator="peak_bin"), pd.sel(estimator="candan"))
+
+
+def test_a_plan_measures_what_draws_take():
+    few, many = (study() for _ in range(2))
+    many = many.model_copy(update={"draws": many.draws.model_copy(update={"number": 10_000})})
+    assert plan(many).seconds_a_point > 20 * plan(few).seconds_a_point

@@ -1,0 +1,100 @@
+"""`sweep spectra`: what it writes is what studies draw, and opens with numpy and xarray."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+from click.testing import CliRunner
+from test_cli import STUDY
+
+import sweep
+from sweep.cli import main
+from sweep.spec import Spec
+
+DRAWS = 30
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A directory of one's own with a study of whole spectra in it."""
+    mapping = yaml.safe_load(STUDY)
+    mapping["instrument"]["processing"] |= {"fft_size": "2^10", "tnr": 3.5, "window": "hann"}
+    mapping |= {
+        "draws": {"method": "spectra", "number": DRAWS},
+        "axes": {"target.range": ["1 km", "3 km"]},
+    }
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(mapping))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*arguments):
+    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
+
+
+def test_spectra_are_those_that_the_study_looks_at(here):
+    """Detections of the fixed threshold counted by hand, one by one, as the store has them."""
+    assert sweep.run(sweep.load("small.yaml"), store="a.zarr", scheduler="none", progress=False)
+    store = sweep.open("a.zarr")
+    for source in ("small.yaml", "a.zarr"):
+        done = command("spectra", source, "--at", "range=3km", "--draws", DRAWS, "-o", "s.zarr",
+                       "--overwrite")  # fmt: skip
+        assert done.exit_code == 0, done.output
+        found = xr.open_zarr("s.zarr", consolidated=False).load()
+        flags = np.abs(found.spectrum) >= found.threshold
+        for segment in ("up", "down", "doppler"):
+            at = int(np.argmax(np.abs(found.signal.sel(segment=segment).values)))
+            near = flags.sel(segment=segment).isel(frequency=slice(at - 1, at + 2))
+            counted = int(near.any("frequency").sum())
+            assert 0 < counted < DRAWS
+            assert counted == int(store[f"n_detected_{segment}"].sel(range=3))
+    assert Spec.from_stored(found.attrs["spec"]).id == sweep.load("small.yaml").id
+
+
+def test_a_file_says_what_is_true(here):
+    """Levels against the spectra themselves; lines against range and velocity."""
+    done = command("spectra", "small.yaml", "--draws", 50, "--first", 7, "-o", "s.npz")
+    assert done.exit_code == 0, done.output
+    s = np.load("s.npz")
+    noise = s["spectrum"] - s["signal"]
+    assert s["draw"].tolist() == list(range(7, 57)) and s["segment"].tolist()[1] == "doppler"
+    power = np.mean(np.abs(noise[..., 1:-1]) ** 2)
+    assert power == pytest.approx(s["noise_power"], rel=5 / np.sqrt(50 * 3 * 511 / 2))
+    assert s["true_frequency"][1] == pytest.approx(2 * s["radial_velocity"] / 1550e-9, rel=1e-3)
+    apart = s["line_frequency"][2].mean() - s["line_frequency"][0].mean()
+    beat = 2 * s["range"] / 299792458 * 1e9 / 500e-6
+    assert apart == pytest.approx(min(2 * beat, 2 * s["true_frequency"][1]), rel=2e-3)
+    assert json.loads(str(s["attributes"]))["window_name"] == "hann"
+    later = command("spectra", "small.yaml", "--first", 20, "-o", "t.npz")
+    assert later.exit_code == 0
+    np.testing.assert_array_equal(np.load("t.npz")["spectrum"][0], s["spectrum"][13])
+
+
+def test_mistakes_are_told(here):
+    assert command("spectra", "small.yaml", "-o", "s.npz").exit_code == 0
+    for arguments, words in (
+        (("-o", "s.npz"), "--overwrite"),
+        (("-o", "s.csv"), ".zarr nor .npz"),
+        (("--at", "rnge=1km", "-o", "t.npz"), "did you mean 'target.range'"),
+    ):
+        done = command("spectra", "small.yaml", *arguments)
+        assert done.exit_code == 2 and words in done.stderr
+
+
+def test_code_is_run_with_leave_alone(here, monkeypatch):
+    monkeypatch.setenv("SWEEP_ALLOW_CODE", "")
+    text = (
+        (here / "small.yaml")
+        .read_text()
+        .replace("    sample_rate:", "    detector: {kind: 'mine_of_cli:detect'}\n    sample_rate:")
+    )
+    (here / "own.yaml").write_text(text)
+    (here / "mine_of_cli.py").write_text(
+        "def detect(power, setting):\n    return power > setting.threshold**2\n"
+    )
+    refused = command("run", "own.yaml", "--scheduler", "none")
+    assert refused.exit_code == 2 and "--allow-code mine_of_cli" in refused.stderr
+    done = command("run", "own.yaml", "--scheduler", "none", "--allow-code", "mine_of_cli")
+    assert done.exit_code == 0, done.output
