@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -45,6 +45,9 @@ stopping: $(READY)
 
 promise: $(READY)
 	$(BIN)/python benchmarks/promise.py
+
+detectors: $(READY)
+	$(BIN)/python benchmarks/detectors.py
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py
