@@ -220,8 +220,8 @@ def plan(spec: Path, workers: int | None) -> None:
     """Say what SPEC would take, and which effects it calls for. Nothing is written.
 
     The time comes from about a second of computing points of the study itself. Of each effect the
-    table says at how many points and where it is simulated, how much it may change a probability
-    (a bound), and the time that it takes a point there.
+    table says at how many points and where it is simulated, how much it may change pd, log10
+    pfa or |X| (a bound), and the time that it takes a point there.
     """
     from sweep.spec import SceneSpec, load
 

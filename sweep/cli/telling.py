@@ -195,7 +195,7 @@ def tell_effects(study: Spec | SceneSpec, store: Location) -> None:
     if absent:
         click.echo(f"Nothing of these in the scene: {', '.join(absent).replace('_', ' ')}.")
     click.echo(
-        f"What is left out may change a probability of detection by {table.error:.2g} at the most; "
+        f"What is left out may change pd, log10 pfa or |X| by {table.error:.2g} at the most; "
         f"the tolerance is {table.tolerance:g}."
     )
     warn(table)

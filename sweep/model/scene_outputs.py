@@ -98,8 +98,9 @@ Where nothing is seen false alarms are those of the noise alone, and all else is
 SIMULATED: dict[str, SceneOutput] = {
     "effects": _shot("1", "effects that were simulated", dtype="uint32"),
     "effects_error": _shot(
-        "1", "largest change of a probability by effects that were left out",
-        comment="sum over the three segments of what they may change of pd",
+        "1", "largest change by effects that were left out",
+        comment="sum over them of what each may change: of pd in all three segments, of log10 of "
+        "the probability of a false alarm, or of a relative magnitude, whichever is most",
     ),
 }  # fmt: skip
 """What was simulated of each shot; none of the effects where nothing is seen."""

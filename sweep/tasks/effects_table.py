@@ -34,7 +34,7 @@ class EffectRow:
     mode: str
     share: float  # of the points at which it is simulated
     where: str  # the part of the study that holds these
-    bound: float  # largest change of a probability that it may make anywhere
+    bound: float  # largest change that it may make anywhere: of pd, log10 pfa or a magnitude
     at: str  # where that is
     seconds_a_point: float  # what it costs where it is simulated; nan where it is not
 
@@ -53,7 +53,7 @@ class EffectsTable:
         for row in self.rows:
             if row.mode == "off" and row.bound > self.tolerance:
                 yield (
-                    f"effects.{row.name} is off and may change a probability by up to "
+                    f"effects.{row.name} is off and may change pd, log10 pfa or |X| by up to "
                     f"{row.bound:.2g} ({row.at}); the tolerance is {self.tolerance:g}: "
                     "say auto to have it where it matters"
                 )
