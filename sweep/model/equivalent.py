@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.elementary import fma
+from sweep.model.lanes import dot
 
 AMPLITUDE_TOLERANCES = (1e-13, 1e-11, 1e-9, 1e-7, 1e-5)
 """Errors of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
@@ -23,10 +24,9 @@ POWER_TOLERANCES = (1e-18, 1e-15, 1e-13, 1e-11, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
 MOST_NODES = 128
 """Equivalent lines at the most; wider bundles are left as they are."""
 
-
-_NODES = np.zeros((MOST_NODES + 1, MOST_NODES))
+CHEBYSHEV = np.zeros((MOST_NODES + 1, MOST_NODES))
 for _n in range(1, MOST_NODES + 1):
-    _NODES[_n, :_n] = np.cos(np.pi * (np.arange(_n) + 0.5) / _n)
+    CHEBYSHEV[_n, :_n] = np.cos(np.pi * (np.arange(_n) + 0.5) / _n)
 
 
 def _bessel_bound(z: float, order: int) -> float:
@@ -58,7 +58,7 @@ def _node_limits(tolerance: float) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def equivalent_lines(
-    delta, re, im, n, band, tolerance, most, limits, out_delta, out_re, out_im, work
+    delta, re, im, n, power, band, tolerance, most, limits, out_delta, out_re, out_im, work
 ):  # fmt: skip
     """Few lines with the same spectrum as n lines: Chebyshev moments put onto Chebyshev nodes.
 
@@ -66,6 +66,8 @@ def equivalent_lines(
     ----------
     delta, re, im : (n,) float64
         Positions [bins from a common origin] and complex weights.
+    power : bool
+        Weights are real, and what ``im`` holds is not looked at.
     band : float
         Half bandwidth of the kernel in radians per bin: pi r for amplitudes, 2 pi r for powers.
     tolerance : float
@@ -93,7 +95,7 @@ def equivalent_lines(
     nodes = nodes_for(band * half, tolerance, limits)
     nodes = nodes if nodes <= most else n
     return put_on_nodes(
-        delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work
+        delta, re, im, n, power, middle, half, nodes, out_delta, out_re, out_im, work
     )  # fmt: skip
 
 
@@ -113,58 +115,59 @@ def nodes_for(turn, tolerance, limits):
 
 
 @njit(cache=True, error_model="numpy")
-def dot(a, b, n):
-    """Sum of n products, in an order of its own: four at a time, as each waits for the last."""
-    w, x, y, z = 0.0, 0.0, 0.0, 0.0
-    i = 0
-    while i + 3 < n:
-        w = fma(a[i], b[i], w)
-        x = fma(a[i + 1], b[i + 1], x)
-        y = fma(a[i + 2], b[i + 2], y)
-        z = fma(a[i + 3], b[i + 3], z)
-        i += 4
-    while i < n:
-        w = fma(a[i], b[i], w)
-        i += 1
-    return (w + x) + (y + z)
-
-
-@njit(cache=True, error_model="numpy")
-def put_on_nodes(delta, re, im, n, middle, half, nodes, out_delta, out_re, out_im, work):
+def put_on_nodes(
+    delta, re, im, n, power, middle, half, nodes, out_delta, out_re, out_im, work
+):  # fmt: skip
     """Moves n weights within ``middle`` +- ``half`` onto Chebyshev nodes there, if they are fewer.
 
-    Other parameters and the result as of :func:`equivalent_lines`.
+    ``power``: weights are real. Other parameters and the result as of :func:`equivalent_lines`.
     """
     if nodes >= n or nodes > MOST_NODES:
         for b in range(n):
             out_delta[b], out_re[b], out_im[b] = delta[b], re[b], im[b]
         return n
-    x, previous, current = work[0], work[1], work[2]
+    x, moment_re, moment_im = work[0], work[3], work[4]
     inverse = 1.0 / half if half > 0.0 else 0.0
     for b in range(n):
         x[b] = (delta[b] - middle) * inverse
-        previous[b] = 1.0
-        current[b] = x[b]
-    chebyshev, following_node = work[3], work[4]
+    chebyshev_moments(x, re, im, n, nodes, power, work[1], work[2], moment_re, moment_im)
+    chebyshev, following_node = work[0], work[1]
     for i in range(nodes):
         chebyshev[i] = 1.0
-        following_node[i] = _NODES[nodes, i]
+        following_node[i] = CHEBYSHEV[nodes, i]
         out_re[i] = 0.0
         out_im[i] = 0.0
         out_delta[i] = following_node[i]
     for j in range(nodes):
-        moment_re, moment_im = dot(re, previous, n), dot(im, previous, n)
-        for b in range(n):
-            following = 2.0 * x[b] * current[b] - previous[b]
-            previous[b] = current[b]
-            current[b] = following
         share = (1.0 if j == 0 else 2.0) / nodes
+        one, other = share * moment_re[j], share * moment_im[j]
         for i in range(nodes):
-            out_re[i] += share * chebyshev[i] * moment_re
-            out_im[i] += share * chebyshev[i] * moment_im
+            out_re[i] = fma(chebyshev[i], one, out_re[i])
+            out_im[i] = fma(chebyshev[i], other, out_im[i])
             after = 2.0 * out_delta[i] * following_node[i] - chebyshev[i]
             chebyshev[i] = following_node[i]
             following_node[i] = after
     for i in range(nodes):
         out_delta[i] = middle + half * out_delta[i]
     return nodes
+
+
+@njit(cache=True, error_model="numpy")
+def chebyshev_moments(x, re, im, n, number, power, even, odd, out_re, out_im):
+    """Sums over n weights of T_0(x) .. T_number-1(x); for ``power`` the imaginary ones are 0.
+
+    ``x`` (n,) lies within -1..1; ``even``, ``odd`` are scratch; results may have one more.
+    """
+    for b in range(n):
+        even[b] = 1.0
+        odd[b] = x[b]
+    for j in range(0, number, 2):
+        out_re[j], out_re[j + 1] = dot(re, even, n), dot(re, odd, n)
+        if not power:
+            out_im[j], out_im[j + 1] = dot(im, even, n), dot(im, odd, n)
+        for b in range(n):
+            twice = 2.0 * x[b]
+            even[b] = fma(twice, odd[b], -even[b])
+            odd[b] = fma(twice, even[b], -odd[b])
+    if power:
+        out_im[:number] = 0.0

@@ -221,9 +221,9 @@ def far_sources(
         Number of sources.
     """
     middle, half = 0.5 * (spread[0] + spread[1]), 0.5 * (spread[1] - spread[0])
-    needed = _sources_needed(half, n, poles)
+    needed = sources_needed(half, n, poles)
     lines = put_on_nodes(
-        delta, re, im, n, middle, half, needed, work[5], out[1], out[2], work
+        delta, re, im, n, power, middle, half, needed, work[5], out[1], out[2], work
     )  # fmt: skip
     images = lines
     if lines > 2 and min(centre, fft_size // 2 - centre) ** 3 > REMOTE * half * half:
@@ -257,7 +257,7 @@ def seen_at(places, n, centre, offset, fft_size, tangent, out, mirrored):
 
 
 @njit(cache=True, error_model="numpy")
-def _sources_needed(half, n, poles):
+def sources_needed(half, n, poles):
     """Sources that serve from the clearance on, for a bundle of this half width [bins]."""
     if half <= 0.0:
         return 1

@@ -43,7 +43,7 @@ SMOOTHNESS = 1e-7
 
 
 @njit(cache=True, error_model="numpy")
-def inspect(origin, n, form, noise, choices, kernel, room, exempt, series):
+def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     """Run of bins, detection and leakage of a segment's lines.
 
     Parameters
@@ -51,8 +51,9 @@ def inspect(origin, n, form, noise, choices, kernel, room, exempt, series):
     origin, n : int
         Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
         ``power`` |C_b|^2 and nothing; they become strengths.
-    form : bool
-        They are the nodes of a form, :mod:`sweep.model.power_forms`.
+    kind : (bool, int)
+        Whether they are the sources of a form (:mod:`sweep.model.power_forms`); which slot of
+        :mod:`sweep.model.known_kernels` their moments or it are made with, -1 for lines.
     noise : (float, float, float)
         sigma per quadrature; threshold; chance of leakage that may be left out.
     choices, kernel
@@ -73,7 +74,7 @@ def inspect(origin, n, form, noise, choices, kernel, room, exempt, series):
     """
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
-    total, lowest, highest = bundle(n, form, power, room)
+    total, lowest, highest = bundle(n, kind, power, room)
     re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     near, mirrored, fits = near_bins(
         origin, lowest, highest, CLEARANCE + len(kernel[1][2]), image, kernel
@@ -89,7 +90,7 @@ def inspect(origin, n, form, noise, choices, kernel, room, exempt, series):
     reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
     alone = _all_beyond(total, float(clearance + reach), noise, image, kernel) <= noise[2]
     sources = not alone or reach > 0 or (image and not mirrored)
-    field = prepare_field(origin, n, form, spread, sources, choices, kernel, room)
+    field = prepare_field(origin, n, kind, spread, sources, choices, kernel, room)
     if alone:
         low, high = max(near[0] - reach, 0), min(near[1] + reach, half_size)
         count = high - low + 1

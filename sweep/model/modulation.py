@@ -13,20 +13,34 @@ Shifts are about the middle of the record: there, lines and images keep their ph
 
 import math
 from collections.abc import Iterator
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from sweep.model import waveform
 from sweep.model.effects.gaussian_line import gaussian_shifts
-from sweep.model.effects.line_splitting import split_lines
-from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.effects.line_splitting import Split, split_lines
+from sweep.model.equivalent import MOST_NODES, chebyshev_moments, equivalent_lines, nodes_for
+from sweep.model.known_kernels import (
+    HALVES,
+    MOST_MOMENTS,
+    at_sources,
+    known,
+    level_for,
+    sources_of,
+    total_strength,
+)
+from sweep.model.power_forms import FORM
 from sweep.model.preparation import LINE_STEPS, Shots
-from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE
+from sweep.model.runs import DELTA, MOMENTS, SLOTS, STRENGTH_IM, STRENGTH_RE
 
 POINTS = 256
 """Points of a stretch."""
+
+LEAST_KNOWN = 6
+"""Lines, or nodes that they need, from which on moments with known kernels are taken."""
 
 SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
 """To which lines are split, relative to all of them in phase: the last that a point allows."""
@@ -136,15 +150,11 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     if not shots.phase_errors or not alike.point.size:
         return (*np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64))
 
-    def phase(x: np.ndarray, segment: int, index: np.ndarray) -> np.ndarray:
-        return np.asarray(sum(error.of(segment, index, x) for error in shots.phase_errors))
-
     splits = []
     for level in np.unique(alike.level):
         some = np.flatnonzero(alike.level == level)
         for segment in map(int, np.flatnonzero(shots.segments)):
-            of_these = partial(phase, segment=segment, index=alike.point[some])
-            split = split_lines(of_these, tolerance=SPLIT_TOLERANCES[level])
+            split = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
             splits.append((segment, some, split))
     most = max(split.offset.shape[1] for _, _, split in splits)
     offset, re, im = np.zeros((3, 3, alike.point.size, most))
@@ -156,6 +166,36 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
         im[segment, some, :lines] = split.weight.imag
         number[segment, some] = split.number
     return offset, re, im, number, alike.which
+
+
+def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> Split:
+    """Lines that each line of some points is split into; what one point has is remembered."""
+    errors = tuple(
+        (error.phase, waveform.SIGNS[segment], tuple(error.chosen(segment, points).items()))
+        for error in shots.phase_errors
+    )
+    if points.size > 1:
+        return split_lines(partial(_total_phase, errors), tolerance=tolerance)
+    alone = tuple(
+        (phase, sign, tuple((name, float(value[0])) for name, value in values))
+        for phase, sign, values in errors
+    )
+    return _split_alone(alone, tolerance)
+
+
+@lru_cache(maxsize=64)
+def _split_alone(errors: tuple, tolerance: float) -> Split:
+    """Lines of one point; errors as of :func:`_total_phase`, their values numbers."""
+    arrays = tuple(
+        (phase, sign, tuple((name, np.array([value])) for name, value in values))
+        for phase, sign, values in errors
+    )
+    return split_lines(partial(_total_phase, arrays), tolerance=tolerance)
+
+
+def _total_phase(errors: tuple, x: np.ndarray) -> np.ndarray:
+    """Sum of phase errors [cycles] at places x: of each the function, the sign, its values."""
+    return np.asarray(sum(phase(x, sign=sign, **dict(values)) for phase, sign, values in errors))
 
 
 def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +211,7 @@ def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
     """Lines in rows DELTA .. after what befalls them, as far as that leaves them plain lines.
 
-    Amplitudes are split into parts, powers shifted; few lines stand for many before and after.
+    Amplitudes are split into parts, powers shifted; few lines stand for many before.
 
     Parameters
     ----------
@@ -217,7 +257,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
                 re[lines + j] = one[j] * a - other[j] * b
                 im[lines + j] = one[j] * b + other[j] * a
             lines += few
-    return take_few(lines, power, allowed, lines - 1, kernel, room)
+    return lines
 
 
 @njit(cache=True, error_model="numpy")
@@ -242,8 +282,8 @@ def reduce_lines(n, power, allowed, most, kernel, room):
         peak = kernel[2][0] * kernel[2][0] if power else kernel[2][0]
         tolerance = allowed / max(peak * _total(n, power, room), 1e-300)
     return equivalent_lines(
-        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, band, tolerance, most, kernel[3],
-        room[4], room[5], room[6], room[7:12],
+        room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, band, tolerance, most,
+        kernel[3], room[4], room[5], room[6], room[7:12],
     )  # fmt: skip
 
 
@@ -265,3 +305,45 @@ def take_few(n, power, allowed, most, kernel, room):
         room[DELTA, j], room[STRENGTH_RE, j] = room[4, j], room[5, j]
         room[STRENGTH_IM, j] = room[6, j]
     return few
+
+
+@njit(cache=True, error_model="numpy")
+def take_moments(n, power, allowed, kernel, room):
+    """Takes n lines as moments (:mod:`sweep.model.known_kernels`), sources of them in their place.
+
+    Returns
+    -------
+    number, level : int
+        Sources, and the slot that they are made with; n lines as they were, and -1, where they are
+        few or close together anyway, or too wide apart.
+    """
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    lowest, highest = delta[0], delta[0]
+    for b in range(n):
+        lowest, highest = min(lowest, delta[b]), max(highest, delta[b])
+    band, peak = np.pi * (2.0 if power else 1.0), kernel[2][0] ** (2 if power else 1)
+    tolerance = allowed / max(peak * _total(n, power, room), 1e-300)
+    few = nodes_for(band * 0.5 * (highest - lowest), tolerance, kernel[3])
+    level = level_for(max(highest, -lowest))
+    if min(n, few) < LEAST_KNOWN or level < 0:
+        return n, -1
+    half = HALVES[level]
+    size = nodes_for(band * half, tolerance, kernel[3])
+    if size > min(3 * n, MOST_MOMENTS):
+        return n, -1
+    slot = room[SLOTS + level]
+    known(slot, half, power, kernel)
+    for b in range(n):
+        room[4, b] = delta[b] / half
+    one, other = room[MOMENTS], room[MOMENTS + 1]
+    chebyshev_moments(room[4], re, im, n, size, power, room[5], room[6], one, other)
+    room[FORM + 3, 1] = total_strength(one, other, size, power, slot, room[4:6])
+    room[FORM + 3, 2] = size
+    at_sources(one, size, slot, re)
+    if not power:
+        at_sources(other, size, slot, im)
+    places = sources_of(slot)
+    delta[: places.size] = places
+    if power:
+        im[: places.size] = 0.0
+    return places.size, level

@@ -1,56 +1,63 @@
 """Lines whose powers add, each of several parts in phase: one quadratic form for all of them.
 
 A phase error over the record splits line b into parts w_k at nu_b + o_k
-(:mod:`sweep.model.effects.line_splitting`). Put as amplitudes a_bj on Chebyshev nodes nu_j that
-serve all lines (:mod:`sweep.model.equivalent`), their strengths are s_bj = a_bj sin(pi nu_j), and
-bins of lines that have powers c_b (:mod:`sweep.model.far_field`) hold
+(:mod:`sweep.model.effects.line_splitting`). Taken as moments mu_bm with known kernels g_m
+(:mod:`sweep.model.known_kernels`), bins of lines that have powers c_b hold
 
-    sum_b c_b |sum_j s_bj (K_j + i w_0)|^2 = sum_ij G_ij K_i K_j + 2 w_0 sum_j g_j K_j + w_0^2 g
+    sum_b c_b |sum_m mu_bm g_m + i w_0 S_b|^2 = sum_mn G_mn g_m g_n + 2 w_0 sum_m g'_m g_m + w_0^2 g
 
-    G_ij = sum_b c_b Re(s_bi s*_bj),   g_j = sum_b c_b Im(s_bj S*_b),   g = sum_b c_b |S_b|^2
+    G_mn = sum_b c_b Re(mu_bm mu*_bn),   g'_m = sum_b c_b Im(mu_bm S*_b),   g = sum_b c_b |S_b|^2
 
-with K_j the window's kernel about node j, w_0 its first sample and S_b = sum_j s_bj; images hold
-the same about mirrored nodes, with -g_j. This is as smooth a function of the bin as the power of a
-line without a phase error, and takes as many kernels as there are nodes, however many lines and
-parts there are.
+with w_0 the window's first sample and S_b the sum of the line's strengths; images hold the same
+about mirrored places, with -g'_m. Far from the lines it is the same with sources in the moments'
+place (:mod:`sweep.model.far_field`). This is as smooth a function of the bin as the power of a
+line without a phase error, and takes as many kernels as there are moments or sources, however many
+lines and parts there are.
 """
 
 import math
 
 from numba import njit
 
-from sweep.model.elementary import fma, sincos_cycles
-from sweep.model.equivalent import dot, nodes_for
-from sweep.model.far_field import kernel_beside
+from sweep.model.elementary import fma
+from sweep.model.equivalent import nodes_for
+from sweep.model.known_kernels import (
+    HALVES,
+    MOST_MOMENTS,
+    known,
+    level_for,
+    sources_of,
+    strengths_at_nodes,
+    strengths_at_sources,
+)
+from sweep.model.lanes import COLUMNS, combine, dot
 from sweep.model.spectrum import fraction
 
-MOST_FORM = 64
-"""Nodes at the most; bundles that spread wider are looked at bin by bin."""
-
-WIDTH = 2 * MOST_FORM**2
-"""Numbers that a row of scratch must hold: products of nodes, moments of lines."""
+WIDTH = 8192
+"""Numbers that a row of scratch must hold: products of moments, moments of lines."""
 
 LEAST_ERROR = 1e-13
-"""Error of amplitudes put on nodes, relative to the sum of all, that is never asked to be less."""
-
-TILE = 32
-"""Bins that are done together."""
+"""Error of amplitudes taken as moments, relative to the sum of all, that is the least asked for."""
 
 FORM = 22
-"""First of the rows of scratch that hold a form: products, K_j's factors, kernels, what it is of.
+"""First of the rows of scratch that hold a form.
 
-The last are w_0^2 g, a bound on the sum of strengths, squared, and the least and largest nu_j.
+Products G_mn and g'_m of moments; kernels; w_0^2 g, a bound on the sum of strengths, squared, and
+the number of moments; products and g'_i of sources.
 """
+
+FAR = FORM + 4
+"""First of the two rows of these."""
 
 
 @njit(cache=True, error_model="numpy")
-def power_form(delta, power, n, fold, parts, edge, tolerance, limits, room):
-    """The form of n lines, into rows FORM ..; its nodes take the lines' place.
+def power_form(delta, power, n, fold, parts, edge, tolerance, kernel, slots, room):
+    """The form of n lines, into rows FORM ..; the places of its sources take the lines' place.
 
     Parameters
     ----------
     delta, power : (>= n,) float64
-        Positions of the lines [bins] and |C_b|^2; the nodes' positions.
+        Positions of the lines [bins] and |C_b|^2; the sources' positions.
     fold : float
         -1 where lines are seen as their images: parts lie on the other side, conjugated.
     parts : tuple of (k,) float64
@@ -59,181 +66,151 @@ def power_form(delta, power, n, fold, parts, edge, tolerance, limits, room):
         w_0.
     tolerance : float
         Error of |X|, over that of all lines in phase on the peak.
-    limits : (levels, m) float64
-        :func:`sweep.model.equivalent.node_limits`.
-    room : (>= FORM + 4, >= WIDTH) float64
+    kernel : tuple
+        :meth:`sweep.model.preparation.Shots.kernel`.
+    slots : (levels, >= WIDTH) float64
+        Rows of :mod:`sweep.model.known_kernels`.
+    room : (>= FAR + 2, >= WIDTH) float64
         Scratch.
 
     Returns
     -------
-    int
-        Number of nodes; 0 where more than :data:`MOST_FORM` are needed, or the lines are too many
-        for :data:`WIDTH`, and all is as it was.
+    sources, level : int
+        Their number; 0 where the lines are too many or too wide apart, and all is as it was. Which
+        of the slots the form is made with.
     """
     place, re, im = parts
-    lowest, highest, least, most = delta[0], delta[0], fold * place[0], fold * place[0]
-    total, each = 0.0, 0.0
+    farthest, aside, total, each = 0.0, 0.0, 0.0, 0.0
     for b in range(n):
-        lowest, highest = min(lowest, delta[b]), max(highest, delta[b])
+        farthest = max(farthest, abs(delta[b]))
         total += abs(power[b])
     for k in range(place.size):
-        least, most = min(least, fold * place[k]), max(most, fold * place[k])
+        aside = max(aside, abs(place[k]))
         each += math.hypot(re[k], im[k])
-    lowest, highest = lowest + least, highest + most
-    middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
-    size = nodes_for(math.pi * half, max(tolerance / each, LEAST_ERROR), limits)
-    if size > MOST_FORM or size * n > WIDTH:
-        return 0
-    _products(delta, power, n, fold, parts, middle, half, size, room)
+    level = level_for(farthest + aside)
+    if level < 0:
+        return 0, -1
+    half = HALVES[level]
+    size = nodes_for(math.pi * half, max(tolerance / each, LEAST_ERROR), kernel[3])
+    if size > MOST_MOMENTS or (size + 1) * 2 * n > WIDTH:
+        return 0, -1
+    slot = slots[level]
+    known(slot, half, False, kernel)
+    _products(delta, power, n, fold, parts, half, size, slot, room)
+    for m in range(size):
+        room[FORM + 1, m] *= 2.0 * edge
+    sources = sources_of(slot)
+    for i in range(sources.size):
+        room[FAR + 1, i] *= 2.0 * edge
+        delta[i] = sources[i]
     room[FORM + 3, 0] *= edge * edge
-    for j in range(size):
-        room[FORM + 1, j] *= 2.0 * edge
-        delta[j] = room[4, j]
-    room[FORM + 3, 1] = total * each * each
-    room[FORM + 3, 2], room[FORM + 3, 3] = lowest, highest
-    return size
+    room[FORM + 3, 1], room[FORM + 3, 2] = total * each * each, size
+    return sources.size, level
 
 
 @njit(cache=True, error_model="numpy")
-def _products(delta, power, n, fold, parts, middle, half, size, room):
-    """G_ij, those beside the diagonal doubled, g_j and g; the nodes' positions into row 4."""
-    gram, linear = room[FORM], room[FORM + 1]
-    toward, sum_re, sum_im = room[5], room[6, :n], room[7, :n]
-    to_nodes = room[FORM + 2, : size * size].reshape((size, size))
-    _nodes(middle, half, size, room[4], room[8], to_nodes)
-    moment_re = room[11, : size * n].reshape((size, n))
-    moment_im = room[12, : size * n].reshape((size, n))
-    x, previous, current = room[8, :n], room[9, :n], room[10, :n]
-    _moments(delta, n, fold, parts, middle, half, x, previous, current, moment_re, moment_im)
-    sum_re[:] = 0.0
-    sum_im[:] = 0.0
+def _products(delta, power, n, fold, parts, half, size, slot, room):
+    """G and g_m of moments, and of sources; g."""
+    both = 2 * n
+    moments = room[11, : size * both].reshape((size, both))
+    _moments(delta, n, fold, parts, half, room[8, :both], room[9, :both], room[10, :both], moments)
+    weight, sums, turned = room[5, :both], room[6, :both], room[7, :both]
+    to_nodes = strengths_at_nodes(slot)
+    sums[:] = 0.0
     for m in range(size):
-        toward[m] = 0.0
-        for j in range(size):
-            toward[m] += to_nodes[m, j]  # S_b of a moment of 1
-        for line in range(n):
-            sum_re[line] += toward[m] * moment_re[m, line]
-            sum_im[line] += toward[m] * moment_im[m, line]
-    constant = 0.0
-    for line in range(n):
-        x[line] = power[line]
-        constant += power[line] * (sum_re[line] * sum_re[line] + sum_im[line] * sum_im[line])
-    room[FORM + 3, 0] = constant
-    for m in range(size):
-        one, two = moment_re[m], moment_im[m]
-        for line in range(n):
-            previous[line], current[line] = x[line] * one[line], x[line] * two[line]
-        linear[m] = dot(current, sum_re, n) - dot(previous, sum_im, n)
-        for j in range(m + 1):
-            value = dot(previous, moment_re[j], n) + dot(current, moment_im[j], n)
-            gram[m * size + j] = value
-            gram[j * size + m] = value
-    _to_nodes(gram, linear, to_nodes, size, room[0], room[1])
+        toward = 0.0
+        for j in range(int(slot[0])):
+            toward += to_nodes[m, j]  # S_b of a moment of 1
+        for b in range(both):
+            sums[b] = fma(toward, moments[m, b], sums[b])
+    for b in range(n):
+        weight[b], weight[n + b] = power[b], power[b]
+        turned[b], turned[n + b] = -power[b] * sums[n + b], power[b] * sums[b]
+    scaled = room[8, :both]
+    for b in range(both):
+        scaled[b] = weight[b] * sums[b]
+    room[FORM + 3, 0] = dot(scaled, sums, both)
+    _gram(moments, size, both, weight, turned, scaled, room[FORM], room[FORM + 1])
+    to_sources = strengths_at_sources(slot)
+    number = int(slot[1])
+    at_sources = room[12, : number * both].reshape((number, both))
+    at_sources[:] = 0.0
+    for i in range(number):
+        for m in range(size):
+            factor = to_sources[m, i]
+            for b in range(both):
+                at_sources[i, b] = fma(factor, moments[m, b], at_sources[i, b])
+    _gram(at_sources, number, both, weight, turned, scaled, room[FAR], room[FAR + 1])
 
 
 @njit(cache=True, error_model="numpy")
-def _moments(delta, n, fold, parts, middle, half, x, previous, current, moment_re, moment_im):
-    """Chebyshev moments of each line's parts, (moments, lines)."""
+def _moments(delta, n, fold, parts, half, x, even, odd, moments):
+    """Chebyshev moments of each line's parts, (moments, 2 lines): real, then imaginary ones."""
     place, re, im = parts
-    inverse = 1.0 / half if half > 0.0 else 0.0
-    moment_re[:] = 0.0
-    moment_im[:] = 0.0
+    moments[:] = 0.0
     for k in range(place.size):
-        a, b = re[k], fold * im[k]
+        a, b, apart = re[k], fold * im[k], fold * place[k]
         for line in range(n):
-            x[line] = (delta[line] + fold * place[k] - middle) * inverse
-            previous[line], current[line] = 1.0, x[line]
-        for m in range(moment_re.shape[0]):
-            into_re, into_im = moment_re[m], moment_im[m]
+            x[line] = (delta[line] + apart) / half
+            even[line], odd[line] = 1.0, x[line]
+        for m in range(0, moments.shape[0], 2):
+            into = moments[m]
             for line in range(n):
-                into_re[line] += a * previous[line]
-                into_im[line] += b * previous[line]
-                following = 2.0 * x[line] * current[line] - previous[line]
-                previous[line], current[line] = current[line], following
+                into[line] = fma(a, even[line], into[line])
+                into[n + line] = fma(b, even[line], into[n + line])
+            if m + 1 < moments.shape[0]:
+                into = moments[m + 1]
+                for line in range(n):
+                    into[line] = fma(a, odd[line], into[line])
+                    into[n + line] = fma(b, odd[line], into[n + line])
+            for line in range(n):
+                twice = 2.0 * x[line]
+                even[line] = fma(twice, odd[line], -even[line])
+                odd[line] = fma(twice, even[line], -odd[line])
 
 
 @njit(cache=True, error_model="numpy")
-def _nodes(middle, half, size, node, turns, to_nodes):
-    """Chebyshev nodes, and the strengths (moments, nodes) of moments of 1."""
-    for j in range(size):
-        turns[j] = sincos_cycles(0.25 * (2 * j + 1) / size)[1]
-        node[j] = middle + half * turns[j]
-        if node[j] == math.floor(node[j]):  # on a bin: moved off it by the last digit
-            node[j] += max(3e-16 * abs(node[j]), 1e-30)
-        to_nodes[0, j] = sincos_cycles(0.5 * node[j])[0] / size
-    for m in range(1, size):
-        for j in range(size):
-            before = to_nodes[m - 2, j] if m > 2 else 2.0 * to_nodes[0, j]
-            now = turns[j] * (to_nodes[m - 1, j] if m > 1 else to_nodes[0, j])
-            to_nodes[m, j] = 2.0 * now - (before if m > 1 else 0.0)
-
-
-@njit(cache=True, error_model="numpy")
-def _to_nodes(gram, linear, to_nodes, size, rows, total):
-    """G and g_j from those of moments; what lies beside the diagonal doubled and put below it."""
-    for m in range(size):  # rows of G T
-        rows[:size] = 0.0
-        for k in range(size):
-            factor = gram[m * size + k]
-            for j in range(size):
-                rows[j] += factor * to_nodes[k, j]
-        gram[m * size : m * size + size] = rows[:size]
-    rows[:size] = 0.0
+def _gram(rows, size, both, weight, turned, scaled, gram, linear):
+    """Products of rows, those beside the diagonal doubled and put below it; g of each."""
     for m in range(size):
-        for j in range(size):
-            rows[j] += linear[m] * to_nodes[m, j]
-    linear[:size] = rows[:size]
-    total[: size * size] = gram[: size * size]
-    gram[: size * size] = 0.0
-    for m in range(size):  # T^t (G T), half of it
-        for i in range(size):
-            factor = to_nodes[m, i] * 2.0
-            for j in range(i + 1):
-                gram[i * size + j] += factor * total[m * size + j]
-    for i in range(size):
-        gram[i * size + i] *= 0.5
+        linear[m] = dot(rows[m], turned, both)
+        for b in range(both):
+            scaled[b] = 2.0 * weight[b] * rows[m, b]
+        for j in range(m):
+            gram[m * size + j] = dot(scaled, rows[j], both)
+        gram[m * size + m] = 0.5 * dot(scaled, rows[m], both)
 
 
 @njit(cache=True, error_model="numpy")
 def add_form_afar(t, tangents, size, numerator, poles, side, room, out):
-    """Adds the form at points where t is tan(pi q / N), but for its constant.
+    """Adds the form of sources at points where t is tan(pi q / N), but for its constant.
 
-    ``tangents`` are those of the nodes' places; ``side`` is -1 for images.
+    ``tangents`` are those of the sources' places; ``side`` is -1 for images.
     """
-    kernels = room[FORM + 2, : size * TILE].reshape((size, TILE))
-    for start in range(0, t.size, TILE):
-        at = t[start : start + TILE]
+    buffer, sums = room[FORM + 2], room[FORM + 3, 8 : 8 + COLUMNS]
+    for start in range(0, t.size, COLUMNS):
+        at = t[start : start + COLUMNS]
         for j in range(size):
+            row = buffer[j * COLUMNS : j * COLUMNS + at.size]
             for i in range(at.size):
-                kernels[j, i] = fraction(at[i], tangents[j], numerator, poles)
-        _add(kernels, size, side, room, out[start : start + TILE])
+                row[i] = fraction(at[i], tangents[j], numerator, poles)
+        form_of(buffer, 0, COLUMNS, size, side, FAR, room, sums)
+        for i in range(at.size):
+            out[start + i] += sums[i]
 
 
 @njit(cache=True, error_model="numpy")
-def add_form_beside(first, nodes, size, fft_size, coefficients, side, room, out):
-    """Adds the form to bins first, first + 1 .. next to the nodes, likewise."""
-    kernels = room[FORM + 2, : size * TILE].reshape((size, TILE))
-    square, scale = (math.pi / fft_size) ** 2, fft_size / math.pi
-    for start in range(0, out.size, TILE):
-        part = out[start : start + TILE]
-        for j in range(size):
-            for i in range(part.size):
-                kernel = kernel_beside(first + start + i, nodes[j], coefficients, square)
-                kernels[j, i] = scale * kernel
-        _add(kernels, size, side, room, part)
+def form_of(rows, at, stride, size, side, which, room, out):
+    """Sum g_m (sum_n<=m G_mn g_n + g'_m) of rows of g as of :func:`sweep.model.lanes.combine`.
 
-
-@njit(cache=True, error_model="numpy")
-def _add(kernels, size, side, room, out):
-    """Adds sum_i K_i (sum_j<=i G_ij K_j + g_i) to bins."""
-    gram, linear, count = room[FORM], room[FORM + 1], out.size
-    inner = room[FORM + 3, 8 : 8 + TILE]
+    ``which`` is FORM or FAR; COLUMNS elements of ``out`` are the result.
+    """
+    gram, linear = room[which], room[which + 1]
+    inner = room[FORM + 3, 8 + COLUMNS : 8 + 2 * COLUMNS]
+    out[:COLUMNS] = 0.0
     for i in range(size):
-        for k in range(count):
-            inner[k] = side * linear[i]
-        for j in range(i + 1):
-            factor = gram[i * size + j]
-            for k in range(count):
-                inner[k] = fma(factor, kernels[j, k], inner[k])
-        for k in range(count):
-            out[k] = fma(inner[k], kernels[i, k], out[k])
+        combine(gram[i * size : i * size + i + 1], rows, i + 1, at, stride, inner)
+        start = at + i * stride
+        own, constant = rows[start : start + COLUMNS], side * linear[i]
+        for k in range(COLUMNS):
+            out[k] = fma(inner[k] + constant, own[k], out[k])

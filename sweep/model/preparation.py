@@ -60,13 +60,13 @@ class PhaseError(NamedTuple):
     values: dict[str, Any]
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
-    def of(self, segment: int, index: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Phase [cycles] of some points at places x of a segment's record."""
-        chosen = {}
+    def chosen(self, segment: int, index: np.ndarray) -> dict[str, np.ndarray]:
+        """Arguments of some points in a segment, as many each."""
+        found = {}
         for name, value in self.values.items():
             value = value[segment] if isinstance(value, tuple) else value
-            chosen[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
-        return self.phase(x, sign=waveform.SIGNS[segment], **chosen)
+            found[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
+        return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

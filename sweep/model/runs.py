@@ -13,8 +13,11 @@ from numba import njit
 
 from sweep.model import far_field
 from sweep.model.detection import mark
+from sweep.model.elementary import fma
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
-from sweep.model.power_forms import FORM, add_form_afar, add_form_beside
+from sweep.model.known_kernels import HALVES, ROWS, kernels_beside
+from sweep.model.lanes import COLUMNS, combine
+from sweep.model.power_forms import FAR, FORM, add_form_afar, form_of
 from sweep.model.spectrum import set_tangents
 
 DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
@@ -22,6 +25,15 @@ DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
 
 SOURCES, IMAGES = 13, 16
 """First of three rows each that hold the sources of lines and of images."""
+
+MOMENTS = FAR + 2
+"""First of two rows that hold the moments of lines, real and imaginary."""
+
+SLOTS = MOMENTS + 2
+"""First of the rows of :mod:`sweep.model.known_kernels`, those of lines before those of forms."""
+
+ROOM = SLOTS + ROWS
+"""Rows of scratch."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -48,7 +60,7 @@ def reach_of(level, weights, envelope, reach):
 
 
 @njit(cache=True, error_model="numpy")
-def detect(origin, n, form, level, choices, kernel, room, exempt):
+def detect(origin, n, kind, level, choices, kernel, room, exempt):
     """Run of bins and detection of a segment's lines, whatever leaks beside them.
 
     Parameters and results as of :func:`sweep.model.leakage.inspect`, without leakage; ``level`` is
@@ -56,7 +68,7 @@ def detect(origin, n, form, level, choices, kernel, room, exempt):
     """
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
-    total, lowest, highest = bundle(n, form, power, room)
+    total, lowest, highest = bundle(n, kind, power, room)
     re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     spread = lowest, highest
     poles = len(kernel[1][2])
@@ -73,7 +85,7 @@ def detect(origin, n, form, level, choices, kernel, room, exempt):
         if not fits:
             return 0, 0, 0, 0
         sources = beyond > clearance or (image and not mirrored)
-        field = prepare_field(origin, n, form, spread, sources, choices, kernel, room)
+        field = prepare_field(origin, n, kind, spread, sources, choices, kernel, room)
         low = max(near[0] - max(beyond - clearance, 0), 0)
         high = min(near[1] + max(beyond - clearance, 0), half_size)
         count = high - low + 1
@@ -88,13 +100,13 @@ def detect(origin, n, form, level, choices, kernel, room, exempt):
 
 
 @njit(cache=True, error_model="numpy")
-def bundle(n, form, power, room):
-    """Turns lines into strengths, unless they are nodes of a form.
+def bundle(n, kind, power, room):
+    """Turns lines into strengths, unless they are sources of moments or of a form.
 
     Returns the sum of their magnitudes, for powers squared, and the range of positions.
     """
-    if form:
-        return room[FORM + 3, 1], room[FORM + 3, 2], room[FORM + 3, 3]
+    if kind[1] >= 0:
+        return room[FORM + 3, 1], -HALVES[kind[1]], HALVES[kind[1]]
     return far_field.strengths(
         room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, room[9]
     )  # fmt: skip
@@ -173,11 +185,11 @@ def near_bins(origin, lowest, highest, apart, image, kernel):
 
 
 @njit(cache=True, error_model="numpy")
-def prepare_field(origin, n, form, spread, sources, choices, kernel, room):
+def prepare_field(origin, n, kind, spread, sources, choices, kernel, room):
     """What the far field needs.
 
     Bin that distances count from; number of sources of the lines and of their images; what the
-    window's first sample adds to every bin, real and imaginary; nodes of a form. Without
+    window's first sample adds to every bin, real and imaginary; of what kind they are. Without
     ``sources`` there are none: all that matters is near.
     """
     power, image = choices[0], choices[1]
@@ -185,11 +197,11 @@ def prepare_field(origin, n, form, spread, sources, choices, kernel, room):
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     centre = seen_from(origin, spread, fft_size)
     lines, images = 0, 0
-    if form:
+    if kind[0]:
         far_field.seen_at(
             delta, n, centre, centre - origin, fft_size, kernel[4], room[SOURCES], room[IMAGES]
         )  # fmt: skip
-        return centre, n, n if image else 0, room[FORM + 3, 0] * (2.0 if image else 1.0), 0.0, n
+        return centre, n, n if image else 0, room[FORM + 3, 0] * (2.0 if image else 1.0), 0.0, kind
     if sources:
         lines, images = far_field.far_sources(
             delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
@@ -199,7 +211,7 @@ def prepare_field(origin, n, form, spread, sources, choices, kernel, room):
     if not image:  # else the imaginary parts of line and image cancel
         images, edge_re = 0, 0.5 * edge_re
         edge_im = 0.0 if power else -0.5 * far_field.edge_field(re, n, edge, False)
-    return centre, lines, images, edge_re, edge_im, 0
+    return centre, lines, images, edge_re, edge_im, kind
 
 
 @njit(cache=True, error_model="numpy")
@@ -236,9 +248,9 @@ def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room
 def add_afar(t, image, field, power, kernel, room, re, im):
     """Adds what lines, or their images, hold in bins far from them; t is tan(pi q / N) there."""
     _, numerator, poles, _, _ = kernel[1]
-    _, lines, images, _, _, form = field
+    _, lines, images, _, _, kind = field
     row, used = (IMAGES, images) if image else (SOURCES, lines)
-    if form:
+    if kind[0]:
         side = -1.0 if image else 1.0
         add_form_afar(t, room[row], used, numerator, poles, side, room, re)
     else:
@@ -248,12 +260,42 @@ def add_afar(t, image, field, power, kernel, room, re, im):
 @njit(cache=True, error_model="numpy")
 def _add_beside(first, row, n, image, field, power, kernel, room, re, im):
     """The same in bins first, first + 1 .. next to n lines, or images, with their places in row."""
+    if field[5][1] >= 0:
+        _add_known(first, image, field[5], power, kernel, room, re, im)
+        return
     coefficients, fft_size = kernel[1][0], kernel[0][0]
-    if field[5]:
-        side = -1.0 if image else 1.0
-        add_form_beside(first, room[row], n, fft_size, coefficients, side, room, re)
-    else:
-        add_near_field(
-            first, room[row], room[STRENGTH_RE], room[STRENGTH_IM], n, image, fft_size,
-            coefficients, power, room[5:7], re, im,
-        )  # fmt: skip
+    add_near_field(
+        first, room[row], room[STRENGTH_RE], room[STRENGTH_IM], n, image, fft_size, coefficients,
+        power, room[5:7], re, im,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def slot_of(kind, room):
+    """What is known of a bundle's kernels."""
+    form, level = kind
+    return room[SLOTS + level + (len(HALVES) if form else 0)]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_known(first, image, kind, power, kernel, room, re, im):
+    """The same by moments, or products of moments, and known kernels."""
+    slot, plain, size = slot_of(kind, room), power and not kind[0], int(room[FORM + 3, 2])
+    buffer, row, sums = room[FORM + 2], room[5], room[6]
+    side = -1.0 if image else 1.0
+    for start in range(0, re.size, COLUMNS):
+        count = min(COLUMNS, re.size - start)
+        rows, at, stride = kernels_beside(
+            first + start, size, image, plain, slot, kernel, row, buffer
+        )
+        if kind[0]:
+            form_of(rows, at, stride, size, side, FORM, room, sums)
+        else:
+            combine(room[MOMENTS], rows, size, at, stride, sums)
+        side_re = 1.0 if power else -side
+        for k in range(count):
+            re[start + k] = fma(side_re, sums[k], re[start + k])
+        if not power:
+            combine(room[MOMENTS + 1], rows, size, at, stride, sums)
+            for k in range(count):
+                im[start + k] -= sums[k]

@@ -10,19 +10,26 @@ from sweep.model.detection import assess, mark
 from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
+from sweep.model.known_kernels import HALVES, WIDTH
 from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
-from sweep.model.power_forms import FORM, WIDTH, power_form
+from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few, take_moments
+from sweep.model.power_forms import power_form
 from sweep.model.preparation import LINE_STEPS
-from sweep.model.runs import DELTA, STRENGTH_IM, STRENGTH_RE, detect, reach_of, smooth
+from sweep.model.runs import (
+    DELTA,
+    ROOM,
+    SLOTS,
+    STRENGTH_IM,
+    STRENGTH_RE,
+    detect,
+    reach_of,
+    smooth,
+)
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 SIGNS = (1.0, 0.0, -1.0)
-
-ROOM = FORM + 4
-"""Rows of scratch that :func:`segment_spectrum` and :func:`inspect_segment` need."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Rows of the result: what is found in each segment's spectrum."""
@@ -193,15 +200,15 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
     """
     power, _, leakage, every_bin = choices
     if smooth(kernel) and not every_bin and (power or not scene[2][0].size):
-        origin, n, form = _smooth_lines(segment, p, scene, at, power, kernel, room)
+        origin, n, kind = _smooth_lines(segment, p, scene, at, power, kernel, room)
         count, chance = 0, 0.0
         if leakage and n:
             low, count, peak, exempted, chance = inspect(
-                origin, n, form, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
+                origin, n, kind, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
             )
         elif n:
             low, count, peak, exempted = detect(
-                origin, n, form, p[11], choices, kernel, room, exempt
+                origin, n, kind, p[11], choices, kernel, room, exempt
             )  # fmt: skip
         if count:
             return low, count, peak, exempted, chance
@@ -210,15 +217,21 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
 
 @njit(cache=True, error_model="numpy")
 def _smooth_lines(segment, p, scene, at, power, kernel, room):
-    """As :func:`_lines_of`: origin, number of lines, and whether they are a form's nodes.
+    """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
 
-    None where the lines are split and spread too wide for that.
+    None where the lines are split and spread too wide for a form.
     """
     origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
     parts = scene[1]
     if not power or not parts[0].size or is_whole(segment, at[1], parts):
-        n = take_few(n, power, allowed(p, power), n // 2, kernel, room) if p[15] > 0.0 else n
-        return origin, n, False
+        level = -1
+        if p[15] > 0.0:
+            n, level = take_moments(n, power, allowed(p, power), kernel, room)
+        if level < 0:
+            split = scene[2][0].size > 0 if power else parts[0].size > 0
+            most = n - 1 if split else (n // 2 if p[15] > 0.0 else 0)
+            n = take_few(n, power, allowed(p, power), most, kernel, room)
+        return origin, n, (False, level)
     n = take_few(n, power, allowed(p, power), n - 1, kernel, room)
     total = 0.0
     for b in range(n):
@@ -230,10 +243,11 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
         parts[2][segment, own, :number],
     )  # fmt: skip
     error = allowed(p, False) / max(kernel[2][0] * math.sqrt(total), 1e-300)
-    size = power_form(
-        room[DELTA], room[STRENGTH_RE], n, fold, split, kernel[1][3], error, kernel[3], room
+    number, level = power_form(
+        room[DELTA], room[STRENGTH_RE], n, fold, split, kernel[1][3], error, kernel,
+        room[SLOTS + len(HALVES) :], room,
     )  # fmt: skip
-    return origin, size, True
+    return origin, number, (True, level)
 
 
 @njit(cache=True, error_model="numpy")
@@ -258,7 +272,9 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     ``lines`` as of :class:`sweep.model.modulation.Stretch`.
     """
     width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, WIDTH) + 16
-    return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
+    room = np.empty((ROOM, width))
+    room[SLOTS:, 0] = 0.0  # nothing is known of any kernel
+    return room, np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 
 @njit(cache=True, error_model="numpy")

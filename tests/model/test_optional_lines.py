@@ -16,6 +16,7 @@ from sweep.model.lines import segment_lines
 from sweep.model.modulation import POINTS, stretches
 from sweep.model.preparation import PhaseError
 from sweep.model.shot import evaluate, find
+from sweep.model.waveform import SIGNS
 from sweep.model.window import samples, transform
 
 AGREEMENT = 1e-9
@@ -181,7 +182,8 @@ def exact(shots, i, segment, shifts):
     x, half = 2 * np.arange(length) / length - 1, shots.fft_size // 2 + 1
     cycles = np.zeros(length)
     for error in shots.phase_errors:
-        cycles = cycles + error.of(segment, np.array([i]), x)[0]
+        values = error.chosen(segment, np.array([i]))
+        cycles = cycles + error.phase(x, sign=SIGNS[segment], **values)[0]
     records = [
         truth.analytic_record(shots, i, segment, b, range_walk=False)
         for b in range(shots.offset.shape[1])

@@ -151,8 +151,8 @@ def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre
         delta += centre
         few, re, im = np.empty(128), np.empty(128), np.empty(128)
         n = equivalent_lines(
-            delta, weights.real.copy(), weights.imag.copy(), 109, np.pi, tolerance, 108, limits,
-            few, re, im, work,
+            delta, weights.real.copy(), weights.imag.copy(), 109, False, np.pi, tolerance, 108,
+            limits, few, re, im, work,
         )  # fmt: skip
         assert n <= 109
         many_sum = np.exp(1j * u * (delta - centre)) @ weights
@@ -168,7 +168,19 @@ def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
         delta = np.linspace(-spread, spread, 109)
         counts.append(
             equivalent_lines(
-                delta, np.ones(109), np.zeros(109), 109, np.pi, 0.0, 108, limits, few, re, im, work
+                delta,
+                np.ones(109),
+                np.zeros(109),
+                109,
+                False,
+                np.pi,
+                0.0,
+                108,
+                limits,
+                few,
+                re,
+                im,
+                work,
             )
         )
     assert counts[0] == 1
@@ -184,7 +196,9 @@ def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most(
 
     def number(tolerance, most):
         line = np.linspace(-1, 1, 109), np.ones(109), np.zeros(109)
-        return equivalent_lines(*line, 109, np.pi, tolerance, most, limits, few, re, im, work)
+        return equivalent_lines(
+            *line, 109, False, np.pi, tolerance, most, limits, few, re, im, work
+        )
 
     counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1.0)]
     assert counts[0] == counts[1] and counts[-1] == counts[-2]

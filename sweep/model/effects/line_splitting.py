@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.elementary import sincos_cycles
-from sweep.model.equivalent import dot
+from sweep.model.lanes import dot
 from sweep.model.unsupported import UnsupportedShot
 
 Phase = Callable[[np.ndarray], np.ndarray]
@@ -187,7 +187,17 @@ def _ladder() -> tuple[tuple[int, float], ...]:
 
     The gentler the phase, the closer its lines: nearly polynomials.
     """
-    steps = [(1, 1.0), (7, 0.2), (11, 0.25), (15, 0.35), (21, 0.5), (31, 0.65)]
+    steps = [
+        (1, 1.0),
+        (3, 0.2),
+        (5, 0.2),
+        (7, 0.2),
+        (9, 0.2),
+        (11, 0.25),
+        (15, 0.35),
+        (21, 0.5),
+        (31, 0.65),
+    ]
     while (lines := int(1.25 * steps[-1][0]) | 1) <= MOST_LINES:
         steps.append((lines, 0.65 if lines < 60 else 0.8))
     return tuple(steps)

@@ -1,0 +1,76 @@
+"""Lines as moments with known kernels, against the same lines one by one and bin by bin."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from test_optional_lines import prepared, scene
+from test_power_forms import PLACES, WINDOWS
+
+from sweep.model import modulation, segments, spectra
+from sweep.model.crossings import crossing_series
+from sweep.model.known_kernels import HALVES
+from sweep.model.shot import find
+
+ROUNDING = 1e-11
+"""Of all lines in phase on the peak."""
+
+
+def run_of_bins(shots, segment):
+    """First bin and |X| of those that are looked at one by one; the level of the moments, or -1."""
+    point = modulation.single(shots, 0)
+    room, exempt, series = segments.workspace(point.lines, shots.fft_size)
+    crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
+    chosen, kernel = modulation.choices(shots), shots.kernel()
+    shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
+    _, _, (form, level) = segments._smooth_lines(*shot, chosen[0], kernel, room)
+    assert not form
+    low, count, *_ = segments.inspect_segment(*shot, chosen, kernel, room, exempt, series)
+    return low, room[0, :count].copy(), level
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_bins_are_those_of_the_lines_one_by_one(phases, place, table_4_1):
+    """Every window; images on top of lines, beside them and far away; tables left and not."""
+    levels = set()
+    for window in WINDOWS:
+        parameters = scene(
+            table_4_1, window=window, phases=phases, power=10.0, beamlets=37, **PLACES[place]
+        )  # fmt: skip
+        for grazing_angle in (0.3, 0.06, 0.02):
+            exact = prepared(parameters | {"target.grazing_angle": grazing_angle})
+            amplitudes = exact.amplitude[exact.row[0]]
+            peak = 0.5 * exact.beat_scale * exact.window.sum * amplitudes.sum()
+            for tolerance in (1e-9, 1e-2):
+                loose = replace(exact, line_tolerance=np.asarray(tolerance))
+                low, found, level = run_of_bins(loose, 0)
+                _, expected = spectra.segment_spectrum(exact, 0, 0)
+                missed = abs(found - expected[low : low + found.size])
+                allowed = tolerance * exact.bin_deviation[0] + ROUNDING * peak
+                assert (missed <= allowed).all()
+                levels.add(level)
+    assert max(levels) >= 0
+
+
+def test_what_is_known_already_changes_no_bit(table_4_1):
+    """Tables are made once for all points of a call, and serve every tolerance."""
+    rng = np.random.default_rng(74)
+    n = 40
+    parameters = scene(
+        table_4_1, phases="coherent", beamlets=37, range=10 ** rng.uniform(1, 4, n),
+        grazing_angle=rng.uniform(0.02, 1.5, n),
+    )  # fmt: skip
+    tolerance = 10 ** rng.uniform(-6, -1, n)
+    shots = replace(prepared(parameters), line_tolerance=tolerance)
+    together = find(shots)
+    for i in range(n):
+        part = {path: v[i : i + 1] if np.ndim(v) else v for path, v in parameters.items()}
+        alone = replace(prepared(part), line_tolerance=tolerance[i : i + 1])
+        np.testing.assert_array_equal(find(alone)[..., 0], together[..., i])
+
+
+def test_the_ladder_holds_wide_bundles_with_few_steps():
+    assert HALVES[0] >= 0.5  # of a line anywhere about its bin
+    assert all(0 < wide / narrow - 1 < 0.5 for narrow, wide in pairwise(HALVES))
