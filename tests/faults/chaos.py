@@ -170,20 +170,26 @@ def set_traps(arena: Arena) -> None:
                 half.unlink()
         return put(path, value, exclusive)
 
-    def trapped_commit(self, receipt):
-        arena.reached(BEFORE_COMMIT, receipt.block)
-        os.write = partial(half_written, receipt.block)
+    def trapped_commit(self, *committed):
+        blocks = [receipt.block for receipt in committed]
+        reached_by_all(BEFORE_COMMIT, blocks)
+        os.write = partial(half_written, blocks)
         try:
-            commit(self, receipt)
+            commit(self, *committed)
         finally:
             os.write = append
-        arena.note(f"{receipt.block} committed")
-        arena.reached(AFTER_COMMIT, receipt.block)
+        for block in blocks:
+            arena.note(f"{block} committed")
+        reached_by_all(AFTER_COMMIT, blocks)
 
-    def half_written(block, log, line):
-        half = append(log, line[: len(line) // 2])
-        arena.reached(IN_COMMIT, block)
-        return half + append(log, line[half:])
+    def half_written(blocks, log, lines):
+        half = append(log, lines[: len(lines) // 2])
+        reached_by_all(IN_COMMIT, blocks)
+        return half + append(log, lines[half:])
+
+    def reached_by_all(moment, blocks):
+        for block in blocks:
+            arena.reached(moment, block)
 
     store.Arrays.write, journal.Journal.commit = trapped_write, trapped_commit
     _local._put = trapped_put
