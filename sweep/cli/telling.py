@@ -26,7 +26,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
     """Say what a run has come to, and leave with its exit code."""
     from sweep.tasks.progress import duration
 
-    if outcome.blocks_done and outcome.store.exists():
+    if outcome.blocks_done and (outcome.store / "zarr.json").exists():
         _print_summary(store)
         tell_accuracy(store)
     for scanner, rays in outcome.rays.items():

@@ -211,7 +211,7 @@ class Session:
             except OSError as error:
                 return unwritable(self._path, error)
             except StoreError:
-                if self._path.exists():
+                if _is_there(self._path):
                     raise
                 return unwritable(self._path, FileNotFoundError())
 
@@ -230,7 +230,7 @@ class Session:
         told, interrupts = False, self._interrupts
         for answer in answers:
             if not self._lock.is_mine():
-                if not self._path.exists():
+                if not _is_there(self._path):
                     raise FileNotFoundError(self._path)
                 return "another process took the store's lock"
             self._commit(answer, todo)
@@ -279,10 +279,15 @@ def unwritable(path: Location, error: OSError) -> str:
     """Why a run stops that can't write, and what to do about it."""
     if isinstance(error, ObjectStoreError):
         return f"the store can't be written: {error.strerror}"
-    if not path.exists():
+    if not _is_there(path):
         return f"{path} is no longer there: have its disk back, or its folder"
     remedy = REMEDIES.get(error.errno or 0, "see to its disk")
     return f"the store can't be written ({error.strerror or error}): {remedy}"
+
+
+def _is_there(path: Location) -> bool:
+    """Whether a store is in its place: of one that went away, writers may leave folders anew."""
+    return (path / "zarr.json").exists()
 
 
 def _unseen(receipt: Receipt) -> Failure:

@@ -1,0 +1,115 @@
+"""Disks that are full, read-only or gone in the midst of a study."""
+
+import os
+import shutil
+import subprocess
+
+import pytest
+from small import receipts, small, tree
+
+from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import StoreError
+from sweep.tasks.verify import verify
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    path = tmp_path_factory.mktemp("undisturbed") / "small.zarr"
+    assert run(small(), store=path, scheduler="none", progress=False).complete
+    return tree(path)
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A small disk of our own."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = os.geteuid() == 0 and mount("-t", "tmpfs", "-o", "size=64k", "tmpfs", str(place))
+    if not mounted:
+        pytest.skip("a disk can't be mounted here")
+    yield place
+    subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def mount(*options: str) -> bool:
+    try:
+        return subprocess.run(["mount", *options], capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+def committed_is_whole(store) -> None:
+    (report,) = verify(store, progress=False)
+    assert report.sound and report.whole == len(set(receipts(store))) < 12
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize("size", ["640k", "1M"])
+def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undisturbed, size, place):
+    store = disk / "small.zarr"
+    assert mount("-o", f"remount,size={size}", str(disk))
+    outcome = run(small(), store=store, progress=False, **place)
+    assert not outcome.complete
+    assert "No space left on device" in outcome.stopped and "make room" in outcome.stopped
+    committed_is_whole(store)
+    before = receipts(store)
+    assert len(before) == outcome.blocks_done
+    again = resume(store, progress=False, **place)
+    assert not again.complete and "make room" in again.stopped
+    assert mount("-o", "remount,size=16M", str(disk))
+    assert resume(store, progress=False, scheduler="none").complete
+    assert receipts(store)[: len(before)] == before and sorted(receipts(store)) == list(range(12))
+    assert tree(store) == undisturbed
+
+
+def test_a_disk_that_is_full_from_the_start_is_left_as_it_was(disk):
+    with pytest.raises(StoreError, match="can't be made: No space left on device"):
+        run(small(), store=disk / "small.zarr", progress=False, scheduler="none")
+    assert list(disk.iterdir()) == []
+
+
+def at_block(number, happening):
+    """The model, with something that happens, once, before a block."""
+    happened = []
+
+    def evaluate(study, block):
+        if block == number and not happened:
+            happened.append(block)
+            happening()
+        return study.evaluate(block)
+
+    return evaluate
+
+
+def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, undisturbed):
+    store = disk / "small.zarr"
+    assert mount("-o", "remount,size=16M", str(disk))
+    evaluate = at_block(5, lambda: mount("-o", "remount,ro", str(disk)) or pytest.fail("busy"))
+    outcome = run(small(), store=store, progress=False, scheduler="none", evaluate=evaluate)
+    assert outcome.blocks_done == 5
+    assert "Read-only file system" in outcome.stopped and "for writing" in outcome.stopped
+    committed_is_whole(store)
+    with pytest.raises(StoreError, match="can't be locked: Read-only file system"):
+        resume(store, progress=False, scheduler="none")
+    assert mount("-o", "remount,rw", str(disk))
+    assert resume(store, progress=False, scheduler="none").complete
+    assert sorted(receipts(store)) == list(range(12)) and tree(store) == undisturbed
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_a_folder_that_vanishes_stops_a_study_that_goes_on_when_it_is_back(
+    tmp_path, undisturbed, place
+):
+    store, elsewhere = tmp_path / "small.zarr", tmp_path / "elsewhere.zarr"
+    evaluate = at_block(5, lambda: shutil.move(store, elsewhere))
+    outcome = run(small(), store=store, progress=False, evaluate=evaluate, **place)
+    assert "small.zarr is no longer there" in outcome.stopped and not outcome.complete
+    with pytest.raises(StoreError, match="there is no store|not a Zarr store of sweep's"):
+        resume(store, progress=False, scheduler="none")
+    shutil.rmtree(store, ignore_errors=True)  # what another worker was at meanwhile
+    before = receipts(elsewhere)
+    assert before
+    shutil.move(elsewhere, store)
+    assert resume(store, progress=False, scheduler="none").complete
+    assert receipts(store)[: len(before)] == before and sorted(receipts(store)) == list(range(12))
+    assert tree(store) == undisturbed
