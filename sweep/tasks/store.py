@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage import chunks
 from sweep.storage.locations import JOURNAL, Location, each, located, zarr_store
 from sweep.storage.objects import in_words
 from sweep.storage.sealing import sealed
@@ -130,7 +131,7 @@ def _list(path: Path, attributes: dict[str, Any]) -> None:
 def _codecs() -> dict[str, Any]:
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    return {"compressors": [ZstdCodec(level=1), Crc32cCodec()]}
+    return {"compressors": [ZstdCodec(level=chunks.ZSTD_LEVEL), Crc32cCodec()]}
 
 
 def _add(group: zarr.Group, layout: ArrayLayout) -> None:
@@ -199,16 +200,16 @@ class Arrays:
             Where the results are not exactly the block's: a missing or unknown name, or a shape
             that would fill its chunks in part.
         """
-        chunks = self._study.chunks(block)
-        if results.keys() != chunks.keys():
-            odd = sorted(results.keys() ^ chunks.keys())
+        positions = self._study.chunks(block)
+        if results.keys() != positions.keys():
+            odd = sorted(results.keys() ^ positions.keys())
             raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
 
         def put(name: str) -> None:
-            self._put(name, chunks[name], results[name])
+            self._put(name, positions[name], results[name])
 
         with in_words(self.path):
-            each(self.path, put, chunks)
+            each(self.path, put, positions)
         return digest(self.path, block_objects(self._study, block))
 
     def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> None:
@@ -223,7 +224,11 @@ class Arrays:
                 f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
                 "blocks write whole chunks only"
             )
-        array[slices or ...] = values
+        if isinstance(self.path, Path) and chunks.is_plain(array):
+            file = self.path / chunk_object(name, position)
+            chunks.put(file, chunks.encoded(array, values))
+        else:
+            array[slices or ...] = values
 
     def _array(self, name: str) -> zarr.Array[Any]:
         if name not in self._arrays:
@@ -236,9 +241,12 @@ class Arrays:
 
 def block_objects(study: Study, block: int) -> list[str]:
     """Paths, inside the store, of the chunks of one block."""
-    return [
-        "/".join([name, "c", *map(str, position)]) for name, position in study.chunks(block).items()
-    ]
+    return [chunk_object(name, position) for name, position in study.chunks(block).items()]
+
+
+def chunk_object(name: str, position: tuple[int, ...]) -> str:
+    """Path, inside the store, of one chunk of an array."""
+    return "/".join([name, "c", *map(str, position)])
 
 
 def sync(path: Location) -> None:
