@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -36,6 +36,14 @@ fuzz: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py
+
+# What the engine costs beside others', and what a second worker brings; on a quiet machine.
+peers: $(READY)
+	$(BIN)/pip install --quiet joblib xyzpy
+	$(BIN)/python benchmarks/peers.py
+
+scaling: $(READY)
+	$(BIN)/python benchmarks/scaling.py
 
 effects: $(READY)
 	$(BIN)/python benchmarks/effects.py

@@ -119,7 +119,7 @@ QDEL = """\
 #!/bin/sh
 job=${{1%%.*}}
 echo $job >> "{directory}/deleted"
-kill -9 -- -$(cat "{directory}/job-$job.pid") 2>/dev/null
+kill -s KILL -- -$(cat "{directory}/job-$job.pid") 2>/dev/null
 exit 0
 """
 

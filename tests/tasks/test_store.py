@@ -87,7 +87,11 @@ def test_writing_again_leaves_the_same_bytes(path, study):
 
 
 def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, study):
-    results = {name: np.full(study.grid.extent(1), np.nan) for name in study.chunks(1)}
+    layouts = {layout.name: layout for layout in study.arrays()}
+    results = {
+        name: np.full(study.grid.extent(1), layouts[name].fill, dtype=layouts[name].dtype)
+        for name in study.chunks(1)
+    }
     store.Arrays(path, study).write(1, results)
     assert store.is_whole(path, store.block_objects(study, 1))
 

@@ -1,0 +1,73 @@
+"""What more workers bring: the published range-angle study on one, two, ... workers, in turns.
+
+Run with `make scaling`, a few minutes on two cores, on a quiet machine. Workers are up and have
+imported the model before the clock starts: a study long enough to need them has them up for most
+of its time. Rounds take turns, as the machine drifts; ratios are within a round.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from peers import client_of, processor_time
+from rich.console import Console
+from rich.table import Table
+
+import sweep
+from sweep.spec import Spec
+from sweep.spec.reading import read_document
+from sweep.tasks.cluster import cores
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+def study(points: int, block_points: int) -> Spec:
+    """The published study over so many ranges a grazing angle."""
+    mapping = read_document(EXPERIMENTS / "range_angle.yaml").value
+    mapping["axes"]["target.range"] = {"linear": ["1 m", "10 km"], "number": points // 90}
+    mapping["storage"] = {"block_points": block_points}
+    mapping["figures"] = []
+    return Spec.from_mapping(mapping, base=EXPERIMENTS)
+
+
+def measure(spec: Spec, workers: int) -> tuple[float, float]:
+    """Seconds of wall time, and of the processor's in all."""
+    with tempfile.TemporaryDirectory() as name, client_of(workers) as client:
+        folder = Path(name)
+        options = {"client": client, "progress": False}
+        sweep.run(study(90 * 2 * workers, 45), store=folder / "rehearsal.zarr", **options)
+        begun, taken = time.perf_counter(), processor_time()
+        outcome = sweep.run(spec, store=folder / "scaling.zarr", **options)
+        wall, taken = time.perf_counter() - begun, processor_time() - taken
+    assert outcome.complete
+    return wall, taken
+
+
+def main() -> None:
+    """Measure in turns, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--most", type=int, default=cores())
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--points", type=int, default=450_000)
+    parser.add_argument("--block-points", type=int, default=9_000)
+    asked = parser.parse_args()
+    numbers = [n for n in (2**i for i in range(20)) if n <= asked.most]
+    spec = study(asked.points, asked.block_points)
+    seen: dict[int, list[tuple[float, float]]] = {n: [] for n in numbers}
+    for _ in range(asked.rounds):
+        for number in numbers:
+            seen[number].append(measure(spec, number))
+    table = Table("workers", "seconds", "times as fast as one", "processor's time, times one's")
+    for number in numbers:
+        pairs = list(zip(seen[number], seen[1], strict=True))
+        faster = statistics.median(one[0] / own[0] for own, one in pairs)
+        dearer = statistics.median(own[1] / one[1] for own, one in pairs)
+        seconds = statistics.median(own[0] for own in seen[number])
+        table.add_row(f"{number}", f"{seconds:.1f}", f"{faster:.2f}", f"{dearer:.3f}")
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
