@@ -4,9 +4,9 @@ from sweep.cli.commands import main
 from sweep.cli.files import certificates, schema
 from sweep.cli.report import report
 from sweep.cli.spectra import spectra
-from sweep.cli.stores import status, verify
+from sweep.cli.stores import finalize, status, verify
 
-for command in (status, verify, report, spectra, certificates, schema):
+for command in (status, verify, finalize, report, spectra, certificates, schema):
     main.add_command(command)
 
 __all__ = ["main"]

@@ -9,7 +9,7 @@ import click
 
 from sweep.cli.places import StorePath, shown
 from sweep.cli.telling import INCOMPLETE, in_bytes, tell_accuracy
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, files_below
 
 if TYPE_CHECKING:
     from sweep.tasks.verify import Report
@@ -92,6 +92,28 @@ def verify(store: Location, repair: bool) -> None:
     if not all(report.complete for report in reports):
         click.echo(f"sweep resume {store}  goes on.", err=True)
         sys.exit(INCOMPLETE)
+
+
+@click.command()
+@STORE
+@click.argument("output", type=StorePath(), required=False)
+def finalize(store: Location, output: Location | None) -> None:
+    """Copy the complete STORE into OUTPUT as few large files [NAME_final.zarr beside NAME.zarr].
+
+    A store has a file for every array and block, so that any number of processes can write it. The
+    copy has the same values, attributes and names in files (shards) of up to 64 MB: quick to move,
+    to list, and to open over a network. Every value is read back and compared; sweep verify checks
+    the copy from then on, and all that reads stores reads it. It can't be resumed.
+
+    \b
+      sweep finalize results/range_angle.zarr
+      sweep finalize results/range_angle.zarr s3://bucket/range_angle.zarr
+    """  # noqa: D301
+    from sweep.tasks.packing import pack
+
+    made = pack(store, output or store.with_name(f"{store.name.removesuffix('.zarr')}_final.zarr"))
+    files = files_below(made)
+    click.echo(f"{shown(made)}: {len(files):,} files, {in_bytes(sum(files.values()))}")
 
 
 def _tell(report: Report) -> None:

@@ -216,8 +216,15 @@ class Storage(Part):
     """How results are cut up in the store; part of a study's identity."""
 
     block_points: Annotated[
-        int, count("Points that one block holds at most", "65536", at_most="1e9")
-    ] = 65536
+        int,
+        count(
+            "Points that one block holds at most; 0 for 65536, and more in studies so large that "
+            "their files would be too many to handle",
+            "65536",
+            at_least="0",
+            at_most="1e9",
+        ),
+    ] = 0
 
 
 class Execution(Part):

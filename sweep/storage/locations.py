@@ -21,6 +21,9 @@ Location = Path | ObjectPath
 #: Directory of the journal inside a store.
 JOURNAL = ".sweep"
 
+#: Attribute of a copy of a store with many chunks to a file.
+PACKED = "packed"
+
 #: Requests to an object store at once: each takes some ms, nearly all of it waiting.
 REQUESTS = 16
 
@@ -83,6 +86,14 @@ def each(
 @cache
 def _requests() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(REQUESTS, thread_name_prefix="object-store")
+
+
+def files_below(location: Location) -> dict[str, int]:
+    """Sizes of all files below a place by their names, relative to it."""
+    if isinstance(location, ObjectPath):
+        return dict(location.below())
+    files = (file for file in location.rglob("*") if file.is_file())
+    return {str(file.relative_to(location)): file.stat().st_size for file in files}
 
 
 def beside(location: Location) -> Path:

@@ -280,7 +280,7 @@ def explained(text: str, root: str) -> tuple[int, str]:
         return errno.ENXIO, f"{at} has no bucket {bucket!r}: make it, or mend its name"
     if (
         "169.254.169.254" in text
-        or "Missing AccessKey" in text
+        or re.search(r"Missing \w*Key", said)
         or "metadata.google.internal" in text
     ):
         return errno.EACCES, (

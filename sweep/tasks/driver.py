@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import PACKED, Location, located
 from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
@@ -171,6 +171,8 @@ def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
         raise StoreError(
             f"{path} holds eyepoints, which the studies that use them cast: run or resume one"
         )
+    if PACKED in attributes:
+        raise StoreError(f"{path} is a packed copy of a complete store: there is nothing to resume")
     return attributes, study
 
 

@@ -31,12 +31,23 @@ GEOMETRIC = (
 GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
 
 
+#: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and
+#: what lists, copies or removes a store handles them one by one.
+BLOCK_POINTS = 1 << 16
+MOST_BLOCKS = 1 << 14
+
+
 def is_geometric(axis: Axis) -> bool:
     """Whether any member of an axis changes where the beamlets fall."""
     return any(
         member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
         for member in axis.members
     )
+
+
+def points_a_block(points: int) -> int:
+    """Points that a block holds at most in a study of so many, where it does not say."""
+    return max(BLOCK_POINTS, -(-points // MOST_BLOCKS))
 
 
 def block_shape(
@@ -86,7 +97,9 @@ class Grid:
         self.dims = tuple(axis.name for axis in self._axes)
         self.shape = tuple(int(axis.size) for axis in self._axes)
         self.geometric = tuple(is_geometric(axis) for axis in self._axes)
-        self.block_shape = block_shape(self.shape, self.geometric, spec.storage.block_points)
+        self.block_shape = block_shape(
+            self.shape, self.geometric, spec.storage.block_points or points_a_block(self.points)
+        )
         self.blocks_along = tuple(
             -(-size // chunk) for size, chunk in zip(self.shape, self.block_shape, strict=True)
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from sweep.storage.locations import JOURNAL, each
+from sweep.storage.locations import JOURNAL, each, files_below
 from sweep.storage.objects import ObjectPath
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import LOCK, Lock
@@ -23,22 +25,34 @@ def send(built: Path, path: ObjectPath) -> ObjectPath:
     StoreError
         Where something is in its place, or it can't be written.
     """
+    names = files_below(built).keys() - {ROOT}
     try:
-        lock = Lock(path)
-        try:
-            _clear(path)
-            mark = path / JOURNAL / PARTIAL
-            mark.write_bytes(b"")
-            names = [str(file.relative_to(built)) for file in built.rglob("*") if file.is_file()]
-            names.remove(ROOT)
+        with making(path):
             each(path, lambda name: (path / name).write_bytes((built / name).read_bytes()), names)
             (path / ROOT).write_bytes((built / ROOT).read_bytes())
-            mark.unlink()
-        finally:
-            lock.release()
     except OSError as error:
         raise StoreError(f"{path} can't be made: {error.strerror or error}") from error
     return path
+
+
+@contextmanager
+def making(path: ObjectPath) -> Iterator[None]:
+    """A place while a store is made there: nobody else's, and marked as half made till the end.
+
+    Raises
+    ------
+    StoreError
+        Where something is there, or somebody makes a store there.
+    """
+    lock = Lock(path)
+    try:
+        _clear(path)
+        mark = path / JOURNAL / PARTIAL
+        mark.write_bytes(b"")
+        yield
+        mark.unlink()
+    finally:
+        lock.release()
 
 
 def _clear(path: ObjectPath) -> None:

@@ -85,7 +85,7 @@ def _row(
     row = SceneRow(part)
     for place, cycles, draws in _stretches(stretches, places):
         shots = slice(*(stretches.shots_a_cycle * edge for edge in (cycles.start, cycles.stop)))
-        if not _is_there(group / "flags", stretches, place, cycles, draws):
+        if flags.shards is None and not _is_there(group / "flags", stretches, place, cycles, draws):
             continue
         found = _read(flags, *place, shots, draws)
         row.shots += found[..., 0].size

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.receipts import read_receipts
 from sweep.tasks import journal, lock, studies
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.listing import listed
+from sweep.tasks.listing import Listed, listed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,9 @@ def status(store: str | Location) -> Status:
     attributes, study = studies.read(path)
     begun = _begun(path)
     receipts = read_receipts(path, study.n_blocks, since=begun)
-    found = listed(path, study, receipts.points > 0)
+    done = receipts.points > 0
+    packed = PACKED in attributes
+    found = Listed(done, sum(files_below(path).values())) if packed else listed(path, study, done)
     holder = lock.holder(path)
     points = study.points_in(found.whole)
     spent = receipts.last - begun

@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,7 +83,13 @@ def remove(path: Location) -> None:
     shutil.rmtree(aside)
 
 
-def build(path: Path, study: Content, attributes: dict[str, Any]) -> None:
+def build(
+    path: Path,
+    study: Content,
+    attributes: dict[str, Any],
+    *,
+    shards: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
+) -> None:
     """Make a store without results, in a place of its own.
 
     Parameters
@@ -92,6 +98,8 @@ def build(path: Path, study: Content, attributes: dict[str, Any]) -> None:
         Where; nothing is there.
     study, attributes
         What it is to hold, and what its group is to say of it.
+    shards
+        Points that a file of an array holds, many chunks; by default a chunk is a file.
     """
     import zarr
 
@@ -99,7 +107,7 @@ def build(path: Path, study: Content, attributes: dict[str, Any]) -> None:
     for name, own in study.groups().items():
         group.create_group(name, attributes=own)
     for layout in study.arrays():
-        _add(group, layout)
+        _add(group, layout, shards(layout))
     (path / JOURNAL).mkdir()
     _consolidate(path)
     _list(path, attributes)
@@ -128,23 +136,25 @@ def _list(path: Path, attributes: dict[str, Any]) -> None:
     (path / JOURNAL / MANIFEST).write_bytes(b"".join(lines))
 
 
-def _codecs() -> dict[str, Any]:
+def codecs() -> dict[str, Any]:
+    """How chunks are encoded: packed, and with a checksum."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     return {"compressors": [ZstdCodec(level=chunks.ZSTD_LEVEL), Crc32cCodec()]}
 
 
-def _add(group: zarr.Group, layout: ArrayLayout) -> None:
+def _add(group: zarr.Group, layout: ArrayLayout, shards: tuple[int, ...] | None) -> None:
     fill: dict[str, Any] = {} if layout.fill is None else {"fill_value": layout.fill}
     array = group.create_array(
         layout.name,
         shape=layout.shape,
         chunks=layout.chunks,
+        shards=shards,
         dtype=layout.dtype,
         **fill,
         dimension_names=layout.dims,
         attributes=dict(layout.attributes),
-        **_codecs(),
+        **codecs(),
     )
     if layout.values is not None:
         array[...] = layout.values
@@ -300,9 +310,14 @@ def is_seen(path: Location, objects: list[str]) -> bool:
 
 def digest(path: Location, objects: list[str]) -> str:
     """blake2b-128 of names and bytes of stored objects, in hex."""
-    sum_ = hashlib.blake2b(digest_size=16)
     contents = each(path, lambda name: (path / name).read_bytes(), objects)
-    for name, content in zip(objects, contents, strict=True):
+    return digest_of(zip(objects, contents, strict=True))
+
+
+def digest_of(contents: Iterable[tuple[str, bytes]]) -> str:
+    """As :func:`digest`, of names and bytes at hand."""
+    sum_ = hashlib.blake2b(digest_size=16)
+    for name, content in contents:
         sum_.update(f"{name}\0{len(content)}\0".encode())
         sum_.update(content)
     return sum_.hexdigest()

@@ -10,7 +10,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import PACKED, Location, located
 from sweep.storage.sealing import damaged_lines, read_sealed
 from sweep.tasks import identity, journal, lock, store, studies, template
 from sweep.tasks.errors import StoreError
@@ -89,8 +89,10 @@ def verify(
 
 def _study(path: Location, attributes: dict[str, Any]) -> AnyStudy | None:
     """The study in a store; None where it holds none, or only who made it could tell."""
-    if attributes["kind"] == studies.ACCURACY or (
-        attributes["kind"] == "eyepoints" and not read_recipe(path)
+    if (
+        attributes["kind"] == studies.ACCURACY
+        or (attributes["kind"] == "eyepoints" and not read_recipe(path))
+        or PACKED in attributes
     ):
         return None
     return studies.described(path, attributes)

@@ -85,7 +85,7 @@ FIELDS = [
     ("draws.limit", 2.5, "must be a whole number"),
     ("draws.interval", "wald", "must be one of clopper_pearson, wilson"),
     ("draws.method", "luck", "must be one of probabilities, noise"),
-    ("storage.block_points", 0, "must be at least 1"),
+    ("storage.block_points", -1, "must be at least 0"),
     ("seed", 1.5, "must be a whole number"),
     ("seed", -1, "must be at least 0"),
     ("title", ..., "is missing"),

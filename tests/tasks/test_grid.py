@@ -6,7 +6,14 @@ import pytest
 from small import STUDY, small
 
 from sweep.model.philox import point_keys
-from sweep.tasks.grid import Grid, block_shape, canonical_rows
+from sweep.tasks.grid import (
+    BLOCK_POINTS,
+    MOST_BLOCKS,
+    Grid,
+    block_shape,
+    canonical_rows,
+    points_a_block,
+)
 
 
 def points_of(grid: Grid) -> np.ndarray:
@@ -138,3 +145,12 @@ def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
     assert peak < 1_000_000
     with pytest.raises(IndexError):
         grid.block(grid.n_blocks)
+
+
+@pytest.mark.parametrize("points", [1, 10**6, 10**9, 10**10, 10**12])
+def test_files_stay_countable_however_large_a_study_is(points):
+    """Blocks of a single axis: 25 arrays of them are less than half a million files."""
+    (size,) = block_shape((points,), (False,), points_a_block(points))
+    assert -(-points // size) <= MOST_BLOCKS
+    assert size >= min(points, BLOCK_POINTS)
+    assert points > BLOCK_POINTS * MOST_BLOCKS or size <= BLOCK_POINTS

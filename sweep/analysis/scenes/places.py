@@ -14,7 +14,7 @@ from sweep.analysis.scenes.recording import Recording
 from sweep.analysis.selection import is_any
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
-from sweep.storage.locations import located
+from sweep.storage.locations import PACKED, located
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ class Place:
     def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """What a scanner recorded there."""
         group = tree.children[scanner].to_dataset(inherit=False)
+        if PACKED in tree.attrs:
+            return Recording(scanner, group.isel(self.index))
         points = located(str(tree.encoding["source"])) / scanner / "flags" / "c"
         return Recording(
             scanner, group.isel(self.index), points.joinpath(*map(str, self.index.values()))

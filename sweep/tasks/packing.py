@@ -1,0 +1,180 @@
+"""A finished store as few large files: a copy, sharded, checked value by value as it is made.
+
+A store that is being written has a file for every chunk, for no two writers may share one. Once it
+is complete, chunks are better kept many to a file: to copy, to archive, to open over a network.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import tempfile
+import uuid
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.storage.locations import (
+    JOURNAL,
+    PACKED,
+    Location,
+    files_below,
+    located,
+    put_whole,
+    read_array,
+    zarr_store,
+)
+from sweep.storage.logs import raw_lines
+from sweep.storage.objects import in_words
+from sweep.storage.sealing import sealed
+from sweep.tasks import remote, store, studies
+from sweep.tasks.errors import StoreError
+from sweep.tasks.journal import LOGS, committed
+from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.recipe import RECIPE
+from sweep.tasks.study import ArrayLayout, Study
+
+if TYPE_CHECKING:
+    import zarr
+
+#: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
+SHARD_BYTES = 64 << 20
+THREADS = 4
+
+
+def pack(
+    path: str | Location, output: str | Location, *, progress: bool | Progress = True
+) -> Location:
+    """Copy a complete store into one of few files, each many chunks.
+
+    Parameters
+    ----------
+    path
+        The store.
+    output
+        Where the copy goes; nothing is there. It is there whole, or not at all.
+    progress
+        As in `run`; shown after two seconds.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or it is not complete; where something is in the way of the copy,
+        or it can't be written or read back as it was.
+    """
+    path, output = located(path).absolute(), located(output).absolute()
+    attributes, study = studies.read(path)
+    left = study.n_blocks - int(np.count_nonzero(committed(path, study)))
+    if attributes.get(PACKED) or left:
+        why = "is packed already" if attributes.get(PACKED) else f"lacks {left:,} blocks: resume it"
+        raise StoreError(f"{path} {why}")
+    if output.exists():
+        raise StoreError(f"{output} is there already: name another place")
+    told = Late(chosen(progress))
+    try:
+        if isinstance(output, Path):
+            _pack_aside(path, output, study, told)
+        else:
+            with remote.making(output):
+                _pack(path, output, study, told)
+    except OSError as error:
+        raise StoreError(f"{output} can't be made: {error.strerror or error}") from error
+    return output
+
+
+def _pack_aside(path: Location, output: Path, study: Study, told: Progress) -> None:
+    aside = output.with_name(f".{output.name}.packing-{os.getpid()}-{uuid.uuid4().hex[:8]}")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        aside.mkdir()
+        _pack(path, aside, study, told)
+        os.rename(aside, output)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _pack(path: Location, output: Location, study: Study, told: Progress) -> None:
+    """Write a packed copy, the document of its group last."""
+    attributes = {**studies.read(path)[0], PACKED: True}
+    with tempfile.TemporaryDirectory() as directory:
+        template = Path(directory) / "template"
+        store.build(template, study, attributes, shards=shard_shape)
+        root = (template / "zarr.json").read_bytes()
+        for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{store.MANIFEST}"}:
+            put_whole(output / name, (template / name).read_bytes())
+    names = sorted(study.owners())
+    told.begin(points=len(names), done=0, unit="arrays")
+    try:
+        for name in names:
+            with in_words(path), in_words(output):
+                _pack_array(path / name, output / name)
+            told.advance(points=1, failed=0)
+    finally:
+        told.end()
+    for name in (*LOGS, RECIPE):
+        if content := b"".join(raw_lines(path / JOURNAL / name)):
+            put_whole(output / JOURNAL / name, content)
+    _list(output, attributes, root)
+    put_whole(output / "zarr.json", root)
+
+
+def _list(output: Location, attributes: dict[str, Any], root: bytes) -> None:
+    """Put down what the copy is made of, with digests, for `sweep verify`."""
+    names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
+    lines = [sealed({"attributes": attributes, "objects": len(names) + 1})]
+    lines += [sealed({"object": n, "digest": store.digest(output, [n])}) for n in sorted(names)]
+    lines.append(sealed({"object": "zarr.json", "digest": store.digest_of([("zarr.json", root)])}))
+    put_whole(output / JOURNAL / store.MANIFEST, b"".join(lines))
+
+
+def _pack_array(path: Location, output: Location) -> None:
+    """Copy an array, shard by shard, and read each back."""
+    import zarr
+
+    source = read_array(path)
+    target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
+    with ThreadPoolExecutor(THREADS) as pool:
+        for _ in pool.map(lambda part: _copy(source, target, part), _parts(target)):
+            pass
+
+
+def _parts(array: zarr.Array[Any]) -> Iterator[tuple[slice, ...]]:
+    """Slices of an array, each a whole file of it."""
+    cut = array.shards or array.chunks
+    for corner in product(*(range(0, n, c) for n, c in zip(array.shape, cut, strict=True))):
+        yield tuple(
+            slice(at, min(at + c, n)) for at, c, n in zip(corner, cut, array.shape, strict=True)
+        )
+
+
+def _copy(source: zarr.Array[Any], target: zarr.Array[Any], part: tuple[slice, ...]) -> None:
+    values = np.asarray(source[part or ...])
+    target[part or ...] = values
+    back = np.asarray(target[part or ...])
+    if back.tobytes() != values.tobytes():
+        raise OSError(5, f"{target.path} does not read back as it was written")
+
+
+def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
+    """Whole chunks along each axis that make a file, the last axis filled first.
+
+    Returns
+    -------
+    tuple of int or None
+        Multiples of the chunks; None where a single chunk is a file, or what it holds is known.
+    """
+    if layout.values is not None:
+        return None
+    room = SHARD_BYTES // max(1, math.prod(layout.chunks) * np.dtype(layout.dtype).itemsize)
+    counts = [1] * len(layout.shape)
+    for k in reversed(range(len(counts))):
+        counts[k] = max(1, min(-(-layout.shape[k] // layout.chunks[k]), room))
+        room //= counts[k]
+    if math.prod(counts) == 1:
+        return None
+    return tuple(count * chunk for count, chunk in zip(counts, layout.chunks, strict=True))

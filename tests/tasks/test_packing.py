@@ -1,0 +1,122 @@
+import warnings
+
+import numpy as np
+import pytest
+import xarray as xr
+from click.testing import CliRunner
+from small import everything, quiet, small
+from small_flights import small_scene
+
+import sweep
+from sweep.analysis.scenes.places import place
+from sweep.cli import main
+from sweep.storage.locations import files_below
+from sweep.tasks import packing
+from sweep.tasks.driver import resume
+from sweep.tasks.errors import StoreError
+from sweep.tasks.packing import pack, shard_shape
+from sweep.tasks.scene_summary import scene_summary
+from sweep.tasks.status import status
+from sweep.tasks.study import ArrayLayout
+from sweep.tasks.verify import verify
+
+
+@pytest.fixture(scope="module")
+def packed(undisturbed, tmp_path_factory):
+    return pack(undisturbed, tmp_path_factory.mktemp("packed") / "final.zarr", progress=False)
+
+
+def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(undisturbed, packed):
+    before = everything(undisturbed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected, found = xr.open_zarr(undisturbed), xr.open_zarr(packed)
+    assert list(found.variables) == list(expected.variables)
+    for name, values in expected.variables.items():
+        assert found[name].values.tobytes() == values.values.tobytes(), name
+        assert found[name].attrs == values.attrs and found[name].dims == values.dims
+        chunks = [f for f in files_below(packed / name) if f.startswith("c/")]
+        assert len(chunks) == 1
+    assert everything(undisturbed) == before
+    assert sweep.open(packed).attrs["finished"] == sweep.open(undisturbed).attrs["finished"] != ""
+
+
+def test_what_reads_stores_reads_the_copy_and_what_writes_them_refuses_it(packed):
+    found = status(packed)
+    assert found.complete and found.bytes == sum(files_below(packed).values())
+    with pytest.raises(StoreError, match="nothing to resume"):
+        resume(packed, progress=False)
+    with pytest.raises(StoreError, match="nothing to resume"):
+        quiet(small(), packed)
+    with pytest.raises(StoreError, match="is packed already"):
+        pack(packed, packed.with_name("twice.zarr"))
+
+
+def test_a_flipped_bit_in_a_copy_is_found(packed, tmp_path):
+    import shutil
+
+    copy = shutil.copytree(packed, tmp_path / "copy.zarr")
+    assert all(report.sound for report in verify(copy, progress=False))
+    (chunk,) = (copy / "pd_shot" / "c").rglob("0/0/0")
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    (report,) = verify(copy, progress=False)
+    assert [damage.object for damage in report.damages] == ["pd_shot/c/0/0/0"]
+
+
+def test_what_is_not_complete_or_in_the_way_is_refused(undisturbed, packed, tmp_path):
+    from small import copied
+
+    store = copied(undisturbed, tmp_path)
+    (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
+    with pytest.raises(StoreError, match="lacks 1 blocks"):
+        pack(store, tmp_path / "final.zarr")
+    assert not (tmp_path / "final.zarr").exists()
+    with pytest.raises(StoreError, match="is there already"):
+        pack(undisturbed, packed)
+
+
+def test_a_copy_that_does_not_read_back_is_not_kept(undisturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr(packing, "_copy", lambda *_: (_ for _ in ()).throw(OSError(5, "no")))
+    with pytest.raises(StoreError, match="can't be made: no"):
+        pack(undisturbed, tmp_path / "final.zarr")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_copy_goes_to_an_object_store_too(undisturbed, tmp_path):
+    there = pack(undisturbed, f"memory://bucket{tmp_path}/final.zarr", progress=False)
+    np.testing.assert_array_equal(
+        sweep.open(there).pd_shot.values, sweep.open(undisturbed).pd_shot.values
+    )
+    assert all(report.sound for report in verify(there, progress=False))
+
+
+def test_a_scene_is_packed_with_all_that_is_told_of_it(tmp_path):
+    made = quiet(small_scene(), tmp_path / "scene.zarr").store
+    told = CliRunner().invoke(main, ["finalize", str(made)])
+    assert told.exit_code == 0, told.output
+    copy = tmp_path / "scene_final.zarr"
+    assert len(files_below(copy)) < len(files_below(made)) / 3
+    assert scene_summary(copy)[0].shots > 0
+    for one, other in zip(scene_summary(made), scene_summary(copy), strict=True):
+        assert (one.shots, one.true, one.false) == (other.shots, other.true, other.false)
+    tree = sweep.open_scene(copy)
+    recording = place(small_scene(), {}).recording(tree, "three")
+    assert recording.computed(slice(0, 12)).all()
+
+
+@pytest.mark.parametrize(
+    ("shape", "chunks", "expected"),
+    [
+        ((100, 100), (10, 10), (100, 100)),
+        ((10**5, 10**3), (10**3, 10**3), (8 * 10**3, 10**3)),
+        ((10**4, 10**4), (10**3, 10**3), (10**3, 8 * 10**3)),
+        ((10**3 + 1,), (10,), (1010,)),
+        ((), (), None),
+    ],
+)
+def test_a_file_is_whole_chunks_and_no_larger_than_it_may_be(shape, chunks, expected):
+    dims = ("x", "y")[: len(shape)]
+    layout = ArrayLayout(name="a", shape=shape, chunks=chunks, dims=dims, dtype="float64")
+    assert shard_shape(layout) == expected
