@@ -6,16 +6,19 @@ from pathlib import Path
 
 import click
 
+from sweep.cli.places import StorePath, shown
+from sweep.storage.locations import Location, beside
+
 
 @click.command()
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=StorePath())
 @click.option(
     "--output",
     "-o",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="The page [NAME-report.html beside NAME.zarr].",
+    help="The page [NAME-report.html beside NAME.zarr, here for a store in an object store].",
 )
-def report(store: Path, output: Path | None) -> None:
+def report(store: Location, output: Path | None) -> None:
     """Write the study in STORE as one page that needs no network.
 
     It says what was asked and simulated, has the figures to turn, cut and save, tables to sort and
@@ -32,7 +35,7 @@ def report(store: Path, output: Path | None) -> None:
     from sweep.tasks.studies import read
 
     read(store)
-    file = output or store.with_name(f"{store.name.removesuffix('.zarr')}-report.html")
+    file = output or beside(store) / f"{store.name.removesuffix('.zarr')}-report.html"
     with Console(stderr=True).status("opening the store") as status:
         write(store, file, lambda text: status.update(f"making: {text}"))
-    click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+    click.echo(f"{shown(file)}: {file.stat().st_size / 1e6:.1f} MB")

@@ -20,6 +20,7 @@ from sweep.report import asked, clouds, detector, flights, heat_maps, lines, sam
 from sweep.report.page import Chart, Page, Section, Table, Text
 from sweep.report.rendering import rendered
 from sweep.spec import Slices, Surface
+from sweep.storage.locations import Location, located
 
 MOST_IN_TABLES = 20_000_000
 """Points of a study up to which the tables that it asks for are made: they hold all in memory."""
@@ -30,7 +31,7 @@ Say = Callable[[str], None]
 Item = Chart | Table | Text
 
 
-def write(store: str | Path, file: str | Path, say: Say = lambda text: None) -> Path:
+def write(store: str | Location, file: str | Path, say: Say = lambda text: None) -> Path:
     """The report of a study as one page that needs nothing else.
 
     Parameters
@@ -49,7 +50,7 @@ def write(store: str | Path, file: str | Path, say: Say = lambda text: None) -> 
     OSError
         Where the file can't be written.
     """
-    store, file = Path(store), Path(file)
+    store, file = located(store), Path(file)
     kind = kind_of(read_attributes(store))
     if kind == ACCURACY:
         raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
@@ -68,7 +69,7 @@ def write(store: str | Path, file: str | Path, say: Say = lambda text: None) -> 
     return file
 
 
-def _grid_page(store: Path, say: Say) -> Page:
+def _grid_page(store: Location, say: Say) -> Page:
     study = Study.of(store)
     dataset, spec = study.dataset, study.spec
     figures = list(_figures(study, say))
@@ -157,7 +158,7 @@ def _shape(study: Study) -> str:
     return " x ".join(sizes) or "a single point"
 
 
-def _scene_page(store: Path, say: Say) -> Page:
+def _scene_page(store: Location, say: Say) -> Page:
     study = SceneStudy.of(store)
     spec, attributes = study.spec, study.tree.attrs
     seen, fewer = clouds.recordings(study)
