@@ -30,6 +30,11 @@ GEOMETRIC = (
 )
 GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
 
+#: Draws of all points of a block at most, which bounds its time: at 1 to 10 us a draw to less than
+#: an hour. And counts of draws, one a point and batch, which bound its memory: to some 200 MB.
+BLOCK_DRAWS = 1 << 28
+BLOCK_COUNTS = 1 << 22
+
 
 #: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and
 #: what lists, copies or removes a store handles them one by one.
@@ -81,6 +86,17 @@ def block_shape(
     return tuple(shape)
 
 
+def most_points(spec: Spec, points: int) -> int:
+    """Points that a block of a study of so many may hold: what the spec says, or fits the study.
+
+    Less where each has many draws.
+    """
+    draws = spec.draws
+    batches = -(-draws.number // draws.batch)
+    bounds = (BLOCK_DRAWS // max(draws.number, draws.limit, 1), BLOCK_COUNTS // max(batches, 1))
+    return max(1, min(spec.storage.block_points or points_a_block(points), *bounds))
+
+
 class Grid:
     """Points of a study and the blocks they are computed in.
 
@@ -97,9 +113,7 @@ class Grid:
         self.dims = tuple(axis.name for axis in self._axes)
         self.shape = tuple(int(axis.size) for axis in self._axes)
         self.geometric = tuple(is_geometric(axis) for axis in self._axes)
-        self.block_shape = block_shape(
-            self.shape, self.geometric, spec.storage.block_points or points_a_block(self.points)
-        )
+        self.block_shape = block_shape(self.shape, self.geometric, most_points(spec, self.points))
         self.blocks_along = tuple(
             -(-size // chunk) for size, chunk in zip(self.shape, self.block_shape, strict=True)
         )

@@ -30,6 +30,10 @@ class _Alarm:
         self._over = self.rung = False
         self._timer = _timer(seconds, self._ring)
 
+    def set(self) -> None:
+        """From here on the thread may be interrupted."""
+        self._timer.start()
+
     def _ring(self) -> None:
         with self._guard:
             if self._over:
@@ -38,6 +42,7 @@ class _Alarm:
             _raise_in(self._thread, _Interruption)
             if self._deadly:
                 self._timer = _timer(GRACE, self._kill)
+                self._timer.start()
 
     def _kill(self) -> None:
         with self._guard:
@@ -59,7 +64,6 @@ class _Alarm:
 def _timer(seconds: float, action: Callable[[], None]) -> threading.Timer:
     timer = threading.Timer(seconds, action)
     timer.daemon = True
-    timer.start()
     return timer
 
 
@@ -86,6 +90,7 @@ def time_limit(seconds: float | None) -> Iterator[None]:
     alarm, where = _Alarm(seconds, deadly=_is_worker_process()), None
     try:
         try:
+            alarm.set()
             yield
         finally:
             alarm.put_off()

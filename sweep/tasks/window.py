@@ -12,7 +12,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from sweep.tasks.errors import SchedulerLost, StoreError
@@ -22,6 +22,7 @@ from sweep.tasks.worker import STORAGE_ERRORS, Answer, Terms, failure, work
 if TYPE_CHECKING:
     from dask.typing import Key
     from distributed import Client, Future
+    from distributed.scheduler import KilledWorker
 
 #: Seconds that a task should take: long beside the 3-9 ms that one costs, short beside a study.
 TASK_SECONDS = 2.0
@@ -217,11 +218,21 @@ class Window:
 
 def _failed(error: BaseException, blocks: list[int]) -> Answer:
     """Answer of a task that raised or killed its workers: any of its blocks may be to blame."""
+    from distributed.scheduler import KilledWorker
+
     if isinstance(error, StoreError):
         raise error
     if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
         raise error
-    return Answer(failures=[failure(block, error) for block in blocks])
+    failures = [failure(block, error) for block in blocks]
+    if isinstance(error, KilledWorker):
+        failures = [replace(each, error=_killed(error)) for each in failures]
+    return Answer(failures=failures)
+
+
+def _killed(error: KilledWorker) -> str:
+    died = f"{error.allowed_failures + 1} worker{'s' if error.allowed_failures else ''} died at it"
+    return f"KilledWorker: {died}: out of memory, stuck beyond --block-timeout, or killed"
 
 
 def task_key(job: Job, blocks: list[int], attempt: int) -> str:

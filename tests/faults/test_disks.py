@@ -104,7 +104,7 @@ def test_a_folder_that_vanishes_stops_a_study_that_goes_on_when_it_is_back(
     evaluate = at_block(5, lambda: shutil.move(store, elsewhere))
     outcome = run(small(), store=store, progress=False, evaluate=evaluate, **place)
     assert "small.zarr is no longer there" in outcome.stopped and not outcome.complete
-    with pytest.raises(StoreError, match="there is no store|not a Zarr store of sweep's"):
+    with pytest.raises(StoreError, match=r"there is no store|not a Zarr store"):
         resume(store, progress=False, scheduler="none")
     shutil.rmtree(store, ignore_errors=True)  # what another worker was at meanwhile
     before = receipts(elsewhere)

@@ -13,6 +13,7 @@ import pytest
 from small import evaluated, logged, receipts, small, tree
 
 from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import StoreError
 from sweep.tasks.status import status
 
 BLOCKS = 12
@@ -177,6 +178,8 @@ def test_a_plain_loop_killed(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path, "none") as client:
         wait_for(lambda: len(receipts(store)) >= 3)
+        with pytest.raises(StoreError, match=f"is being written by process {client.pid} on"):
+            resume(store, progress=False, scheduler="none")
         os.kill(client.pid, signal.SIGKILL)
         client.wait()
     finish(tmp_path, undisturbed)

@@ -154,3 +154,20 @@ def test_files_stay_countable_however_large_a_study_is(points):
     assert -(-points // size) <= MOST_BLOCKS
     assert size >= min(points, BLOCK_POINTS)
     assert points > BLOCK_POINTS * MOST_BLOCKS or size <= BLOCK_POINTS
+
+
+@pytest.mark.parametrize(
+    ("draws", "most"),
+    [
+        ({}, 50_000),
+        ({"number": 100}, 50_000),
+        ({"number": 1_000_000, "batch": 1_000_000}, 268),
+        ({"limit": 1_000_000}, 268),
+        ({"number": 1_000_000, "batch": 100}, 268),
+        ({"number": 100_000, "batch": 10}, 419),
+    ],
+)
+def test_a_block_of_points_with_many_draws_holds_fewer(draws, most):
+    axes = {"target.range": {"linear": ["1 km", "2 km"], "number": 100_000}}
+    spec = small(axes=axes, draws=draws, storage={"block_points": 50_000})
+    assert Grid(spec).block_shape == (most,)

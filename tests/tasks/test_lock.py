@@ -8,8 +8,10 @@ import time
 from dataclasses import asdict, replace
 
 import pytest
+from small import quiet, receipts, small
 
 from sweep.tasks import lock
+from sweep.tasks.driver import resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import Holder, Lock, holder, is_live
 from sweep.tasks.store import JOURNAL
@@ -103,3 +105,21 @@ def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
     for process in tries:
         process.join()
     assert got.count(True) == 1
+
+
+def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
+    """As one that stood still so long that another host held it for dead."""
+    other = Holder(host="elsewhere", pid=1, started=1.0, token="t")
+
+    def evaluate(study, block):
+        if block == 4:
+            put(study_path, other)
+        return study.evaluate(block)
+
+    study_path = tmp_path / "small.zarr"
+    outcome = quiet(small(), study_path, scheduler="none", evaluate=evaluate)
+    assert outcome.stopped == "another process took the store's lock"
+    assert receipts(study_path) == [0, 1, 2, 3]
+    assert holder(study_path) == other
+    with pytest.raises(StoreError, match="process 1 on elsewhere"):
+        resume(study_path, progress=False, scheduler="none")

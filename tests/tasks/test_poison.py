@@ -1,0 +1,159 @@
+"""Blocks that take too long, too much memory or their worker with them."""
+
+import os
+import threading
+import time
+
+import dask
+import pytest
+from distributed import Client, LocalCluster
+from small import copied, evaluated, quiet, receipts, small, tree
+
+from sweep.tasks import time_limit
+from sweep.tasks.clusters import local
+from sweep.tasks.driver import resume, run
+from sweep.tasks.status import status
+from sweep.tasks.time_limit import Overtime
+
+
+def endless(block, log):
+    """The model, with a block that never ends."""
+
+    def evaluate(study, number):
+        with open(log, "a") as lines:
+            lines.write(f"{number} {os.getpid()}\n")
+        while number == block:
+            time.sleep(0.01)
+        return study.evaluate(number)
+
+    return evaluate
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
+    path, log = tmp_path / "small.zarr", tmp_path / "log"
+    study = small()
+    outcome = run(
+        study, store=path, progress=False, block_timeout=3.0, evaluate=endless(4, log), **place
+    )
+    assert outcome.blocks_done == 11
+    (failure,) = outcome.failures
+    assert failure.block == 4
+    assert failure.error == "Overtime: took longer than the 3 s that a block may take"
+    assert "time.sleep(0.01)" in failure.traceback  # where it was
+    assert evaluated(log).count(4) == 2
+    assert resume(path, progress=False, scheduler="none").left_out == 1
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
+    assert tree(path) == tree(undisturbed)
+
+
+def stuck_or_hungry(stuck, hungry):
+    """The model, with a block stuck in compiled code and one that takes all memory."""
+
+    def evaluate(study, block):
+        from sweep.tasks import time_limit
+
+        time_limit.GRACE = 0.2
+        if block == stuck:
+            time.sleep(600)
+        taken = []
+        while block == hungry:
+            taken.append(b"x" * (50 << 20))
+            time.sleep(0.05)
+        return study.evaluate(block)
+
+    return evaluate
+
+
+@pytest.mark.slow
+def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_given_up(
+    undisturbed, tmp_path, monkeypatch
+):
+    path = tmp_path / "small.zarr"
+    monkeypatch.setattr(local, "_memory", lambda cluster, bounds: 1 << 30)
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        outcome = run(
+            small(), store=path, progress=False, workers=2, block_timeout=20.0,
+            evaluate=stuck_or_hungry(2, 8),
+        )  # fmt: skip
+    assert outcome.blocks_done == 10
+    assert sorted(failure.block for failure in outcome.failures) == [2, 8]
+    for failure in outcome.failures:
+        assert failure.error.startswith("KilledWorker: 1 worker died at it")
+        assert "--block-timeout" in failure.error and "memory" in failure.error
+    assert set(status(path).failures) == {2, 8}
+    assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
+    assert tree(path) == tree(undisturbed)
+
+
+def test_a_block_that_failed_goes_to_another_worker(tmp_path):
+    log = tmp_path / "log"
+
+    def evaluate(study, block):
+        from sweep.tasks.time_limit import worker_address
+
+        with open(log, "a") as lines:
+            lines.write(f"{block} {worker_address()}\n")
+        if block == 5:
+            raise ValueError("nothing good comes of it")
+        return study.evaluate(block)
+
+    with (
+        LocalCluster(
+            n_workers=3, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as workers,
+        Client(workers) as client,
+    ):
+        run(small(), store=tmp_path / "s.zarr", client=client, evaluate=evaluate, progress=False)
+    first, second = (line.split()[1] for line in log.read_text().splitlines() if line[:2] == "5 ")
+    assert first != second
+
+
+def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
+    with pytest.raises(Overtime, match=r"longer than the 0\.05 s"), time_limit.time_limit(0.05):
+        while True:
+            time.sleep(0.001)
+    for _ in range(200):  # ends about when the alarm rings
+        try:
+            with time_limit.time_limit(0.002):
+                until = time.perf_counter() + 0.002
+                while time.perf_counter() < until:
+                    pass
+        except Overtime:
+            pass
+        sum(range(1000))  # where a stray interruption would arrive
+    with time_limit.time_limit(60.0):
+        pass
+    with time_limit.time_limit(None):
+        pass
+    deadline = time.monotonic() + 10
+    while any(isinstance(t, threading.Timer) and t.is_alive() for t in threading.enumerate()):
+        assert time.monotonic() < deadline, "an alarm is still set"
+        time.sleep(0.01)
+
+
+def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts(
+    undisturbed, tmp_path, monkeypatch
+):
+    from sweep.tasks import store
+
+    path, at = tmp_path / "small.zarr", []
+    sync = store.sync
+    monkeypatch.setattr(store, "sync", lambda place: (sync(place), at.append(receipts(path))))
+    assert quiet(small(), path, scheduler="none", durable=True).complete
+    assert tree(path) == tree(undisturbed)
+    assert [len(before) for before in at] == list(range(12))  # each synced, then committed
+
+
+def test_what_cannot_be_synced_is_not_committed(undisturbed, tmp_path, monkeypatch):
+    from sweep.tasks import store
+
+    path = copied(undisturbed, tmp_path)
+    (path / "pd_up" / "c" / "0" / "5" / "0").unlink()
+
+    def broken(place):
+        raise OSError(5, "Input/output error", str(place))
+
+    monkeypatch.setattr(store, "sync", broken)
+    outcome = resume(path, progress=False, scheduler="none", durable=True)
+    assert outcome.blocks_computed == 0 and "Input/output error" in outcome.stopped
