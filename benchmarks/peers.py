@@ -13,9 +13,12 @@ Names of contenders as arguments measure those alone.
 """
 
 import argparse
+import json
 import logging
 import multiprocessing
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from contextlib import ExitStack, contextmanager, redirect_stderr, suppress
@@ -25,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import psutil
+import scale_page
 import xarray as xr
 from rich.console import Console
 from rich.table import Table
@@ -296,33 +300,62 @@ def middle(shares: list[Shares]) -> float:
     return statistics.median(share.wall for share in shares)
 
 
+def apart(*words: str) -> list[float]:
+    """Numbers that this program prints in a process of its own: contenders share nothing."""
+    command = [sys.executable, __file__, *words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def rows(shares: dict[str, list[Shares]], workers: int) -> list[list[str]]:
+    """Lines of the table, the fastest first."""
+    lines = []
+    for name, each in sorted(shares.items(), key=lambda item: -middle(item[1])):
+        rate = middle(each) * workers / MILLISECOND
+        best = max(share.wall for share in each)
+        processor = statistics.median(share.processor for share in each)
+        lines.append(
+            [name, f"{rate:,.0f}", f"{middle(each):.1%}", f"{best:.1%}", f"{processor:.1%}"]
+        )
+    return lines
+
+
 def main() -> None:
-    """Measure in turns, and print."""
+    """Measure in turns, print, and put the table into the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*CONTENDERS, []])
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--one", choices=[*CONTENDERS, "second"], help=argparse.SUPPRESS)
     asked = parser.parse_args()
+    workers = ["--workers", str(asked.workers)]
+    if asked.one == "second":
+        print(json.dumps([blocks_of_a_second(asked.workers)]))
+        return
+    if asked.one:
+        print(json.dumps(measure(asked.one, asked.workers)))
+        return
     names = asked.names or list(CONTENDERS)
     shares: dict[str, list[Shares]] = {name: [] for name in names}
+    lost = []
     for _ in range(asked.rounds):
         for name in names:
-            shares[name].append(measure(name, asked.workers))
-    table = Table(
-        "contender", "points a second", "of the ideal", "best", "processor's time", "rounds"
+            shares[name].append(Shares(*apart("--one", name, *workers)))
+        lost += apart("--one", "second", *workers)
+    head = ["contender", "points a second", "of the ideal", "best round", "of the processor's time"]
+    table = Table(*head)
+    lines = rows(shares, asked.workers)
+    for line in lines:
+        table.add_row(*line)
+    said = (
+        f"For blocks of a second {statistics.median(lost):.1%} of the wall time of "
+        f"{asked.workers} workers was not the blocks' own (median of {asked.rounds} rounds)."
     )
-    for name, each in sorted(shares.items(), key=lambda item: -middle(item[1])):
-        rate = middle(each) * asked.workers / MILLISECOND
-        best = max(share.wall for share in each)
-        processor = statistics.median(share.processor for share in each)
-        table.add_row(
-            name, f"{rate:,.0f}", f"{middle(each):.1%}", f"{best:.1%}", f"{processor:.1%}",
-            f"{len(each)}",
-        )  # fmt: skip
-    console = Console(width=100)
+    console = Console(width=110)
     console.print(table)
-    lost = [blocks_of_a_second(asked.workers) for _ in range(asked.rounds)]
-    console.print(f"not the blocks' own, for blocks of a second: {statistics.median(lost):.2%}")
+    console.print(said)
+    if not asked.names:
+        scale_page.put("peers", head, lines, said)
 
 
 if __name__ == "__main__":

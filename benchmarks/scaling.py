@@ -11,6 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import scale_page
 from peers import client_of, processor_time
 from rich.console import Console
 from rich.table import Table
@@ -59,14 +60,19 @@ def main() -> None:
     for _ in range(asked.rounds):
         for number in numbers:
             seen[number].append(measure(spec, number))
-    table = Table("workers", "seconds", "times as fast as one", "processor's time, times one's")
+    head = ["workers", "seconds", "times as fast as one", "processor's time, times one's"]
+    rows = []
     for number in numbers:
         pairs = list(zip(seen[number], seen[1], strict=True))
         faster = statistics.median(one[0] / own[0] for own, one in pairs)
         dearer = statistics.median(own[1] / one[1] for own, one in pairs)
         seconds = statistics.median(own[0] for own in seen[number])
-        table.add_row(f"{number}", f"{seconds:.1f}", f"{faster:.2f}", f"{dearer:.3f}")
+        rows.append([f"{number}", f"{seconds:.1f}", f"{faster:.2f}", f"{dearer:.3f}"])
+    table = Table(*head)
+    for row in rows:
+        table.add_row(*row)
     Console(width=100).print(table)
+    scale_page.put("scaling", head, rows)
 
 
 if __name__ == "__main__":

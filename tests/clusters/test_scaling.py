@@ -1,0 +1,67 @@
+"""Workers between bounds, and a file's options as the command and Python take them."""
+
+import pytest
+from click.testing import CliRunner
+from small import quiet, small, tree
+
+from sweep.cli import main
+from sweep.spec import cluster_of
+from sweep.tasks import cluster
+from sweep.tasks.errors import ClusterError
+
+LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
+
+
+def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
+    log = tmp_path / "pids"
+
+    def evaluate(study, block):
+        import os
+        import time
+
+        time.sleep(1.0)
+        with open(log, "a") as lines:
+            lines.write(f"{os.getpid()}\n")
+        return study.evaluate(block)
+
+    described = {**LOCAL, "workers": {"least": 1, "most": 2}}
+    outcome = quiet(small(), tmp_path / "grown.zarr", cluster=described, evaluate=evaluate)
+    assert outcome.complete
+    assert tree(outcome.store) == tree(undisturbed)
+    assert len(set(log.read_text().split())) == 2
+
+
+def test_no_more_workers_are_started_than_there_are_blocks():
+    bounds = cluster.Bounds(2, 40)
+    described = cluster_of({**LOCAL, "workers": bounds._asdict()})
+    assert cluster._bounds(described, 9) == (2, 9)
+    assert cluster._bounds(described, 1) == (1, 1)
+    assert cluster._bounds(cluster_of(LOCAL), 10**6) == (cluster.cores(), cluster.cores())
+
+
+def test_a_number_of_workers_fixes_those_of_a_file_and_none_are_started_elsewhere():
+    described = cluster_of({**LOCAL, "workers": {"least": 2, "most": 40}})
+    assert cluster.of_workers(described, 7).workers == (7, 7)
+    assert cluster.of_workers(described, None) is described
+    with pytest.raises(ClusterError, match="there already"):
+        cluster.of_workers(cluster_of({"kind": "scheduler", "address": "tcp://a:1"}), 3)
+
+
+def test_the_command_tells_what_is_wrong_with_a_clusters_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    from pathlib import Path
+
+    import sweep
+
+    spec = Path(sweep.__file__).parents[1] / "experiments" / "quickstart.yaml"
+    (tmp_path / "bad.yaml").write_text("kind: slurm\nworkers: none\n")
+    result = CliRunner().invoke(main, ["run", str(spec), "--cluster", "bad.yaml"])
+    assert result.exit_code == 2
+    assert "bad.yaml:2: workers: must be a number" in result.output
+    assert not (tmp_path / "results").exists()
+    (tmp_path / "local.yaml").write_text("kind: local\n")
+    both = ["run", str(spec), "--cluster", "local.yaml", "--scheduler", "none"]
+    result = CliRunner().invoke(main, both)
+    assert result.exit_code == 2
+    assert "both named" in result.output
+    assert not (tmp_path / "results").exists()
