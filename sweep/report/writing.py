@@ -76,11 +76,13 @@ def _grid_page(store: Location, say: Say) -> Page:
     tables = list(_tables(study, say))
     say("the detector")
     tracks, fewer = detector.tracks(study)
-    trades: list[Item | None] = [
-        detector.roc(study, tracks, fewer),
-        detector.false_alarms(study, tracks, fewer),
-        detector.noise_budget(study, tracks, fewer),
-    ]
+    trades: list[Item | None] = [detector.noise_budget(study, tracks, fewer)]
+    if not spec.draws.whole_spectra:  # of what looks at those there are no closed forms
+        trades = [
+            detector.roc(study, tracks, fewer),
+            detector.false_alarms(study, tracks, fewer),
+            *trades,
+        ]
     say("effects and accuracy")
     effects = asked.effects([dataset["effects"]], spec.modes(), dataset.coords)
     told = asked.accuracy(dataset, spec)

@@ -10,7 +10,7 @@ from small import quiet, small
 
 import sweep
 from sweep.tasks import user_code
-from sweep.tasks.errors import CodeError
+from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
 
 CODE = """
@@ -152,6 +152,21 @@ def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
         np.testing.assert_array_equal(values, stores[1][name], err_msg=name)
     pd = stores[0].pd_shot
     np.testing.assert_array_equal(pd.sel(estimator="peak_bin"), pd.sel(estimator="candan"))
+
+
+def test_what_accuracy_costs_is_not_asked_of_whole_spectra(tmp_path):
+    from sweep.tasks.accuracy.run import measure
+
+    with pytest.raises(TaskError, match="draws whole spectra"):
+        measure(study(), store_path=tmp_path / "a.zarr")
+
+
+def test_a_page_of_whole_spectra_shows_what_is_stored(tmp_path):
+    from sweep.report.writing import write
+
+    quiet(study(), tmp_path / "a.zarr")
+    text = write(tmp_path / "a.zarr", tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "false_alarms" in text and "Noise by source" in text and "pfa_segment" not in text
 
 
 def test_a_plan_measures_what_draws_take():

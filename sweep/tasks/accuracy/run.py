@@ -19,7 +19,7 @@ from sweep.tasks.accuracy.measure import (
     differences,
 )
 from sweep.tasks.accuracy.rungs import REFERENCE, Rung
-from sweep.tasks.errors import StoreError
+from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen
 from sweep.tasks.studies import ACCURACY
@@ -69,13 +69,18 @@ def measure(
 
     Raises
     ------
-    StoreError
-        Where a store is in the way or can't be written.
+    StoreError, TaskError
+        Where a store is in the way or can't be written; where the study draws whole spectra.
     SceneError
         Where a file of a scene is missing, changed or unfit.
     """
     from sweep.tasks.accuracy.measure import Nothing
 
+    if getattr(spec.draws, "whole_spectra", False):
+        raise TaskError(
+            "this study draws whole spectra, which have no settings to try: "
+            "leave out draws.method, detector and estimator"
+        )
     _refuse_in_the_way(store_path, overwrite)
     told = chosen(progress)
     with Interrupts() as interrupts:
