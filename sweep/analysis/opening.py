@@ -9,6 +9,7 @@ from typing import Any
 
 import xarray as xr
 
+import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
 from sweep.storage.locations import JOURNAL, Location, located, zarr_store
 from sweep.storage.objects import ObjectStoreError
 from sweep.storage.receipts import read_receipts

@@ -1,0 +1,143 @@
+"""Errors of range and velocity beside the least that the record allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.answers.physical import parameter, spec_of
+from sweep.model import cramer_rao, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.window import window
+
+_NAMES = ("up", "doppler", "down")
+_INSTRUMENT = "instrument."
+_PARAMETERS = {
+    "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
+    "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
+    "duration": "chirp.duration", "sample_rate": "processing.sample_rate",
+    "fft_size": "processing.fft_size", "window": "processing.window",
+    "delay": "processing.acquisition_delay",
+}  # fmt: skip
+
+
+def range_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported range, and the Cramer-Rao bound on any unbiased estimate of it.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or a part of it.
+
+    Returns
+    -------
+    xarray.Dataset
+        [m], lazy: `reported`, reported less true range without noise, from whole bins;
+        `resolution`, the spread that whole bins make on the average, a bin over sqrt(24) as
+        two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
+        SNR in the three segments together (:mod:`sweep.model.cramer_rao`). Where noise is
+        taken for signal, below the threshold, no estimate comes near it.
+    """
+    return _errors(dataset, "range", "range_error", lambda found: found.range)
+
+
+def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported radial velocity, and the Cramer-Rao bound.
+
+    Parameters and results as of :func:`range_error`, in m/s.
+    """
+    return _errors(
+        dataset, "radial velocity", "radial_velocity_error", lambda found: found.radial_velocity
+    )
+
+
+def _errors(
+    dataset: xr.Dataset,
+    words: str,
+    stored: str,
+    which: Callable[[cramer_rao.Bounds], np.ndarray],
+) -> xr.Dataset:
+    spec = spec_of(dataset)
+    values = {n: parameter(dataset, _INSTRUMENT + p, spec) for n, p in _PARAMETERS.items()}
+    values |= {
+        name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
+    }
+    snr = [dataset[f"snr_{name}"] for name in _NAMES]
+
+    def bound(*arrays: np.ndarray) -> np.ndarray:
+        names = dict(zip(values, arrays[3:], strict=True))
+        return which(_bounds(arrays[:3], names))
+
+    bounds = xr.apply_ufunc(
+        bound, *snr, *values.values(), dask="parallelized", output_dtypes=[float]
+    ).transpose(*snr[0].dims)
+    width = values["sample_rate"] / values["fft_size"]
+    bins = (
+        SPEED_OF_LIGHT / 2 * values["duration"] / values["bandwidth"] * width
+        if stored == "range_error"
+        else values["wavelength"] / 2 * width
+    )
+    # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
+    result = xr.Dataset({
+        "reported": dataset[stored],
+        "resolution": bins / np.sqrt(24.0) + xr.zeros_like(bounds),
+        "bound": bounds,
+    })  # fmt: skip
+    units = str(dataset[stored].attrs.get("units", ""))
+    for name, text in (
+        ("resolution", f"standard deviation that whole bins give to the {words}"),
+        ("bound", f"Cramer-Rao bound on the standard deviation of the {words}"),
+    ):
+        result[name].attrs = {"units": units, "long_name": text}
+    return result.assign_attrs(dataset.attrs)
+
+
+def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao.Bounds:
+    """Bounds of points that share no more than their order; words and sizes one by one."""
+    shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
+    flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
+    seen = [np.broadcast_to(a, shape).ravel() for a in snr]
+    kinds = list(zip(flat["architecture"], flat["window"], flat["fft_size"], flat["duration"],
+                     flat["delay"], flat["sample_rate"], strict=True))  # fmt: skip
+    spread = np.empty((2, len(kinds)))
+    for kind in dict.fromkeys(kinds):
+        mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
+        part = {name: a[mask] for name, a in flat.items()}
+        spread[:, mask] = _alike([s[mask] for s in seen], part)
+    return cramer_rao.Bounds(*spread.reshape(2, *shape))
+
+
+def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Bounds:
+    """Bounds of points of one architecture, window and record."""
+    size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
+    length = int(waveform.record_length(
+        fft_size=p["fft_size"][:1], duration=p["duration"][:1], acquisition_delay=p["delay"][:1],
+        sample_rate=p["sample_rate"][:1],
+    )[0])  # fmt: skip
+    shape = window(str(p["window"][0]), length)
+    carriers = waveform.carrier_frequencies(
+        str(p["architecture"][0]), wavelength=p["wavelength"],
+        start_frequency=p["start_frequency"], bandwidth=p["bandwidth"],
+    )  # fmt: skip
+    chirp_rate = p["bandwidth"] / p["duration"]
+    variances = []
+    for sign, carrier, seen in zip(waveform.SIGNS, carriers, snr, strict=True):
+        beat = waveform.beat_frequency(
+            sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"],
+            radial_velocity=p["radial_velocity"],
+        )  # fmt: skip
+        place = waveform.fold(beat, p["sample_rate"]) / rate * size
+        # in bins of fs/L: a padded FFT's bins are finer than the window's
+        offset = (place - np.rint(place)) * length / size
+        matched = cramer_rao.matched_snr(snr=seen, window=shape, offset=offset)
+        variances.append(
+            cramer_rao.frequency_variance(snr=matched, samples=length, sample_rate=rate)
+        )
+    found = cramer_rao.bounds(
+        variances, carriers=carriers, chirp_rate=chirp_rate, range=p["range"],
+        radial_velocity=p["radial_velocity"],
+    )  # fmt: skip
+    dark = np.isnan(snr[0]) | np.isnan(snr[2])
+    return cramer_rao.Bounds(*(np.where(dark, np.nan, b) for b in found))

@@ -1,0 +1,203 @@
+"""Values with units on a dataset's coordinates, and SI values of its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sweep.spec import Spec
+from sweep.spec.fields import parameter_rules
+from sweep.spec.rules import Numeric
+from sweep.units import QuantityError, read_quantity
+
+CLOSE = 1e-9
+"""Relative difference up to which a value is one on the grid."""
+
+
+def spec_of(dataset: xr.Dataset) -> Spec:
+    """The study that a dataset comes from.
+
+    Raises
+    ------
+    ValueError
+        The dataset has lost its attributes, or is none of sweep's.
+    """
+    text = dataset.attrs.get("spec")
+    if not text:
+        raise ValueError("the dataset lacks the attribute 'spec': take one that sweep.open gave")
+    return Spec.from_stored(text)
+
+
+def quantity(written: object, *, si_unit: str, name: str) -> float:
+    """SI value of ``"20 Hz"``, or of a number, which is SI already.
+
+    Raises
+    ------
+    ValueError
+        It cannot be read, or is of another dimension.
+    """
+    if isinstance(written, int | float) and not isinstance(written, bool):
+        return float(written)
+    try:
+        value, unit = read_quantity(written, si_unit=si_unit, example=f"1 {si_unit}")
+    except QuantityError as error:
+        raise ValueError(f"{name} {error}") from None
+    return unit.to_si(value)
+
+
+def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
+    """A coordinate by its name or by the dotted path of its parameter.
+
+    Raises
+    ------
+    ValueError
+        There is none, with those that are.
+    """
+    for known, array in dataset.coords.items():
+        if name in (known, array.attrs.get("path")):
+            return array
+    names = ", ".join(map(str, dataset.coords)) or "none"
+    raise ValueError(f"'{name}' is no coordinate of this dataset: there is {names}")
+
+
+def shown(array: xr.DataArray, written: object) -> float | str:
+    """A written value in the units of a coordinate; a number without a unit is in them already.
+
+    Raises
+    ------
+    ValueError
+        It cannot be read, or is of another dimension.
+    """
+    rule = parameter_rules().get(array.attrs.get("path", ""))
+    if isinstance(written, int | float | np.number) and not isinstance(written, bool):
+        return float(written)
+    if not isinstance(rule, Numeric):
+        return str(written)
+    units = array.attrs.get("units", "")
+    try:
+        number, unit = rule.exact(written)
+        display = rule.exact(f"1 {units}" if units else 1)[1]
+    except QuantityError as error:
+        raise ValueError(f"{array.name} {error}") from None
+    if unit.decibel or display.decibel:
+        ratio = unit.to_si(number)
+        return float(10 * np.log10(ratio)) if display.decibel else ratio / float(display.factor)
+    return float((unit.factor * number + unit.offset - display.offset) / display.factor)
+
+
+def si(array: xr.DataArray) -> xr.DataArray:
+    """SI values of a coordinate of numbers; of one of words, these."""
+    rule = parameter_rules().get(array.attrs.get("path", ""))
+    units = array.attrs.get("units", "")
+    if array.dtype.kind not in "fiu":
+        return array.copy(
+            data=np.array([str(v) for v in array.values.ravel()]).reshape(array.shape)
+        )
+    if not isinstance(rule, Numeric) or not units:
+        return array
+    unit = rule.exact(f"1 {units}")[1]
+    if unit.decibel:
+        return 10 ** (array / 10)
+    return array * float(unit.factor) + float(unit.offset)
+
+
+def parameter(dataset: xr.Dataset, path: str, spec: Spec | None = None) -> xr.DataArray:
+    """SI value of a parameter at each point: along its axis, or one value for all.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or a part of it.
+    path
+        Dotted path, as in a spec.
+    spec
+        The dataset's study, if that is known.
+    """
+    for array in dataset.coords.values():
+        if array.attrs.get("path") == path:
+            return si(array).drop_vars(list(array.coords), errors="ignore").assign_coords(
+                {n: c for n, c in array.coords.items() if n in array.dims}
+            )  # fmt: skip
+    return xr.DataArray((spec or spec_of(dataset)).parameters()[path])
+
+
+def select(
+    dataset: xr.Dataset, wanted: Mapping[str, Any], *, method: str | None = None
+) -> xr.Dataset:
+    """Points at which coordinates have some values.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or a part of it.
+    wanted
+        By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
+        units), a list of values, or a slice from one value to another, both included. One value
+        of a coordinate with a dimension of its own takes that dimension away; a coordinate along
+        a zipped axis keeps the points of the axis that have it.
+    method
+        ``nearest`` takes the nearest value; by default it must be there, to 1e-9 of it.
+
+    Raises
+    ------
+    ValueError
+        No such coordinate, a value that cannot be read, or one that is not on the grid.
+    """
+    if method not in (None, "nearest"):
+        raise ValueError(f"method '{method}' is unknown: take 'nearest', or none")
+    for name, written in wanted.items():
+        array = coordinate(dataset, name)
+        if not array.dims:
+            _places(array, np.atleast_1d(array.values), written, method)
+            continue
+        chosen = _places(array, array.values, written, method)
+        single = not isinstance(written, list | tuple | slice | np.ndarray)
+        if single and array.name in array.dims:
+            dataset = dataset.isel({array.dims[0]: int(chosen[0])})
+        else:
+            dataset = dataset.isel({array.dims[0]: chosen})
+    return dataset
+
+
+def _places(
+    array: xr.DataArray, values: np.ndarray, written: Any, method: str | None
+) -> np.ndarray:
+    """Indices of the values that are wanted, in the order of the coordinate for slices."""
+    if isinstance(written, slice):
+        ends = [
+            None if e is None else float(shown(array, e)) for e in (written.start, written.stop)
+        ]
+        low, high = -np.inf if ends[0] is None else ends[0], np.inf if ends[1] is None else ends[1]
+        room = CLOSE * np.abs(values)
+        return np.flatnonzero((values >= low - room) & (values <= high + room))
+    several = written if isinstance(written, list | tuple | np.ndarray) else [written]
+    found = [_matching(array, values, shown(array, value), method) for value in several]
+    return np.concatenate(found)
+
+
+def _matching(
+    array: xr.DataArray, values: np.ndarray, value: float | str, method: str | None
+) -> np.ndarray:
+    """Indices of one value."""
+    units = array.attrs.get("units", "")
+    if values.dtype.kind not in "fiu":
+        words = [str(word) for word in values]
+        same = np.flatnonzero([word == str(value) for word in words])
+        if not same.size:
+            there = ", ".join(dict.fromkeys(words))
+            raise ValueError(f"{array.name} '{value}' is not on the grid: there is {there}")
+        return same
+    distance = np.abs(values - float(value))
+    nearest = values[np.argmin(distance)]
+    if method == "nearest":
+        return np.flatnonzero(values == nearest)
+    same = np.flatnonzero(distance <= CLOSE * np.maximum(np.abs(values), abs(float(value))))
+    if not same.size:
+        raise ValueError(
+            f"{array.name} {value:g} {units} is not on the grid: {nearest:g} {units} is nearest, "
+            "which method='nearest' takes"
+        )
+    return same

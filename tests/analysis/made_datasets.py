@@ -1,0 +1,30 @@
+"""Datasets like those of stores, with values that are known in closed form."""
+
+import numpy as np
+import xarray as xr
+from drawn_studies import study
+from scipy.special import ndtr
+
+import sweep.analysis.answers.accessor  # noqa: F401
+
+PATHS = {"range": "target.range", "grazing_angle": "target.grazing_angle"}
+UNITS = {"range": "m", "grazing_angle": "deg"}
+
+
+def made(z, half_width=None, **coordinates):
+    """A dataset whose pd has the normal deviates z (an array over the coordinates, in order)."""
+    dims = list(coordinates)
+    z = np.asarray(z, float)
+    variables = {"pd_shot": (dims, ndtr(z)), "miss_shot": (dims, ndtr(-z))}
+    if half_width is not None:
+        variables["pd_shot_half_width"] = (dims, np.full(z.shape, half_width))
+    dataset = xr.Dataset(
+        variables,
+        {
+            name: ([name], np.asarray(values, float), {"units": UNITS[name], "path": PATHS[name]})
+            for name, values in coordinates.items()
+        },
+        {"spec": study({}).to_json(), "title": "Made"},
+    )
+    dataset.pd_shot.attrs = {"units": "1", "long_name": "probability of detection, shot"}
+    return dataset
