@@ -64,6 +64,7 @@ def _errors(
     values |= {
         name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
     }
+    values["walks"] = _walks(dataset)
     snr = [dataset[f"snr_{name}"] for name in _NAMES]
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
@@ -92,6 +93,13 @@ def _errors(
     ):
         result[name].attrs = {"units": units, "long_name": text}
     return result.assign_attrs(dataset.attrs)
+
+
+def _walks(dataset: xr.Dataset) -> xr.DataArray:
+    """Where range walk is simulated, which moves the peak off the beat at the record's start."""
+    attributes = dataset["effects"].attrs
+    masks = dict(zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True))
+    return (dataset["effects"] & int(masks["range_walk"])) > 0
 
 
 def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao.Bounds:
@@ -128,6 +136,9 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Bounds
             sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"],
             radial_velocity=p["radial_velocity"],
         )  # fmt: skip
+        # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
+        walk = sign * chirp_rate * (2 * p["radial_velocity"] / SPEED_OF_LIGHT) * length / rate
+        beat = np.where(p["walks"], beat + walk, beat)
         place = waveform.fold(beat, p["sample_rate"]) / rate * size
         # in bins of fs/L: a padded FFT's bins are finer than the window's
         offset = (place - np.rint(place)) * length / size
