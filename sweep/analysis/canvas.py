@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from matplotlib import rc_context, rcdefaults, rcParams
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Sheet
@@ -19,6 +22,38 @@ LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000
 """Colours that stay apart for the colour-blind (Okabe and Ito 2008), for lines."""
 
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
+
+
+FORMATS = ("png", "pdf", "svg")
+"""What pictures can be written as; text and lines of the last two are no pixels."""
+
+PRINTED_DPI = 300
+"""Of what stays pixels in PDF and SVG: surfaces and clouds of many points."""
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "pdf.fonttype": 42,  # whole outlines, as publishers ask for
+    "svg.fonttype": "path",
+    "svg.hashsalt": "sweep",
+    "path.simplify": True,
+    "path.snap": True,
+}
+
+_NO_TRACES = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Creator": None, "Date": None},
+}
+"""Metadata that would make a file differ from one run, or one machine, to the next."""
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """The one style of all pictures, whatever its user has set."""
+    with rc_context():
+        rcdefaults()
+        rcParams.update(STYLE)
+        yield
 
 
 def sheet(width: float, height: float) -> Sheet:
@@ -59,7 +94,10 @@ def caption(figure: Sheet, text: str) -> None:
 
 
 def save(figure: Sheet, path: Path) -> Path:
-    """The sheet as a PNG file."""
+    """The sheet as a file of the format that its suffix names; the same sheet, the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    kind = path.suffix.removeprefix(".")
+    dpi = DPI if kind == "png" else PRINTED_DPI
+    with style():
+        figure.savefig(path, format=kind, dpi=dpi, metadata=_NO_TRACES[kind])
     return path

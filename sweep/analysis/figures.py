@@ -52,7 +52,9 @@ class Study:
         return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
 
 
-def draw(store_path: str | Location, directory: str | Path | None = None) -> list[Path]:
+def draw(
+    store_path: str | Location, directory: str | Path | None = None, form: str = "png"
+) -> list[Path]:
     """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
 
     Parameters
@@ -62,40 +64,47 @@ def draw(store_path: str | Location, directory: str | Path | None = None) -> lis
     directory
         Where to; by default ``NAME-figures`` for ``NAME.zarr``: beside the store, or in the folder
         that one is in where the store is an object store's.
+    form
+        ``png``, ``pdf`` or ``svg``. The same store gives the same bytes.
 
     Returns
     -------
     list of Path
-        The files written: PNG of figures, TXT and CSV of tables.
+        The files written: pictures of figures, TXT and CSV of tables.
 
     Raises
     ------
     NotAStoreError
         Where there is no store of a grid of points, of a scene or of what accuracy costs.
     """
-    store_path = located(store_path)
+    with canvas.style():
+        return _drawn(located(store_path), directory, form)
+
+
+def _drawn(store_path: Location, directory: str | Path | None, form: str) -> list[Path]:
+    """All of it, whichever kind of store."""
     if kind_of(read_attributes(store_path)) == ACCURACY:
         from sweep.analysis.accuracy import report
 
-        return report.draw(store_path, None if directory is None else Path(directory))
+        return report.draw(store_path, None if directory is None else Path(directory), form)
     stem = store_path.name.removesuffix(".zarr")
     directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
     if kind_of(read_attributes(store_path)) == SCENE:
         from sweep.analysis.scenes import figures as of_scenes
 
-        return of_scenes.draw(store_path, directory)
+        return of_scenes.draw(store_path, directory, form)
     study = Study.of(store_path)
     figures = study.spec.figures or default_figures(study.spec)
     if not figures:
         return mean_table.outputs_page(study.dataset).save(directory, "outputs")
-    return [path for figure in figures for path in _made(study, figure, directory)]
+    return [path for figure in figures for path in _made(study, figure, directory, form)]
 
 
-def _made(study: Study, figure: Figure, directory: Path) -> list[Path]:
+def _made(study: Study, figure: Figure, directory: Path, form: str) -> list[Path]:
     """Files of one figure."""
     if isinstance(figure, Surface | Slices):
         sheet = _sheet(study, figure)
-        return [canvas.save(sheet, directory / f"{figure.stem}.png")]
+        return [canvas.save(sheet, directory / f"{figure.stem}.{form}")]
     return made_page(study, figure).save(directory, figure.stem)
 
 

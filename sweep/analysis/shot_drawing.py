@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Sheet
 from sweep.analysis import canvas, labels
 from sweep.analysis.shot_spectra import Segment, Shot, quantity_at
 
-SPECTRUM, THRESHOLD, NOISE, DETECTION = "#1f4e79", "green", "red", "maroon"
+SPECTRUM, THRESHOLD, NOISE, DETECTION = canvas.LINES[0], canvas.LINES[2], canvas.LINES[1], "black"
 MARGIN_BELOW, MARGIN_ABOVE = 25.0, 12.0
 """Decibels shown below the noise level, and above the strongest bin."""
 
@@ -85,7 +85,7 @@ def _lines(axes: Axes, shot: Shot, segment: Segment, chosen: slice, width: float
         label="threshold",
     )  # fmt: skip
     axes.axhline(
-        float(shot.dbv(shot.noise_level)), color=NOISE, linestyle="--", linewidth=1.2,
+        float(shot.dbv(shot.noise_level)), color=NOISE, linestyle="-.", linewidth=1.2,
         label="noise (rms)",
     )  # fmt: skip
     peaks = np.array([group.peak for group in segment.groups], dtype=int)

@@ -68,7 +68,10 @@ def report(
     ]
     directory, stem = Path(directory), _stem(at)
     remark = f"noise drawn with seed {seed}" if noise else "the signal alone, no noise drawn"
-    sheet = shot_drawing.draw(shots, title=spec.title, note=labels.joined([remark, _held(shots)]))
+    with canvas.style():
+        sheet = shot_drawing.draw(
+            shots, title=spec.title, note=labels.joined([remark, _held(shots)])
+        )
     page = Page(spec.title, _blocks(shots), [f"Spectra: {remark}."], [])
     files = [canvas.save(sheet, directory / f"{stem}.png"), directory / f"{stem}.txt"]
     files[1].write_text(page.text(), encoding="utf-8")

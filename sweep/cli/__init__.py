@@ -1,12 +1,13 @@
 """The `sweep` command."""
 
 from sweep.cli.commands import main
+from sweep.cli.compare import compare
 from sweep.cli.files import certificates, schema
 from sweep.cli.report import report
 from sweep.cli.spectra import spectra
 from sweep.cli.stores import finalize, status, verify
 
-for command in (status, verify, finalize, report, spectra, certificates, schema):
+for command in (status, verify, finalize, report, compare, spectra, certificates, schema):
     main.add_command(command)
 
 __all__ = ["main"]

@@ -94,6 +94,7 @@ def main() -> None:
       sweep verify results/quickstart.zarr        is every byte as it was written?
       sweep figures results/quickstart.zarr       draw it
       sweep report results/quickstart.zarr        one page with all of it, for a browser
+      sweep compare results/a.zarr results/b.zarr what differs between two studies?
       sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
 
     A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
@@ -343,14 +344,21 @@ def accuracy(
     type=click.Path(file_okay=False, path_type=Path),
     help="Directory of the figures [NAME-figures beside NAME.zarr].",
 )
-def figures(store: Location, output: Path | None) -> None:
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["png", "pdf", "svg"]),
+    default="png",
+    help="Format of the pictures [png]; pdf and svg for print.",
+)
+def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
     from sweep.tasks.studies import check
 
     check(store)
     from sweep.analysis.figures import draw
 
-    _list(draw(store, output))
+    _list(draw(store, output, form))
 
 
 @main.command()

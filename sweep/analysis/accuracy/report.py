@@ -27,12 +27,12 @@ def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
     return whole, settings_in(whole)
 
 
-def draw(store: Location, directory: Path | None = None) -> list[Path]:
-    """The figure as NAME.png and the tables as NAME.txt, beside NAME.zarr or in a directory."""
+def draw(store: Location, directory: Path | None = None, form: str = "png") -> list[Path]:
+    """The figure as NAME.png (pdf, svg), the tables as NAME.txt, beside NAME.zarr or elsewhere."""
     dataset, settings = opened(store)
     stem = store.name.removesuffix(".zarr")
     place = beside(store) if directory is None else directory
     file = place / f"{stem}.txt"
-    drawn = canvas.save(figure.draw(dataset, settings), place / f"{stem}.png")
+    drawn = canvas.save(figure.draw(dataset, settings), place / f"{stem}.{form}")
     file.write_text(text.page(dataset, settings).text(), encoding="utf-8")
     return [drawn, file]

@@ -81,7 +81,7 @@ class SceneStudy:
         return "\n".join([self.spec.title, figure.title or otherwise])
 
 
-def draw(store_path: str | Location, directory: Path) -> list[Path]:
+def draw(store_path: str | Location, directory: Path, form: str = "png") -> list[Path]:
     """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
 
     Parameters
@@ -90,11 +90,13 @@ def draw(store_path: str | Location, directory: Path) -> list[Path]:
         The store, complete or not.
     directory
         Where to.
+    form
+        ``png``, ``pdf`` or ``svg``.
 
     Returns
     -------
     list of Path
-        The files written: PNG of figures, TXT and CSV of tables.
+        The files written: pictures of figures, TXT and CSV of tables.
 
     Raises
     ------
@@ -103,10 +105,10 @@ def draw(store_path: str | Location, directory: Path) -> list[Path]:
     """
     study = SceneStudy.of(store_path)
     figures: Sequence[SceneFigure] = study.spec.figures or default_figures(study.tree)
-    return [path for figure in figures for path in _made(study, figure, directory)]
+    return [path for figure in figures for path in _made(study, figure, directory, form)]
 
 
-def _made(study: SceneStudy, figure: SceneFigure, directory: Path) -> list[Path]:
+def _made(study: SceneStudy, figure: SceneFigure, directory: Path, form: str) -> list[Path]:
     """Files of one figure."""
     at = place(study.spec, figure.where)
     if isinstance(figure, NavigationTable):
@@ -123,7 +125,7 @@ def _made(study: SceneStudy, figure: SceneFigure, directory: Path) -> list[Path]
         NavigationFigure: _navigation,
     }
     sheet = makers[type(figure)](study, figure, at)
-    return [canvas.save(sheet, directory / f"{figure.stem}.png")]
+    return [canvas.save(sheet, directory / f"{figure.stem}.{form}")]
 
 
 def _recording(

@@ -1,0 +1,67 @@
+"""`sweep compare`: what differs between two studies, and whether that is more than is known."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from sweep.cli.telling import INCOMPLETE, print_table
+
+DIFFERENT = 4
+
+
+@click.command()
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@click.option(
+    "--figure",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Draw the differences of pd into this file: .png, .pdf or .svg.",
+)
+def compare(a: Path, b: Path, figure: Path | None) -> None:
+    """Say what differs between the studies in two stores A and B, and by how much: B less A.
+
+    Points are matched by the values of their parameters. Probabilities of detection agree at a
+    point where they differ by no more than is known of both: half-widths of what is drawn, and
+    what effects and beamlets that were left out may change.
+
+    Exit codes: 0 they agree wherever both are computed, 2 a mistake in what was asked, 3 nothing
+    to compare is computed yet, 4 they differ.
+
+    \b
+      sweep compare results/range_angle.zarr results/other.zarr
+      sweep compare results/a.zarr results/b.zarr --figure difference.pdf
+    """  # noqa: D301
+    from sweep.analysis.canvas import FORMATS
+
+    if figure is not None and figure.suffix.removeprefix(".") not in FORMATS:
+        raise click.BadParameter(
+            f"{figure} ends in none of {', '.join(FORMATS)}", param_hint="--figure"
+        )
+    from sweep.analysis.answers import comparison_table
+    from sweep.analysis.opening import open as open_store
+    from sweep.spec import difference
+
+    left, right = open_store(a), open_store(b)
+    for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
+        click.echo(line)
+    try:
+        compared = comparison_table.compared(left, right)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    print_table(
+        f"{b.name} less {a.name}",
+        list(comparison_table.COLUMNS),
+        comparison_table.rows(compared),
+        "largest at",
+    )
+    if figure is not None:
+        from sweep.analysis.answers import comparison_figure
+
+        click.echo(comparison_figure.save(compared, figure))
+    verdict, words = comparison_table.verdict(compared)
+    click.echo(words)
+    if code := {"different": DIFFERENT, "nothing": INCOMPLETE}.get(verdict, 0):
+        sys.exit(code)

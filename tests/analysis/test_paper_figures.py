@@ -1,0 +1,58 @@
+"""Figures for print: vector formats, the same bytes every time, whatever the user's own style."""
+
+import matplotlib
+import pytest
+from drawn_studies import SURFACE, stored
+
+from sweep.analysis import canvas
+from sweep.analysis.figures import draw
+
+ASKED = [
+    {"kind": "surface", "name": "surface", "variable": "pd_shot", "x": "range",
+     "y": "grazing_angle"},
+    {"kind": "slices", "name": "slices", "variable": "snr_up", "x": "range", "by": "grazing_angle",
+     "where": {"grazing_angle": ["10 deg", "90 deg"]}},
+]  # fmt: skip
+
+BEGINNINGS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return stored(tmp_path_factory.mktemp("paper"), SURFACE, figures=ASKED)
+
+
+@pytest.mark.parametrize("form", canvas.FORMATS)
+def test_the_same_store_gives_the_same_bytes_whatever_the_day_and_the_style(
+    form, store, tmp_path, monkeypatch
+):
+    first = draw(store, tmp_path / "first", form)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 5, "svg.hashsalt": "other"}):
+        again = draw(store, tmp_path / "again", form)
+    assert [file.name for file in first] == [f"surface.{form}", f"slices.{form}"]
+    for a, b in zip(first, again, strict=True):
+        assert a.read_bytes() == b.read_bytes()
+        assert a.read_bytes().startswith(BEGINNINGS[form])
+
+
+def test_vector_files_hold_no_date_and_no_program(store, tmp_path):
+    pdf = draw(store, tmp_path, "pdf")[1].read_bytes()
+    svg = draw(store, tmp_path, "svg")[1].read_text()
+    assert not any(word in pdf for word in (b"CreationDate", b"Matplotlib", b"Producer"))
+    assert "<dc:date>" not in svg and "Matplotlib v" not in svg
+
+
+def test_lines_stay_lines_and_surfaces_are_one_picture(store, tmp_path):
+    surface, slices = (file.read_text() for file in draw(store, tmp_path, "svg"))
+    assert "<image" not in slices
+    assert 1 <= surface.count("<image") <= 3  # the panel, and the colour bar
+
+
+def test_pdf_holds_whole_fonts(store, tmp_path):
+    assert b"/Type3" not in draw(store, tmp_path, "pdf")[1].read_bytes()
+
+
+def test_another_suffix_is_refused(tmp_path):
+    with pytest.raises(KeyError):
+        canvas.save(canvas.empty("x"), tmp_path / "x.bmp")
