@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -59,6 +59,12 @@ detectors: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py
+
+# docs/validation.md from the stores in results/; those that are missing are computed first.
+validation: $(READY)
+	for name in $$($(BIN)/python benchmarks/validation.py --missing); do \
+	  $(BIN)/sweep run experiments/$$name.yaml || exit 1; done
+	$(BIN)/python benchmarks/validation.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete

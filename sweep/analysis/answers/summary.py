@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dask.array
 import numpy as np
 import xarray as xr
 
@@ -19,15 +20,38 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Every variable of floats over `statistic`, lazy. The store goes through memory piece by
-        piece, once for all variables if they are computed together.
+        Every variable of floats over `statistic`, lazy; nan where no point is finite. The store
+        goes through memory chunk by chunk, each chunk once.
     """
     result = xr.Dataset(coords={"statistic": list(STATISTICS)}, attrs=dataset.attrs)
     for name, array in dataset.data_vars.items():
         if array.dtype.kind == "f":
-            parts = [array.mean(), array.min(), array.max(), np.isfinite(array).sum().astype(float)]
-            joined = xr.concat(
-                [p.drop_vars(list(p.coords)) for p in parts], dim="statistic", coords="minimal"
-            )
-            result[name] = joined.assign_attrs(array.attrs)
+            result[name] = xr.DataArray(_reduced(array), dims=["statistic"], attrs=array.attrs)
     return result
+
+
+def _reduced(array: xr.DataArray) -> dask.array.Array:
+    """The statistics of an array, (4,)."""
+    data = array.chunk().data if array.chunks is None else array.data
+    axis = data.ndim
+    parts = data.map_blocks(
+        _of_block, dtype=float, new_axis=axis, chunks=(*((1,) * n for n in data.numblocks), (4,))
+    )
+    return parts.reshape(-1, 4).rechunk(-1).map_blocks(
+        _of_all, dtype=float, drop_axis=0, chunks=((4,),)
+    )  # fmt: skip
+
+
+def _of_block(block: np.ndarray) -> np.ndarray:
+    """Sum, extremes and number of the finite values of a block, (1, .., 1, 4)."""
+    known = block[np.isfinite(block)]
+    least, largest = (known.min(), known.max()) if known.size else (np.inf, -np.inf)
+    return np.array([known.sum(), least, largest, known.size]).reshape((1,) * block.ndim + (4,))
+
+
+def _of_all(parts: np.ndarray) -> np.ndarray:
+    """The statistics of all blocks together, from (blocks, 4)."""
+    number = parts[:, 3].sum()
+    if not number:
+        return np.array([np.nan, np.nan, np.nan, 0.0])
+    return np.array([parts[:, 0].sum() / number, parts[:, 1].min(), parts[:, 2].max(), number])
