@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation docs fields lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -65,6 +65,14 @@ validation: $(READY)
 	for name in $$($(BIN)/python benchmarks/validation.py --missing); do \
 	  $(BIN)/sweep run experiments/$$name.yaml || exit 1; done
 	$(BIN)/python benchmarks/validation.py
+
+# The site, from the pages in docs/, in build/site; what is amiss in a page is an error.
+docs: $(READY)
+	$(BIN)/pip install --quiet --editable '.[docs]'
+	$(BIN)/sphinx-build -W --keep-going -b html docs build/site
+
+fields: $(READY)
+	$(BIN)/python docs/field_reference.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete
