@@ -101,8 +101,13 @@ def _values_at(study: Study, variable: str, track: Track, places: np.ndarray) ->
     return np.asarray(array.isel({track.side.dim: track.side.positions[places]}).values)
 
 
-def roc(study: Study, found: list[Track], fewer: int) -> Chart:
-    """Probability of detection over that of a false alarm, as the threshold moves."""
+def roc(study: Study, found: list[Track], fewer: int) -> Chart | None:
+    """Probability of detection over that of a false alarm, as the threshold moves.
+
+    None where detectors look at whole spectra, which have no one threshold.
+    """
+    if study.spec.draws.whole_spectra:
+        return None
     traces: list[go.Scatter] = []
     told: list[str] = []
     for track in found:
@@ -283,7 +288,8 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
         return None
     packed = max(t.side.together(STRETCHES) for t in found if t.side)
     kinds = (MEAN, HIGHEST) if packed > 1 else (MEAN,)
-    wanted = [(t, v, k) for t in found for v in ALARMS for k in kinds]
+    known = [variable for variable in ALARMS if variable in study.dataset]
+    wanted = [(t, v, k) for t in found for v in known for k in kinds]
     lazy = [
         reduced(study.dataset[v], [(t.side, STRETCHES)], t.part.at(t.side), k).data
         for t, v, k in wanted
@@ -301,7 +307,7 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
         if t.side is not None
     ]  # fmt: skip
     own = [f"{_short(study, v)}: {wording.spread(y)}" for (_, v, k), y in zip(wanted, values,
-           strict=True) if k == MEAN][: len(ALARMS)]  # fmt: skip
+           strict=True) if k == MEAN][: len(known)]  # fmt: skip
     closed = noise_only.bin_probability(float(study.spec.parameters()[TNR]))
     return Chart(
         heading="False alarms",

@@ -38,8 +38,8 @@ def fits(study: Study, figure: Surface) -> bool:
     return axis_of(study.spec, figure.x) is not axis_of(study.spec, figure.y)
 
 
-def chart(study: Study, figure: Surface, share: float) -> Chart:
-    """A heat map, with cuts through it.
+def chart(study: Study, figure: Surface, share: float) -> Chart | None:
+    """A heat map, with cuts through it; none where no point is within its limits.
 
     Parameters
     ----------
@@ -49,6 +49,8 @@ def chart(study: Study, figure: Surface, share: float) -> Chart:
         Part of the page's cells that it may take.
     """
     found, fewer = parts(study.spec, [figure.x, figure.y], figure.where)
+    if not found:
+        return None
     maps = [_Map(p, p.side(study.spec, figure.x), p.side(study.spec, figure.y)) for p in found]
     worst = surface.worst(figure.variable)
     most = _most(maps, CELLS * share / (len(maps) * (1 + bool(worst))))

@@ -34,8 +34,10 @@ class _Line:
     side: Side
 
 
-def chart(study: Study, figure: Slices) -> Chart:
+def chart(study: Study, figure: Slices) -> Chart | None:
     """Lines along a coordinate; of long ones the mean of stretches, and the band of their points.
+
+    None where no point is within the figure's limits.
 
     Parameters
     ----------
@@ -44,6 +46,8 @@ def chart(study: Study, figure: Slices) -> Chart:
     """
     names = [figure.x, figure.by] if figure.by else [figure.x]
     found, fewer = parts(study.spec, names, figure.where)
+    if not found:
+        return None
     lines: list[_Line] = []
     for part in found:
         own, lacking = part.lines(study.spec, figure.by, slices.MOST_LINES)

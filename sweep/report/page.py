@@ -9,8 +9,6 @@ from typing import Any
 import pandas
 import plotly.graph_objects as go
 
-Tick = Mapping[str, Any]
-
 
 @dataclass(frozen=True)
 class Control:

@@ -111,6 +111,27 @@ def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_pag
     assert grid_page.stat().st_size < 9e6
 
 
+def test_figures_without_points_are_told_and_whole_spectra_have_no_threshold_to_move(tmp_path):
+    figures = [{"kind": "slices", "variable": "pd_shot", "x": "range", "title": "Elsewhere",
+                "where": {"range": "7 km"}}]  # fmt: skip
+    kinds = {"instrument.processing.detector.kind": ["fixed", "ca_cfar"]}
+    spec = Spec.from_mapping(
+        GRID
+        | {
+            "instrument": {"file": GRID["instrument"], "processing": {"fft_size": "2^12"}},
+            "axes": {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["45 deg"]} | kinds,
+            "draws": {"method": "spectra", "number": 3},
+            "figures": figures,
+        },
+        base=EXPERIMENTS,
+    )
+    store = tmp_path / "spectra.zarr"
+    driver.run(spec, store=store, scheduler="none", progress=False)
+    text = write(store, tmp_path / "spectra.html").read_text()
+    assert "No point of the study is within its limits." in text
+    assert "Receiver operating characteristic" not in text and "Noise by source" in text
+
+
 def test_an_incomplete_store_says_so(tmp_path):
     axes = {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["45 deg"]}
     spec = Spec.from_mapping(
