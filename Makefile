@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation docs fields lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -47,6 +47,9 @@ scaling: $(READY)
 
 effects: $(READY)
 	$(BIN)/python benchmarks/effects.py
+
+scale: $(READY)
+	$(BIN)/python benchmarks/scale.py
 
 stopping: $(READY)
 	$(BIN)/python benchmarks/stopping.py

@@ -11,6 +11,7 @@ import click
 
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.assignments import assignments
+from sweep.cli.options import BLOCK_TIMEOUT, DURABLE, PERFORMANCE_REPORT
 from sweep.cli.places import StorePath, shown
 from sweep.cli.spectra import ALLOW_CODE
 from sweep.cli.telling import (
@@ -39,16 +40,6 @@ CLUSTER = click.option(
     "--cluster",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="A file that describes a cluster: deploy/ has one of each kind.",
-)
-
-BLOCK_TIMEOUT = click.option(
-    "--block-timeout",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Give a block up that takes longer, twice [none].",
-)
-DURABLE = click.option(
-    "--durable", is_flag=True, help="Blocks count once they are on the disk: safe from power loss."
 )
 
 
@@ -120,6 +111,7 @@ def main() -> None:
 @ALLOW_CODE
 @BLOCK_TIMEOUT
 @DURABLE
+@PERFORMANCE_REPORT
 def run(
     spec: Path,
     store: Location | None,
@@ -129,6 +121,7 @@ def run(
     overwrite: bool,
     block_timeout: float | None,
     durable: bool,
+    performance_report: Path | None,
 ) -> None:
     """Compute the study SPEC into a Zarr store.
 
@@ -156,6 +149,7 @@ def run(
         overwrite=overwrite,
         block_timeout=block_timeout,
         durable=durable,
+        performance_report=performance_report,
     )
     conclude(outcome, shown(outcome.store))
 
@@ -178,6 +172,7 @@ def _default_store(spec: Path) -> Path:
 @ALLOW_CODE
 @BLOCK_TIMEOUT
 @DURABLE
+@PERFORMANCE_REPORT
 def resume(
     store: Location,
     spec: Path | None,
@@ -187,6 +182,7 @@ def resume(
     cluster: Path | None,
     block_timeout: float | None,
     durable: bool,
+    performance_report: Path | None,
 ) -> None:
     """Compute what STORE lacks: what was interrupted, what was lost.
 
@@ -209,6 +205,7 @@ def resume(
         cluster=cluster,
         block_timeout=block_timeout,
         durable=durable,
+        performance_report=performance_report,
     )
     conclude(outcome, store)
 

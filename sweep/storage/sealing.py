@@ -16,7 +16,11 @@ _END = b'"}\n'
 
 def sealed(record: dict[str, Any]) -> bytes:
     """A record, not empty, as one line of JSON whose last field is a digest of the others."""
-    body = json.dumps(record, separators=(",", ":")).encode()[:-1]
+    return closed(json.dumps(record, separators=(",", ":")).encode()[:-1])
+
+
+def closed(body: bytes) -> bytes:
+    """A line of the fields of a record, written without the last brace."""
     return body + _SUM + _digest(body) + _END
 
 

@@ -50,6 +50,7 @@ def run(
     progress: bool | Progress = True,
     block_timeout: float | None = None,
     durable: bool = False,
+    performance_report: str | Path | None = None,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
     """Compute a study into a new store.
@@ -75,6 +76,8 @@ def run(
     durable
         Whether blocks are on the disk, and not only with the operating system, once committed: a
         power failure then loses none of them.
+    performance_report
+        HTML file to put Dask's own account of the run into.
     evaluate
         What computes a block in place of the model, with the same results; for instrumenting.
 
@@ -95,6 +98,7 @@ def run(
     place = Place(
         client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
         processes=processes, terms=Terms(evaluate, block_timeout, durable),
+        performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec)  # fmt: skip
     _make(path, study, overwrite, told)
     if durable:
@@ -119,6 +123,7 @@ def resume(
     progress: bool | Progress = True,
     block_timeout: float | None = None,
     durable: bool = False,
+    performance_report: str | Path | None = None,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
     """Compute what a store lacks.
@@ -131,7 +136,8 @@ def resume(
         The study that the store is expected to hold; without it, whatever it holds.
     retry_failed
         Whether to try blocks again that were given up, for their errors, in an earlier run.
-    client, workers, scheduler, cluster, processes, progress, block_timeout, durable, evaluate
+    client, workers, scheduler, cluster, processes, progress, block_timeout, durable,
+    performance_report, evaluate
         As in `run`.
 
     Raises
@@ -157,6 +163,7 @@ def resume(
     place = Place(
         client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
         processes=processes, terms=Terms(evaluate, block_timeout, durable),
+        performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec or study.spec)  # fmt: skip
     return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -12,6 +13,7 @@ from sweep.spec.clusters import Address, AnyCluster, Local, LocalWorker
 from sweep.tasks import cluster
 from sweep.tasks.cluster import Reached
 from sweep.tasks.errors import ClusterError
+from sweep.tasks.performance import reported
 from sweep.tasks.todo import Todo
 from sweep.tasks.window import Job, Window, plain
 from sweep.tasks.worker import Answer, Terms
@@ -32,6 +34,7 @@ class Place:
     cluster: AnyCluster | None = None
     processes: bool = True
     terms: Terms = field(default_factory=Terms)
+    performance_report: Path | None = None
 
     def for_spec(self, spec: Spec | SceneSpec) -> Place:
         """The same place, with what it leaves open taken from the spec's `execution`.
@@ -72,7 +75,7 @@ class Pool:
     def __init__(self, place: Place, *, most: int, say: Callable[[str], None]) -> None:
         self._place, self._most, self._say = place, most, say
         self._stack = ExitStack()
-        self._reached = Reached(place.client, 0) if place.client is not None else None
+        self._reached: Reached | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -98,19 +101,26 @@ class Pool:
         ClusterError
             Where there is no scheduler or worker to be had.
         """
-        if self._reached is None and self._place.scheduler == cluster.NONE:
+        if self._place.client is None and self._place.scheduler == cluster.NONE:
+            if self._place.performance_report is not None:
+                self._say("no performance report: a plain loop has no scheduler to tell of it")
             return plain(job, todo, stopping)
         return Window(*self._connected(), job, todo).answers(stopping)
 
     def _connected(self) -> Reached:
         if self._reached is None:
-            assert self._place.cluster is not None  # for_spec saw to it
-            self._reached = self._stack.enter_context(
-                cluster.connected(
-                    self._place.cluster,
-                    most=self._most,
-                    processes=self._place.processes,
-                    say=self._say,
-                )
-            )
+            self._reached = self._reach()
+            if (file := self._place.performance_report) is not None:
+                self._stack.enter_context(reported(self._reached.client, file, self._say))
         return self._reached
+
+    def _reach(self) -> Reached:
+        place = self._place
+        if place.client is not None:
+            return Reached(place.client, 0)
+        assert place.cluster is not None  # for_spec saw to it
+        return self._stack.enter_context(
+            cluster.connected(
+                place.cluster, most=self._most, processes=place.processes, say=self._say
+            )
+        )

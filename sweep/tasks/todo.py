@@ -55,6 +55,11 @@ class Todo:
         """Put blocks back whose answer was lost, by no fault of theirs."""
         self._returned.extend(blocks)
 
+    @property
+    def any_failed(self) -> bool:
+        """Whether any block has failed so far."""
+        return bool(self._failed_once)
+
     def attempt(self, block: int) -> int:
         """How often a block has failed so far."""
         return int(block in self._failed_once)

@@ -159,7 +159,9 @@ class Window:
 
         Tasks on a worker that one of them kills all count as failed; a second failure is final.
         """
-        return any(self._todo.attempt(blocks[0]) for _, blocks in self._flying.values())
+        return self._todo.any_failed and any(
+            self._todo.attempt(blocks[0]) for _, blocks in self._flying.values()
+        )
 
     def _send(self, blocks: list[int]) -> None:
         job = self._job

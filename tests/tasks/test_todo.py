@@ -80,7 +80,7 @@ def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_i
         def result(self, timeout):
             raise RuntimeError("killed")
 
-    window = Window(None, Job("x.zarr", "0", "0"), Todo(np.zeros(8, dtype=bool)))
+    window = Window(None, 0, Job("x.zarr", "0", "0"), Todo(np.zeros(8, dtype=bool)))
     window._flying["lost"] = (Lost(), [3, 4])
     window._arrived.put(Lost())
     answer = window._next()

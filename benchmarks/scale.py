@@ -1,0 +1,247 @@
+"""How far the engine goes: ``make scale`` writes its part of docs/scale.md.
+
+Blocks: what a plan, a log and the folders of up to ten million blocks cost to read, each in a
+process of its own. Workers: the engine's window over the real scheduler with a thousand worker
+slots whose tasks only wait, for tasks of several lengths: where it keeps them busy, and where not.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
+BEGIN, END = "<!-- engine: begin -->", "<!-- engine: end -->"
+
+BLOCKS = (10**4, 10**5, 10**6, 10**7)
+MOST_FILES = 10**6
+LINKS = 30_000
+"""Names of a file that a file system bears."""
+
+SLOTS = 1000
+TASK_SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
+MEASURED = 30.0
+"""Seconds that each length is measured for."""
+
+
+class Line:
+    """A study of many blocks along one axis, of one array."""
+
+    unit, id = "points", "scale"
+
+    def __init__(self, n_blocks):
+        self.n_blocks = n_blocks
+
+    def owners(self):
+        return {"array": np.arange(self.n_blocks)}
+
+
+def receipt(block):
+    """A receipt as workers give it."""
+    from sweep.tasks import versions
+    from sweep.tasks.journal import Receipt
+
+    return Receipt(
+        block=block, points=65_536, digest="0" * 32, seconds=1.234567, write_seconds=0.0123,
+        host="node-0123", pid=12_345, versions=versions.software(),
+    )  # fmt: skip
+
+
+def filled(directory, n_blocks):
+    """A store's log, and its chunks as names of a few files, of so many blocks all done."""
+    from sweep.storage.sealing import closed
+
+    store = Path(directory) / "line.zarr"
+    (store / ".sweep").mkdir(parents=True)
+    record = {**vars(receipt(0)), "time": round(time.time(), 3)}
+    rest = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
+    with open(store / ".sweep" / "receipts.jsonl", "wb") as log:
+        for block in range(n_blocks):
+            log.write(closed(f'{{"block":{block},{rest}'.encode()))
+    chunks = store / "array" / "c"
+    chunks.mkdir(parents=True)
+    for block in range(n_blocks if n_blocks <= MOST_FILES else 0):
+        if block % LINKS == 0:
+            chunk = chunks / str(block)
+            chunk.write_bytes(b"chunk")
+        else:
+            os.link(chunk, chunks / str(block))
+    return store
+
+
+def timed(what):
+    begun, cpu = time.perf_counter(), time.process_time()
+    found = what()
+    return found, time.perf_counter() - begun, time.process_time() - cpu
+
+
+def blocks(n_blocks, store):
+    """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
+    from sweep.spec import load
+    from sweep.storage.receipts import read_receipts
+    from sweep.tasks.grid import Grid
+    from sweep.tasks.listing import listed
+    from sweep.tasks.todo import Todo
+
+    spec = load(Path(__file__).parents[1] / "experiments" / "quickstart.yaml")
+    axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
+            "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip
+    mapping = spec.to_yaml_mapping() | {"axes": axes, "storage": {"block_points": 1}, "figures": []}
+    grid, _, planned = timed(lambda: Grid(type(spec).from_mapping(mapping)))
+    assert grid.n_blocks == n_blocks
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    receipts, _, reading = timed(lambda: read_receipts(store, n_blocks))
+    assert receipts.blocks == n_blocks
+    listing = float("nan")
+    if n_blocks <= MOST_FILES:
+        found, _, listing = timed(lambda: listed(store, Line(n_blocks), receipts.points > 0))
+        assert found.whole.all()
+
+    def hand_out():
+        todo = Todo(np.zeros(n_blocks, bool))
+        while todo.take(1000):
+            pass
+
+    _, _, handing = timed(hand_out)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(json.dumps([planned, reading, listing, handing, (after - before) * 1024 / 1e6]))
+
+
+def block_rows(directory):
+    """Lines of the table of blocks."""
+    yield "| blocks | grid | log of receipts | folders of one array | handing out | memory |"
+    yield "| ---: | ---: | ---: | ---: | ---: | ---: |"
+    for n_blocks in BLOCKS:
+        store = filled(directory, n_blocks)
+        command = [sys.executable, __file__, "--blocks", str(n_blocks), "--store", str(store)]
+        told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        *seconds, memory = json.loads(told.splitlines()[-1])
+        cells = ["-" if s != s else f"{s:.2g} s" for s in seconds]
+        yield f"| {n_blocks:,} | {' | '.join(cells)} | {memory:,.0f} MB |"
+        shutil.rmtree(store)
+
+
+def nap_for(seconds):
+    """What workers do in place of computing: wait, and give a receipt for every block."""
+
+    def nap(path, study_id, blocks, terms):
+        from sweep.tasks.journal import Receipt
+        from sweep.tasks.worker import Answer
+
+        time.sleep(seconds)
+        return Answer(
+            receipts=[
+                Receipt(block=block, points=1, digest="0" * 32, seconds=seconds / len(blocks),
+                        write_seconds=0.0, host="h", pid=1, versions={})
+                for block in blocks
+            ]
+        )  # fmt: skip
+
+    return nap
+
+
+def worker_rows(slots, lengths, measured):
+    """Lines of the table of workers."""
+    from distributed import Client, LocalCluster
+
+    yield "| tasks of | tasks/s | slots busy | scheduler and client, a task |"
+    yield "| ---: | ---: | ---: | ---: |"
+    threads = 50
+    with (
+        LocalCluster(
+            n_workers=slots // threads, threads_per_worker=threads, processes=False,
+            dashboard_address=None, memory_limit=0,
+        ) as cluster,
+        Client(cluster) as client,
+    ):  # fmt: skip
+        client.wait_for_workers(slots // threads)
+        for seconds in lengths:
+            rate, cpu = through(client, seconds, measured)
+            busy = min(1.0, rate * seconds / slots)
+            yield f"| {seconds:g} s | {rate:,.0f} | {100 * busy:.0f} % | {1e3 * cpu:.2g} ms |"
+
+
+def through(client, seconds, measured):
+    """Tasks a second that go through, once all slots have work, and processor time of each."""
+    from sweep.tasks import window
+    from sweep.tasks.todo import Todo
+    from sweep.tasks.window import Job, Window
+
+    window.work = nap_for(seconds)
+    slots = sum(client.nthreads().values())
+    tasks = Window(client, 0, Job("x", f"waiting {seconds}", "0"), Todo(np.zeros(10**7, bool)))
+    arrived, counted, stop = 0, 0, threading.Event()
+    begun = cpu = rate = spent = 0.0
+    for answer in tasks.answers(stop.is_set):
+        arrived += bool(answer.receipts)
+        if not begun and arrived >= slots:
+            begun, cpu, counted = time.perf_counter(), time.process_time(), 0
+        counted += bool(answer.receipts)
+        if begun and not stop.is_set() and time.perf_counter() - begun > max(measured, 2 * seconds):
+            rate = counted / (time.perf_counter() - begun)
+            spent = (time.process_time() - cpu) / counted
+            stop.set()
+    return rate, spent
+
+
+def write(of_blocks, of_workers):
+    """Put the tables into the page, between the marks, and leave the rest of it."""
+    text = f"""{BEGIN}
+## Blocks
+
+{platform.processor() or platform.machine()}, {os.cpu_count()} processors, Python
+{platform.python_version()}. Seconds of processor time of a process of its own; memory beyond what
+its libraries take. The log has a receipt for every block, some 330 bytes each. A folder's look
+takes its time for each array that blocks write (a grid without draws has 27), where the store has
+that many: from 10^9 points on blocks grow, so that a study has some 16,000 of them, half a million
+files, unless it asks for smaller ones.
+
+{chr(10).join(of_blocks)}
+
+## Workers
+
+{SLOTS:,} worker slots in one process, tasks that only wait, sent and taken by the engine's own
+window through the real scheduler. "Slots busy" is what of their time they work; the last column
+is the processor time of scheduler, client and workers together. Where that times the tasks a
+second comes near one, no more go through. The engine's tasks are made to last 2 s.
+
+{chr(10).join(of_workers)}
+{END}"""
+    page = PAGE.read_text() if PAGE.exists() else "# How far it goes\n\n" + BEGIN + END + "\n"
+    if BEGIN not in page:
+        page = f"{page.rstrip()}\n\n{BEGIN}{END}\n"
+    head, _, rest = page.partition(BEGIN)
+    PAGE.write_text(head + text + rest.partition(END)[2])
+
+
+def main():
+    """All of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--blocks", type=int)
+    parser.add_argument("--store", type=Path)
+    parser.add_argument("--slots", type=int, default=SLOTS)
+    parser.add_argument("--seconds", type=float, default=MEASURED)
+    given = parser.parse_args()
+    if given.blocks:
+        blocks(given.blocks, given.store)
+        return
+    with tempfile.TemporaryDirectory() as directory:
+        of_blocks = list(block_rows(directory))
+    print("\n".join(of_blocks))
+    of_workers = list(worker_rows(given.slots, TASK_SECONDS, given.seconds))
+    print("\n".join(of_workers))
+    write(of_blocks, of_workers)
+
+
+if __name__ == "__main__":
+    main()
