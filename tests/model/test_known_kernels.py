@@ -51,7 +51,8 @@ def test_bins_are_those_of_the_lines_one_by_one(phases, place, table_4_1):
                 allowed = tolerance * exact.bin_deviation[0] + ROUNDING * peak
                 assert (missed <= allowed).all()
                 levels.add(level)
-    assert max(levels) >= 0
+    # at DC all lines lie so close together that few of them do
+    assert (max(levels) >= 0) == (phases == "incoherent" or place != "at DC")
 
 
 def test_what_is_known_already_changes_no_bit(table_4_1):
