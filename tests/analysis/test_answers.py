@@ -241,16 +241,16 @@ def lone_tone_bound(distance, noise_variance):
     echo = np.pi * (25e-3 / 2) ** 2 * 0.1 / (2 * np.pi * distance**2)
     size, rate, slope, speed = 2**17, 600e6, 1e9 / 500e-6, 299_792_458.0
     carrier = speed / 1550e-9
-    variances = []
+    beats = []
     for sign, start in ((1, carrier), (0, carrier), (-1, carrier + 1e9)):
         beat = 2 * 150 / speed * start - sign * slope * 2 * distance / speed
         gain = 7e3 / (1 + (beat / 400e6) ** 2)  # two poles, detector's and amplifier's
         amplitude = 2 * 1.1 * np.sqrt(1e-3 * echo) * gain
-        snr = size * amplitude**2 / (4 * noise_variance)
-        variances.append(cramer_rao.frequency_variance(snr=snr, samples=size, sample_rate=rate))
-    return cramer_rao.bounds(
-        variances, carriers=(carrier, carrier, carrier + 1e9), chirp_rate=slope, range=distance,
-        radial_velocity=150.0,
+        cnr = amplitude**2 / (2 * noise_variance)
+        beats.append(cramer_rao.beat_deviation(cnr=cnr, samples=size, sample_rate=rate))
+    return cramer_rao.resolved_deviation(
+        up=beats[0], doppler=beats[1], down=beats[2], carriers=(carrier, carrier, carrier + 1e9),
+        chirp_rate=slope, range=distance, radial_velocity=150.0,
     )  # fmt: skip
 
 
@@ -271,3 +271,22 @@ def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
     assert place.resolution.values == pytest.approx(width / np.sqrt(24), rel=1e-9)
     assert (abs(place.reported) <= width).all() and place.bound.attrs["units"] == "m"
     assert speed.bound.attrs["units"] == "m s-1"
+
+
+def test_a_study_of_whole_spectra_answers_with_what_it_counted(tmp_path):
+    from drawn_studies import INSTRUMENT
+
+    small = INSTRUMENT | {"processing": INSTRUMENT["processing"] | {"fft_size": 2048}}
+    axes = {"target.range": ["20 m", "60 m"]}
+    dataset = sweep.open(
+        stored(tmp_path, axes, instrument=small, draws={"method": "spectra", "number": 40})
+    ).compute()
+    found = dataset.sweep.range_error()
+    assert set(found.data_vars) == {"bias", "rmse", "bound"}
+    assert found.bound.identical(dataset.range_bound)
+    rate = dataset.sweep.false_alarms_per_second("20 Hz").values
+    assert rate == pytest.approx(20 * dataset.false_alarms.values)
+    assert dataset.sweep.compare(dataset).pd_shot_agrees.all()
+    assert "range_rmse" in dataset.sweep.compare(dataset)
+    with pytest.raises(ValueError, match="has no closed form"):
+        dataset.sweep.roc()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
 from sweep.analysis.answers.physical import parameter, spec_of
 from sweep.model import cramer_rao, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.window import window
+from sweep.model.window import transform, window
 
 _NAMES = ("up", "doppler", "down")
 _INSTRUMENT = "instrument."
@@ -57,7 +59,7 @@ def _errors(
     dataset: xr.Dataset,
     words: str,
     stored: str,
-    which: Callable[[cramer_rao.Bounds], np.ndarray],
+    which: Callable[[cramer_rao.Deviation], np.ndarray],
 ) -> xr.Dataset:
     spec = spec_of(dataset)
     values = {n: parameter(dataset, _INSTRUMENT + p, spec) for n, p in _PARAMETERS.items()}
@@ -102,7 +104,7 @@ def _walks(dataset: xr.Dataset) -> xr.DataArray:
     return (dataset["effects"] & int(masks["range_walk"])) > 0
 
 
-def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao.Bounds:
+def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao.Deviation:
     """Bounds of points that share no more than their order; words and sizes one by one."""
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
     flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
@@ -114,10 +116,10 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao
         mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
         part = {name: a[mask] for name, a in flat.items()}
         spread[:, mask] = _alike([s[mask] for s in seen], part)
-    return cramer_rao.Bounds(*spread.reshape(2, *shape))
+    return cramer_rao.Deviation(*spread.reshape(2, *shape))
 
 
-def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Bounds:
+def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Deviation:
     """Bounds of points of one architecture, window and record."""
     size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
     length = int(waveform.record_length(
@@ -130,7 +132,7 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Bounds
         start_frequency=p["start_frequency"], bandwidth=p["bandwidth"],
     )  # fmt: skip
     chirp_rate = p["bandwidth"] / p["duration"]
-    variances = []
+    deviations = []
     for sign, carrier, seen in zip(waveform.SIGNS, carriers, snr, strict=True):
         beat = waveform.beat_frequency(
             sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"],
@@ -142,13 +144,22 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Bounds
         place = waveform.fold(beat, p["sample_rate"]) / rate * size
         # in bins of fs/L: a padded FFT's bins are finer than the window's
         offset = (place - np.rint(place)) * length / size
-        matched = cramer_rao.matched_snr(snr=seen, window=shape, offset=offset)
-        variances.append(
-            cramer_rao.frequency_variance(snr=matched, samples=length, sample_rate=rate)
+        cnr = cramer_rao.carrier_to_noise_ratio(
+            snr=seen / main_lobe(shape.name, length)(np.abs(offset)) ** 2, window=shape
         )
-    found = cramer_rao.bounds(
-        variances, carriers=carriers, chirp_rate=chirp_rate, range=p["range"],
-        radial_velocity=p["radial_velocity"],
+        deviation = cramer_rao.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
+        deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
+    up, doppler, down = deviations
+    found = cramer_rao.resolved_deviation(
+        up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
+        range=p["range"], radial_velocity=p["radial_velocity"],
     )  # fmt: skip
     dark = np.isnan(snr[0]) | np.isnan(snr[2])
-    return cramer_rao.Bounds(*(np.where(dark, np.nan, b) for b in found))
+    return cramer_rao.Deviation(*(np.where(dark, np.nan, b) for b in found))
+
+
+@lru_cache(maxsize=32)
+def main_lobe(name: str, length: int) -> CubicSpline:
+    """|W(delta)| / W(0) over delta from 0 to half a bin of fs/L, to 1e-8."""
+    shape, places = window(name, length), np.linspace(0.0, 0.5, 33)
+    return CubicSpline(places, np.abs(transform(shape, places)) / shape.sum)
