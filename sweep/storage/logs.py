@@ -19,6 +19,10 @@ from sweep.storage.objects import ObjectPath
 #: Seconds for which lines are gathered before they are put as one object.
 WAVE = 1.0
 
+#: Objects of a log beyond which they are put into few, and bytes of one of those.
+MOST_SEGMENTS = 64
+SEGMENT_BYTES = 16 << 20
+
 
 class FileLog:
     """A file that is appended to, and not kept open: one whose directory went away takes no more.
@@ -95,8 +99,7 @@ class ObjectLog:
             return True
         if time.monotonic() - self._put < WAVE and not now:
             return False
-        # the name is nobody else's, should there be two writers against all precautions
-        segment = self._path / f"{self._number + 1:08d}-{uuid.uuid4().hex[:8]}"
+        segment = self._path / _segment(self._number + 1)
         segment.write_bytes(b"".join(self._lines))
         self._number += 1
         self._lines.clear()
@@ -104,12 +107,32 @@ class ObjectLog:
         return True
 
     def keep(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Drop the lines that are not sound."""
-        for name in segments(self._path):
-            lines = (self._path / name).read_bytes().splitlines(keepends=True)
-            if not all(map(is_sound, lines)):
-                sound = b"".join(line for line in lines if is_sound(line))
-                (self._path / name).write_bytes(sound)
+        """Drop the lines that are not sound; where objects are many, put their lines in few."""
+        names = segments(self._path)
+        merging = len(names) > MOST_SEGMENTS
+        group: list[str] = []
+        lines: list[bytes] = []
+        size = 0
+        for name, content in _contents(self._path, names):
+            group.append(name)
+            lines += content.splitlines(keepends=True)
+            size += len(content)
+            if not merging or size > SEGMENT_BYTES or name == names[-1]:
+                self._rewrite(group, lines, is_sound)
+                group, lines, size = [], [], 0
+
+    def _rewrite(
+        self, names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
+    ) -> None:
+        """Put the sound lines of some objects in the place of the last one, then remove these.
+
+        Cut short, it leaves lines twice: in their order they say the same as once.
+        """
+        sound = [line for line in lines if is_sound(line)]
+        if len(names) == 1 and len(sound) == len(lines):
+            return
+        (self._path / _segment(_number(names[-1]))).write_bytes(b"".join(sound))
+        each(self._path, lambda name: (self._path / name).unlink(), names)
 
 
 Log = FileLog | ObjectLog
@@ -128,9 +151,21 @@ def segments(path: ObjectPath) -> list[str]:
     return sorted(name for name, _ in path.below() if _number(name) > 0)
 
 
+def _segment(number: int) -> str:
+    """Name of an object; nobody else's, should two write against all precautions."""
+    return f"{number:08d}-{uuid.uuid4().hex[:8]}"
+
+
 def _number(segment: str) -> int:
     number = segment.partition("-")[0]
     return int(number) if number.isdigit() else 0
+
+
+def _contents(path: ObjectPath, names: list[str]) -> Iterator[tuple[str, bytes]]:
+    """Objects of a log with their names, some of them in memory at a time."""
+    for start in range(0, len(names), REQUESTS):
+        some = names[start : start + REQUESTS]
+        yield from zip(some, each(path, lambda name: (path / name).read_bytes(), some), strict=True)
 
 
 def raw_lines(path: Location) -> Iterator[bytes]:
@@ -139,10 +174,8 @@ def raw_lines(path: Location) -> Iterator[bytes]:
         names = segments(path)
         if not names and path.size() > 0:
             yield from path.read_bytes().splitlines(keepends=True)
-        for start in range(0, len(names), REQUESTS):
-            some = [path / name for name in names[start : start + REQUESTS]]
-            for content in each(path, ObjectPath.read_bytes, some):
-                yield from content.splitlines(keepends=True)
+        for _, content in _contents(path, names):
+            yield from content.splitlines(keepends=True)
     elif path.exists():
         with open(path, "rb") as log:
             yield from log

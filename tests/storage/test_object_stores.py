@@ -24,7 +24,7 @@ import sweep
 from sweep.cli import main
 from sweep.storage import logs, objects
 from sweep.storage.locations import JOURNAL, located
-from sweep.storage.sealing import read_lines
+from sweep.storage.sealing import read_lines, sealed, unsealed
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import LOCK, Holder, Lock, holder
@@ -250,6 +250,26 @@ def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
     log = located(memory) / JOURNAL / "receipts.jsonl"
     assert len(logs.segments(log)) <= 2  # the first at once, the others at the end
     assert sorted(receipts(memory)) == list(range(BLOCKS))
+
+
+@pytest.mark.parametrize("most", [1, 2, 100])
+def test_many_objects_of_a_log_become_few_and_say_the_same(memory, monkeypatch, most):
+    monkeypatch.setattr(logs, "MOST_SEGMENTS", most)
+    monkeypatch.setattr(logs, "SEGMENT_BYTES", 200)
+    path = located(memory) / "log"
+    log = logs.ObjectLog(path)
+    lines = [sealed({"block": block, "text": "x" * 50}) for block in range(9)]
+    for line in lines:
+        log.append(line)
+        log.flush(now=True)
+    (path / logs.segments(path)[4]).write_bytes(lines[4][:-9] + b"\n")
+    log.keep(lambda line: unsealed(line) is not None)
+    assert list(logs.raw_lines(path)) == lines[:4] + lines[5:]
+    assert len(logs.segments(path)) == (9 if most == 100 else 3)
+    again = logs.ObjectLog(path)
+    again.append(lines[4])
+    again.flush(now=True)
+    assert list(logs.raw_lines(path)) == [*lines[:4], *lines[5:], lines[4]]
 
 
 def test_plain_zarr_libraries_read_it(faults, place, undisturbed):
