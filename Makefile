@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
+.PHONY: demo test test-all stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -33,6 +33,11 @@ stability: $(READY)
 # 10,000 random specs and 10,000 spoilt ones, some 40 minutes; failures are saved in results/fuzz.
 fuzz: $(READY)
 	$(BIN)/python tests/fuzz/campaign.py --seed $(SEED)
+
+# Some 200 kills of clients, workers, nannies and schedulers, ten minutes: docs/reliability.md.
+KILLS ?= 210
+chaos: $(READY)
+	$(BIN)/python tests/faults/chaos.py --kills $(KILLS) --seed $(SEED)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py
