@@ -264,8 +264,8 @@ def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
     for i, distance in enumerate((1003.0, 4001.0)):
         bound = lone_tone_bound(distance, float(dataset.noise_variance[i, 0]))
         # whatever the window, and wherever in its bin the beat falls
-        assert place.bound[i].values == pytest.approx(bound.range, rel=1e-3)
-        assert speed.bound[i].values == pytest.approx(bound.radial_velocity, rel=1e-3)
+        assert place.bound[i].values == pytest.approx(float(bound.range), rel=1e-3)
+        assert speed.bound[i].values == pytest.approx(float(bound.radial_velocity), rel=1e-3)
     # half a sum of two whole bins of 4577.6 Hz, each off by that over the root of 12
     width = 299_792_458 / 2 * 500e-6 / 1e9 * 600e6 / 2**17
     assert place.resolution.values == pytest.approx(width / np.sqrt(24), rel=1e-9)
@@ -283,7 +283,7 @@ def test_a_study_of_whole_spectra_answers_with_what_it_counted(tmp_path):
     ).compute()
     found = dataset.sweep.range_error()
     assert set(found.data_vars) == {"bias", "rmse", "bound"}
-    assert found.bound.identical(dataset.range_bound)
+    assert found.bound.equals(dataset.range_bound)
     rate = dataset.sweep.false_alarms_per_second("20 Hz").values
     assert rate == pytest.approx(20 * dataset.false_alarms.values)
     assert dataset.sweep.compare(dataset).pd_shot_agrees.all()

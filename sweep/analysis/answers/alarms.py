@@ -23,7 +23,8 @@ def false_alarms_per_second(
         Shots a second, ``"20 Hz"`` or a number; by default as many as chirps leave time for,
         1 / (3 T), 3 being the segments.
     leakage
-        Whether extra groups that leaked signal raises count as well as noise.
+        Whether extra groups that leaked signal raises count as well as noise. A study that draws
+        whole spectra counts every false alarm of a shot, of either cause, whatever is asked.
 
     Returns
     -------
@@ -87,7 +88,10 @@ def false_alarms_per_kilometre(
 
 
 def _of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Probability of a false alarm in both chirp segments."""
+    """Probability of a false alarm in both chirp segments, or mean number of false alarms."""
+    if "pfa_shot" not in dataset:
+        # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
+        return dataset["false_alarms"]
     noise = dataset["pfa_shot"]
     if not leakage:
         return noise

@@ -8,6 +8,7 @@ import xarray as xr
 
 from sweep.analysis.answers.physical import parameter, si, spec_of
 from sweep.model.outputs import OUTPUTS, PROMISED
+from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
 
 ROUNDING = 1e-12
 """What another processor's last digits may change of a probability."""
@@ -41,7 +42,7 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     """
     left, right = _matched(ours, other)
     result = xr.Dataset(attrs={"ours": _titled(ours), "other": _titled(other)})
-    names = [n for n in OUTPUTS if n in left and n in right]
+    names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in left and n in right]
     for name in names:
         result[name] = (right[name] - left[name]).assign_attrs(
             left[name].attrs, long_name=f"difference of {left[name].attrs.get('long_name', name)}"

@@ -14,7 +14,7 @@ COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
 SHOWN = (
     *PROMISED, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_shot", "p_leakage_up",
     "p_leakage_down", "snr_up", "snr_doppler", "snr_down", "noise_variance", "range_error",
-    "radial_velocity_error",
+    "radial_velocity_error", "false_alarms", "range_rmse", "radial_velocity_rmse",
 )  # fmt: skip
 
 

@@ -41,6 +41,7 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
         SNR in the three segments together (:mod:`sweep.model.cramer_rao`). Where noise is
         taken for signal, below the threshold, no estimate comes near it.
+        Of a study that draws whole spectra instead what it stores: `bias`, `rmse` and `bound`.
     """
     return _errors(dataset, "range", "range_error", lambda found: found.range)
 
@@ -61,6 +62,10 @@ def _errors(
     stored: str,
     which: Callable[[cramer_rao.Deviation], np.ndarray],
 ) -> xr.Dataset:
+    quantity = stored.removesuffix("_error")
+    if f"{quantity}_rmse" in dataset:
+        kinds = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
+        return xr.Dataset(kinds).assign_attrs(dataset.attrs)
     spec = spec_of(dataset)
     values = {n: parameter(dataset, _INSTRUMENT + p, spec) for n, p in _PARAMETERS.items()}
     values |= {

@@ -73,8 +73,13 @@ def roc(
     Raises
     ------
     ValueError
-        Too many points, or a probability that is none.
+        Too many points, a probability that is none, or a study of whole spectra.
     """
+    if "log10_pfa_bin" not in dataset:
+        raise ValueError(
+            "a study that draws whole spectra has no closed form: put the detector's threshold or "
+            "design pfa on an axis, and read pd over pfa_bin"
+        )
     chances = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
     if not ((chances > 0) & (chances < 1)).all():
         raise ValueError("probabilities of a false alarm lie between 0 and 1")
