@@ -19,16 +19,18 @@ def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
         import os
         import time
 
-        time.sleep(1.0)
         with open(log, "a") as lines:
             lines.write(f"{os.getpid()}\n")
+        deadline = time.monotonic() + 60  # the first waits for the second to come
+        while len(set(log.read_text().split())) < 2 and time.monotonic() < deadline:
+            time.sleep(0.1)
         return study.evaluate(block)
 
     described = {**LOCAL, "workers": {"least": 1, "most": 2}}
     outcome = quiet(small(), tmp_path / "grown.zarr", cluster=described, evaluate=evaluate)
     assert outcome.complete
     assert tree(outcome.store) == tree(undisturbed)
-    assert len(set(log.read_text().split())) == 2
+    assert len(set(log.read_text().split())) >= 2
 
 
 def test_no_more_workers_are_started_than_there_are_blocks():
