@@ -18,6 +18,9 @@ from sweep.units import QuantityError
 
 CHEAP: dict[str, Any] = {
     "Processing.fft_size": {"at_most": "2^12", "example": "2^10"},
+    "Detector.training": {"at_most": "40", "example": "16"},
+    "Detector.guard": {"at_most": "8", "example": "2"},
+    "Detector.rank": {"at_most": "8", "example": "6"},
     "Footprint.beamlets": {"at_most": "12", "example": "7"},
     "Draws.number": {"at_most": "9", "example": "5"},
     "Draws.batch": {"at_most": "9", "example": "4"},
@@ -67,6 +70,9 @@ def studies(draw: st.DrawFn) -> dict[str, Any]:
 QUANTA = ("instrument.receiver.responsivity", "instrument.laser.wavelength")
 """What electrons a photon follow from."""
 
+FFT_SIZE = "instrument.processing.fft_size"
+"""Too small for whole spectra only, which then are not drawn: the usual size would cost much."""
+
 TIMING = (DURATION, DELAY, RANGE, SAMPLE_RATE)
 """Parameters that a record's length follows from."""
 
@@ -87,7 +93,7 @@ def mended(written: dict[str, Any]) -> dict[str, Any]:
 def _mend(written: dict[str, Any], path: str) -> None:
     """Take out a field or an axis that is to blame; of a record's length, all that counts."""
     axes = written.get("axes", {})
-    blamed = {DURATION: TIMING, QUANTA[0]: QUANTA}.get(path, (path,))
+    blamed = {DURATION: TIMING, QUANTA[0]: QUANTA, FFT_SIZE: ("draws",)}.get(path, (path,))
     if path.startswith("axes."):
         axis = path.removeprefix("axes.").split(".zip")[0]
         axes.pop(axis, None)

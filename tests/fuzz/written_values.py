@@ -17,6 +17,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from sweep.spec import list_rules, window_rule
+from sweep.spec.method_rule import Method
 from sweep.spec.rules import Choice, Numeric, Rule, Text
 from sweep.units import _PREFIXED, QuantityError, Unit
 
@@ -266,6 +267,8 @@ def values(rule: Rule, decades: float) -> st.SearchStrategy[Any]:
     if isinstance(rule, Choice):
         words = rule.schema()["enum"]
         return st.sampled_from(words)
+    if isinstance(rule, Method):  # a function of the user's would have to be there
+        return st.sampled_from(rule.options)
     if isinstance(rule, Text):
         return texts(rule)
     if isinstance(rule, list_rules.Flag):
