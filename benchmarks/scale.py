@@ -201,8 +201,9 @@ def write(of_blocks, of_workers):
     text = f"""{BEGIN}
 ## Blocks
 
-{platform.processor() or platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}. Seconds of processor time of a process of its
-own; memory beyond what its libraries take. The log has a receipt for every block, some 330 bytes each. A folder's look
+{platform.processor() or platform.machine()}, {os.cpu_count()} processors,
+Python {platform.python_version()}. Seconds of processor time of a process of its own; memory beyond
+what its libraries take. The log has a receipt for every block, some 330 bytes each. A folder's look
 takes its time for each array that blocks write (a grid without draws has 27), where the store has
 that many: from 10^9 points on blocks grow, so that a study has some 16,000 of them, half a million
 files, unless it asks for smaller ones.
