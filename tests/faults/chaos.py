@@ -33,8 +33,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from small import receipts, small, tree
-from zarr.storage import _local
 
+from sweep.storage import chunks
 from sweep.tasks import journal, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
@@ -146,7 +146,7 @@ def set_traps(arena: Arena) -> None:
     """Have all that is written and committed from here on pass by the arena, here and in forks."""
     ARENA[:] = [arena]
     write, commit, put, append = (
-        store.Arrays.write, journal.Journal.commit, _local._put, os.write,
+        store.Arrays.write, journal.Journal.commit, chunks.put, os.write,
     )  # fmt: skip
     writing: list[int] = []  # the block, and how many of its files are written
 
@@ -157,7 +157,7 @@ def set_traps(arena: Arena) -> None:
         arena.reached(AFTER_WRITE, block)
         return digest
 
-    def trapped_put(path, value, exclusive=False):
+    def trapped_put(path, content):
         if writing and "c" in path.parts:
             writing[1] += 1
             if writing[1] == 5:
@@ -165,10 +165,10 @@ def set_traps(arena: Arena) -> None:
             if writing[1] == 9 and any(k.moment == IN_A_FILE for k in arena.kills):
                 half = path.with_suffix(f".{os.getpid()}.partial")
                 half.parent.mkdir(parents=True, exist_ok=True)
-                half.write_bytes(bytes(value.as_buffer_like())[: len(value) // 2])
+                half.write_bytes(content[: len(content) // 2])
                 arena.reached(IN_A_FILE, writing[0])
                 half.unlink()
-        return put(path, value, exclusive)
+        return put(path, content)
 
     def trapped_commit(self, *committed):
         blocks = [receipt.block for receipt in committed]
@@ -192,7 +192,7 @@ def set_traps(arena: Arena) -> None:
             arena.reached(moment, block)
 
     store.Arrays.write, journal.Journal.commit = trapped_write, trapped_commit
-    _local._put = trapped_put
+    chunks.put = trapped_put
 
 
 def forked(work: Callable[[], object]) -> int:
