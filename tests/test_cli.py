@@ -153,7 +153,9 @@ def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch
     shown = sweep("status", "results/small.zarr").stdout
     assert "72 of 80 points, 9 of 10 blocks" in shown
     assert "block 4 failed on" in shown and "sweep resume" in shown
-    assert sweep("resume", "results/small.zarr", "--scheduler", "none").exit_code == 0
+    again = "resume", "results/small.zarr", "--scheduler", "none"
+    assert sweep(*again).exit_code == 3  # what failed is left out until it is asked for
+    assert sweep(*again, "--retry-failed").exit_code == 0
     assert "complete" in sweep("status", "results/small.zarr").stdout
 
 

@@ -110,7 +110,10 @@ def connected(
             say(f"{_described(cluster, bounds)}: scheduler {address}")
             yield Reached(client, bounds.most * cluster.worker.threads)
         return
-    with _started(cluster, bounds, processes) as started, Client(started) as client:
+    with (
+        _started(cluster, bounds, processes) as started,
+        Client(started, set_as_default=False) as client,
+    ):
         _keep(started, cluster, bounds)
         say(f"{_described(cluster, bounds)}: dashboard {started.dashboard_link}")
         yield Reached(client, bounds.most * cluster.worker.threads)
@@ -123,10 +126,16 @@ def _bounds(cluster: Any, most: int) -> Bounds:
 
 
 def _reached(address: str, cluster: AnyCluster) -> Client:
+    """A client that is nobody's default: one that fails to connect would stay it."""
     from distributed import Client
 
     try:
-        return Client(address, timeout=CONNECT_TIMEOUT, security=common.security_of(cluster))
+        return Client(
+            address,
+            timeout=CONNECT_TIMEOUT,
+            security=common.security_of(cluster),
+            set_as_default=False,
+        )
     except (OSError, ValueError) as error:
         raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
 

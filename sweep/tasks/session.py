@@ -223,7 +223,7 @@ class Session:
         """Wait for the kernels, and say so where that is not a matter of reading them from disk."""
         compiling.join(COMPILING)
         if compiling.is_alive():
-            self._progress.say("compiling the model's kernels, once: some 20 s")
+            self._progress.say("compiling the model's kernels, once: about a minute")
             compiling.join()
 
     def _take(self, answers: Iterator[Answer], todo: Todo) -> str:

@@ -100,7 +100,9 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
             quiet(small(), tmp_path / "stranger.zarr", cluster=stranger)
         with pytest.raises((OSError, TypeError)):
-            Client(address, timeout=2, security=Security(require_encryption=True))
+            Client(
+                address, timeout=2, security=Security(require_encryption=True), set_as_default=False
+            )
     assert not (tmp_path / "plain.zarr").exists()
 
 

@@ -98,6 +98,8 @@ def _mend(written: dict[str, Any], path: str) -> None:
         axis = path.removeprefix("axes.").split(".zip")[0]
         axes.pop(axis, None)
         blamed = (axis,) if axis in parameter_rules() else TIMING
+    for name in [name for name in axes if set(plain_paths({name: axes[name]})) & set(blamed)]:
+        axes.pop(name)
     for each in blamed:
         drop(written, each)
         rule = parameter_rules().get(each)

@@ -5,6 +5,8 @@ from itertools import pairwise
 
 import pytest
 
+playwright = pytest.importorskip("playwright.sync_api")
+
 SHOWN = """(chart) => document.querySelector(chart + " .plot").data
     .filter((trace) => trace.visible === true).map((trace) => trace.name ?? "")"""
 
@@ -77,7 +79,7 @@ def test_tables_sort_search_and_download(grid, tmp_path):
     heading = points.get_by_role("columnheader", name="range [m]")
     for wanted in ("ascending", "descending"):
         heading.get_by_role("button").press("Enter")
-        assert heading.get_attribute("aria-sort") == wanted
+        playwright.expect(heading).to_have_attribute("aria-sort", wanted)
     assert float(points.locator("tbody tr").first.locator("td").nth(1).inner_text()) == 12000
     with grid.expect_download() as download:
         points.get_by_role("button", name="Download CSV").click()

@@ -7,14 +7,14 @@ import pytest
 import zarr
 
 from sweep.storage import chunks
-from sweep.tasks.store import WRITTEN_WHOLE, _codecs
+from sweep.tasks.store import WRITTEN_WHOLE, codecs
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
 
 def array_at(path, shape, chunk, dtype, fill):
     made = zarr.create_array(
-        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, **_codecs()
+        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, **codecs()
     )
     return made.with_config(WRITTEN_WHOLE)
 

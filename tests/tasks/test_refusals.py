@@ -1,5 +1,6 @@
 import json
 
+import dask
 import pytest
 import xarray as xr
 from small import STUDY, copied, everything, quiet, small, tree
@@ -131,3 +132,4 @@ def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monke
             progress=False,
         )
     assert list(tmp_path.iterdir()) == []
+    assert dask.config.get("scheduler", None) is None  # what is read later is read without it
