@@ -135,8 +135,8 @@ def main() -> None:
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     with Progress() as told:
         for path in paths:
-            if missing := lacking(path):
-                print(f"{path.stem}: needs {missing}", file=sys.stderr)
+            if why := left_out(path):
+                print(f"{path.stem}: {why}", file=sys.stderr)
                 continue
             lines.append(row(path, told))
             print(lines[-1], flush=True)
@@ -144,15 +144,16 @@ def main() -> None:
         TABLE.write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")
 
 
-def lacking(path: Path) -> str:
-    """A file that an experiment needs and that is not here."""
+def left_out(path: Path) -> str:
+    """Why an experiment is not looked at: a file is not here, or it has no probabilities."""
     from sweep.spec import SpecError, load
 
     try:
-        load(path)
+        spec = load(path)
     except SpecError as error:
-        return str(error).splitlines()[0]
-    return ""
+        return f"needs {str(error).splitlines()[0]}"
+    counts = isinstance(spec, Spec) and spec.draws.method == "spectra"
+    return "counts detections in whole spectra" if counts else ""
 
 
 if __name__ == "__main__":
