@@ -185,7 +185,7 @@ def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
 
 def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:
     if path.exists() and overwrite:
-        identity.read_attributes(path)  # what is not a store of ours is not ours to remove
+        identity.refuse_foreign(path)  # what is not a store of ours is not ours to remove
         lock = Lock(path)  # refuses where someone writes to it
         remove(path)
         lock.release()

@@ -42,11 +42,43 @@ def read_attributes(path: Location) -> dict[str, Any]:
     Raises
     ------
     StoreError
-        Where there is no store, or not one of this program's.
+        Where there is no store, or not one that this version of the program can read.
     """
+    return recognised(path, _written(path))
+
+
+def recognised(path: Location, attributes: Any) -> dict[str, Any]:
+    """Attributes of a store, where this version of the program can read it.
+
+    Raises
+    ------
+    StoreError
+        Where it can't.
+    """
+    ours = _ours(path, attributes)
+    if ours.get("layout") != LAYOUT:
+        raise StoreError(
+            f"{path} is laid out as version {ours.get('layout')}; this sweep writes {LAYOUT}"
+        )
+    if any(key not in ours for key in REQUIRED):
+        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
+    return ours
+
+
+def refuse_foreign(path: Location) -> None:
+    """Refuse what no version of this program has made.
+
+    Raises
+    ------
+    StoreError
+        Where that is so.
+    """
+    _ours(path, _written(path))
+
+
+def _written(path: Location) -> Any:
     try:
-        document = json.loads((path / "zarr.json").read_text())
-        attributes = document["attributes"]
+        return json.loads((path / "zarr.json").read_text())["attributes"]
     except ObjectStoreError:
         raise
     except (OSError, ValueError, KeyError, TypeError):
@@ -57,24 +89,10 @@ def read_attributes(path: Location) -> dict[str, Any]:
                 f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair` puts it back"
             ) from None
         raise StoreError(f"{path} is not a Zarr store of sweep's") from None
-    return recognised(path, attributes)
 
 
-def recognised(path: Location, attributes: Any) -> dict[str, Any]:
-    """Attributes of a store, where they are those of one of this program's.
-
-    Raises
-    ------
-    StoreError
-        Where they are not.
-    """
+def _ours(path: Location, attributes: Any) -> dict[str, Any]:
     if not isinstance(attributes, dict) or "study_id" not in attributes:
-        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
-    if attributes.get("layout") != LAYOUT:
-        raise StoreError(
-            f"{path} is laid out as version {attributes.get('layout')}; this sweep writes {LAYOUT}"
-        )
-    if any(key not in attributes for key in REQUIRED):
         raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
     return attributes
 
