@@ -34,6 +34,9 @@ class Change(NamedTuple):
     cancel: a share of what they leave cannot be told."""
     shift: ArrayLike = 0.0
     """Bins by which it moves what is measured; they count as a change of a probability does."""
+    alarms: ArrayLike = 0.0
+    """Change of log10 of a shot's probability of a false alarm as it lifts bins over the threshold
+    or lets them fall below, (tiles,) or a scalar; 0 where it hardly ever does."""
 
 
 class Mean(NamedTuple):

@@ -5,8 +5,15 @@ one that is not. Without the effect only the kernel of the folded line itself is
 is seen. It acts on the spectrum. Bound by the envelope E of the window's sidelobes: with a
 footprint that keeps e bins from the edge (DC or Nyquist), bins within e/2 of its lines have
 images at most E(3/2 e) high, and all others at most E(e/2) + E(e) altogether.
+
+A bin at the threshold, far down the lines' sidelobes, is smaller than the largest by far, and moved
+by an image that the largest does not feel. It then belongs to the detection, or does no more, and
+of the bins that may raise a false alarm there is one fewer or more. With lines d bins away such a
+bin has images at 2 e - d; if these move it by a share x of the threshold, it must lie that near,
+and bins whose sidelobes fall no slower than 1/d lie there with a chance of x d.
 """
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,11 +21,16 @@ import numpy as np
 
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.footprint_sum import footprint_sum
 from sweep.model.effects.line_spread import power_range
-from sweep.model.preparation import Shots
+from sweep.model.preparation import PROCESSING, Shots
 
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
+
+_SELDOM = 1e-4
+"""Expected bins at the threshold of a shot that are not reckoned with."""
+_CHIRPS = [0, 2]
 
 
 def bound(block: "Block") -> Change:
@@ -34,11 +46,50 @@ def bound(block: "Block") -> Change:
     with np.errstate(divide="ignore", over="ignore"):
         far = (beside**2 + outside**2) / least_power
         high = np.sqrt(np.maximum(1 + inside**2 / least_power, far))
+    alarms = alarm_change(block)
     if not block.adds_amplitudes:
-        return Change(signal=(1.0, high))
+        return Change(signal=(1.0, high), alarms=alarms)
     uphill = np.exp(np.minimum(line.tilt * np.asarray(spread.extreme), 50.0))
     added = uphill * outside / line.lobe.least(line.bin_offset)
-    return Change(signal=(1.0, 1.0 if block.architecture == "direct" else high), added=added)
+    most = 1.0 if block.architecture == "direct" else high
+    return Change(signal=(1.0, most), added=added, alarms=alarms)
+
+
+def alarm_change(block: "Block") -> np.ndarray:
+    """Change of log10 pfa of a shot by the bins that images move across the threshold, (tiles,).
+
+    That of one bin, or of as many as are to be expected; 0 where fewer than ``_SELDOM`` are.
+    """
+    if block.word(PROCESSING + "bins_counted") == "all":
+        return np.zeros(block.size)
+    bins, taken = moved_bins(block)
+    left = np.maximum(block.fft_size / 2 - taken, 1.0)
+    return np.where(bins > _SELDOM, np.maximum(bins, 1.0) / (math.log(10) * left), 0.0)
+
+
+def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
+    """Bins of a shot that images move across the threshold, and most that a detection takes.
+
+    Returns
+    -------
+    (tiles,), (tiles,) ndarray
+        Expected number, were lines anywhere between two bins, of both chirps together; bins of
+        one.
+    """
+    line, lobe, half = block.lines, block.lines.lobe, block.fft_size / 2
+    extreme = np.fmin(block.spread.extreme, half)
+    uphill = np.exp(np.minimum(line.tilt * extreme, 50.0))
+    peak = (block.beat / block.deviation).high * np.minimum(line.transfer * uphill, 1.0)
+    in_phase = np.maximum(peak * footprint_sum(block).in_phase, 1e-300)
+    level = np.asarray(block.threshold.low)
+    away = np.minimum(lobe.within(level / in_phase), half)
+    apart = line.edge - extreme
+    moved = np.zeros_like(apart)
+    for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
+        share = np.minimum(in_phase * lobe.tail(distance) / level, 1.0)
+        moved += share if block.adds_amplitudes else share**2 / 2
+    reach = away + extreme
+    return (moved * reach)[_CHIRPS].sum(axis=0), 2 * reach[_CHIRPS].max(axis=0) + 4
 
 
 def act(shots: Shots, scene: Scene) -> Shots:

@@ -54,6 +54,11 @@ class Lobe(NamedTuple):
         place = np.searchsorted(self.reach, np.maximum(np.nan_to_num(away), 0.0), "right") - 1
         return np.asarray(self.envelope[place])
 
+    def within(self, magnitude: np.ndarray) -> np.ndarray:
+        """Distance [bins] from which on all bins are smaller; infinite where none is known."""
+        ends = np.append(self.reach, np.inf)
+        return np.asarray(ends[np.searchsorted(-self.envelope, -np.asarray(magnitude, float))])
+
     def most(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line, 0..1/2."""
         return self._read(self.highest, distance) * (1 + _ROUNDING)

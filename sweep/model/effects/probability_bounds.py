@@ -47,8 +47,8 @@ def probability_changes(
 
     For a :class:`Change` the largest of these: the sum of the changes of pd in the three segments,
     which bounds that of their product; the change of log10 of the probability of a false alarm in
-    a shot; that of the largest bin's magnitude in any segment, in relation to it or to sigma,
-    whichever is larger; its shift in bins.
+    a shot, by noise or by bins that change sides of the threshold; that of the largest bin's
+    magnitude in any segment, in relation to it or to sigma, whichever is larger; its shift in bins.
 
     Parameters
     ----------
@@ -73,7 +73,8 @@ def probability_changes(
     out = np.empty((len(bounds), tiles))
     for row, bound in zip(out, bounds, strict=True):
         if isinstance(bound, Change):
-            row[:] = np.maximum(next(found), np.max(np.atleast_2d(bound.shift), axis=0))
+            shift = np.max(np.atleast_2d(bound.shift), axis=0)
+            row[:] = np.maximum(np.maximum(next(found), shift), bound.alarms)
         else:
             value = np.asarray(bound, float)
             row[:] = value.sum(axis=0) if value.ndim > 1 else value

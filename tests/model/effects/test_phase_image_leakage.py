@@ -15,7 +15,9 @@ from effect_points import (
 )  # fmt: skip
 
 from sweep.model.effects import footprint_phase, image
+from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.change import pd_change
+from sweep.model.effects.planning import plan
 from sweep.model.shot import find
 from sweep.model.spectra import segment_spectrum
 
@@ -214,3 +216,43 @@ def test_lines_spread_over_all_bins_and_beyond_may_leak_in_any(table_4_1, phases
     phased = {"footprint_phase"} if phases == "coherent" else set()
     leaks = found(parameters, {"footprint", "doppler", "image", "leakage"} | phased)[:, 5]
     assert (np.nan_to_num(leaks) <= most * (1 + 1e-9) + 1e-12).all() and np.nanmax(leaks) > 1e-3
+
+
+@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
+@pytest.mark.parametrize("window", ["hann", "hamming", "blackman"])
+def test_as_many_bins_as_expected_are_moved_across_the_threshold_by_images(
+    table_4_1, phases, window
+):
+    parameters = scene(
+        table_4_1, 3000, 3, range=np.geomspace(4, 400, 3000), fft_size=2**12, window=window,
+        power=10 ** np.random.default_rng(3).uniform(-3, 1, 3000), beamlets=1, phases=phases,
+        radial_velocity=0.0, across=0.0, tnr=6.0,
+    )  # fmt: skip
+    block = point_block(parameters)
+    (expected, taken), said = image.moved_bins(block), image.alarm_change(block)
+    names = {*POWERS, *(["footprint_phase"] if phases == "coherent" else [])}
+    on, off = (found(parameters, each)[[0, 2], 4] for each in (names, names - {"image"}))
+    moved = abs(on - off).sum(axis=0)
+    assert moved.sum() > 30 and moved.sum() <= expected.sum() <= 50 * moved.sum()
+    assert (off <= taken).all()
+    few = expected < 0.03
+    assert moved[few].sum() <= expected[few].sum() + 5 * np.sqrt(expected[few].sum())
+    assert (said == 0).sum() > 20 and not moved[said == 0].any()
+    one = 1 / np.log(10) / 2**11
+    assert (said[said > 0] >= one).all()
+    np.testing.assert_array_equal(image.bound(block).alarms, said)
+
+
+@pytest.mark.parametrize("counted", ["half", "all"])
+def test_an_image_is_kept_where_a_bin_more_or_less_is_above_the_tolerance(table_4_1, counted):
+    block = point_block(
+        scene(
+            table_4_1, 40, 3, range=np.linspace(118, 124, 40), fft_size=2**13, window="hann",
+            beamlets=1, radial_velocity=1.0, across=0.0, power=1.0, tnr=6.0, bins_counted=counted,
+            grazing_angle=np.pi / 2, duration=500e-6,
+        )
+    )  # fmt: skip
+    only = [effect for effect in EFFECTS if effect.name == "image"]
+    one = 1 / np.log(10) / 2**12
+    fine, coarse = (plan(block, {}, share * one, only).kept for share in (0.9, 1.2))
+    assert fine.all() == (counted == "half") and not coarse.any()
