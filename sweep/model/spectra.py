@@ -31,4 +31,7 @@ def segment_spectrum(
         segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0), level,
         modulation.choices(shots), shots.kernel(), room,
     )  # fmt: skip
+    half = shots.fft_size // 2
+    if level <= 0 and count <= half:  # nothing comes back: no line has any bins of its own
+        return np.arange(half + 1), np.zeros(half + 1)
     return np.arange(low, low + count), room[0, :count].copy()

@@ -201,12 +201,18 @@ _WIDTH_ORDER = [PROMISED.index(name.removesuffix("_half_width")) for name in WID
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add(values, moments):
-    """Draws into running numbers, means and sums of squared deviations; nan is no draw."""
+    """Draws into running numbers, means and sums of squared deviations; nan is no draw.
+
+    What is infinite in one of them, as bounds without an echo are, is so in the mean.
+    """
     for name in range(values.shape[0]):
         for x in values[name]:
             if np.isnan(x):
                 continue
             moments[0, name] += 1.0
+            if np.isinf(x) or np.isinf(moments[1, name]):
+                moments[1, name] = np.inf
+                continue
             apart = x - moments[1, name]
             moments[1, name] += apart / moments[0, name]
             moments[2, name] += apart * (x - moments[1, name])

@@ -210,3 +210,14 @@ def test_a_file_that_is_no_yaml_is_told_with_a_remedy(tmp_path):
     (tmp_path / "found.yaml").write_text("title: [a\nb: }")
     told = CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")])
     assert told.exit_code == 2 and "look at the brackets" in told.stderr
+
+
+@pytest.mark.parametrize("architecture", ["homodyne", "direct"])
+def test_whole_spectra_of_a_target_that_sends_nothing_back_are_noise(tmp_path, architecture):
+    """Its spectrum without noise was of eight bins."""
+    dark = {
+        "draws.method": "spectra", "draws.number": 3, "target.reflectance": 0.0,
+        "instrument.receiver.architecture": architecture,
+    }  # fmt: skip
+    assert planned(tmp_path, plain(dark)).exit_code == 0
+    assert not judged(tmp_path, plain(dark)).refusals
