@@ -23,6 +23,7 @@ CHEAP: dict[str, Any] = {
     "Detector.rank": {"at_most": "8", "example": "6"},
     "Footprint.beamlets": {"at_most": "12", "example": "7"},
     "Draws.number": {"at_most": "9", "example": "5"},
+    "Draws.limit": {"at_most": "40", "example": "20"},
     "Draws.batch": {"at_most": "9", "example": "4"},
     "Storage.block_points": {"at_most": "40", "example": "8"},
     "Execution.workers": {"at_most": "4"},
