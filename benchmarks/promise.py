@@ -1,7 +1,7 @@
 """Whether tolerances are kept: 1,000 points of every experiment, at six tolerances.
 
-Run with `make promise`, some five minutes on one core; names of experiments as arguments look at
-those alone. Writes docs/promise.md.
+Run with `make promise`, some ten minutes; names of experiments as arguments look at those alone.
+Writes docs/promise.md.
 """
 
 import argparse
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import promise_drawn
 from rich.console import Console
 from rich.progress import Progress
 
@@ -18,18 +19,29 @@ from sweep.tasks.accuracy.bench import Bench, Seen, Trial
 from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.grid_bench import GridBench
 from sweep.tasks.accuracy.measure import FIXED_AS_AT, apart
-from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, FIXED, REFERENCE, WRITTEN, Rung, ladder
+from sweep.tasks.accuracy.rungs import (
+    ADAPTIVE,
+    ALL_ON,
+    FINEST_RAYS,
+    FIXED,
+    REFERENCE,
+    TOLERANCES,
+    WRITTEN,
+    Ladder,
+    Rung,
+    ladder,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "promise.md"
 POINTS, SEED, ROUNDS = 1000, 2017, 2
 KEPT = 0.999
-"""Share of the points that shall keep a tolerance; where draws decide, their confidence."""
-DRAWN = {0.1: 96, 0.01: 48, 0.001: 4}
-"""Points that are drawn until a tolerance is met."""
-LONG_RUN = {0.1: 10_000, 0.01: 100_000, 0.001: 1_000_000}
-"""Draws of the reference there."""
-TOLERANCE, DRAWS, LIMIT = "accuracy.tolerance", "draws.number", "draws.limit"
+"""Share of the points that shall keep a tolerance."""
+TOLERANCE = "accuracy.tolerance"
+MORE_RAYS = 4003
+"""What the reference of flights is held against."""
+DEARER = 1.1
+"""What timings may be off."""
 WHAT = ("pd", "log10 pfa", "magnitude")
 VARIANTS = {
     "range_angle_over_rough_ground": (
@@ -45,21 +57,32 @@ all effects on and, where their number follows from the tolerance, as many beaml
 far off is pd (the largest of segments and shot), how far log10 of the probability of a false alarm,
 and how far |X| of the largest bins, relative to itself or to sigma if that is larger? A cell has
 the error of the worst point; before it, where not all points are within the tolerance, the share
-of those that are. 99.9 % is what is asked for; of points that are drawn, the `accuracy.confidence`
-of their intervals.
+of those that are: 99.9 % is what is asked for. Points that are drawn have a table of their own.
 
 One bin more or fewer that a detection occupies, of the 65,536 that could raise a false alarm, is
-6.6e-6 of log10 pfa: it is left out of account where effects are.
+6.6e-6 of log10 pfa.
 
 `us` is processor time a point, planning included. `fixed` is that of the cheapest setting with the
 same effects at every point that keeps the tolerance: the front of the ladder of `sweep accuracy`.
 
 """
-BEAMLETS = """
-## Beamlets of flights
+RAYS = f"""
+## Flights against many more rays
 
-A flight has as many beamlets as it says, or 109, whatever the tolerance: each is a ray. Against all
-effects on with 1009 of them, all effects on with its own number are off at the most by
+A flight has as many beamlets as it says, or 109, whatever the tolerance: each is a ray, and part of
+the scene, as its footprint's phases are. Above, they are held against all effects on with the same
+rays; here against all effects on with {FINEST_RAYS:,}, which is what endless rays would see, but
+for the errors in the last row of each: {MORE_RAYS:,} rays against {FINEST_RAYS:,}, at one stretch
+of the flight. A cell has the share of shots within the tolerance, then the error that 90 % of the
+shots keep, then that of the worst. `us` is processor time a shot, rays included.
+"""
+COSTS = """
+## Cost and tolerance
+
+Does cost rise with accuracy no faster than the front of the ladder? From one tolerance to the next,
+`us` a point over that of the cheapest setting with the same effects at every point that is as
+accurate (`fixed`): below 1 asking for a tolerance is the cheaper. The cost has risen no faster than
+the front where no ratio is higher than the first by more than {margin:.0%}.
 """
 
 
@@ -68,7 +91,7 @@ class Row(NamedTuple):
 
     tolerance: float
     errors: tuple[np.ndarray, ...]
-    """(points,) each, by :data:`WHAT`; of drawn points pd alone."""
+    """(points,) each, by :data:`WHAT`."""
     seconds: float
     fixed: float = np.nan
     """Time of the cheapest fixed setting that is as accurate [s]; nan where there is none."""
@@ -98,8 +121,16 @@ def together(trials: Sequence[Trial], share: np.ndarray) -> Trial:
     return Trial(seen, float(seconds), float(planning))
 
 
-def known(spec: Spec | SceneSpec) -> tuple[list[Row], tuple[np.ndarray, ...] | None]:
-    """Tolerances of a study without draws; of a flight, what its number of beamlets changes."""
+class Found(NamedTuple):
+    """What came of an experiment."""
+
+    rows: list[Row]
+    rays: list[Row]
+    """Of a flight: its own number against many more; last, these against yet more."""
+
+
+def known(spec: Spec | SceneSpec) -> Found:
+    """Tolerances of a study without draws."""
     flight = isinstance(spec, SceneSpec)
     bench = FlightBench(spec, POINTS) if flight else GridBench(spec, POINTS, SEED)
     whole = ladder(spec)
@@ -114,28 +145,29 @@ def known(spec: Spec | SceneSpec) -> tuple[list[Row], tuple[np.ndarray, ...] | N
     finest = seen[whole.reference.name].seen
     true = seen[every.name].seen if flight else finest
     worst = {r.name: np.nanmax(np.concatenate(apart(seen[r.name].seen, true))) for r in fixed}
-    rows = []
+    rows, rays = [], []
     for tolerance, rung in at.items():
         as_good = [seen[name].seconds for name, error in worst.items() if error <= tolerance]
-        errors = apart(seen[rung.name].seen, true)
-        rows.append(Row(tolerance, errors, seen[rung.name].seconds, min(as_good, default=np.nan)))
-    return rows, apart(true, finest) if flight else None
+        trial = seen[rung.name]
+        best = min(as_good, default=np.nan)
+        rows.append(Row(tolerance, apart(trial.seen, true), trial.seconds, best))
+        rays.append(Row(tolerance, apart(trial.seen, finest), trial.seconds))
+    if flight:
+        rays += with_more_rays(bench, whole, seen[whole.reference.name].seconds)
+    return Found(rows, rays if flight else [])
 
 
-def drawn(spec: Spec) -> list[Row]:
-    """Tolerances of a study that draws, against a long run with other draws."""
-    rows = []
-    every = ladder(spec).reference.overrides
-    for tolerance, points in DRAWN.items():
-        until = {DRAWS: 0, LIMIT: 10**7, TOLERANCE: tolerance}
-        other = {DRAWS: LONG_RUN[tolerance], LIMIT: 0, "seed": int(spec.seed) ^ 1}
-        rungs = [
-            Rung(name="until", kind=ADAPTIVE, overrides=until),
-            Rung(name="reference", kind=REFERENCE, overrides=dict(every) | other, plans=False),
-        ]
-        trial, reference = tried(GridBench(spec, points, SEED), rungs, 1)
-        rows.append(Row(tolerance, apart(trial.seen, reference.seen)[:1], trial.seconds))
-    return rows
+def with_more_rays(bench: Bench, whole: Ladder, seconds: float) -> list[Row]:
+    """The reference's number of rays against more of them, at a part of the sample."""
+    reference = whole.reference
+    more = reference.overrides | {"footprint.beamlets": MORE_RAYS}
+    part = bench.parts(POINTS)[0]
+    seen, other = (
+        bench.try_on(Rung(name=f"{i} rays", kind=REFERENCE, overrides=put, plans=False), part, 1)
+        for i, put in enumerate((dict(reference.overrides), more))
+    )
+    bench.forget()
+    return [Row(np.inf, apart(seen.seen, other.seen), seconds)]
 
 
 def cell(errors: np.ndarray, tolerance: float) -> str:
@@ -148,59 +180,103 @@ def cell(errors: np.ndarray, tolerance: float) -> str:
     return text if share == 1 else f"**{100 * share:.2f} %**, {text}"
 
 
+def spread_cell(errors: np.ndarray, tolerance: float) -> str:
+    """Share of the points within the tolerance, the error that 90 % keep, and the worst."""
+    told = errors[np.isfinite(errors)]
+    if not told.size:
+        return "-"
+    share = f"{100 * (told <= tolerance).mean():.4g} %, " if np.isfinite(tolerance) else ""
+    return f"{share}{np.quantile(told, 0.9):.1e}, {told.max():.1e}"
+
+
 def lines_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Rows of the table."""
     for row in rows:
         cells = [cell(errors, row.tolerance) for errors in row.errors]
-        cells += ["-"] * (len(WHAT) - len(cells))
         fixed = f"{1e6 * row.fixed:.3g}" if np.isfinite(row.fixed) else "-"
         shown = [name, f"{len(row.errors[0]):,}", f"{row.tolerance:g}", *cells]
         yield "| " + " | ".join([*shown, f"{1e6 * row.seconds:.3g}", fixed]) + " |"
 
 
-def missed(name: str, rows: Sequence[Row], share: float) -> Iterator[str]:
+def rays_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Rows of the table of rays."""
+    for row in rows:
+        cells = [spread_cell(errors, row.tolerance) for errors in row.errors]
+        which = f"{row.tolerance:g}" if np.isfinite(row.tolerance) else f"{FINEST_RAYS:,} rays"
+        yield "| " + " | ".join([name, which, *cells, f"{1e6 * row.seconds:.3g}"]) + " |"
+
+
+def costs_of(name: str, rows: Sequence[Row]) -> str:
+    """A row of the table of costs: ratios by tolerance, and whether they rise."""
+    ratios = [row.seconds / row.fixed for row in rows]
+    there = [ratio for ratio in ratios if np.isfinite(ratio)]
+    rise = max(there) / there[0] if there else np.nan
+    told = "kept" if rise <= DEARER else f"NOT kept: {rise:.2f} times"
+    cells = [f"{ratio:.2f}" if np.isfinite(ratio) else "-" for ratio in ratios]
+    return "| " + " | ".join([name, *cells, told if there else "no front"]) + " |"
+
+
+def missed(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """What does not keep its tolerance, in words."""
     for row in rows:
-        for what, errors in zip(WHAT, row.errors, strict=False):
+        for what, errors in zip(WHAT, row.errors, strict=True):
             told = errors[np.isfinite(errors)]
             kept = float((told <= row.tolerance).mean()) if told.size else 1.0
-            if kept < share:
+            if kept < KEPT:
                 share_missed = f"{100 * (1 - kept):.2f} %"
                 yield f"- {name} at {row.tolerance:g}: {what} of {share_missed} of the points"
 
 
-def page(names: Sequence[str], bar: Progress) -> str:
-    """The whole text."""
-    table, beamlets, short = [], [], []
-    for stem in bar.track(names, description="points of each experiment"):
+class Page:
+    """The page, experiment by experiment."""
+
+    def __init__(self) -> None:
+        self._short: list[str] = []
+        self._table: list[str] = []
+        self._rays: list[str] = []
+        self._costs: list[str] = []
+        self._drawn: list[str] = []
+
+    def add(self, stem: str) -> None:
+        """Look at an experiment."""
         experiment, overrides = VARIANTS.get(stem, (stem, {}))
-        name = stem.replace("_", " ")
+        name, path = stem.replace("_", " "), ROOT / "experiments" / f"{experiment}.yaml"
         try:
-            spec = load(ROOT / "experiments" / f"{experiment}.yaml")
+            spec = load(path)
         except SpecError as error:
-            short.append(f"- {name}: not looked at: {str(error).splitlines()[0]}")
-            continue
+            self._short.append(f"- {name}: not looked at: {str(error).splitlines()[0]}")
+            return
         spec = Rung(name="", kind=WRITTEN, overrides=overrides).of(spec)
         if spec.draws.method == "spectra":
-            short.append(f"- {name}: not looked at: draws noise alone, and counts")
-            continue
-        draws = not isinstance(spec, SceneSpec) and (spec.draws.number or spec.draws.limit)
-        rows, other = (drawn(spec), None) if draws else known(spec)
-        table += lines_of(name, rows)
-        print("\n".join(lines_of(name, rows)), flush=True)
-        short += missed(name, rows, spec.accuracy.confidence if draws else KEPT)
-        if other is not None:
-            worst = [cell(errors, np.inf) for errors in other]
-            beamlets.append(f"| {name} | " + " | ".join(worst) + " |")
-    heads = ["experiment", "points", "tolerance", *WHAT, "us", "fixed"]
-    parts = [
-        HEAD.strip(),
-        "\n".join(short) if short else "Every tolerance is kept.",
-        "\n".join([header(heads), *table]),
-        BEAMLETS.strip(),
-        "\n".join([header(["experiment", *WHAT]), *beamlets]),
-    ]
-    return "\n\n".join(parts) + "\n"
+            self._short.append(f"- {name}: not looked at: draws noise alone, and counts")
+        elif not isinstance(spec, SceneSpec) and spec.draws.any:
+            rows, off = promise_drawn.drawn(path, spec)
+            self._short += promise_drawn.verdicts(name, rows, float(spec.accuracy.confidence))
+            self._drawn.append(promise_drawn.section(name, rows, off, spec))
+        else:
+            self._know(name, known(spec))
+
+    def _know(self, name: str, found: Found) -> None:
+        self._table += lines_of(name, found.rows)
+        self._rays += rays_of(name, found.rays)
+        self._costs.append(costs_of(name, found.rows))
+        self._short += missed(name, found.rows)
+
+    def text(self) -> str:
+        """The whole text."""
+        tolerances = [f"{tolerance:g}" for tolerance in TOLERANCES]
+        heads = ["experiment", "points", "tolerance", *WHAT, "us", "fixed"]
+        parts = [
+            HEAD.strip(),
+            "\n".join(self._short) if self._short else "Every tolerance is kept.",
+            "\n".join([header(heads), *self._table]),
+            *self._drawn,
+            RAYS.strip(),
+            "\n".join([header(["experiment", "tolerance", *WHAT, "us"]), *self._rays]),
+            COSTS.strip().format(margin=DEARER - 1),
+            "\n".join([header(["experiment", *tolerances, "no faster"]), *self._costs]),
+        ]
+        return "\n\n".join(parts) + "\n"
 
 
 def header(heads: Sequence[str]) -> str:
@@ -214,8 +290,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*every, []])
     asked = parser.parse_args()
+    page = Page()
     with Progress(console=Console(stderr=True)) as bar:
-        text = page(asked.names or every, bar)
+        for stem in bar.track(asked.names or every, description="points of each experiment"):
+            page.add(stem)
+    text = page.text()
     if asked.names:
         print(text.removeprefix(HEAD))
     else:
