@@ -37,7 +37,7 @@ PAGE = ROOT / "docs" / "promise.md"
 POINTS, SEED, ROUNDS = 1000, 2017, 2
 KEPT = 0.999
 """Share of the points that shall keep a tolerance."""
-TOLERANCE = "accuracy.tolerance"
+TOLERANCE, BEAMLETS = "accuracy.tolerance", "footprint.beamlets"
 MORE_RAYS = 4003
 """What the reference of flights is held against."""
 DEARER = 1.1
@@ -69,12 +69,16 @@ same effects at every point that keeps the tolerance: the front of the ladder of
 RAYS = f"""
 ## Flights against many more rays
 
-A flight has as many beamlets as it says, or 109, whatever the tolerance: each is a ray, and part of
-the scene, as its footprint's phases are. Above, they are held against all effects on with the same
-rays; here against all effects on with {FINEST_RAYS:,}, which is what endless rays would see, but
-for the errors in the last row of each: {MORE_RAYS:,} rays against {FINEST_RAYS:,}, at one stretch
-of the flight. A cell has the share of shots within the tolerance, then the error that 90 % of the
-shots keep, then that of the worst. `us` is processor time a shot, rays included.
+A flight has as many beamlets as it says, or 109, whatever the tolerance: each is a ray. Above, they
+are held against all effects on with the same rays, here against all effects on with as many as
+{FINEST_RAYS:,}. That these are enough is seen from the last row of each flight: {FINEST_RAYS:,}
+rays against {MORE_RAYS:,}, at one stretch of it. A cell has the share of shots within the
+tolerance, the error that 90 % of the shots keep, and the worst. `us` is processor time a shot, rays
+included.
+
+Where phases are coherent the number of beamlets is part of the scene, as the thesis has it, and no
+number is enough: a smooth slope sends next to nothing back, and what is left of the sum of so many
+beamlets is their own. Of these flights there is one row, their own number against {MORE_RAYS:,}.
 """
 COSTS = """
 ## Cost and tolerance
@@ -95,6 +99,8 @@ class Row(NamedTuple):
     seconds: float
     fixed: float = np.nan
     """Time of the cheapest fixed setting that is as accurate [s]; nan where there is none."""
+    label: str = ""
+    """What stands in the place of a tolerance."""
 
 
 def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
@@ -152,22 +158,24 @@ def known(spec: Spec | SceneSpec) -> Found:
         best = min(as_good, default=np.nan)
         rows.append(Row(tolerance, apart(trial.seen, true), trial.seconds, best))
         rays.append(Row(tolerance, apart(trial.seen, finest), trial.seconds))
-    if flight:
-        rays += with_more_rays(bench, whole, seen[whole.reference.name].seconds)
-    return Found(rows, rays if flight else [])
+    if not flight:
+        return Found(rows, [])
+    if BEAMLETS not in whole.reference.overrides:
+        return Found(rows, [with_more_rays(bench, whole, seen[every.name], "own, coherent")])
+    last = with_more_rays(bench, whole, seen[whole.reference.name], f"{FINEST_RAYS:,} rays")
+    return Found(rows, [*rays, last])
 
 
-def with_more_rays(bench: Bench, whole: Ladder, seconds: float) -> list[Row]:
+def with_more_rays(bench: Bench, whole: Ladder, own: Trial, label: str) -> Row:
     """The reference's number of rays against more of them, at a part of the sample."""
-    reference = whole.reference
-    more = reference.overrides | {"footprint.beamlets": MORE_RAYS}
+    put = dict(whole.reference.overrides)
     part = bench.parts(POINTS)[0]
     seen, other = (
-        bench.try_on(Rung(name=f"{i} rays", kind=REFERENCE, overrides=put, plans=False), part, 1)
-        for i, put in enumerate((dict(reference.overrides), more))
+        bench.try_on(Rung(name=f"{i} rays", kind=REFERENCE, overrides=each, plans=False), part, 1)
+        for i, each in enumerate((put, put | {BEAMLETS: MORE_RAYS}))
     )
     bench.forget()
-    return [Row(np.inf, apart(seen.seen, other.seen), seconds)]
+    return Row(np.inf, apart(seen.seen, other.seen), own.seconds, label=label)
 
 
 def cell(errors: np.ndarray, tolerance: float) -> str:
@@ -176,8 +184,12 @@ def cell(errors: np.ndarray, tolerance: float) -> str:
     if not told.size:
         return "-"
     worst, share = float(told.max()), float((told <= tolerance).mean())
-    text = "<1e-9" if worst < 1e-9 else f"{worst:.1e}"
-    return text if share == 1 else f"**{100 * share:.2f} %**, {text}"
+    return small(worst) if share == 1 else f"**{100 * share:.2f} %**, {small(worst)}"
+
+
+def small(error: float) -> str:
+    """An error as cells have it."""
+    return "<1e-9" if error < 1e-9 else f"{error:.1e}"
 
 
 def spread_cell(errors: np.ndarray, tolerance: float) -> str:
@@ -186,7 +198,7 @@ def spread_cell(errors: np.ndarray, tolerance: float) -> str:
     if not told.size:
         return "-"
     share = f"{100 * (told <= tolerance).mean():.4g} %, " if np.isfinite(tolerance) else ""
-    return f"{share}{np.quantile(told, 0.9):.1e}, {told.max():.1e}"
+    return f"{share}{small(np.quantile(told, 0.9))}, {small(told.max())}"
 
 
 def lines_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
@@ -202,7 +214,7 @@ def rays_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Rows of the table of rays."""
     for row in rows:
         cells = [spread_cell(errors, row.tolerance) for errors in row.errors]
-        which = f"{row.tolerance:g}" if np.isfinite(row.tolerance) else f"{FINEST_RAYS:,} rays"
+        which = row.label or f"{row.tolerance:g}"
         yield "| " + " | ".join([name, which, *cells, f"{1e6 * row.seconds:.3g}"]) + " |"
 
 
