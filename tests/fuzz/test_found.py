@@ -221,3 +221,16 @@ def test_whole_spectra_of_a_target_that_sends_nothing_back_are_noise(tmp_path, a
     }  # fmt: skip
     assert planned(tmp_path, plain(dark)).exit_code == 0
     assert not judged(tmp_path, plain(dark)).refusals
+
+
+def test_leakage_is_bounded_where_the_signal_s_noise_drowns_the_threshold(tmp_path):
+    """Its shot noise over nearly none: the least threshold over sigma is 0."""
+    loud = {
+        "instrument.laser.power": "1 kW", "instrument.laser.beam_divergence": "170 arcmin",
+        "instrument.telescope.aperture": "1 um", "instrument.processing.tnr": 7600,
+        "instrument.receiver.amplifier_bandwidth": "1 mHz", "instrument.processing.fft_size": 23,
+        "instrument.receiver.detector_bandwidth": "565 kHz", "footprint.beamlets": 109,
+        "target.grazing_angle": "6e-5 arcmin", "target.pointing_jitter": "75.1 arcsec",
+        "target.reflectance": 1.0, "draws.limit": 40,
+    }  # fmt: skip
+    assert not judged(tmp_path, plain(loud)).refusals

@@ -97,9 +97,12 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     ).reshape(columns[0].shape)  # fmt: skip
     if not block.segment_exists[1]:
         found[1] = 0.0
-    higher = np.divide(threshold.high, threshold.low) ** 4
-    higher = np.where(np.greater(threshold.low, 2), np.minimum(higher, _HIGHER), higher)
-    return np.asarray(np.minimum(higher * found, 1.0))
+    low = np.asarray(threshold.low, float)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        higher = np.divide(threshold.high, low) ** 4
+        higher = np.where(low > 2, np.minimum(higher, _HIGHER), higher)
+        # where other effects may drown the threshold, any bin may cross it
+        return np.where(low > 0, np.minimum(higher * found, 1.0), 1.0)
 
 
 @lru_cache(maxsize=32)
