@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model import far_field
+from sweep.model.bundles import STRENGTH_IM, STRENGTH_RE
 from sweep.model.crossings import (
     added_crossings,
     any_crossing,
@@ -23,8 +24,6 @@ from sweep.model.crossings import (
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE
 from sweep.model.runs import (
-    STRENGTH_IM,
-    STRENGTH_RE,
     add_afar,
     bundle,
     magnitudes,
@@ -51,9 +50,8 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     origin, n : int
         Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
         ``power`` |C_b|^2 and nothing; they become strengths.
-    kind : (bool, int)
-        Whether they are the sources of a form (:mod:`sweep.model.power_forms`); which slot of
-        :mod:`sweep.model.known_kernels` their moments or it are made with, -1 for lines.
+    kind : tuple
+        Whether they are sources of bundles, and of which: :func:`sweep.model.bundles.take_bundles`.
     noise : (float, float, float)
         sigma per quadrature; threshold; chance of leakage that may be left out.
     choices, kernel

@@ -3,8 +3,7 @@
 Shots may carry phase errors that all lines of a segment share (:class:`PhaseError`), and a
 Gaussian width of their beat. The compiled code takes both as numbers: each line becomes a few
 lines (:mod:`sweep.model.effects.line_splitting`), each spectrum the mean over a few shifts
-(:func:`sweep.model.effects.gaussian_line.gaussian_shifts`). Split lines that add as powers are
-looked at as forms of few kernels (:mod:`sweep.model.power_forms`). They are worked out for a
+(:func:`sweep.model.effects.gaussian_line.gaussian_shifts`). They are worked out for a
 stretch of points at a time, so that what they take of memory does not grow with the number of
 points; shots without them are one stretch, and pay for nothing.
 
@@ -20,27 +19,14 @@ import numpy as np
 from numba import njit
 
 from sweep.model import waveform
+from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_splitting import Split, split_lines
-from sweep.model.equivalent import MOST_NODES, chebyshev_moments, equivalent_lines, nodes_for
-from sweep.model.known_kernels import (
-    HALVES,
-    MOST_MOMENTS,
-    at_sources,
-    known,
-    level_for,
-    sources_of,
-    total_strength,
-)
-from sweep.model.power_forms import FORM
+from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.preparation import LINE_STEPS, Shots
-from sweep.model.runs import DELTA, MOMENTS, SLOTS, STRENGTH_IM, STRENGTH_RE
 
 POINTS = 256
 """Points of a stretch."""
-
-LEAST_KNOWN = 6
-"""Lines, or nodes that they need, from which on moments with known kernels are taken."""
 
 SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
 """To which lines are split, relative to all of them in phase: the last that a point allows."""
@@ -305,45 +291,3 @@ def take_few(n, power, allowed, most, kernel, room):
         room[DELTA, j], room[STRENGTH_RE, j] = room[4, j], room[5, j]
         room[STRENGTH_IM, j] = room[6, j]
     return few
-
-
-@njit(cache=True, error_model="numpy")
-def take_moments(n, power, allowed, kernel, room):
-    """Takes n lines as moments (:mod:`sweep.model.known_kernels`), sources of them in their place.
-
-    Returns
-    -------
-    number, level : int
-        Sources, and the slot that they are made with; n lines as they were, and -1, where they are
-        few or close together anyway, or too wide apart.
-    """
-    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
-    lowest, highest = delta[0], delta[0]
-    for b in range(n):
-        lowest, highest = min(lowest, delta[b]), max(highest, delta[b])
-    band, peak = np.pi * (2.0 if power else 1.0), kernel[2][0] ** (2 if power else 1)
-    tolerance = allowed / max(peak * _total(n, power, room), 1e-300)
-    few = nodes_for(band * 0.5 * (highest - lowest), tolerance, kernel[3])
-    level = level_for(max(highest, -lowest))
-    if min(n, few) < LEAST_KNOWN or level < 0:
-        return n, -1
-    half = HALVES[level]
-    size = nodes_for(band * half, tolerance, kernel[3])
-    if size > min(3 * n, MOST_MOMENTS):
-        return n, -1
-    slot = room[SLOTS + level]
-    known(slot, half, power, kernel)
-    for b in range(n):
-        room[4, b] = delta[b] / half
-    one, other = room[MOMENTS], room[MOMENTS + 1]
-    chebyshev_moments(room[4], re, im, n, size, power, room[5], room[6], one, other)
-    room[FORM + 3, 1] = total_strength(one, other, size, power, slot, room[4:6])
-    room[FORM + 3, 2] = size
-    at_sources(one, size, slot, re)
-    if not power:
-        at_sources(other, size, slot, im)
-    places = sources_of(slot)
-    delta[: places.size] = places
-    if power:
-        im[: places.size] = 0.0
-    return places.size, level

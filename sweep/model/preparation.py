@@ -19,6 +19,7 @@ from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 from sweep.model.ground import Ground
+from sweep.model.known_kernels import unknown_kernels
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -217,7 +218,10 @@ class Shots:
         return np.array(np.broadcast_arrays(*columns), dtype=float)
 
     def kernel(self) -> tuple:
-        """What the spectrum needs to know of window and FFT, as the compiled code takes it."""
+        """What the spectrum needs to know of window and FFT, as the compiled code takes it.
+
+        The last is scratch, for kernels that are worked out when they are met: of one call's use.
+        """
         w = self.window
         return (
             (self.fft_size, w.length),
@@ -225,6 +229,7 @@ class Shots:
             (w.sum, w.envelope, w.reach),
             node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
             tangents(self.fft_size),
+            unknown_kernels(),
         )
 
     def counted_bins(self, exempted: np.ndarray) -> np.ndarray:

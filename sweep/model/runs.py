@@ -12,28 +12,20 @@ import numpy as np
 from numba import njit
 
 from sweep.model import far_field
+from sweep.model.bundles import (
+    DELTA,
+    STRENGTH_IM,
+    STRENGTH_RE,
+    add_forms_afar,
+    add_near,
+    constant_of,
+)
 from sweep.model.detection import mark
-from sweep.model.elementary import fma
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
-from sweep.model.known_kernels import HALVES, ROWS, kernels_beside
-from sweep.model.lanes import COLUMNS, combine
-from sweep.model.power_forms import FAR, FORM, add_form_afar, form_of
 from sweep.model.spectrum import set_tangents
-
-DELTA, STRENGTH_RE, STRENGTH_IM = 19, 20, 21
-"""Rows of scratch that hold the lines."""
 
 SOURCES, IMAGES = 13, 16
 """First of three rows each that hold the sources of lines and of images."""
-
-MOMENTS = FAR + 2
-"""First of two rows that hold the moments of lines, real and imaginary."""
-
-SLOTS = MOMENTS + 2
-"""First of the rows of :mod:`sweep.model.known_kernels`, those of lines before those of forms."""
-
-ROOM = SLOTS + ROWS
-"""Rows of scratch."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -101,12 +93,12 @@ def detect(origin, n, kind, level, choices, kernel, room, exempt):
 
 @njit(cache=True, error_model="numpy")
 def bundle(n, kind, power, room):
-    """Turns lines into strengths, unless they are sources of moments or of a form.
+    """Turns lines into strengths, unless they are sources of bundles.
 
     Returns the sum of their magnitudes, for powers squared, and the range of positions.
     """
-    if kind[1] >= 0:
-        return room[FORM + 3, 1], -HALVES[kind[1]], HALVES[kind[1]]
+    if kind[0] >= 0:
+        return kind[6]
     return far_field.strengths(
         room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, room[9]
     )  # fmt: skip
@@ -197,11 +189,12 @@ def prepare_field(origin, n, kind, spread, sources, choices, kernel, room):
     delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
     centre = seen_from(origin, spread, fft_size)
     lines, images = 0, 0
-    if kind[0]:
+    if kind[5]:
         far_field.seen_at(
             delta, n, centre, centre - origin, fft_size, kernel[4], room[SOURCES], room[IMAGES]
         )  # fmt: skip
-        return centre, n, n if image else 0, room[FORM + 3, 0] * (2.0 if image else 1.0), 0.0, kind
+        constant = constant_of(n, kind, room) * (2.0 if image else 1.0)
+        return centre, n, n if image else 0, constant, 0.0, kind
     if sources:
         lines, images = far_field.far_sources(
             delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
@@ -250,9 +243,9 @@ def add_afar(t, image, field, power, kernel, room, re, im):
     _, numerator, poles, _, _ = kernel[1]
     _, lines, images, _, _, kind = field
     row, used = (IMAGES, images) if image else (SOURCES, lines)
-    if kind[0]:
+    if kind[5]:
         side = -1.0 if image else 1.0
-        add_form_afar(t, room[row], used, numerator, poles, side, room, re)
+        add_forms_afar(t, room[row], used, kind, numerator, poles, side, room, re)
     else:
         add_far_field(t, room[row : row + 3], used, numerator, poles, power, re, im)
 
@@ -260,42 +253,11 @@ def add_afar(t, image, field, power, kernel, room, re, im):
 @njit(cache=True, error_model="numpy")
 def _add_beside(first, row, n, image, field, power, kernel, room, re, im):
     """The same in bins first, first + 1 .. next to n lines, or images, with their places in row."""
-    if field[5][1] >= 0:
-        _add_known(first, image, field[5], power, kernel, room, re, im)
+    if field[5][0] >= 0:
+        add_near(first, image, field[5], power, kernel, room, re, im)
         return
     coefficients, fft_size = kernel[1][0], kernel[0][0]
     add_near_field(
         first, room[row], room[STRENGTH_RE], room[STRENGTH_IM], n, image, fft_size, coefficients,
         power, room[5:7], re, im,
     )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def slot_of(kind, room):
-    """What is known of a bundle's kernels."""
-    form, level = kind
-    return room[SLOTS + level + (len(HALVES) if form else 0)]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_known(first, image, kind, power, kernel, room, re, im):
-    """The same by moments, or products of moments, and known kernels."""
-    slot, plain, size = slot_of(kind, room), power and not kind[0], int(room[FORM + 3, 2])
-    buffer, row, sums = room[FORM + 2], room[5], room[6]
-    side = -1.0 if image else 1.0
-    for start in range(0, re.size, COLUMNS):
-        count = min(COLUMNS, re.size - start)
-        rows, at, stride = kernels_beside(
-            first + start, size, image, plain, slot, kernel, row, buffer
-        )
-        if kind[0]:
-            form_of(rows, at, stride, size, side, FORM, room, sums)
-        else:
-            combine(room[MOMENTS], rows, size, at, stride, sums)
-        side_re = 1.0 if power else -side
-        for k in range(count):
-            re[start + k] = fma(side_re, sums[k], re[start + k])
-        if not power:
-            combine(room[MOMENTS + 1], rows, size, at, stride, sums)
-            for k in range(count):
-                im[start + k] -= sums[k]

@@ -5,28 +5,26 @@ import math
 import numpy as np
 from numba import njit
 
+from sweep.model.bundles import (
+    DELTA,
+    ROOM,
+    STRENGTH_IM,
+    STRENGTH_RE,
+    WIDTH,
+    as_lines,
+    take_bundles,
+)
 from sweep.model.crossings import MOST_TERMS, crossing_series, largest
 from sweep.model.detection import assess, mark
 from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
-from sweep.model.known_kernels import HALVES, WIDTH
 from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few, take_moments
-from sweep.model.power_forms import power_form
+from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
 from sweep.model.preparation import LINE_STEPS
-from sweep.model.runs import (
-    DELTA,
-    ROOM,
-    SLOTS,
-    STRENGTH_IM,
-    STRENGTH_RE,
-    detect,
-    reach_of,
-    smooth,
-)
+from sweep.model.runs import detect, reach_of, smooth
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 SIGNS = (1.0, 0.0, -1.0)
@@ -64,7 +62,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
         First bin, number of bins.
     """
     power, image = choices[0], choices[1]
-    origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
+    origin, n, fold = _lines_of(segment, p, scene, at, power, True, kernel, room)
     few = reduce_lines(n, power, allowed(p, power), n - 1, kernel, room)
     _, parts, shifts = scene
     reach = _extent(segment, at[1], fold, few, parts, shifts, power, kernel, room)
@@ -95,10 +93,11 @@ def allowed(p, power):
 
 
 @njit(cache=True, error_model="numpy")
-def _lines_of(segment, p, scene, at, power, kernel, room):
+def _lines_of(segment, p, scene, at, power, split, kernel, room):
     """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into rows DELTA ..
 
-    Returns their origin, their number, and -1 where they are seen as their images, else 1.
+    Those that add as amplitudes are replaced by their parts, if asked for. Returns their origin,
+    their number, and -1 where they are seen as their images, else 1.
     """
     footprint, parts, shifts = scene
     row, sizes = at[0], kernel[0]
@@ -113,9 +112,10 @@ def _lines_of(segment, p, scene, at, power, kernel, room):
     n, fold = offset.size, 1.0
     if parts[0].size or shifts[0].size:
         fold = folding(which, chirp, record)
-        n = modulate(
-            segment, at[1], n, fold, parts, shifts, power, allowed(p, power), kernel, room
-        )  # fmt: skip
+        if power or split:
+            n = modulate(
+                segment, at[1], n, fold, parts, shifts, power, allowed(p, power), kernel, room
+            )  # fmt: skip
     return origin, n, fold
 
 
@@ -124,7 +124,7 @@ def _magnitudes(
     low, high, origin, n, segment, i, fold, parts, shifts, choices, kernel, room
 ):  # fmt: skip
     """|X| of bins low .. high of n lines in rows 4 to 6, into row 0."""
-    sizes, shape, _, _, tangent = kernel
+    sizes, shape, _, _, tangent, _ = kernel
     power, image = choices[0], choices[1]
     delta, re, im = room[4], room[5], room[6]
     if power and parts[0].size:
@@ -150,7 +150,7 @@ def _magnitudes(
 @njit(cache=True, error_model="numpy")
 def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
     """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
-    sizes, shape, _, _, tangent = kernel
+    sizes, shape, _, _, tangent, _ = kernel
     total, moved = room[0, : high - low + 1], room[10]
     total[:] = 0.0
     for m in range(shifts[0].shape[1]):
@@ -196,7 +196,7 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
     Notes
     -----
     Means of several spectra are those of amplitudes over shifts: their bins are looked at one by
-    one. So are those of powers whose lines are split and spread too wide for a form.
+    one. So are those of lines in parts that are too many or spread too wide for bundles.
     """
     power, _, leakage, every_bin = choices
     if smooth(kernel) and not every_bin and (power or not scene[2][0].size):
@@ -219,35 +219,22 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
 def _smooth_lines(segment, p, scene, at, power, kernel, room):
     """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
 
-    None where the lines are split and spread too wide for a form.
+    None where the lines have parts, and these are too many or spread too wide for bundles.
     """
-    origin, n, fold = _lines_of(segment, p, scene, at, power, kernel, room)
-    parts = scene[1]
-    if not power or not parts[0].size or is_whole(segment, at[1], parts):
-        level = -1
-        if p[15] > 0.0:
-            n, level = take_moments(n, power, allowed(p, power), kernel, room)
-        if level < 0:
-            split = scene[2][0].size > 0 if power else parts[0].size > 0
-            most = n - 1 if split else (n // 2 if p[15] > 0.0 else 0)
-            n = take_few(n, power, allowed(p, power), most, kernel, room)
-        return origin, n, (False, level)
-    n = take_few(n, power, allowed(p, power), n - 1, kernel, room)
-    total = 0.0
-    for b in range(n):
-        total += abs(room[STRENGTH_RE, b])
-    own = parts[4][at[1]]
-    number = parts[3][segment, own]
-    split = (
-        parts[0][segment, own, :number], parts[1][segment, own, :number],
-        parts[2][segment, own, :number],
-    )  # fmt: skip
-    error = allowed(p, False) / max(kernel[2][0] * math.sqrt(total), 1e-300)
-    number, level = power_form(
-        room[DELTA], room[STRENGTH_RE], n, fold, split, kernel[1][3], error, kernel,
-        room[SLOTS + len(HALVES) :], room,
-    )  # fmt: skip
-    return origin, number, (True, level)
+    origin, n, fold = _lines_of(segment, p, scene, at, power, False, kernel, room)
+    parts, own = scene[1], -1
+    if parts[0].size and not is_whole(segment, at[1], parts):
+        own = parts[4][at[1]]
+    if own >= 0 or p[15] > 0.0:
+        n, kind = take_bundles(
+            n, power, (segment, own, fold), parts, allowed(p, power), kernel, room
+        )  # fmt: skip
+        if own >= 0 or kind[0] >= 0:
+            return origin, n, kind
+    widened = power and scene[2][0].size > 0
+    most = n - 1 if widened else (n // 2 if p[15] > 0.0 else 0)
+    n = take_few(n, power, allowed(p, power), most, kernel, room)
+    return origin, n, as_lines()
 
 
 @njit(cache=True, error_model="numpy")
@@ -272,16 +259,14 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     ``lines`` as of :class:`sweep.model.modulation.Stretch`.
     """
     width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, WIDTH) + 16
-    room = np.empty((ROOM, width))
-    room[SLOTS:, 0] = 0.0  # nothing is known of any kernel
-    return room, np.empty(width, np.bool_), np.empty(MOST_TERMS)
+    return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 
 @njit(cache=True, error_model="numpy")
 def lent(scene, kernel, work):
     """Scene, kernel and workspace for the length of a call, their use uncounted."""
     (offset, doppler, amplitude, phase), (apart, re, im, number, which), (shift, share) = scene
-    sizes, shape, sidelobes, limits, tangent = kernel
+    sizes, shape, sidelobes, limits, tangent, known = kernel
     coefficients, numerator, poles, edge, table = shape
     window_sum, envelope, reach = sidelobes
     room, exempt, series = work
@@ -297,6 +282,7 @@ def lent(scene, kernel, work):
             (window_sum, borrowed(envelope), borrowed(reach)),
             borrowed(limits),
             borrowed(tangent),
+            borrowed(known),
         ),
         (borrowed(room), borrowed(exempt), borrowed(series)),
     )

@@ -39,11 +39,11 @@ def run_of_bins(shots, segment):
     room, exempt, series = segments.workspace(point.lines, shots.fft_size)
     crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
     shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
-    _, number, (form, _) = segments._smooth_lines(*shot, True, shots.kernel(), room)
+    _, number, kind = segments._smooth_lines(*shot, True, shots.kernel(), room)
     low, count, *_ = segments.inspect_segment(
         *shot, modulation.choices(shots), shots.kernel(), room, exempt, series
     )
-    return np.arange(low, low + count), room[0, :count].copy(), form and number > 0
+    return np.arange(low, low + count), room[0, :count].copy(), kind[5] and number > 0
 
 
 def apart(shots, segment):
