@@ -304,6 +304,18 @@ def test_importing_the_package_and_asking_for_help_stay_cheap():
     assert done.stdout.strip() == "[]"
 
 
+def test_a_spec_is_read_and_planned_without_what_few_specs_need():
+    """scipy.signal brings scipy.stats with it, which takes longer to import than all the rest."""
+    code = (
+        "import sys, sweep.tasks.driver, sweep.model.window;"
+        "sweep.model.window.samples('hann', 8);"
+        "slow = ('stats', 'signal', 'optimize', 'interpolate', 'ndimage');"
+        "print([m for m in slow if f'scipy.{m}' in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_the_package_offers_load_run_and_resume(here):
     import sweep as package
 

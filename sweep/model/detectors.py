@@ -31,7 +31,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numba import njit
-from scipy.optimize import brentq
 from scipy.special import gammaln
 
 from sweep.model.processing import Setting
@@ -74,6 +73,8 @@ def crossing_probability(kind: str, factor: float, *, training: int, rank: int) 
 
 def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
     """Factor on the level of training cells for a design probability of a false alarm in a bin."""
+    from scipy.optimize import brentq  # slow to import, and only CFAR has a factor to find
+
     if kind == CA:
         return training * math.expm1(-math.log(pfa) / training)
 

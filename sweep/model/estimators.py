@@ -26,16 +26,22 @@ distance (the phase of half a record a bin taken off):
   Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
-from scipy import fft, signal
+from scipy import fft
 
 from sweep.model.processing import Setting, taper
 from sweep.model.window import Window
+
+if TYPE_CHECKING:
+    from scipy import signal
 
 Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
 """From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
@@ -167,6 +173,8 @@ def _ratio(turned: np.ndarray, sign: int) -> np.ndarray:
 @lru_cache(maxsize=16)
 def _lone_tones(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances [bins] from -1 to 1, and the turned bins of tones that far above one, (k, 3)."""
+    from scipy import signal  # slow to import
+
     steps = np.arange(-_STEPS, _STEPS + 1)
     half_turn = 0.5 * window.length / fft_size
     y = np.arange(2 * _STEPS + 1) / _STEPS
@@ -191,6 +199,8 @@ def jacobsen_form(window: Window, fft_size: int) -> tuple[int, float]:
 @lru_cache(maxsize=4)
 def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
     """Chirp-z transform of a record at rest, from -1 to 1 bin."""
+    from scipy import signal  # slow to import
+
     edge = 1.0 / fft_size
     return signal.ZoomFFT(length, [-edge, edge], 2 * _ZOOM + 1, fs=1.0, endpoint=True)
 

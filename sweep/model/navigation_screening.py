@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 SOLVED = 0
 """All valid beams are in the solution."""
@@ -69,7 +69,7 @@ def screen(
         return fitted, used, status
     if not 0 < level < 1:
         raise ValueError(f"the test's level lies between 0 and 1, not {level}")
-    most = np.concatenate([[np.inf], chi2.isf(level, np.arange(1, b + 1))])
+    most = np.concatenate([[np.inf], chdtri(np.arange(1, b + 1), level)])
     suspect = np.flatnonzero(fitted.solved & (fitted.chi_square > most[fitted.degrees]))
     passes = np.zeros((suspect.size, b), bool)
     for beam in range(b):

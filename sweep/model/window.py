@@ -19,7 +19,6 @@ from functools import lru_cache
 
 import mpmath
 import numpy as np
-from scipy import signal
 
 COSINE_SUMS: dict[str, tuple[str, ...]] = {
     "rectangular": ("1", "0"),
@@ -104,13 +103,30 @@ def samples(name: str, length: int) -> np.ndarray:
         Where scipy knows no such window or refuses its parameters.
     """
     name = canonical_name(name)
+    if name in COSINE_SUMS:
+        return _cosine_samples(name, length)
+
+    from scipy import signal  # which takes longer to import than all else that a spec needs
+
     match = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
     if match:
         parameters = tuple(float(p) for p in match[2].split(",") if p)
         return np.asarray(signal.get_window((match[1], *parameters), length, fftbins=True))
-    return np.asarray(
-        signal.get_window("boxcar" if name == "rectangular" else name, length, fftbins=True)
-    )
+    return np.asarray(signal.get_window(name, length, fftbins=True))
+
+
+def _cosine_samples(name: str, length: int) -> np.ndarray:
+    """A cosine sum's samples, the very bits of scipy.signal's."""
+    c = [float(t) for t in COSINE_SUMS[name]]
+    if len(c) == 2:
+        c[1] = 1.0 - c[0]
+    if length == 1 or name == "rectangular":
+        return np.ones(length)
+    turn = np.linspace(-np.pi, np.pi, length + 1)
+    w = np.zeros(length + 1)
+    for m, weight in enumerate(c):
+        w += weight * np.cos(m * turn)
+    return w[:-1]
 
 
 @lru_cache(maxsize=32)

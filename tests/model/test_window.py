@@ -13,6 +13,13 @@ OTHERS = (
 )  # fmt: skip
 
 
+@pytest.mark.parametrize("name", [*COSINE_SUMS, "boxcar"])
+def test_cosine_sums_have_the_very_bits_of_scipys(name):
+    for length in (1, 2, 3, 37, 64, 1000, 2**17, 300_000):
+        expected = signal.get_window("boxcar" if name == "rectangular" else name, length)
+        assert samples(name, length).tobytes() == expected.tobytes()
+
+
 @pytest.mark.parametrize(
     "name, scalloping, bandwidth",
     [("rectangular", 3.92, 1.00), ("hann", 1.42, 1.50), ("hamming", 1.75, 1.36)],

@@ -27,7 +27,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
@@ -48,6 +47,8 @@ from sweep.model.preparation import Shots
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
     from sweep.model.effects.block import Block
 
 _GONE = 40.0
@@ -194,8 +195,10 @@ def _aliases(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def autocorrelation(window: Window) -> CubicSpline:
+def autocorrelation(window: Window) -> "CubicSpline":
     """Sum_n w_n w_(n+j) as a function of the lag j, 0..L [samples]."""
+    from scipy.interpolate import CubicSpline  # slow to import
+
     w = samples(window.name, window.length)
     spectrum = np.abs(np.fft.rfft(w, 2 * window.length)) ** 2
     r = np.fft.irfft(spectrum, 2 * window.length)[: window.length + 1]
