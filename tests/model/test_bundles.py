@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_optional_lines import exact, prepared, scene
+from windows import marked
 
 from sweep.model import modulation, segments
 from sweep.model.crossings import crossing_series
@@ -59,7 +60,7 @@ def apart(shots, segment):
 @pytest.mark.parametrize(
     "place, image", [*((place, True) for place in PLACES), ("in the band", False)]
 )
-@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("window", marked(WINDOWS))
 def test_bins_are_those_of_the_record(window, place, image, table_4_1):
     """From gentle drifts to those over ten bins; bright, so that runs are wide."""
     without = () if image else ("image",)
@@ -74,7 +75,7 @@ def test_bins_are_those_of_the_record(window, place, image, table_4_1):
             assert form or drift > 0.1
 
 
-@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("window", marked(WINDOWS))
 def test_bins_are_within_what_is_allowed(window, table_4_1):
     changed = 0
     for drift in (1e-3, 0.1, 1.0, 4.0):

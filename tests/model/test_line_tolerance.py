@@ -18,7 +18,7 @@ def some_shots(table_4_1, phases, effects, seed):
     """From the target on the doorstep to the far one, where phases cancel and where they do not."""
     rng = np.random.default_rng((81, seed))
     parameters = DEFAULTS | table_4_1(
-        phases=phases, fft_size=2**13, window=str(rng.choice(["hamming", "blackman"])),
+        phases=phases, fft_size=2**13, window=str(rng.choice(["hamming", "flattop"])),
         range=10 ** rng.uniform(0.5, 4, POINTS), power=10 ** rng.uniform(-3, 1, POINTS),
         grazing_angle=np.radians(rng.uniform(2, 90, POINTS)),
         radial_velocity=rng.choice([5.0, 150.0], POINTS), beam_divergence=1e-4,

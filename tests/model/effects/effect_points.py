@@ -11,8 +11,8 @@ from sweep.model.effects.span import Span
 from sweep.model.shot import find
 
 SIZES = (2**12, 2**13, 2**14, 2**15, 2**16, 2**17, 2**18)
-WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop", "kaiser(8.6)")
-CLOSED = WINDOWS[:5]
+CLOSED = ("hamming", "hann", "rectangular", "flattop")
+WINDOWS = (*CLOSED, "kaiser(8.6)")
 
 ACROSS = "target.transverse_velocity"
 WIDENED = {
