@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
+.PHONY: demo test test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -19,13 +19,21 @@ demo: $(READY)
 
 # A compiled kernel's cache does not notice a change in a kernel that it calls: begin without it.
 test: $(READY) forget-kernels
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(MAKE) --jobs 3 --output-sync lint compile-grids compile-flights
 	$(BIN)/pytest -n auto --dist worksteal
 
 test-all: $(READY) forget-kernels
+	$(MAKE) --jobs 2 compile-grids compile-flights
 	$(BIN)/pytest -n auto --dist worksteal -m ''
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# Once for all processes of tests, which would each compile the same.
+compile-%: $(READY)
+	$(BIN)/python tests/compiling.py $*
 
 stability: $(READY)
 	$(BIN)/python tests/stability/stability_table.py

@@ -21,10 +21,10 @@ SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109},
     "draws": {"number": 3000, "method": "noise", "batch": 1000},
-    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 160}},
+    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 100}},
     "storage": {"block_points": 1},
 }
-BLOCKS = 160
+BLOCKS = 100
 WAIT = 120.0
 
 

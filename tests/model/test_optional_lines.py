@@ -1,6 +1,7 @@
 """Spectra of what shots carry only where an effect asks for it: images, leakage, phases, widths."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -217,12 +218,18 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize(
-    "effects", [DRIFTING[:1], DRIFTING, ("line_width",), (*DRIFTING[:1], "line_width")]
-)
+SMEARING = DRIFTING[:1], DRIFTING, ("line_width",), (*DRIFTING[:1], "line_width")
+
+
+def smeared():
+    """All of effects, cases, windows and phases; the fast suite has every two of them together."""
+    every = product(enumerate(SMEARING), enumerate(CASES), enumerate(WINDOWS), PHASES)
+    for (i, effects), (j, case), (k, window), phases in every:
+        marks = [pytest.mark.slow] if (i + j + k) % len(WINDOWS) else []
+        yield pytest.param(effects, case, window, phases, marks=marks)
+
+
+@pytest.mark.parametrize("effects, case, window, phases", smeared())
 def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, phases, table_4_1):
     parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
     shots, plain = prepared(parameters, *effects), prepared(parameters)
