@@ -28,8 +28,16 @@ run(small_scene(), store=sys.argv[1], scheduler="none", evaluate=slowly, progres
 """
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """Files of the study and of its eyepoints, run as a plain loop."""
+    store = tmp_path_factory.mktemp("plain") / "scene.zarr"
+    run(small_scene(), store=store, scheduler="none", progress=False)
+    return tree(store.parent)
+
+
 @pytest.mark.parametrize("stage", ["casting", "looking"])
-def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, stage):
+def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()
     eyepoints = eyepoints_path(store, small_scene().geometry_id("three"))
@@ -48,6 +56,4 @@ def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, stage):
     for path, committed in before.items():
         after = receipts(path)
         assert after[: len(committed)] == committed and len(set(after)) == len(after)
-    plain = tmp_path / "plain" / "scene.zarr"
-    run(small_scene(), store=plain, scheduler="none", progress=False)
-    assert tree(store.parent) == tree(plain.parent)
+    assert tree(store.parent) == plain

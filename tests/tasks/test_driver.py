@@ -34,7 +34,7 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
     [
         {"workers": 1},
         {"workers": 2},
-        {"workers": 4},
+        pytest.param({"workers": 4}, marks=pytest.mark.slow),
         {"workers": 2, "processes": False},
         {"workers": 4, "processes": False},
     ],
