@@ -3,11 +3,18 @@
 from math import pi
 
 import pytest
+from dask.system import CPU_COUNT
 from hypothesis import settings
 
 # The first call of a compiled kernel may compile it, which no deadline should count.
 settings.register_profile("sweep", deadline=None, derandomize=True)
 settings.load_profile("sweep")
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: a tenth of the time tests wait for processes of their own."""
+    return CPU_COUNT + 1
+
 
 TABLE_4_1 = {
     "instrument.laser.wavelength": 1550e-9,

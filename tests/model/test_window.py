@@ -152,7 +152,7 @@ def test_a_tone_leaks_no_more_than_all_its_energy(name):
 def test_the_envelope_bounds_every_sidelobe_beyond_its_reach(name, length):
     shape = window(name, length)
     rng = np.random.default_rng(length)
-    dense = np.concatenate([np.arange(0.125, 60, 1 / 64), rng.uniform(0.2, length / 2, 1500)])
+    dense = np.concatenate([np.arange(0.125, 60, 1 / 32), rng.uniform(0.2, length / 2, 600)])
     y = np.sort(dense[(dense >= shape.reach[0]) & (dense <= length / 2)])
     magnitude = np.abs(transform(shape, y)) / shape.sum
     bound = shape.envelope[np.searchsorted(shape.reach, y, side="right") - 1]
