@@ -12,7 +12,7 @@ settings.load_profile("sweep")
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: a tenth of the time tests wait for processes of their own."""
+    """One more than there are cores, since some tests wait for processes of their own."""
     return CPU_COUNT + 1
 
 

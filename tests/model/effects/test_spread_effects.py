@@ -107,7 +107,8 @@ def test_the_axis_amplitude_is_the_model_s_with_one_beamlet(table_4_1):
         settled = line.bin_offset == line.bin_offset_least  # not with and without a slow Doppler
         alone = settled & (line.edge > 200 * line.lobe.margin)
         expected = block.amplitude.low
-        assert measured[alone] == pytest.approx(expected[alone], rel=3e-5)
+        room = 3e-5 + 1e-3 * (shots.window.name == "flattop")  # least and most of a flat top
+        assert measured[alone] == pytest.approx(expected[alone], rel=room)
 
 
 @pytest.mark.parametrize("law", ["thesis", "lambert", "lommel_seeliger"])
