@@ -37,6 +37,11 @@ def test_workers_are_dealt_out_evenly():
     assert list(ssh.workers(cluster, 2)) == ["a", "b"]
 
 
+def test_workers_have_the_threads_of_the_file():
+    cluster = cluster_of({**SSH, "worker": {"memory": "1 GB", "threads": 3}})
+    assert ssh.nanny(cluster)["nthreads"] == 3
+
+
 @contextmanager
 def server(directory: Path):
     """An SSH server that runs commands here: its port, and what was asked of it."""

@@ -172,4 +172,4 @@ def test_a_page_of_whole_spectra_shows_what_is_stored(tmp_path):
 def test_a_plan_measures_what_draws_take():
     few, many = (study() for _ in range(2))
     many = many.model_copy(update={"draws": many.draws.model_copy(update={"number": 10_000})})
-    assert plan(many).seconds_a_point > 20 * plan(few).seconds_a_point
+    assert plan(many).seconds_a_point > 5 * plan(few).seconds_a_point
