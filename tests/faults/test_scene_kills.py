@@ -32,7 +32,9 @@ run(small_scene(), store=sys.argv[1], scheduler="none", evaluate=slowly, progres
 def plain(tmp_path_factory):
     """Files of the study and of its eyepoints, run as a plain loop."""
     store = tmp_path_factory.mktemp("plain") / "scene.zarr"
-    run(small_scene(), store=store, scheduler="none", progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sweep.tasks.eyepoint_study.BLOCK_SHOTS", 24)
+        run(small_scene(), store=store, scheduler="none", progress=False)
     return tree(store.parent)
 
 

@@ -229,7 +229,7 @@ def smeared():
         yield pytest.param(effects, case, window, phases, marks=marks)
 
 
-@pytest.mark.parametrize("effects, case, window, phases", smeared())
+@pytest.mark.parametrize("effects, case, window, phases", list(smeared()))
 def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, phases, table_4_1):
     parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
     shots, plain = prepared(parameters, *effects), prepared(parameters)
