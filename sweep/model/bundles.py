@@ -57,9 +57,6 @@ LEAST_KNOWN = 6
 WIDEST, SIDE_BY_SIDE = (9, 6), (7, 6)
 """Levels: of a bundle by itself at the most, of bundles side by side; of amplitudes, of powers."""
 
-LEAST_ERROR = 1e-13
-"""Error of amplitudes taken as moments, relative to the sum of all, that is the least asked for."""
-
 
 @njit(cache=True, error_model="numpy")
 def as_lines():

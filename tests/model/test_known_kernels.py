@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from test_optional_lines import prepared, scene
 from test_bundles import PLACES, WINDOWS
+from test_optional_lines import prepared, scene
 
 from sweep.model import modulation, segments, spectra
 from sweep.model.crossings import crossing_series
@@ -24,7 +24,7 @@ def run_of_bins(shots, segment):
     crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
     chosen, kernel = modulation.choices(shots), shots.kernel()
     shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
-    _, _, (row, number, *_, form, _) = segments._smooth_lines(*shot, chosen[0], kernel, room)
+    _, _, (row, *_, form, _) = segments._smooth_lines(*shot, chosen[0], kernel, room)
     assert not form
     low, count, *_ = segments.inspect_segment(*shot, chosen, kernel, room, exempt, series)
     return low, room[0, :count].copy(), row
