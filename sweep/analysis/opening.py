@@ -16,6 +16,10 @@ from sweep.storage.receipts import read_receipts
 from sweep.storage.sealing import read_lines
 
 BATCH = "batch"
+PIECE = 2**20
+"""Values of an array that are read at a time: few enough for any memory, and enough that Dask's
+list of what is to be read stays short (some 7 kB a piece; a piece of floats has 8 MB)."""
+
 NOT_COUNTED = -1
 """What a count holds where its block is not computed."""
 
@@ -38,8 +42,8 @@ def open(path: str | Location) -> xr.Dataset:
 
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
     written in, and every variable has its units and what it is. Arrays are read when they are
-    needed. What is not computed yet is nan; -1 for counts of draws, which are summed over their
-    batches, and for their number `n_draws`.
+    needed, as Dask arrays in pieces of whole chunks of the store. What is not computed yet is nan;
+    -1 for counts of draws, which are summed over their batches, and for their number `n_draws`.
 
     Parameters
     ----------
@@ -59,9 +63,8 @@ def open(path: str | Location) -> xr.Dataset:
     """
     path = located(path)
     attributes = read_attributes(path, GRID)
-    dataset = xr.open_zarr(
-        zarr_store(path), consolidated="consolidated_metadata" in _document(path)
-    )
+    consolidated = "consolidated_metadata" in _document(path)
+    dataset = in_pieces(xr.open_zarr(zarr_store(path), chunks=None, consolidated=consolidated))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
@@ -116,6 +119,20 @@ def _near(path: Location) -> str:
     names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     return f"; stores near it: {shown}" if names else ""
+
+
+def in_pieces(dataset: xr.Dataset) -> xr.Dataset:
+    """Arrays that are read where they are sliced as Dask arrays, in pieces of whole stored chunks.
+
+    A piece has no more than `PIECE` values, or is one chunk where that has more. It grows
+    along the last dimension first, in which values lie next to each other.
+    """
+    largest = max(dataset.data_vars.values(), key=lambda array: array.ndim)
+    pieces = dict(zip(largest.dims, largest.encoding["chunks"], strict=True))
+    for dim in reversed(largest.dims):
+        room = PIECE // math.prod(pieces.values())
+        pieces[dim] = min(largest.sizes[dim], pieces[dim] * max(1, room))
+    return dataset.chunk(pieces)
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:

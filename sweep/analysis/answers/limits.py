@@ -4,12 +4,13 @@ Between two points of the grid the place is interpolated in the normal deviate z
 Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is nearly a straight line
 where pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
 
-Everything is a reduction of pairs of neighbours, so that it is lazy, and a store larger than memory
-goes through piece by piece.
+Everything is a reduction of pairs of neighbours: of those within a piece first, then of those that
+lie in two, so that it is lazy, and a store larger than memory goes through piece by piece.
 """
 
 from __future__ import annotations
 
+import dask.array
 import numpy as np
 import xarray as xr
 from scipy.special import ndtri
@@ -29,7 +30,10 @@ def deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
     lost = 1 - pd if miss is None else miss
 
     def of(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return np.clip(np.where(p < 0.5, ndtri(p), -ndtri(q)), -_FARTHEST, _FARTHEST)
+        z = np.where(p < 0.5, p, q)
+        ndtri(z, out=z)
+        np.negative(z, out=z, where=p >= 0.5)
+        return np.clip(z, -_FARTHEST, _FARTHEST, out=z)
 
     return xr.apply_ufunc(of, pd, lost, dask="parallelized", output_dtypes=[float])
 
@@ -117,26 +121,16 @@ def _answers(
 ) -> dict[str, xr.DataArray]:
     """Both answers and their reasons."""
     z = deviate(pd, miss) - float(ndtri(level))
-    steps = xr.DataArray(np.arange(x.size, dtype=float), dims=[dim])
-    first, last = {dim: slice(None, -1)}, {dim: slice(1, None)}
-    here, there = _bare(z.isel(first), dim), _bare(z.isel(last), dim)
-    falls = (here >= 0) & (there < 0)
-    # Places are counted in steps along the axis, so that they rise whichever way it is walked.
-    place = steps.isel(first) + here / xr.where(falls, here - there, 1.0)
-    break_at = place.where(falls, np.inf).min(dim)
-    left_at = place.where(falls, -np.inf).max(dim)
-    z = _bare(z, dim)
-    unknown = z.isnull()
-    first_unknown = steps.where(unknown, np.inf).min(dim)
-    last_unknown = steps.where(unknown, -np.inf).max(dim)
-    starts, ends = z.isel({dim: 0}) >= 0, z.isel({dim: -1}) >= 0
+    marks = _marks(z, dim)
+    starts, ends = marks["first"] >= 0, marks["last"] >= 0
+    break_at, left_at = marks["break_at"], marks["left_at"]
     unbroken = xr.where(
-        first_unknown < xr.where(starts, break_at, 0.5),
+        marks["first_unknown"] < xr.where(starts, break_at, 0.5),
         NOT_COMPUTED,
         xr.where(~starts, NEVER, xr.where(np.isinf(break_at), ALWAYS, FOUND)),
     )
     farthest = xr.where(
-        last_unknown > xr.where(ends, float(x.size), left_at),
+        marks["last_unknown"] > xr.where(ends, float(x.size), left_at),
         NOT_COMPUTED,
         xr.where(ends, ALWAYS, xr.where(np.isinf(left_at), NEVER, FOUND)),
     )
@@ -148,10 +142,70 @@ def _answers(
     }
 
 
-def _bare(array: xr.DataArray, dim: str) -> xr.DataArray:
-    """An array without coordinates along a dimension, so that neighbours meet."""
-    names = [name for name, c in array.coords.items() if dim in c.dims]
-    return array.drop_vars(names)
+_MARKS = ("first", "last", "break_at", "left_at", "first_unknown", "last_unknown")
+
+
+def _marks(z: xr.DataArray, dim: str) -> xr.Dataset:
+    """All that answers need to know of z along a dimension, each piece of it read once.
+
+    Places are counted in steps along the axis, so that they rise whichever way it is walked; those
+    that there are none of are infinite.
+    """
+    z = z.transpose(dim, ...)
+    data = z.data if z.chunks else dask.array.from_array(z.values, chunks=-1)
+    after = np.cumsum((0, *data.chunks[0]))
+    starts = dask.array.from_array(after[:-1], chunks=1).reshape(-1, *(1,) * (z.ndim - 1))
+    parts = dask.array.map_blocks(
+        _marks_of_piece, data, starts, dtype=float, new_axis=z.ndim,
+        chunks=((1,) * data.numblocks[0], *data.chunks[1:], (len(_MARKS),)),
+    )  # fmt: skip
+    whole = parts.rechunk({0: -1}).map_blocks(
+        _marks_of_all, after[1:-1], dtype=float, drop_axis=0,
+    )  # fmt: skip
+    others = {name: c for name, c in z.coords.items() if dim not in c.dims}
+    found = xr.DataArray(whole, dims=[*z.dims[1:], "mark"], coords=others)
+    marks = xr.Dataset({name: found.isel(mark=i) for i, name in enumerate(_MARKS)})
+    return marks if z.chunks else marks.compute()
+
+
+def _marks_of_piece(z: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Marks (1, ..., 6) of a piece (n, ...) whose first value is at the step `start`."""
+    steps = start.ravel()[0] + np.arange(float(len(z))).reshape(-1, *(1,) * (z.ndim - 1))
+    falls, place = _falls(z[:-1], z[1:], steps[:-1])
+    unknown = np.isnan(z)
+    marks = [
+        z[0],
+        z[-1],
+        np.min(place, axis=0, where=falls, initial=np.inf),
+        np.max(place, axis=0, where=falls, initial=-np.inf),
+        np.min(np.broadcast_to(steps, z.shape), axis=0, where=unknown, initial=np.inf),
+        np.max(np.broadcast_to(steps, z.shape), axis=0, where=unknown, initial=-np.inf),
+    ]
+    return np.stack(marks, axis=-1)[np.newaxis]
+
+
+def _marks_of_all(parts: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Marks (..., 6) of pieces (k, ..., 6) together; the second to the last begin at `starts`."""
+    first, last, break_at, left_at, first_unknown, last_unknown = np.moveaxis(parts, -1, 0)
+    steps = starts.reshape(-1, *(1,) * (first.ndim - 1)) - 1.0
+    falls, place = _falls(last[:-1], first[1:], steps)
+    marks = [
+        first[0],
+        last[-1],
+        np.fmin(break_at.min(0), np.min(place, axis=0, where=falls, initial=np.inf)),
+        np.fmax(left_at.max(0), np.max(place, axis=0, where=falls, initial=-np.inf)),
+        first_unknown.min(0),
+        last_unknown.max(0),
+    ]
+    return np.stack(marks, axis=-1)
+
+
+def _falls(
+    here: np.ndarray, there: np.ndarray, steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between which neighbours z falls below 0, and at which place."""
+    falls = (here >= 0) & (there < 0)
+    return falls, steps + here / np.where(falls, here - there, 1.0)
 
 
 def _value(place: xr.DataArray, x: xr.DataArray) -> xr.DataArray:
