@@ -22,16 +22,16 @@ BYTES_A_POINT = 8 * 27 + 4
 """27 arrays of floats and one of flags."""
 
 
-def spec_of(gigabytes, block_points=CHUNK):
+def spec_of(gigabytes, block_points=CHUNK, powers=100):
     """A study of about so many GB of results."""
     from sweep.spec import load
 
-    ranges = max(2, round(gigabytes * 1e9 / BYTES_A_POINT / ANGLES / 100))
+    ranges = max(2, round(gigabytes * 1e9 / BYTES_A_POINT / ANGLES / powers))
     spec = load(Path(__file__).parents[1] / "experiments" / "quickstart.yaml")
     mapping = spec.to_yaml_mapping() | {
         "title": "Made up",
         "axes": {
-            "instrument.laser.power": {"log": ["1 W", "10 W"], "number": 100},
+            "instrument.laser.power": {"log": ["1 W", "10 W"], "number": powers},
             "target.range": {"linear": ["100 m", "20 km"], "number": ranges},
             "target.grazing_angle": {"linear": ["20 deg", "90 deg"], "number": ANGLES},
         },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,26 +61,62 @@ def reduced(grid: Grid, kind: str, columns: int, rows: int) -> Grid:
     columns, rows
         Most cells along x and along y.
     """
-    values, x = _blocks(grid.values, grid.x, kind, columns, axis=1)
-    values, y = _blocks(values, grid.y, kind, rows, axis=0)
-    return Grid(x, y, values)
+    by = together(grid.y.size, rows), together(grid.x.size, columns)
+    return Grid(middles(grid.x, by[1]), middles(grid.y, by[0]), in_cells(grid.values, kind, by))
 
 
-def _blocks(
-    values: np.ndarray, along: np.ndarray, kind: str, most: int, axis: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Values and coordinate with neighbours along an axis taken together, as few as will do."""
-    if along.size <= most:
-        return values, along
-    starts = np.arange(0, along.size, -(-along.size // most))
-    number = np.diff(starts, append=along.size)
-    middle = along[starts] if is_words(along) else np.add.reduceat(along, starts) / number
-    if kind == "mean":
-        known = np.add.reduceat(~np.isnan(values), starts, axis=axis)
-        total = np.add.reduceat(np.nan_to_num(values), starts, axis=axis)
-        return np.where(known, total / np.maximum(known, 1), np.nan), middle
-    best = np.fmin if kind == "lowest" else np.fmax
-    return best.reduceat(values, starts, axis=axis), middle
+def together(number: int, most: int) -> int:
+    """How many neighbours a cell stands for, so that there are `most` cells or fewer."""
+    return -(-number // most)
+
+
+def middles(along: np.ndarray, by: int) -> np.ndarray:
+    """Mean value of a coordinate in each cell of `by` neighbours; of words the first."""
+    if by == 1:
+        return along
+    starts = np.arange(0, along.size, by)
+    if is_words(along):
+        return along[starts]
+    return np.add.reduceat(along, starts) / np.diff(starts, append=along.size)
+
+
+def in_cells(values: np.ndarray, kind: str, by: Sequence[int]) -> np.ndarray:
+    """Values with neighbours taken together, `by` along each axis, the last ones fewer.
+
+    Parameters
+    ----------
+    values, by
+        As many dimensions as numbers.
+    kind
+        "lowest", "highest" or "mean" of the values that share a cell; nan only where all are.
+    """
+    starts = [np.arange(0, size, number) for size, number in zip(values.shape, by, strict=True)]
+    return told(gathered(tallied(values, kind), kind, starts), kind)
+
+
+def tallied(values: np.ndarray, kind: str) -> np.ndarray:
+    """What is gathered of values (...), in a further last dimension."""
+    if kind != "mean":
+        return values[..., np.newaxis]
+    missing = np.isnan(values)
+    return np.stack([np.where(missing, 0.0, values), ~missing], axis=-1)
+
+
+def gathered(tallies: np.ndarray, kind: str, starts: Sequence[np.ndarray]) -> np.ndarray:
+    """Tallies of cells that begin at some places along each axis, from those of their values."""
+    ufunc = {"mean": np.add, "lowest": np.fmin, "highest": np.fmax}[kind]
+    for axis, places in enumerate(starts):
+        if places.size < tallies.shape[axis]:
+            tallies = ufunc.reduceat(tallies, places, axis=axis)
+    return tallies
+
+
+def told(tallies: np.ndarray, kind: str) -> np.ndarray:
+    """Values of cells (...) from their tallies."""
+    if kind != "mean":
+        return tallies[..., 0]
+    total, number = tallies[..., 0], tallies[..., 1]
+    return np.where(number > 0, total / np.maximum(number, 1.0), np.nan)
 
 
 def edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:

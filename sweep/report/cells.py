@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import dask.array
 import numpy as np
 import xarray as xr
 
@@ -33,14 +35,11 @@ class Side:
 
     def together(self, most: int) -> int:
         """How many neighbours a cell stands for, so that there are `most` cells or fewer."""
-        return 1 if surface.is_words(self.values) else -(-self.values.size // most)
+        return 1 if surface.is_words(self.values) else surface.together(self.values.size, most)
 
     def middles(self, most: int) -> np.ndarray:
         """Mean value of the coordinate in each cell."""
-        if self.together(most) == 1:
-            return self.values
-        row = surface.Grid(self.values, np.zeros(1), np.zeros((1, self.values.size)))
-        return surface.reduced(row, MEAN, most, 1).x
+        return surface.middles(self.values, self.together(most))
 
 
 def reduced(
@@ -66,11 +65,48 @@ def reduced(
     }
     array = known(array.isel(dict(at)).isel(chosen))
     array = array.transpose(*(side.dim for side, _ in sides))
-    by = {side.dim: side.together(most) for side, most in sides}
-    if all(number == 1 for number in by.values()):
+    by = [side.together(most) for side, most in sides]
+    if max(by) == 1:
         return array
-    cells = array.drop_vars(list(array.coords)).coarsen(by, boundary="pad")  # type: ignore[arg-type]
-    return {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
+    return xr.DataArray(_in_cells(array.data, kind, by), dims=array.dims)
+
+
+def _in_cells(data: dask.array.Array, kind: str, by: Sequence[int]) -> dask.array.Array:
+    """Cells of `by` values along each axis: first within the pieces, then across their borders."""
+    cells = [_cells_of(own, number) for own, number in zip(data.chunks, by, strict=True)]
+    tallies = data.map_blocks(
+        _of_piece,  # type: ignore[arg-type]
+        kind, by, dtype=float, new_axis=data.ndim,
+        chunks=(*(tuple(part.size for part in own) for own in cells), (1 + (kind == MEAN),)),
+    )  # fmt: skip
+    numbers = [np.concatenate(own) for own in cells]
+    return tallies.rechunk(-1).map_blocks(
+        lambda whole: surface.told(
+            surface.gathered(whole, kind, [np.unique(n, return_index=True)[1] for n in numbers]),
+            kind,
+        ),
+        dtype=float, drop_axis=data.ndim, chunks=tuple((int(n[-1]) + 1,) for n in numbers),
+    )  # fmt: skip
+
+
+def _cells_of(lengths: Sequence[int], by: int) -> list[np.ndarray]:
+    """Numbers of the cells that pieces of some lengths have a part of."""
+    ends = np.cumsum(lengths)
+    starts = ends - lengths
+    return [
+        np.arange(first // by, (last - 1) // by + 1)
+        for first, last in zip(starts, ends, strict=True)
+    ]
+
+
+def _of_piece(values: np.ndarray, kind: str, by: Sequence[int], block_info: Any) -> np.ndarray:
+    """Tallies of the cells that a piece has a part of."""
+    places = [first for first, _ in block_info[0]["array-location"]]
+    starts = [
+        np.maximum(np.arange(-(place % number), size, number), 0)
+        for place, number, size in zip(places, by, values.shape, strict=True)
+    ]
+    return surface.gathered(surface.tallied(values, kind), kind, starts)
 
 
 def known(array: xr.DataArray) -> xr.DataArray:

@@ -200,9 +200,7 @@ def _marks_of_all(parts: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.stack(marks, axis=-1)
 
 
-def _falls(
-    here: np.ndarray, there: np.ndarray, steps: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _falls(here: np.ndarray, there: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Between which neighbours z falls below 0, and at which place."""
     falls = (here >= 0) & (there < 0)
     return falls, steps + here / np.where(falls, here - there, 1.0)
