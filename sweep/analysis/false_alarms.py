@@ -71,9 +71,8 @@ def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     """
     first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
     parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
-    processing = "instrument.processing."
-    size, tnr = int(parameters[processing + "fft_size"]), float(parameters[processing + "tnr"])
-    bins = size if parameters[processing + "bins_counted"] == "all" else size // 2
+    tnr = float(parameters["instrument.processing.tnr"])
+    bins = noise_only.bins_counted(parameters)
     found = evaluate(parameters)
     return Reference(
         tnr=tnr,

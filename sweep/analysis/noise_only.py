@@ -8,6 +8,10 @@ probability (1 - (1 - p)^N)^2: what Tables 4.3 to 4.5 of the thesis print.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 
 def bin_exponent(tnr: float) -> float:
@@ -20,10 +24,21 @@ def bin_probability(tnr: float) -> float:
     return math.exp(-bin_exponent(tnr))
 
 
+def bins_counted(parameters: Mapping[str, Any]) -> int:
+    """Bins of a segment that can raise a false alarm, from SI values by dotted path."""
+    size = int(parameters["instrument.processing.fft_size"])
+    return size if parameters["instrument.processing.bins_counted"] == "all" else size // 2
+
+
+def segment_probability(bin_probability: np.ndarray, bins: float) -> np.ndarray:
+    """Probability of a false alarm in a segment of so many bins, 1 - (1 - p)^N, 0..1."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(-np.expm1(bins * np.log1p(-np.asarray(bin_probability))))
+
+
 def shot_probability(tnr: float, bins: float) -> float:
     """Probability that both of two segments of so many bins raise a false alarm, 0..1."""
-    p = bin_probability(tnr)
-    return 1.0 if p >= 1.0 else math.expm1(bins * math.log1p(-p)) ** 2
+    return float(segment_probability(np.asarray(bin_probability(tnr)), bins)) ** 2
 
 
 def variance_excess_of_bin(probability: float, tnr: float) -> float:

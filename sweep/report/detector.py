@@ -9,14 +9,15 @@ from typing import Any
 import dask
 import numpy as np
 import plotly.graph_objects as go
+import xarray as xr
 
 from sweep.analysis import labels, noise_only
+from sweep.analysis.answers.physical import parameter
 from sweep.analysis.cuts import RANGE, coordinate_of
 from sweep.analysis.figures import Study
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.flags import names_of
-from sweep.model.shot import evaluate
 from sweep.report import looks, wording
 from sweep.report.cells import HIGHEST, MEAN, Side, reduced
 from sweep.report.choosing import Part, parts
@@ -32,8 +33,11 @@ PLACES = 24
 CHANCES = (0.999, 0.9, 0.5, 0.1, 0.01)
 """Probabilities of detection near which points are taken whose characteristic is drawn."""
 
-THRESHOLDS = np.sqrt(4 / (4 - np.pi) * np.log(10) * np.linspace(0.05, 16, 90))
-"""TNR at which a bin of noise crosses with probabilities from 0.9 to 1e-16."""
+IN_A_BIN = np.logspace(-0.05, -16, 90)
+"""Probabilities of a false alarm in a bin, over which characteristics are drawn."""
+
+DRAWS = 400
+"""Draws of each point whose characteristic is random."""
 
 ALARMS = ("pfa_bin", "pfa_segment", "pfa_shot", "p_leakage_up", "p_leakage_down")
 
@@ -111,12 +115,10 @@ def roc(study: Study, found: list[Track], fewer: int) -> Chart | None:
     traces: list[go.Scatter] = []
     told: list[str] = []
     for track in found:
-        places = _places_of_interest(study, track)
-        effects = effects_at(study, track, places)
-        for number, (place, own) in enumerate(zip(places, effects, strict=True)):
+        for number, place in enumerate(_places_of_interest(study, track)):
             name = _named(study, track, place)
-            curve = _characteristic(study.spec, track.position(place), own)
-            traces += _roc_traces(track, name, number, *curve)
+            point = study.dataset.isel(track.position(place))
+            traces += _roc_traces(track, name, number, point.compute())
             if track is found[0]:
                 told.append(name)
     return Chart(
@@ -126,8 +128,10 @@ def roc(study: Study, found: list[Track], fewer: int) -> Chart | None:
             f"alarm, as the threshold moves, {'; '.join(told) or 'at the point'}."
         ),
         caption=wording.sentences(
-            ["Simulated for this page, with the effects that the study simulates at each point"
-             + (" but for the random ones" if _draws(study) else ""),
+            ["From the stored signal-to-noise ratio; where that alone does not give the stored "
+             "probability of detection, simulated for this page with the effects that the study "
+             "simulates at the point" + (f", in {DRAWS} draws" if study.spec.draws.any else ""),
+             "False alarms of noise alone, in all bins that are counted",
              "Dots: the study's own threshold",
              "Points: those whose probability of detection comes nearest to "
              + ", ".join(f"{chance:g}" for chance in CHANCES),
@@ -147,11 +151,12 @@ def roc(study: Study, found: list[Track], fewer: int) -> Chart | None:
     )  # fmt: skip
 
 
-_ALARM_OF = {"in a segment": "pfa_segment", "in a bin": "pfa_bin", "in both chirps": "pfa_shot"}
-
-
-def _draws(study: Study) -> bool:
-    return bool(study.spec.draws.any)
+_ALARM_OF = {
+    "in a segment": noise_only.segment_probability,
+    "in a bin": lambda bin_probability, bins: bin_probability,
+    "in both chirps": lambda p, bins: noise_only.segment_probability(p, bins) ** 2,
+}
+"""Probability of a false alarm from that in a bin, and the number of bins that are counted."""
 
 
 def _named(study: Study, track: Track, place: int) -> str:
@@ -173,32 +178,28 @@ def _places_of_interest(study: Study, track: Track) -> np.ndarray:
     return np.unique(nearest)
 
 
-def _characteristic(
-    spec: Spec, position: Mapping[str, int], effects: list[str]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Outputs over the threshold, and at the study's own."""
-    parameters = parameters_at(spec, position)
-    over = evaluate(parameters | {TNR: THRESHOLDS}, effects)
-    return over, evaluate(parameters, effects)
-
-
-def _roc_traces(
-    track: Track, name: str, number: int, over: dict[str, np.ndarray], own: dict[str, np.ndarray]
-) -> list[go.Scatter]:
+def _roc_traces(track: Track, name: str, number: int, point: xr.Dataset) -> list[go.Scatter]:
     """Line and dot of one point, for each kind of false alarm."""
+    curve = point.sweep.roc(IN_A_BIN, draws=DRAWS)
+    spec = point.sweep.spec
+    bins = noise_only.bins_counted(spec.parameters() | {
+        str(c.attrs["path"]): parameter(point, str(c.attrs["path"]), spec).values.item()
+        for c in point.coords.values() if "path" in c.attrs
+    })  # fmt: skip
     traces = []
-    for alarm, variable in _ALARM_OF.items():
+    for alarm, of in _ALARM_OF.items():
         meta = when(number, part=track.words, alarm=alarm)
         line = {"dash": looks.DASHES[number % len(looks.DASHES)], "width": 2}
+        own = of(10.0 ** point["log10_pfa_bin"].values, bins)
         traces += [
             go.Scatter(
-                x=over[variable].astype(np.float32), y=over["pd_shot"].astype(np.float32),
-                text=[f"TNR {t:.3g}" for t in THRESHOLDS],
+                x=of(IN_A_BIN, bins).astype(np.float32), y=curve["pd"].values.astype(np.float32),
+                text=[f"TNR {t:.3g}" for t in curve["tnr"].values],
                 name=name, legendgroup=name, showlegend=bool(name), meta=meta, line=line,
                 mode="lines",
             ),
             go.Scatter(
-                x=own[variable], y=own["pd_shot"], name=f"{name}, as studied", legendgroup=name,
+                x=[own], y=[point["pd_shot"].values], name=f"{name}, as studied", legendgroup=name,
                 showlegend=False, meta=meta, mode="markers", marker={"size": 9},
             ),
         ]  # fmt: skip

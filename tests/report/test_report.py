@@ -15,9 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reported import EXPERIMENTS, GRID
 
+from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
-from sweep.report import looks
+from sweep.model.shot import evaluate
+from sweep.report import detector, looks
 from sweep.report.cells import HIGHEST, LOWEST, MEAN, Side, reduced
 from sweep.report.choosing import parts
 from sweep.report.writing import write
@@ -162,6 +164,24 @@ def test_the_command_writes_the_page_beside_the_store(grid_store):
     assert ran.exit_code == 0 and ran.stdout.startswith(f"{page}: ")
     assert page.stat().st_size > 5e6
     page.unlink()
+
+
+def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(grid_store):
+    study = Study.of(grid_store)
+    (track, *_), _ = detector.tracks(study)
+    chart = detector.roc(study, [track], 0)
+    (place, *_) = detector._places_of_interest(study, track)
+    point = study.dataset.isel(track.position(place))
+    curve = point.sweep.roc(detector.IN_A_BIN)
+    by_alarm = {t.meta["when"]["alarm"]: t for t in chart.figure.data[:6] if t.mode == "lines"}
+    for line in by_alarm.values():
+        np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
+    parameters = detector.parameters_at(study.spec, track.position(place))
+    of_model = evaluate(parameters | {detector.TNR: curve["tnr"].values}, [])
+    for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
+                        ("in both chirps", "pfa_shot")):  # fmt: skip
+        # the model leaves out the few bins in which the target lies
+        np.testing.assert_allclose(by_alarm[alarm].x, of_model[name], rtol=2e-2, atol=1e-30)
 
 
 def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
