@@ -33,6 +33,7 @@ def report(
     *,
     noise: bool = False,
     seed: int = 0,
+    form: str = "png",
 ) -> tuple[str, list[Path]]:
     """Spectra, threshold, noise level and detections of one shot, and what it reports.
 
@@ -47,6 +48,8 @@ def report(
         Where to put the figure and the text.
     noise, seed
         Whether to add noise to the spectra, and its seed.
+    form
+        ``png``, ``pdf`` or ``svg``.
 
     Returns
     -------
@@ -72,8 +75,8 @@ def report(
         sheet = shot_drawing.draw(
             shots, title=spec.title, note=labels.joined([remark, _held(shots)])
         )
+        files = [canvas.save(sheet, directory / f"{stem}.{form}"), directory / f"{stem}.txt"]
     page = Page(spec.title, _blocks(shots), [f"Spectra: {remark}."], [])
-    files = [canvas.save(sheet, directory / f"{stem}.png"), directory / f"{stem}.txt"]
     files[1].write_text(page.text(), encoding="utf-8")
     return page.text(), files
 

@@ -249,8 +249,15 @@ def plan(spec: Path, workers: int | None) -> None:
     type=click.Path(file_okay=False, path_type=Path),
     help="Directory of the figure [results/<name of the spec>].",
 )
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["png", "pdf", "svg"]),
+    default="png",
+    help="PNG, or PDF or SVG for print [png].",
+)
 def shot(
-    spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None
+    spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None, form: str
 ) -> None:
     """Simulate one shot of SPEC: spectra, threshold, detections, noise budget.
 
@@ -272,6 +279,7 @@ def shot(
         directory=output or Path("results") / spec.stem,
         noise=noise,
         seed=study.seed if seed is None else seed,
+        form=form,
     )
     click.echo(text)
     _list(files)

@@ -29,13 +29,12 @@ def report(store: Location, output: Path | None) -> None:
       sweep report results/range_angle.zarr
       sweep report results/forest_scan.zarr -o forest.html
     """  # noqa: D301
-    from rich.console import Console
-
+    from sweep.cli.pieces import bar
     from sweep.report.writing import write
     from sweep.tasks.studies import read
 
     read(store)
     file = output or beside(store) / f"{store.name.removesuffix('.zarr')}-report.html"
-    with Console(stderr=True).status("opening the store") as status:
-        write(store, file, lambda text: status.update(f"making: {text}"))
+    with bar("opening the store") as say:
+        write(store, file, say)
     click.echo(f"{shown(file)}: {file.stat().st_size / 1e6:.1f} MB")
