@@ -22,14 +22,12 @@ def big_store():
 
 
 def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
-    monkeypatch.setattr(opening, "PIECE", 2**14)
+    monkeypatch.setattr(opening, "PIECE", 2**13)
     sizes, peaks = [], []
     # what is imported and kept on the first time is no part of it
-    for number, gigabytes in enumerate((0.004, 0.01, 0.04)):
+    for number, gigabytes in enumerate((0.002, 0.006, 0.024)):
         path = tmp_path / f"{number}.zarr"
-        sizes.append(
-            big_store.make(path, big_store.spec_of(gigabytes, block_points=1000, powers=4))
-        )
+        sizes.append(big_store.make(path, big_store.spec_of(gigabytes, block_points=500, powers=4)))
         tracemalloc.start()
         found = big_store.reduce(path)
         peaks.append(tracemalloc.get_traced_memory()[1])
