@@ -161,7 +161,8 @@ def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch
 
 def test_status_tells_who_is_at_work(here):
     sweep("run", "small.yaml", "--scheduler", "none")
-    (here / "results" / "small.zarr" / "pd_up" / "c" / "3" / "0").unlink()
+    log = here / "results" / "small.zarr" / ".sweep" / "receipts.jsonl"
+    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:-1]))
     held = Lock(here / "results" / "small.zarr")
     shown = sweep("status", "results/small.zarr").stdout
     held.release()

@@ -1,4 +1,4 @@
-"""Chunks on disk, as Zarr writes them and to the same bytes, at a third of the time.
+"""Chunks on disk, as Zarr writes them and to the same bytes, at a tenth of the time.
 
 Zarr hands every chunk to an event loop, and its compression and its writing to threads of that:
 nearly a millisecond, which for a block of 26 arrays is 2 % of a second's work.
@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import uuid
+from contextlib import suppress
 from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -21,31 +21,56 @@ if TYPE_CHECKING:
 #: How chunks of every array are compressed.
 ZSTD_LEVEL = 1
 
+#: What the name of a file ends in that is still being written.
+PARTIAL = ".partial"
+
 #: Kinds of numpy's types whose chunks are their values and nothing else.
 PLAIN = "biuf"
 
 
-def is_plain(array: zarr.Array[Any]) -> bool:
-    """Whether chunks of an array are numbers."""
-    return array.dtype.kind in PLAIN
+class Chunked(NamedTuple):
+    """How an array is cut into chunks, at hand: Zarr works these out anew whenever asked."""
 
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fill: Any
 
-def encoded(array: zarr.Array[Any], values: np.ndarray) -> bytes:
-    """Bytes of a chunk: little-endian values in C order, compressed, and the crc32c of that.
+    @classmethod
+    def of(cls, array: zarr.Array[Any]) -> Self:
+        """That of an array."""
+        return cls(array.shape, array.chunks, array.dtype, array.fill_value)
 
-    Parameters
-    ----------
-    array
-        Where it belongs.
-    values
-        Its values; at the array's far edge they fill a part of it.
-    """
-    from google_crc32c import value as crc32c
+    @property
+    def is_plain(self) -> bool:
+        """Whether chunks are numbers."""
+        return self.dtype.kind in PLAIN
 
-    chunk = np.full(array.chunks, array.fill_value, dtype=array.dtype.newbyteorder("<"))
-    chunk[tuple(slice(size) for size in values.shape)] = values
-    content: bytes = _zstd().encode(chunk)
-    return content + int(crc32c(content)).to_bytes(4, "little")
+    def place(self, position: tuple[int, ...]) -> tuple[slice, ...]:
+        """What of the array a chunk holds; at the far edge that is a part of it."""
+        return tuple(
+            slice(p * chunk, min((p + 1) * chunk, size))
+            for p, chunk, size in zip(position, self.chunks, self.shape, strict=True)
+        )
+
+    def encoded(self, values: np.ndarray) -> bytes:
+        """Bytes of a chunk: little-endian values in C order, compressed, and the crc32c of that.
+
+        Parameters
+        ----------
+        values
+            Its values; at the array's far edge they fill a part of it.
+        """
+        from google_crc32c import value as crc32c
+
+        dtype = self.dtype.newbyteorder("<")
+        if values.shape == self.chunks:
+            chunk = np.ascontiguousarray(values, dtype).reshape(self.chunks)
+        else:
+            chunk = np.full(self.chunks, self.fill, dtype)
+            chunk[tuple(slice(size) for size in values.shape)] = values
+        content: bytes = _zstd().encode(chunk)
+        return content + int(crc32c(content)).to_bytes(4, "little")
 
 
 @cache
@@ -55,16 +80,27 @@ def _zstd() -> Zstd:
     return Zstd(level=ZSTD_LEVEL)
 
 
-def put(file: Path, content: bytes) -> None:
+def put(file: str, content: bytes) -> None:
     """Write a chunk in one step: whoever looks finds all of it, or nothing."""
-    draft = file.with_name(f"{file.name}.{uuid.uuid4().hex}.partial")
+    draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
     try:
         try:
-            draft.write_bytes(content)
+            _write(draft, content)
         except FileNotFoundError:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            draft.write_bytes(content)
+            os.makedirs(os.path.dirname(file), exist_ok=True)
+            _write(draft, content)
         os.replace(draft, file)
     except BaseException:
-        draft.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
+            os.unlink(draft)
         raise
+
+
+def _write(file: str, content: bytes) -> None:
+    opened = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        left = memoryview(content)
+        while left:
+            left = left[os.write(opened, left) :]
+    finally:
+        os.close(opened)

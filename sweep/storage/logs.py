@@ -63,8 +63,8 @@ class FileLog:
 
     def keep(self, is_sound: Callable[[bytes], bool]) -> None:
         """Drop the lines that are not sound."""
-        lines = list(raw_lines(self._path))
-        if not all(map(is_sound, lines)):
+        if not all(map(is_sound, raw_lines(self._path))):
+            lines = raw_lines(self._path)
             put_whole(self._path, b"".join(line for line in lines if is_sound(line)))
 
 

@@ -16,7 +16,7 @@ from sweep.storage.sealing import body_of
 
 RECEIPTS = "receipts.jsonl"
 
-_HEAD = re.compile(rb'\{"block":(\d+),"(?:points":(\d+)|withdrawn")')
+_HEAD = re.compile(rb'\{"block":(\d+),"(?:points":(\d+)(?:,"bytes":(\d+))?|withdrawn")')
 _TIME = re.compile(rb'"time":([\d.]+)$')
 _WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
 
@@ -27,6 +27,8 @@ class Receipts:
 
     points: np.ndarray
     """(blocks,) int64: points of every block that is committed, 0 of the others."""
+    bytes: np.ndarray
+    """(blocks,) int64: bytes of these as they are stored, where the receipt says."""
     first: float = np.inf
     last: float = -np.inf
     """Times of the first and last receipt [s since the epoch]."""
@@ -53,17 +55,17 @@ def read_receipts(store: Location, n_blocks: int, *, since: float = np.inf) -> R
     since
         Time from which on points and workers are counted [s since the epoch].
     """
-    found = Receipts(np.zeros(n_blocks, np.int64))
+    found = Receipts(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in raw_lines(store / JOURNAL / RECEIPTS):
         body = body_of(line)
         head = body and _HEAD.match(body)
         if not body or not head or (block := int(head[1])) >= n_blocks:
             continue
         if head[2] is None:
-            found.points[block] = 0
+            found.points[block] = found.bytes[block] = 0
             continue
         points, time = int(head[2]), _TIME.search(body, len(body) - 40)
-        found.points[block] = points
+        found.points[block], found.bytes[block] = points, int(head[3] or 0)
         if time:
             _date(found, body, points, float(time[1]), since)
     return found

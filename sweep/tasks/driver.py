@@ -17,7 +17,7 @@ from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Journal, committed
+from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen
@@ -192,7 +192,7 @@ def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told:
     elif path.exists():
         attributes, held = _held(path)
         identity.refuse_other_study(path, attributes, held.spec, study.spec)
-        done = int(np.count_nonzero(committed(path, study)))
+        done = int(np.count_nonzero(receipted(path, study)))
         raise StoreError(
             f"{path} holds this study already, {done} of {study.n_blocks} blocks done: "
             f"`sweep resume {path}` goes on with it, --overwrite begins anew"
@@ -223,7 +223,7 @@ def _go_on(
             if isinstance(study, GridStudy):
                 return session.to_its_end()
             write_recipe(path, base=str(study.spec.base.absolute()))
-            if committed(path, study).all() and eyepoints_are_sound(study):
+            if _is_done(path, study) and eyepoints_are_sound(study):
                 return session.to_its_end()
             rays, why = cast(
                 study, pool=pool, told=told, interrupts=interrupts, retry_failed=retry_failed
@@ -231,6 +231,11 @@ def _go_on(
             return session.to_its_end(before=why, rays=rays)
     finally:
         lock.release()
+
+
+def _is_done(path: Location, study: FlightStudy) -> bool:
+    """Whether no block is missing; the folders are looked at only where the log says so."""
+    return bool(receipted(path, study).all() and committed(path, study).all())
 
 
 def _journal(path: Location, durable: bool) -> Journal:

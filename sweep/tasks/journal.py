@@ -18,7 +18,7 @@ import numpy as np
 from sweep.storage.locations import Location
 from sweep.storage.logs import open_log
 from sweep.storage.receipts import RECEIPTS, read_receipts
-from sweep.storage.sealing import read_lines, sealed, unsealed
+from sweep.storage.sealing import body_of, read_lines, sealed
 from sweep.tasks import store
 from sweep.tasks.listing import listed
 from sweep.tasks.study import Study
@@ -34,6 +34,7 @@ class Receipt:
 
     block: int
     points: int
+    bytes: int  # as stored
     digest: str  # of the bytes stored, `store.digest`
     seconds: float  # evaluating and writing
     write_seconds: float
@@ -119,7 +120,7 @@ def _now() -> str:
 
 def drop_damaged(path: Location) -> None:
     """Take lines out of a log that are damaged, or cut short by their writer's death."""
-    open_log(path).keep(lambda line: unsealed(line) is not None)
+    open_log(path).keep(lambda line: body_of(line) is not None)
 
 
 def digests(store_path: Location, n_blocks: int) -> np.ndarray:
@@ -131,6 +132,11 @@ def digests(store_path: Location, n_blocks: int) -> np.ndarray:
     return found
 
 
+def receipted(store_path: Location, study: Study) -> np.ndarray:
+    """Which blocks have a receipt, (blocks,) bool; whether their chunks are there is not seen."""
+    return read_receipts(store_path, study.n_blocks).points > 0
+
+
 def committed(store_path: Location, study: Study) -> np.ndarray:
     """Which blocks are done.
 
@@ -139,8 +145,7 @@ def committed(store_path: Location, study: Study) -> np.ndarray:
     ndarray of bool (blocks,)
         True where there is a receipt and every object of the block is in the store.
     """
-    receipted = read_receipts(store_path, study.n_blocks).points > 0
-    return listed(store_path, study, receipted).whole
+    return listed(store_path, study, receipted(store_path, study))
 
 
 def failures(store_path: Location) -> dict[int, dict[str, Any]]:

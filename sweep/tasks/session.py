@@ -20,7 +20,8 @@ from sweep.storage.objects import ObjectStoreError
 from sweep.tasks import store, versions
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Failure, Journal, Receipt, committed, given_up
+from sweep.tasks.journal import Failure, Journal, Receipt, given_up, receipted
+from sweep.tasks.listing import Look
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Pool
 from sweep.tasks.progress import Progress
@@ -40,6 +41,10 @@ REMEDIES = {
     errno.EACCES: "have the permission to write there",
     errno.EPERM: "have the permission to write there",
 }
+
+#: Seconds for which a run waits to see that what is committed is there; of more files it begins
+#: with what the log says, and looks on meanwhile.
+LOOKING = 2.0
 
 #: Seconds after which the kernels are being compiled and not read.
 COMPILING = 2.0
@@ -138,16 +143,20 @@ class Session:
             Rays that were cast for it.
         """
         begun = time.monotonic()
-        done = committed(self._path, self._study)
-        had = int(np.count_nonzero(done)), self._study.points_in(done)
-        settled = done.copy()
-        if not self._retry_failed:
-            settled[list(given_up(self._path, done.size))] = True
-        stopped = self._record("begun", host=socket.gethostname(), pid=os.getpid()) or before
-        if not (settled.all() or stopped):
-            stopped = self._compute(Todo(settled), had[1])
-        left_out = int(np.count_nonzero(settled & ~done))
-        outcome = self._outcome(had, left_out, stopped, time.monotonic() - begun, rays or {})
+        look = Look(self._path, self._study, receipted(self._path, self._study))
+        try:
+            look.within(LOOKING)
+            done = look.whole()
+            settled = done.copy()
+            if not self._retry_failed:
+                settled[list(given_up(self._path, done.size))] = True
+            left_out = int(np.count_nonzero(settled & ~done))
+            stopped = self._record("begun", host=socket.gethostname(), pid=os.getpid()) or before
+            stopped = stopped or self._compute(settled, done) or self._look_on(look, done)
+            done &= look.whole()
+        finally:
+            look.stop()
+        outcome = self._outcome(done, left_out, stopped, time.monotonic() - begun, rays or {})
         if outcome.complete:
             store.remove_partials(self._path)
         self._record(
@@ -165,7 +174,7 @@ class Session:
 
     def _outcome(
         self,
-        before: tuple[int, int],
+        before: np.ndarray,
         left_out: int,
         stopped: str,
         seconds: float,
@@ -177,8 +186,8 @@ class Session:
             unit=self._study.unit,
             points=self._study.points,
             blocks=self._study.n_blocks,
-            points_done=before[1] + tally.points,
-            blocks_done=before[0] + tally.blocks,
+            points_done=self._study.points_in(before) + tally.points,
+            blocks_done=int(np.count_nonzero(before)) + tally.blocks,
             points_computed=tally.points,
             blocks_computed=tally.blocks,
             failures=tuple(tally.failures),
@@ -190,8 +199,24 @@ class Session:
             rays=rays,
         )
 
-    def _compute(self, todo: Todo, points_before: int) -> str:
-        """Compute blocks until none is left; why it ended, where it was not that."""
+    def _look_on(self, look: Look, done: np.ndarray) -> str:
+        """See the look at what was done to its end, and compute what of it is not there."""
+        if not look.within(LOOKING):
+            self._progress.say("looking whether the chunks of what was done before are there")
+        while not look.within(LOOKING):
+            if self._interrupts.stopping:
+                return "interrupted"
+        settled = look.whole() | ~done
+        return self._compute(settled, settled & done)
+
+    def _compute(self, settled: np.ndarray, done: np.ndarray) -> str:
+        """Compute all blocks but those that are settled; why it ended before, where it did.
+
+        Those that are done are told as such.
+        """
+        if settled.all():
+            return ""
+        todo, points_before = Todo(settled), self._study.points_in(done) + self._tally.points
         with ExitStack() as stack:
             try:
                 compiling = threading.Thread(target=self._compile, daemon=True)

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.receipts import read_receipts
 from sweep.tasks import journal, lock, studies
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.listing import Listed, listed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +27,7 @@ class Status:
     holder: lock.Holder | None  # who writes to it
     holder_lives: bool
     draws_done: int  # where each point has a fixed number; else 0
-    bytes: int  # of all results, as they are stored
+    bytes: int  # of all results, as they were stored; of a packed copy all its files
     rate: float  # points a second in the last run, 0 where none committed anything
     workers: int  # processes that computed in the last run
     heartbeat: float  # age of its holder's last sign of life [s]; infinite without one
@@ -47,7 +44,7 @@ class Status:
 
 
 def status(store: str | Location) -> Status:
-    """How far a store is.
+    """How far a store is, by its log of receipts; whether all chunks are there is not looked at.
 
     Raises
     ------
@@ -58,11 +55,9 @@ def status(store: str | Location) -> Status:
     attributes, study = studies.read(path)
     begun = _begun(path)
     receipts = read_receipts(path, study.n_blocks, since=begun)
-    done = receipts.points > 0
-    packed = PACKED in attributes
-    found = Listed(done, sum(files_below(path).values())) if packed else listed(path, study, done)
+    packed = sum(files_below(path).values()) if PACKED in attributes else 0
     holder = lock.holder(path)
-    points = study.points_in(found.whole)
+    points = study.points_in(receipts.points > 0)
     spent = receipts.last - begun
     return Status(
         store=path,
@@ -72,12 +67,12 @@ def status(store: str | Location) -> Status:
         points=study.points,
         points_done=points,
         blocks=study.n_blocks,
-        blocks_done=int(np.count_nonzero(found.whole)),
+        blocks_done=receipts.blocks,
         failures=journal.given_up(path, study.n_blocks),
         holder=holder,
         holder_lives=holder is not None and lock.is_live(path, holder),
         draws_done=points * int(study.spec.draws.number) if isinstance(study, GridStudy) else 0,
-        bytes=found.bytes,
+        bytes=packed or int(receipts.bytes.sum()),
         rate=receipts.recent / spent if receipts.recent and spent > 0 else 0.0,
         workers=len(receipts.workers),
         heartbeat=lock.heartbeat_age(path) if holder else float("inf"),

@@ -15,8 +15,9 @@ import shutil
 import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -180,6 +181,13 @@ def _consolidate(path: Path) -> None:
     (path / "zarr.json").write_text(json.dumps(root, indent=2))
 
 
+class Written(NamedTuple):
+    """What is stored of a block."""
+
+    digest: str  # of its bytes and their places, `digest`
+    bytes: int
+
+
 class Arrays:
     """Arrays of a store for writing blocks, each opened when it is first written and kept open.
 
@@ -194,15 +202,15 @@ class Arrays:
     def __init__(self, path: str | Location, study: Study) -> None:
         self.path = located(path)
         self._study = study
-        self._arrays: dict[str, zarr.Array[Any]] = {}
+        self._arrays: dict[str, tuple[zarr.Array[Any], chunks.Chunked]] = {}
 
-    def write(self, block: int, results: Mapping[str, np.ndarray]) -> str:
+    def write(self, block: int, results: Mapping[str, np.ndarray]) -> Written:
         """Write the chunks of one block, each whole.
 
         Returns
         -------
-        str
-            Digest of the bytes stored (`digest`).
+        Written
+            What is stored.
 
         Raises
         ------
@@ -215,37 +223,38 @@ class Arrays:
             odd = sorted(results.keys() ^ positions.keys())
             raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
 
-        def put(name: str) -> None:
-            self._put(name, positions[name], results[name])
+        def put(name: str) -> tuple[str, bytes]:
+            return self._put(name, positions[name], results[name])
 
         with in_words(self.path):
-            each(self.path, put, positions)
-        return digest(self.path, block_objects(self._study, block))
+            stored = each(self.path, put, positions)
+        return Written(digest_of(stored), sum(len(content) for _, content in stored))
 
-    def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> None:
-        array = self._array(name)
-        slices = tuple(
-            slice(p * chunk, min((p + 1) * chunk, size))
-            for p, chunk, size in zip(position, array.chunks, array.shape, strict=True)
-        )
-        whole = tuple(s.stop - s.start for s in slices)
+    def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> tuple[str, bytes]:
+        """Write a chunk; its path inside the store, and the bytes that are there."""
+        array, chunked = self._array(name)
+        place = chunked.place(position)
+        whole = tuple(s.stop - s.start for s in place)
         if values.shape != whole:
             raise ValueError(
                 f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
                 "blocks write whole chunks only"
             )
-        if isinstance(self.path, Path) and chunks.is_plain(array):
-            file = self.path / chunk_object(name, position)
-            chunks.put(file, chunks.encoded(array, values))
+        stored = chunk_object(name, position)
+        if isinstance(self.path, Path) and chunked.is_plain:
+            content = chunked.encoded(values)
+            chunks.put(f"{self.path}/{stored}", content)
         else:
-            array[slices or ...] = values
+            array[place or ...] = values
+            content = (self.path / stored).read_bytes()
+        return stored, content
 
-    def _array(self, name: str) -> zarr.Array[Any]:
+    def _array(self, name: str) -> tuple[zarr.Array[Any], chunks.Chunked]:
         if name not in self._arrays:
             import zarr
 
             opened = zarr.open_array(zarr_store(self.path / name), mode="r+")
-            self._arrays[name] = opened.with_config(WRITTEN_WHOLE)
+            self._arrays[name] = opened.with_config(WRITTEN_WHOLE), chunks.Chunked.of(opened)
         return self._arrays[name]
 
 
@@ -286,8 +295,17 @@ def sync(path: Location) -> None:
 def remove_partials(path: Location) -> None:
     """Remove what writers that were killed in the midst of a file have left."""
     if isinstance(path, Path):
-        for file in path.rglob("*.partial"):
-            file.unlink(missing_ok=True)
+        _remove_partials(str(path))
+
+
+def _remove_partials(folder: str) -> None:
+    with os.scandir(folder) as entries:
+        for entry in entries:  # no look at a file: there may be millions
+            if entry.is_dir(follow_symlinks=False):
+                _remove_partials(entry.path)
+            elif entry.name.endswith(chunks.PARTIAL):
+                with suppress(FileNotFoundError):
+                    os.unlink(entry.path)
 
 
 def is_whole(path: Location, objects: list[str]) -> bool:

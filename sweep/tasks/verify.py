@@ -115,7 +115,7 @@ def _verify(path: Location, study: AnyStudy | None, repair: bool, told: Progress
 
 
 def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
-    done = journal.committed(path, study)
+    done = journal.receipted(path, study)
     done[[damage.block for damage in damages]] = False
     return int(np.count_nonzero(done))
 

@@ -9,6 +9,7 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from sweep.storage.locations import located
 from sweep.tasks import store, versions
@@ -45,6 +46,7 @@ class Opened:
 
 
 _studies: dict[tuple[str, str], Opened] = {}
+_stamps: dict[str, tuple[tuple[int, ...], str]] = {}
 _opening = threading.Lock()
 
 
@@ -60,6 +62,7 @@ def study(path: str, study_id: str) -> Opened:
         if (path, study_id) not in _studies:
             if len(_studies) >= STUDIES_OPEN:
                 _studies.clear()
+                _stamps.clear()
             _studies[path, study_id] = _open(path, study_id)
         return _studies[path, study_id]
 
@@ -76,11 +79,37 @@ def _open(path: str, study_id: str) -> Opened:
 
 def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
-    from sweep.tasks.identity import read_attributes
-
-    held = read_attributes(located(path))["study_id"]
+    held = _held(path, _stamp(path))
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
+
+
+def _stamp(path: str) -> tuple[int, ...] | None:
+    """What tells a store's metadata from any other that were or will be in their place.
+
+    None where there is no such thing: reading them is then the only way to know.
+    """
+    if not isinstance(located(path), Path):
+        return None
+    try:
+        with open(f"{path}/zarr.json", "rb") as file:  # opened: a file server is asked anew
+            found = os.fstat(file.fileno())
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+def _held(path: str, stamp: tuple[int, ...] | None) -> str:
+    """Id of the study in a store; read again where its stamp is another."""
+    from sweep.tasks.identity import read_attributes
+
+    known = _stamps.get(path)
+    if known and stamp and known[0] == stamp:
+        return known[1]
+    held = str(read_attributes(located(path))["study_id"])
+    if stamp:
+        _stamps[path] = stamp, held
+    return held
 
 
 @dataclass(frozen=True)
@@ -132,12 +161,13 @@ def _one(opened: Opened, block: int, terms: Terms) -> Receipt:
         results = terms.evaluate(held, block) if terms.evaluate else held.evaluate(block)
     evaluated = time.perf_counter()
     _refuse_another(str(opened.arrays.path), held.id)  # its driver may be long dead
-    digest = opened.arrays.write(block, results)
+    written = opened.arrays.write(block, results)
     ended = time.perf_counter()
     return Receipt(
         block=block,
         points=held.block_size(block),
-        digest=digest,
+        bytes=written.bytes,
+        digest=written.digest,
         seconds=round(ended - begun, 6),
         write_seconds=round(ended - evaluated, 6),
         host=socket.gethostname(),

@@ -157,7 +157,8 @@ def set_traps(arena: Arena) -> None:
         arena.reached(AFTER_WRITE, block)
         return digest
 
-    def trapped_put(path, content):
+    def trapped_put(file, content):
+        path = Path(file)
         if writing and "c" in path.parts:
             writing[1] += 1
             if writing[1] == 5:
@@ -168,7 +169,7 @@ def set_traps(arena: Arena) -> None:
                 half.write_bytes(content[: len(content) // 2])
                 arena.reached(IN_A_FILE, writing[0])
                 half.unlink()
-        return put(path, content)
+        return put(file, content)
 
     def trapped_commit(self, *committed):
         blocks = [receipt.block for receipt in committed]

@@ -10,6 +10,7 @@ from sweep.tasks.journal import Failure, Journal, Receipt
 
 def receipt(block: int) -> Receipt:
     return Receipt(
+        bytes=100,
         block=block,
         points=8,
         digest="ab",

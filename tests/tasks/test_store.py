@@ -68,9 +68,10 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     arrays = store.Arrays(path, study)
     objects = store.block_objects(study, 3)
     assert not store.is_whole(path, objects)
-    digest = arrays.write(3, results)
+    written = arrays.write(3, results)
     assert store.is_whole(path, objects)
-    assert digest == store.digest(path, objects)
+    assert written.digest == store.digest(path, objects)
+    assert written.bytes == sum((path / name).stat().st_size for name in objects)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
         stored = dataset[name].values[study.grid.block(3)]
@@ -97,7 +98,7 @@ def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, stu
 
 
 def test_a_flipped_bit_in_a_chunk_is_seen_on_reading_and_changes_the_digest(path, study):
-    digest = store.Arrays(path, study).write(0, study.evaluate(0))
+    digest = store.Arrays(path, study).write(0, study.evaluate(0)).digest
     chunk = path / "pd_shot" / "c" / "0" / "0" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
