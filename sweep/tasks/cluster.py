@@ -141,14 +141,17 @@ def _reached(address: str, cluster: AnyCluster) -> Client:
 
 
 def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> Any:
-    try:
-        if isinstance(cluster, Local):
-            return local.start(cluster, bounds, processes=processes)
-        if isinstance(cluster, Batch):
-            from sweep.tasks.clusters import batch
+    import dask
 
-            return batch.start(cluster, bounds)
-        return ssh.start(cluster, bounds)
+    try:
+        with dask.config.set(common.CALM):
+            if isinstance(cluster, Local):
+                return local.start(cluster, bounds, processes=processes)
+            if isinstance(cluster, Batch):
+                from sweep.tasks.clusters import batch
+
+                return batch.start(cluster, bounds)
+            return ssh.start(cluster, bounds)
     except (OSError, RuntimeError, ImportError) as error:
         raise ClusterError(f"no workers could be started: {error}") from error
 

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 #: Seconds between lines without a terminal.
 LINE_EVERY = 30.0
 
+#: Times a second that a bar is drawn, each some ms of the driver's time.
+REFRESHES = 4.0
+
 #: Seconds before anything is shown of what is most often over by then.
 LATE = 2.0
 
@@ -24,6 +27,9 @@ class Progress(Protocol):
 
     def advance(self, *, points: int, failed: int) -> None:
         """Points that were committed and blocks that were given up; both 0 as time passes."""
+
+    def at_work(self, *, workers: int, stored: int) -> None:
+        """Workers that there are, and bytes that are stored; told before `advance`."""
 
     def say(self, text: str) -> None:
         """Something to know, in words."""
@@ -46,6 +52,9 @@ class Silent:
         """Nothing."""
 
     def advance(self, *, points: int, failed: int) -> None:
+        """Nothing."""
+
+    def at_work(self, *, workers: int, stored: int) -> None:
         """Nothing."""
 
     def say(self, text: str) -> None:
@@ -84,6 +93,11 @@ class Late:
             self._showing = True
             self._shown.begin(points=self._total, done=self._done, unit=self._unit)
 
+    def at_work(self, *, workers: int, stored: int) -> None:
+        """Shown where all else is."""
+        if self._showing:
+            self._shown.at_work(workers=workers, stored=stored)
+
     def say(self, text: str) -> None:
         """Shown at once."""
         self._shown.say(text)
@@ -106,7 +120,7 @@ class Lines:
     def __init__(self, every: float = LINE_EVERY) -> None:
         self._every = every
         self._points = self._done = self._before = self._failed = 0
-        self._unit = "points"
+        self._unit, self._work = "points", ""
         self._begun = self._said = time.monotonic()
 
     def begin(self, *, points: int, done: int, unit: str) -> None:
@@ -121,6 +135,10 @@ class Lines:
         self._failed += failed
         if time.monotonic() - self._said >= self._every:
             self._line()
+
+    def at_work(self, *, workers: int, stored: int) -> None:
+        """For the next line."""
+        self._work = at_work(workers, stored)
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -138,13 +156,15 @@ class Lines:
             parts.append(f"{rate:,.0f} {self._unit}/s")
             if self._done < self._points:
                 parts.append(f"{duration((self._points - self._done) / rate)} left")
+        if self._work:
+            parts.append(self._work)
         if self._failed:
             parts.append(f"{self._failed} blocks failed")
         self.say(", ".join(parts))
 
 
 class Bar:
-    """A bar with points, rate, time left and failures, on standard error."""
+    """A bar with points, rate, time left, workers, bytes and failures, on standard error."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -155,8 +175,10 @@ class Bar:
             TextColumn("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
             TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[work]}"),
             TextColumn("[red]{task.fields[failures]}"),
             console=Console(stderr=True),
+            refresh_per_second=REFRESHES,
         )
         self._task: TaskID | None = None
         self._points = self._failed = 0
@@ -167,7 +189,9 @@ class Bar:
         """The bar appears."""
         self._begun = time.monotonic()
         self._unit, self._points = unit, 0
-        self._task = self._bar.add_task(unit, total=points, completed=done, rate="", failures="")
+        self._task = self._bar.add_task(
+            unit, total=points, completed=done, rate="", work="", failures=""
+        )
         self._bar.start()
 
     def advance(self, *, points: int, failed: int) -> None:
@@ -182,6 +206,11 @@ class Bar:
             self._task, advance=points, rate=f"{rate:,.0f} {self._unit}/s", failures=failures
         )
 
+    def at_work(self, *, workers: int, stored: int) -> None:
+        """Shown beside the rate."""
+        if self._task is not None:
+            self._bar.update(self._task, work=at_work(workers, stored))
+
     def say(self, text: str) -> None:
         """A line above the bar."""
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -189,6 +218,14 @@ class Bar:
     def end(self) -> None:
         """The bar stays as it is."""
         self._bar.stop()
+
+
+def at_work(workers: int, stored: int) -> str:
+    """Workers and bytes in words: `2 workers, 3.1 MB stored`."""
+    from rich.filesize import decimal
+
+    count = f"{workers:,} worker{'' if workers == 1 else 's'}"
+    return f"{count}, {decimal(stored)} stored"
 
 
 def duration(seconds: float) -> str:

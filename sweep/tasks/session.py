@@ -17,14 +17,15 @@ import numpy as np
 
 from sweep.storage.locations import Location
 from sweep.storage.objects import ObjectStoreError
+from sweep.storage.receipts import read_receipts
 from sweep.tasks import store, versions
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Failure, Journal, Receipt, given_up, receipted
+from sweep.tasks.journal import Failure, Journal, Receipt, given_up
 from sweep.tasks.listing import Look
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Pool
-from sweep.tasks.progress import Progress
+from sweep.tasks.progress import Progress, duration
 from sweep.tasks.study import Study
 from sweep.tasks.todo import Todo
 from sweep.tasks.window import Job
@@ -45,6 +46,9 @@ REMEDIES = {
 #: Seconds for which a run waits to see that what is committed is there; of more files it begins
 #: with what the log says, and looks on meanwhile.
 LOOKING = 2.0
+
+#: Seconds without any worker after which that is said.
+ABSENT = 20.0
 
 #: Seconds after which the kernels are being compiled and not read.
 COMPILING = 2.0
@@ -84,14 +88,37 @@ class Tally:
     blocks: int = 0
     seconds: float = 0.0
     write_seconds: float = 0.0
+    bytes: int = 0
     failures: list[Failure] = field(default_factory=list)
 
     def add(self, receipt: Receipt) -> None:
         """Count a committed block."""
         self.points += receipt.points
         self.blocks += 1
+        self.bytes += receipt.bytes
         self.seconds += receipt.seconds
         self.write_seconds += receipt.write_seconds
+
+
+class Absence:
+    """Says when a cluster has had no worker for long, again after twice as long, and so on."""
+
+    def __init__(self) -> None:
+        self._since, self._ever, self._patience = time.monotonic(), False, ABSENT
+
+    def told(self, workers: int) -> str:
+        """What to say now that there are so many workers; mostly nothing."""
+        if workers:
+            self._since, self._ever, self._patience = time.monotonic(), True, ABSENT
+        waited = time.monotonic() - self._since
+        if waited < self._patience:
+            return ""
+        self._patience *= 2
+        what = "no worker is left" if self._ever else "no worker yet"
+        return (
+            f"{what} ({duration(waited)}): the cluster has none ready; "
+            "Ctrl-C stops, nothing is lost"
+        )
 
 
 class Session:
@@ -129,7 +156,7 @@ class Session:
         self._progress, self._interrupts = progress, interrupts
         self._journal, self._lock = journal, lock
         self._retry_failed = retry_failed
-        self._tally = Tally()
+        self._tally, self._stored = Tally(), 0
         self._gathered: list[Receipt] = []  # committed as soon as the journal has written them
 
     def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
@@ -143,7 +170,9 @@ class Session:
             Rays that were cast for it.
         """
         begun = time.monotonic()
-        look = Look(self._path, self._study, receipted(self._path, self._study))
+        receipts = read_receipts(self._path, self._study.n_blocks)
+        self._stored = int(receipts.bytes.sum())
+        look = Look(self._path, self._study, receipts.points > 0)
         try:
             look.within(LOOKING)
             done = look.whole()
@@ -252,12 +281,14 @@ class Session:
             compiling.join()
 
     def _take(self, answers: Iterator[Answer], todo: Todo) -> str:
-        told, interrupts = False, self._interrupts
+        told, interrupts, absence = False, self._interrupts, Absence()
         for answer in answers:
             if not self._lock.is_mine():
                 if not _is_there(self._path):
                     raise FileNotFoundError(self._path)
                 return "another process took the store's lock"
+            if missing := absence.told(answer.workers):
+                self._progress.say(missing)
             self._commit(answer, todo)
             if interrupts.stopping and not told:
                 self._progress.say("stopping when what runs is written; again to stop at once")
@@ -283,6 +314,7 @@ class Session:
         for failure in answer.failures:
             self._fail(failure, todo)
         self._count()
+        self._progress.at_work(workers=answer.workers, stored=self._stored + self._tally.bytes)
         self._progress.advance(
             points=self._tally.points - before[0], failed=len(self._tally.failures) - before[1]
         )

@@ -178,7 +178,7 @@ def _consolidate(path: Path) -> None:
         "must_understand": False,
         "metadata": documents,
     }
-    (path / "zarr.json").write_text(json.dumps(root, indent=2))
+    (path / "zarr.json").write_text(json.dumps(root))  # not indented: ten times as fast
 
 
 class Written(NamedTuple):
@@ -313,7 +313,7 @@ def is_whole(path: Location, objects: list[str]) -> bool:
     if not isinstance(path, Path):
         return all(size > 0 for size in each(path, lambda name: (path / name).size(), objects))
     try:
-        return all(os.stat(path / name).st_size > 0 for name in objects)
+        return all(os.stat(f"{path}/{name}").st_size > 0 for name in objects)
     except (FileNotFoundError, NotADirectoryError):
         return False
 

@@ -12,6 +12,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -123,7 +124,8 @@ class Window:
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers as they arrive; an empty one every `TICK` while none does.
 
-        Once `stopping` says so nothing more is sent, and the iteration ends with what is out.
+        Once `stopping` says so nothing more is sent, and the iteration ends with what is out, or
+        at once where there is no worker to do it.
 
         Raises
         ------
@@ -136,20 +138,36 @@ class Window:
             while True:
                 if not stopping():
                     self._fill()
+                elif not self._workers():
+                    return  # nothing that is out will ever come
                 if not self._flying:
                     return
-                yield self._next()
+                answer = self._next()
+                answer.workers = len(self._slots.addresses)
+                yield answer
         finally:
             self._flying.clear()  # a task without a future is cancelled
 
     def _fill(self) -> None:
-        try:
+        with self._connected():
             slots = self._slots.now()
             while len(self._flying) < 2 * slots:
                 count = self._pace.blocks_a_task(self._todo.left, slots)
                 if not (blocks := self._todo.take(count, suspects=not self._suspect_flies())):
                     return
                 self._send(blocks)
+
+    def _workers(self) -> int:
+        """Workers that there are."""
+        with self._connected():
+            self._slots.now()
+        return len(self._slots.addresses)
+
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """What asks the scheduler for something, which may be gone."""
+        try:
+            yield
         except (OSError, CancelledError, RuntimeError) as error:
             self._check()
             raise SchedulerLost(str(error)) from error

@@ -35,6 +35,7 @@ class Answer:
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     worker: str = ""  # address of the one that computed them, where there is one
+    workers: int = 1  # that there were as it arrived
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,8 @@ class StopAfter:
         if points and -6 < self.points <= 0:
             os.kill(os.getpid(), signal.SIGINT)
 
+    def at_work(self, *, workers, stored): ...
+
     def say(self, text):
         self.said.append(text)
 
@@ -305,6 +307,8 @@ def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
 
         def advance(self, *, points, failed):
             most.append(len(client.futures))
+
+        def at_work(self, *, workers, stored): ...
 
         def say(self, text): ...
 
