@@ -52,8 +52,8 @@ def receipt(block):
     from sweep.tasks.journal import Receipt
 
     return Receipt(
-        block=block, points=65_536, digest="0" * 32, seconds=1.234567, write_seconds=0.0123,
-        host="node-0123", pid=12_345, versions=versions.software(),
+        block=block, points=65_536, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
+        write_seconds=0.0123, host="node-0123", pid=12_345, versions=versions.software(),
     )  # fmt: skip
 
 
@@ -90,6 +90,7 @@ def blocks(n_blocks, store):
     from sweep.spec import load
     from sweep.storage.receipts import read_receipts
     from sweep.tasks.grid import Grid
+    from sweep.tasks.journal import Journal
     from sweep.tasks.listing import listed
     from sweep.tasks.todo import Todo
 
@@ -100,12 +101,13 @@ def blocks(n_blocks, store):
     grid, _, planned = timed(lambda: Grid(type(spec).from_mapping(mapping)))
     assert grid.n_blocks == n_blocks
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _, _, opening = timed(lambda: Journal(store))
     receipts, _, reading = timed(lambda: read_receipts(store, n_blocks))
     assert receipts.blocks == n_blocks
     listing = float("nan")
     if n_blocks <= MOST_FILES:
         found, _, listing = timed(lambda: listed(store, Line(n_blocks), receipts.points > 0))
-        assert found.whole.all()
+        assert found.all()
 
     def hand_out():
         todo = Todo(np.zeros(n_blocks, bool))
@@ -114,13 +116,13 @@ def blocks(n_blocks, store):
 
     _, _, handing = timed(hand_out)
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(json.dumps([planned, reading, listing, handing, (after - before) * 1024 / 1e6]))
+    print(json.dumps([planned, opening, reading, listing, handing, (after - before) * 1024 / 1e6]))
 
 
 def block_rows(directory):
     """Lines of the table of blocks."""
-    yield "| blocks | grid | log of receipts | folders of one array | handing out | memory |"
-    yield "| ---: | ---: | ---: | ---: | ---: | ---: |"
+    yield "| blocks | grid | log opened | log read | folders of one array | handing out | memory |"
+    yield "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
     for n_blocks in BLOCKS:
         store = filled(directory, n_blocks)
         command = [sys.executable, __file__, "--blocks", str(n_blocks), "--store", str(store)]
@@ -141,7 +143,7 @@ def nap_for(seconds):
         time.sleep(seconds)
         return Answer(
             receipts=[
-                Receipt(block=block, points=1, digest="0" * 32, seconds=10.0,
+                Receipt(block=block, points=1, bytes=1, digest="0" * 32, seconds=10.0,
                         write_seconds=0.0, host="h", pid=1, versions={})
                 for block in blocks
             ]
@@ -203,8 +205,10 @@ def write(of_blocks, of_workers):
 
 {platform.processor() or platform.machine()}, {os.cpu_count()} processors,
 Python {platform.python_version()}. Seconds of processor time of a process of its own; memory beyond
-what its libraries take. The log has a receipt for every block, some 330 bytes each. A folder's look
-takes its time for each array that blocks write (a grid without draws has 27), where the store has
+what its libraries take. The log has a receipt for every block, some 330 bytes each. `sweep status`
+reads the log, and so does `sweep resume` before it begins; that opens the log, too: it checks every
+line. The folders' look goes on in threads beside the work, and takes its time for each array that
+blocks write (a grid without draws has 27), where the store has
 that many: from 10^9 points on blocks grow, so that a study has some 16,000 of them, half a million
 files, unless it asks for smaller ones.
 

@@ -27,7 +27,7 @@ class Receipts:
 
     points: np.ndarray
     """(blocks,) int64: points of every block that is committed, 0 of the others."""
-    bytes: np.ndarray
+    sizes: np.ndarray
     """(blocks,) int64: bytes of these as they are stored, where the receipt says."""
     first: float = np.inf
     last: float = -np.inf
@@ -62,10 +62,10 @@ def read_receipts(store: Location, n_blocks: int, *, since: float = np.inf) -> R
         if not body or not head or (block := int(head[1])) >= n_blocks:
             continue
         if head[2] is None:
-            found.points[block] = found.bytes[block] = 0
+            found.points[block] = found.sizes[block] = 0
             continue
         points, time = int(head[2]), _TIME.search(body, len(body) - 40)
-        found.points[block], found.bytes[block] = points, int(head[3] or 0)
+        found.points[block], found.sizes[block] = points, int(head[3] or 0)
         if time:
             _date(found, body, points, float(time[1]), since)
     return found

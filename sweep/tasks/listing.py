@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -111,7 +112,7 @@ def _keys(folder: ObjectPath, shape: tuple[int, ...]) -> Iterator[tuple[tuple[in
                 yield position, size
 
 
-def _look(folder: Location | str, there: np.ndarray, within: int | None = None) -> None:
+def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> None:
     """Note the chunks in a folder and those below it.
 
     Parameters

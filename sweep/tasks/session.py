@@ -171,7 +171,7 @@ class Session:
         """
         begun = time.monotonic()
         receipts = read_receipts(self._path, self._study.n_blocks)
-        self._stored = int(receipts.bytes.sum())
+        self._stored = int(receipts.sizes.sum())
         look = Look(self._path, self._study, receipts.points > 0)
         try:
             look.within(LOOKING)

@@ -72,7 +72,7 @@ def status(store: str | Location) -> Status:
         holder=holder,
         holder_lives=holder is not None and lock.is_live(path, holder),
         draws_done=points * int(study.spec.draws.number) if isinstance(study, GridStudy) else 0,
-        bytes=packed or int(receipts.bytes.sum()),
+        bytes=packed or int(receipts.sizes.sum()),
         rate=receipts.recent / spent if receipts.recent and spent > 0 else 0.0,
         workers=len(receipts.workers),
         heartbeat=lock.heartbeat_age(path) if holder else float("inf"),
