@@ -17,6 +17,7 @@ _HOMES = {
     "load": "sweep.spec",
     "run": "sweep.tasks.driver",
     "resume": "sweep.tasks.driver",
+    "extend": "sweep.tasks.driver",
     "open": "sweep.analysis.opening",
     "open_scene": "sweep.analysis.scenes.opening",
     "export": "sweep.analysis.export",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import click
 
 
-def assignments(texts: tuple[str, ...]) -> dict[str, str]:
-    """Values by name, as written.
+def assignments(
+    texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
+) -> dict[str, str]:
+    """Values by name, as written after an option.
 
     Raises
     ------
@@ -18,7 +20,7 @@ def assignments(texts: tuple[str, ...]) -> dict[str, str]:
         name, equals, value = text.partition("=")
         if not (name.strip() and equals and value.strip()):
             raise click.BadParameter(
-                f"{text!r} is not NAME=VALUE, as in range=2km", param_hint="--at"
+                f"{text!r} is not NAME=VALUE, as in {example}", param_hint=option
             )
         found[name.strip()] = value.strip()
     return found

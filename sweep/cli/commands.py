@@ -11,7 +11,14 @@ import click
 
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.assignments import assignments
-from sweep.cli.options import BLOCK_TIMEOUT, DURABLE, PERFORMANCE_REPORT
+from sweep.cli.options import (
+    BLOCK_TIMEOUT,
+    CLUSTER,
+    DURABLE,
+    PERFORMANCE_REPORT,
+    SCHEDULER,
+    WORKERS,
+)
 from sweep.cli.places import StorePath, shown
 from sweep.cli.spectra import ALLOW_CODE
 from sweep.cli.telling import (
@@ -28,19 +35,6 @@ MISTAKE = 2
 
 SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 STORE = click.argument("store", type=StorePath())
-WORKERS = click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Workers to start [all cores here; those of --cluster].",
-)
-SCHEDULER = click.option(
-    "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
-)
-CLUSTER = click.option(
-    "--cluster",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="A file that describes a cluster: deploy/ has one of each kind.",
-)
 
 
 class Commands(click.Group):
@@ -82,6 +76,7 @@ def main() -> None:
       sweep run experiments/quickstart.yaml       do it, on all cores
       sweep status results/quickstart.zarr        how far is it? (any time)
       sweep resume results/quickstart.zarr        go on after an interruption
+      sweep extend results/quickstart.zarr ...    more values, axes, draws: only what is new
       sweep verify results/quickstart.zarr        is every byte as it was written?
       sweep figures results/quickstart.zarr       draw it
       sweep report results/quickstart.zarr        one page with all of it, for a browser

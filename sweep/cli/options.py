@@ -6,6 +6,19 @@ from pathlib import Path
 
 import click
 
+WORKERS = click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Workers to start [all cores here; those of --cluster].",
+)
+SCHEDULER = click.option(
+    "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
+)
+CLUSTER = click.option(
+    "--cluster",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A file that describes a cluster: deploy/ has one of each kind.",
+)
 BLOCK_TIMEOUT = click.option(
     "--block-timeout",
     type=click.FloatRange(min=0, min_open=True),

@@ -23,12 +23,20 @@ LOOKED_AT = 1024
 
 
 def conclude(outcome: Outcome, store: Location) -> None:
-    """Say what a run has come to, and leave with its exit code."""
+    """Say what a run has come to, and leave with its exit code.
+
+    Parameters
+    ----------
+    outcome
+        What it has come to.
+    store
+        The store that the user named: one that is being extended lies beside it.
+    """
     from sweep.tasks.progress import duration
 
     if outcome.blocks_done and (outcome.store / "zarr.json").exists():
-        _print_summary(store)
-        tell_accuracy(store)
+        _print_summary(outcome.store)
+        tell_accuracy(outcome.store)
     for scanner, rays in outcome.rays.items():
         told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")

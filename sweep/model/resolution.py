@@ -26,6 +26,7 @@ from sweep.model.effects.line_spread import (
 )
 from sweep.model.effects.lobes import lobe
 from sweep.model.preparation import (
+    AUTOMATIC,
     BEAMLETS_ERROR,
     CHIRP,
     LASER,
@@ -90,6 +91,14 @@ def finest(words: Mapping[str, Any]) -> tuple[int, str]:
 def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:
     """What is left of a tolerance for the effects that are left out."""
     return tolerance * (EFFECTS_SHARE - (SHARE if number == 0 and _is_open(words) else 0.0))
+
+
+def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
+    """Where the tolerance alone says how finely points are computed, effects apart; or a scalar."""
+    given = parameters[BEAMLETS] > np.asarray(0)
+    for path in ("accuracy.line_error", "accuracy.leakage_error"):
+        given = given & (np.asarray(parameters[path]) != AUTOMATIC)
+    return ~given
 
 
 def _is_open(words: Mapping[str, Any]) -> bool:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sweep.spec.experiment import Spec
-from sweep.spec.reading import read_document
+from sweep.spec.mistakes import SpecError
+from sweep.spec.reading import parsed, read_document
 from sweep.spec.scene_spec import SceneSpec
 
 
@@ -21,6 +24,26 @@ def load(path: str | Path) -> Spec | SceneSpec:
     document = read_document(Path(path))
     kind = SceneSpec if "scene" in document.value else Spec
     return kind.from_document(document, Path(path).parent)
+
+
+def written(fields: Mapping[str, str]) -> dict[str, Any]:
+    """Values as a file has them, from the text that would stand there.
+
+    Parameters
+    ----------
+    fields : mapping
+        Text by dotted path: ``{"axes.target.range": "[1 km, 2 km]"}``.
+
+    Raises
+    ------
+    SpecError
+        Where one is no YAML.
+    """
+    text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in fields.items())
+    document = parsed(text, Path("--set"))
+    if document.findings:
+        raise SpecError(map(document.mistake, document.findings))
+    return document.value
 
 
 def from_stored(text: str, base: Path | str | None = None) -> Spec | SceneSpec:

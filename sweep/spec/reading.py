@@ -79,7 +79,17 @@ def read_document(path: Path) -> Document:
     SpecError
         Where the file is no readable YAML mapping. Lesser mistakes are left in the document.
     """
-    text = _read_text(path)
+    return parsed(_read_text(path), path)
+
+
+def parsed(text: str, path: Path) -> Document:
+    """Mapping in YAML text, mistakes in which are told as those of a file.
+
+    Raises
+    ------
+    SpecError
+        As of :func:`read_document`.
+    """
     try:
         root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:

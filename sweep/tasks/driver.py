@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +15,7 @@ from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
 from sweep.tasks.errors import ClusterError, StoreError
+from sweep.tasks.extension import changed, refuse_unlike, what_is_there
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -21,10 +24,11 @@ from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.recipe import refuse_damaged_recipe, write_recipe
+from sweep.tasks.recipe import EXTENDS, refuse_damaged_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate
+from sweep.tasks.succession import beside, succeed, under_way
 from sweep.tasks.template import refuse_damaged
 from sweep.tasks.worker import Terms
 
@@ -126,7 +130,7 @@ def resume(
     performance_report: str | Path | None = None,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
-    """Compute what a store lacks.
+    """Compute what a store lacks; where it is being extended, what the larger one lacks.
 
     Parameters
     ----------
@@ -149,15 +153,14 @@ def resume(
     ClusterError
         Where there is no scheduler or worker to be had.
     """
-    path = located(store).absolute()
+    named = located(store).absolute()
+    path = under_way(named) or named
     attributes, study = _held(path)
     if spec is not None:
         identity.refuse_other_study(path, attributes, study.spec, spec)
-    identity.refuse_other_versions(path, attributes, where="this machine")
-    identity.refuse_altered(path, attributes, study.spec)
+    _refuse_unsound(path, attributes, study)
     user_code.check(study.spec)
     asked = study if spec is None else studies.study_of(spec, path)  # it knows where its files are
-    refuse_damaged(path)
     if spec is None:
         refuse_damaged_recipe(path)
     place = Place(
@@ -165,7 +168,83 @@ def resume(
         processes=processes, terms=Terms(evaluate, block_timeout, durable),
         performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec or study.spec)  # fmt: skip
+    if path != named:
+        return _grow(named, path, place, chosen(progress), retry_failed=retry_failed)
     return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
+
+
+def extend(
+    store: str | Location,
+    spec: Declared | None = None,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    to: str | Location | None = None,
+    client: Client | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    cluster: Declaration | None = None,
+    processes: bool = True,
+    overwrite: bool = False,
+    progress: bool | Progress = True,
+    block_timeout: float | None = None,
+    durable: bool = False,
+    performance_report: str | Path | None = None,
+    evaluate: Evaluate | None = None,
+) -> Outcome:
+    """Turn a store into that of a larger study, and compute only what is new.
+
+    The larger study has further values on its axes, further axes, more draws or a tighter
+    tolerance. It is computed beside the store and takes its place when it is complete; its bytes
+    are those of the larger study run at once.
+
+    Parameters
+    ----------
+    store
+        Where a store is that `run` made, complete or not. It is only read.
+    spec
+        The larger study; by default what the store holds.
+    changes
+        What is different in it, by dotted path: ``{"axes.target.range": ["1 km", "2 km"]}``.
+    to
+        Another place for the larger store: the old one then stays. Needed in an object store.
+    overwrite
+        Whether to begin anew where an extension was begun, or another store is in the place `to`.
+    client, workers, scheduler, cluster, processes, progress, block_timeout, durable,
+    performance_report, evaluate
+        As in `run`.
+
+    Returns
+    -------
+    Outcome
+        Complete, or why not; `extend` or `resume` goes on from there.
+
+    Raises
+    ------
+    StoreError, ClusterError
+        As in `run` and `resume`; where the study asked for is not a larger one.
+    """
+    path, told = located(store).absolute(), chosen(progress)
+    under_way(path)
+    attributes, older = _held(path)
+    asked = changed(older.spec if spec is None else spec, changes or {})
+    user_code.check(asked)
+    place = Place(
+        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
+        processes=processes, terms=Terms(evaluate, block_timeout, durable),
+        performance_report=None if performance_report is None else Path(performance_report),
+    ).for_spec(asked)  # fmt: skip
+    _refuse_unsound(path, attributes, older)
+    if asked.id == attributes["study_id"]:
+        told.say(f"nothing to extend: {path} holds this very study")
+        return _go_on(path, older, place, told)
+    refuse_unlike(path, older.spec, asked)
+    new = _successor(path, to)
+    if overwrite or not new.exists():
+        _make(new, studies.study_of(asked, new), overwrite, told)
+    begun, held = _held(new)
+    identity.refuse_other_study(new, begun, held.spec, asked)
+    _refuse_unsound(new, begun, held)
+    return _grow(path, new, place, told)
 
 
 def _declared(cluster: Declaration | None) -> AnyCluster | None:
@@ -181,6 +260,45 @@ def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
     if PACKED in attributes:
         raise StoreError(f"{path} is a packed copy of a complete store: there is nothing to resume")
     return attributes, study
+
+
+def _refuse_unsound(
+    path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
+) -> None:
+    """Refuse a store of other versions, or one that is not as it was made."""
+    identity.refuse_other_versions(path, attributes, where="this machine")
+    identity.refuse_altered(path, attributes, study.spec)
+    refuse_damaged(path)
+
+
+def _successor(path: Location, to: str | Location | None) -> Location:
+    """Where a larger store is made."""
+    if to is not None:
+        return located(to).absolute()
+    if not isinstance(path, Path):
+        raise StoreError(
+            f"{path} can't be extended in its place, as an object store has no renaming: "
+            "name another place for the larger store with --store; this one then stays"
+        )
+    return beside(path)
+
+
+def _grow(
+    path: Location, new: Location, place: Place, told: Progress, *, retry_failed: bool = False
+) -> Outcome:
+    """Compute what a larger store lacks, and have it succeed the one that it extends."""
+    with ExitStack() as stack:
+        in_place = isinstance(path, Path) and isinstance(new, Path) and new == beside(path)
+        if in_place:
+            stack.callback(Lock(path).release)
+        write_recipe(new, **{EXTENDS: str(path)})
+        study = _held(new)[1]
+        told.say(what_is_there(new, study))
+        outcome = _go_on(new, study, place, told, retry_failed=retry_failed)
+        if outcome.complete and isinstance(path, Path) and in_place:
+            succeed(path, durable=place.terms.durable)
+            return replace(outcome, store=path)
+        return outcome
 
 
 def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
 from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.study import Results
+from sweep.tasks.study import NOTHING_KNOWN, Known, Results
 
 if TYPE_CHECKING:
     from sweep.model.sampling import Promise
@@ -31,7 +31,9 @@ NOT_PHYSICAL = (
 DOMAIN = "sweep.draws"
 
 
-def evaluate_block(spec: Spec, grid: Grid, block: int, called: Called) -> Results:
+def evaluate_block(
+    spec: Spec, grid: Grid, block: int, called: Called, known: Known = NOTHING_KNOWN
+) -> Results:
     """Results of one block.
 
     Parameters
@@ -42,6 +44,8 @@ def evaluate_block(spec: Spec, grid: Grid, block: int, called: Called) -> Result
         Number of the block.
     called
         What is simulated at each of its points, in C order over it.
+    known
+        Points that are not computed, and their outputs.
 
     Returns
     -------
@@ -49,16 +53,25 @@ def evaluate_block(spec: Spec, grid: Grid, block: int, called: Called) -> Result
         Each output of the model with the block's extent as its shape, and what was simulated;
         counts of draws with a last dimension over batches, where the study draws a fixed number.
     """
-    extent, parameters = grid.extent(block), grid.parameters(block)
-    order = grid.geometry_order(block)
+    extent, size = grid.extent(block), grid.block_size(block)
     results: Results = {EFFECTS: called.flags, ERROR: called.error}
+    for points, found in (known, *_computed(spec, grid, block, called, known.points)):
+        for name, values in found.items():
+            room = (size, *values.shape[1:])
+            results.setdefault(name, np.empty(room, values.dtype))[points] = values
+    return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
+
+
+def _computed(
+    spec: Spec, grid: Grid, block: int, called: Called, but_for: np.ndarray
+) -> Iterator[Known]:
+    """Outputs of a block's points but for some, as many together as call for the same effects."""
+    parameters, order = grid.parameters(block), grid.geometry_order(block)
+    order = order[~np.isin(order, but_for)]
     for members, effects in called.some(order).groups():
         for points in np.split(order[members], range(_step(spec), len(members), _step(spec))):
             found = evaluate_points(spec, select(parameters, points), len(points), effects)
-            for name, values in found.items():
-                room = (len(order), *values.shape[1:])
-                results.setdefault(name, np.empty(room, values.dtype))[points] = values
-    return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
+            yield Known(points, found)
 
 
 def evaluate_points(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
+from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling, layouts
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
-from sweep.tasks.study import ArrayLayout, Results
+from sweep.tasks.study import NOTHING_KNOWN, ArrayLayout, Known, Results
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
@@ -39,6 +41,16 @@ def output_names(spec: Spec) -> list[str]:
     return sorted([*outputs_of(spec), EFFECTS, ERROR])
 
 
+class Earlier(Protocol):
+    """Where results of a study may be had without computing them."""
+
+    def known(self, block: int, called: Called) -> Known:
+        """Points of a block that are there, computed as they would be here."""
+
+    def count(self, block: int) -> int:
+        """How many these are, if none is damaged."""
+
+
 class GridStudy:
     """A study over a grid of parameters.
 
@@ -46,15 +58,25 @@ class GridStudy:
     ----------
     spec
         The study.
+    look_up
+        Finds where some of its results are already; asked as the first block is computed.
     """
 
     unit = "points"
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(
+        self, spec: Spec, look_up: Callable[[GridStudy], Earlier | None] | None = None
+    ) -> None:
         self.spec = spec
+        self._look_up = look_up
         self.grid = Grid(spec)
         self.calling = Calling(spec, self.grid)
         self._names = output_names(spec)
+
+    @cached_property
+    def earlier(self) -> Earlier | None:
+        """Where some of its results are already, if anywhere."""
+        return self._look_up(self) if self._look_up else None
 
     @property
     def id(self) -> str:
@@ -147,7 +169,9 @@ class GridStudy:
 
     def evaluate(self, block: int) -> Results:
         """Outputs of a block."""
-        return evaluate_block(self.spec, self.grid, block, self.calling.of_block(block))
+        called = self.calling.of_block(block)
+        known = self.earlier.known(block, called) if self.earlier else NOTHING_KNOWN
+        return evaluate_block(self.spec, self.grid, block, called, known)
 
     def compile(self) -> None:
         """Compile the model's kernels."""

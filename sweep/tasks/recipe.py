@@ -1,11 +1,12 @@
-"""What a store's own bytes do not say: the folder that the files of its study lie under.
+"""What a store's own bytes do not say: where its study's files are, and which store it extends.
 
-A study is the same wherever its files are, so their place stands in the journal's directory. It is
-written anew by whoever runs the study from its spec.
+A study is the same wherever its files are, and however much of it was computed before, so that
+stands in the journal's directory. It is written anew by whoever runs the study from its spec.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from sweep.storage.locations import JOURNAL, Location, put_whole
@@ -13,6 +14,9 @@ from sweep.storage.sealing import damaged_lines, read_sealed, sealed
 from sweep.tasks.errors import StoreError
 
 RECIPE = "recipe.json"
+
+#: The place of the store that points are taken from, while this one is extended from it.
+EXTENDS = "extends"
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
@@ -24,6 +28,11 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
     """What was put down; empty where nothing was, or where it is damaged."""
     records = [record for _, record in read_sealed(store_path / JOURNAL / RECIPE)]
     return records[0] or {} if len(records) == 1 else {}
+
+
+def forget_recipe(store_path: Path) -> None:
+    """Take away what was put down."""
+    (store_path / JOURNAL / RECIPE).unlink(missing_ok=True)
 
 
 def refuse_damaged_recipe(store_path: Location) -> None:

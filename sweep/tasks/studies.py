@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, located
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.identity import read_attributes, read_spec
-from sweep.tasks.recipe import read_recipe
+from sweep.tasks.recipe import EXTENDS, read_recipe
+from sweep.tasks.reuse import older_store
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -67,7 +69,10 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
     base = Path(recipe["base"]) if "base" in recipe else None
     if attributes["kind"] == "eyepoints":
         return _eyepoints(path, recipe, base)
-    return study_of(read_spec(path, attributes["spec"], base), path)
+    spec = read_spec(path, attributes["spec"], base)
+    if attributes["kind"] == "grid" and EXTENDS in recipe:
+        return GridStudy(spec, partial(older_store, located(recipe[EXTENDS])))  # type: ignore[arg-type]
+    return study_of(spec, path)
 
 
 def _eyepoints(path: Location, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 Results = dict[str, np.ndarray]
+
+
+class Known(NamedTuple):
+    """Results of some points of a block that need not be computed again."""
+
+    points: np.ndarray
+    """(m,) int64: their numbers in C order over the block."""
+    results: Results
+    """(m, ...) each, by name."""
+
+
+NOTHING_KNOWN = Known(np.zeros(0, np.int64), {})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,140 @@
+"""What a larger study has in common with the one in a store, and whether it is one at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.spec import Spec, difference
+from sweep.spec.fields import parameter_rules
+from sweep.storage.locations import Location
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.journal import committed
+from sweep.tasks.matching import Matching
+from sweep.tasks.reuse import ignored
+from sweep.tasks.study import Study
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec
+
+#: Fields that may grow, and one that may shrink; blocks may be of any size.
+GROWING = ("draws.number", "draws.limit")
+SHRINKING = ("accuracy.tolerance",)
+FREE = ("storage.block_points",)
+
+#: Values of an axis that are told where they would be lost.
+MOST_TOLD = 5
+
+
+def changed(spec: Spec | SceneSpec, changes: Mapping[str, Any]) -> Spec | SceneSpec:
+    """A study with some of its fields written anew.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    changes
+        What stands at dotted paths, as in a file: ``{"axes.target.range": ["1 km", "2 km"]}``.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in what comes out.
+    """
+    written = spec.to_yaml_mapping()
+    for path, value in changes.items():
+        first, _, rest = path.partition(".")
+        if first == "axes":
+            written[first] = {**written.get(first, {}), rest: value}
+            continue
+        *sections, last = path.split(".")
+        section = written
+        for name in sections:
+            section = section.setdefault(name, {})
+        section[last] = value
+    return type(spec).from_mapping(written)
+
+
+def refuse_unlike(path: Location, older: Spec | SceneSpec, spec: Spec | SceneSpec) -> None:
+    """Refuse what is not a larger study than the one in a store.
+
+    Raises
+    ------
+    StoreError
+        With each field, its rule, its values, and what to do.
+    """
+    if not (isinstance(older, Spec) and isinstance(spec, Spec)):
+        raise StoreError(
+            f"{path} can't be extended: only studies over grids can, and not flights over a scene. "
+            "Run the larger study into a store of its own; eyepoints that are there are used."
+        )
+    lines = [*_altered(older, spec), *_lost(older, spec)]
+    if lines:
+        listed = "\n".join(f"  {line}" for line in lines)
+        raise StoreError(
+            f"{path} can't be extended to this study (in the store -> asked for):\n{listed}\n"
+            "A store is extended by values on axes, new axes, more draws or a tighter "
+            "accuracy.tolerance. Any other study needs a store of its own: "
+            "sweep run SPEC --store NEW"
+        )
+
+
+def what_is_there(path: Location, study: Study) -> str:
+    """How many points of a larger study there are, here and in the store that it extends."""
+    assert isinstance(study, GridStudy)  # others are refused
+    done = committed(path, study)
+    there = study.points_in(done)
+    if study.earlier is not None:
+        there += sum(study.earlier.count(int(block)) for block in np.flatnonzero(~done))
+    return f"{there:,} of {study.points:,} points are there; {study.points - there:,} to compute"
+
+
+def _altered(older: Spec, spec: Spec) -> Iterator[str]:
+    """Fields that are not as they must be."""
+    on_axes = {
+        member.path for each in (older, spec) for axis in each.axes for member in axis.members
+    }
+    for line in difference(older, spec):
+        path = line.partition(": ")[0]
+        if path in on_axes or path in FREE or path.partition(".")[0] == "axes":
+            continue
+        growth = _value(spec, path) - _value(older, path) if path in GROWING + SHRINKING else 0
+        if path in GROWING and not growth > 0 < _value(older, path):
+            yield f"{line}, and may only grow"
+        elif path in SHRINKING and not growth < 0:
+            yield f"{line}, and may only become tighter"
+        elif path not in GROWING + SHRINKING:
+            yield f"{line}, and must stay as it is"
+
+
+def _value(spec: Spec, path: str) -> float:
+    section, _, name = path.partition(".")
+    return float(getattr(getattr(spec, section), name))
+
+
+def _lost(older: Spec, spec: Spec) -> Iterator[str]:
+    """Values of the store that the study lacks."""
+    had, grid = Grid(older), Grid(spec)
+    varying = {path for each in (had, grid) for values in each.values for path in values}
+    for places in Matching(grid, had, ignored(older, spec)).places:
+        if (places.where >= 0).all() or varying.isdisjoint(places.paths):
+            continue
+        at = np.argwhere(places.where < 0).T
+        told = ", ".join(_told(had, path, at) for path in places.paths)
+        yield f"{told}: lost, and must stay among the values"
+
+
+def _told(grid: Grid, path: str, at: np.ndarray) -> str:
+    """Values of a parameter at places of a grid, (axes, places)."""
+    values: list[object] = [grid.fixed[path]]
+    for own, index in zip(grid.values, at, strict=True):
+        if path in own:
+            values = own[path][np.unique(index)].tolist()
+    shown = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+    more = ["..."] if len(shown) > MOST_TOLD else []
+    units = parameter_rules()[path].units
+    return f"{path}: {', '.join(shown[:MOST_TOLD] + more)}{f' {units}' if units else ''}"

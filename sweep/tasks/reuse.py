@@ -1,0 +1,169 @@
+"""Points of an older store that a larger study has too: taken from there, bit for bit.
+
+What a point comes to follows from its parameters, its draws and the effects that are simulated,
+and from nothing else. Effects are planned tile by tile, and a larger grid has other tiles: a point
+whose effects are not those of the older store is computed anew. The older store is only read. Each
+of its blocks is held against the digest in its receipt first; one that is damaged counts as absent.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.model.resolution import by_tolerance
+from sweep.spec import Spec
+from sweep.spec.detector_check import is_method
+from sweep.storage.locations import Location, read_array
+from sweep.tasks import identity, store
+from sweep.tasks.calling import EFFECTS, ERROR, TOLERANCE, Called
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.journal import digests
+from sweep.tasks.matching import Matching
+from sweep.tasks.study import NOTHING_KNOWN, Known, Results
+
+if TYPE_CHECKING:
+    import zarr
+
+#: Blocks of the older store that a process keeps in memory.
+BLOCKS_KEPT = 4
+
+
+class Share(NamedTuple):
+    """Points of a block that an older block has."""
+
+    block: int
+    """Of the older store."""
+    points: np.ndarray
+    """(m,) int64: their numbers in the block."""
+    place: np.ndarray
+    """(m,) int64: their numbers in the older one."""
+
+
+class OlderStore:
+    """What a store knows of a larger study.
+
+    Parameters
+    ----------
+    path, older
+        The store, and the study in it.
+    study
+        The larger one.
+    """
+
+    def __init__(self, path: Location, older: GridStudy, study: GridStudy) -> None:
+        self._path, self._older, self._study = path, older, study
+        self._digests = digests(path, older.n_blocks)
+        self._arrays: dict[str, zarr.Array] = {}
+        self._block = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
+
+    @cached_property
+    def _matching(self) -> Matching:
+        older, study = self._older, self._study
+        return Matching(older.grid, study.grid, ignored(older.spec, study.spec))
+
+    def known(self, block: int, called: Called) -> Known:
+        """Points of a block of the larger study that need not be computed, with their outputs."""
+        points: list[np.ndarray] = []
+        found: list[Results] = []
+        for share in self._shares(block):
+            if (older := self._block(share.block)) is None:
+                continue
+            same = older[EFFECTS][share.place] == called.flags[share.points]
+            points.append(share.points[same])
+            found.append({name: values[share.place[same]] for name, values in older.items()})
+        if not points:
+            return NOTHING_KNOWN
+        outputs = found[0].keys() - {EFFECTS, ERROR}
+        results = {name: np.concatenate([each[name] for each in found]) for name in outputs}
+        return Known(np.concatenate(points), results)
+
+    def count(self, block: int) -> int:
+        """Points of a block that `known` would tell of, if nothing is damaged."""
+        called, number = self._study.calling.of_block(block), 0
+        for share in self._shares(block):
+            flags = self._chunk(EFFECTS, share.block)
+            number += int(np.sum(flags[share.place] == called.flags[share.points]))
+        return number
+
+    def _shares(self, block: int) -> list[Share]:
+        """The committed older blocks that have points of a block."""
+        grid = self._older.grid
+        numbers = self._matching.of_block(block)
+        points = np.flatnonzero((numbers >= 0) & self._same_resolution(block))
+        at = np.unravel_index(numbers[points], grid.shape) if grid.shape else ()
+        blocks, place = np.zeros((2, points.size), np.int64)
+        for k, index in enumerate(at):
+            chunk = grid.block_shape[k]
+            start = index // chunk * chunk
+            blocks = blocks * grid.blocks_along[k] + index // chunk
+            place = place * np.minimum(chunk, grid.shape[k] - start) + index - start
+        return [
+            Share(int(b), points[blocks == b], place[blocks == b])
+            for b in np.unique(blocks)
+            if self._digests[b]
+        ]
+
+    def _same_resolution(self, block: int) -> np.ndarray | bool:
+        """Which points of a block are computed as finely here as there, (points,)."""
+        older, ours = _tolerance(self._older.spec), _tolerance(self._study.spec)
+        if older is None or ours is None or older == ours:
+            return True  # points are told apart by it, or have the same
+        return ~by_tolerance(self._study.grid.parameters(block))
+
+    def _read(self, block: int) -> Results | None:
+        """Results of an older block, (points, ...) each; None where it is damaged or lost."""
+        try:
+            objects = store.block_objects(self._older, block)
+            if store.digest(self._path, objects).encode() != self._digests[block]:
+                return None
+            return {name: self._chunk(name, block) for name in self._older.chunks(block)}
+        except OSError:
+            return None
+
+    def _chunk(self, name: str, block: int) -> np.ndarray:
+        """An array's values at the points of an older block, (points, ...)."""
+        if name not in self._arrays:
+            self._arrays[name] = read_array(self._path / name)
+        part = self._older.grid.block(block)
+        values = np.asarray(self._arrays[name][part or ...])
+        return values.reshape(self._older.block_size(block), *values.shape[len(part) :])
+
+
+def older_store(path: Location, study: GridStudy) -> OlderStore | None:
+    """What the store at a path knows of a study; None where it is gone, or knows nothing."""
+    try:
+        attributes = identity.read_attributes(path)
+        identity.refuse_other_versions(path, attributes, where="this machine")
+        held = identity.read_spec(path, attributes.get("spec", "{}"))
+    except StoreError:
+        return None
+    if not isinstance(held, Spec) or not same_draws(held, study.spec):
+        return None
+    return OlderStore(path, GridStudy(held), study)
+
+
+def ignored(older: Spec, spec: Spec) -> tuple[str, ...]:
+    """Parameters in which points may differ that are to be taken for the same.
+
+    The tolerance, where neither study varies it, and what looks at spectra where none are drawn.
+    """
+    ours = [path for path in spec.parameters() if is_method(path) and not spec.draws.whole_spectra]
+    fixed = _tolerance(older) is not None and _tolerance(spec) is not None
+    return (*ours, TOLERANCE) if fixed else tuple(ours)
+
+
+def same_draws(older: Spec, spec: Spec) -> bool:
+    """Whether points of two studies that are computed as finely have the same draws."""
+    if spec.draws != older.draws or spec.seed != older.seed:
+        return False
+    return not spec.draws.any or _tolerance(older) == _tolerance(spec)
+
+
+def _tolerance(spec: Spec) -> float | None:
+    """The tolerance of all points; None where an axis varies it."""
+    value = spec.parameters_off_axes().get(TOLERANCE)
+    return None if value is None else float(value)
