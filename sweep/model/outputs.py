@@ -140,3 +140,12 @@ ACCURACY_OUTPUTS: dict[str, Output] = {
     ),
 }
 """What draws have come to, point by point."""
+
+RUNNING = "running_sums"
+
+RUNNING_OUTPUTS: dict[str, Output] = {
+    RUNNING: Output(
+        "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
+    ),
+}
+"""What draws of random effects leave for further ones, a row a point."""

@@ -20,7 +20,7 @@ from sweep.model.chain import SHARED, assembled, nodes
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane
-from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS
+from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.resolution import resolved_categories
 from sweep.model.shot import statistics
@@ -32,6 +32,11 @@ BEAMLETS = 1 << 19
 
 _NAMES = list(OUTPUTS)
 _LOGARITHMS = np.array([name.startswith("log10_") for name in _NAMES])
+_SPREAD_OF = _LOGARITHMS | np.array([f"{name}_error" in ERROR_OUTPUTS for name in _NAMES])
+"""Outputs whose spread shows in a result."""
+
+RUNNING_COLUMNS = len(_NAMES) + int(_SPREAD_OF.sum()) + int(_LOGARITHMS.sum())
+"""Numbers a point that further draws need besides the means: counts, spreads, logarithms."""
 
 
 class Stretch(NamedTuple):
@@ -155,6 +160,21 @@ class Means:
         n = self._count[rows]
         with np.errstate(invalid="ignore"):
             return np.where(n > 0, self._mean[rows], np.nan), self._spread[rows] / (n - 1.0), n
+
+    def running(self) -> np.ndarray:
+        """What further draws are added to, besides the means, (n, RUNNING_COLUMNS)."""
+        kept = self._count, self._spread[_SPREAD_OF], self._mean[_LOGARITHMS]
+        return np.concatenate(kept).T
+
+    def go_on_from(self, means: Mapping[str, np.ndarray]) -> None:
+        """Go on from what `results` and `running` gave before; zeros where nothing was drawn."""
+        columns = np.cumsum([len(_NAMES), _SPREAD_OF.sum()])
+        count, spread, largest = np.split(means[RUNNING].T, columns)
+        self._count[...] = count
+        self._spread[_SPREAD_OF] = spread
+        mean = np.array([means[name] for name in OUTPUTS])
+        mean[_LOGARITHMS] = largest
+        self._mean[...] = np.where(count > 0, mean, self._mean)
 
     def results(self) -> dict[str, np.ndarray]:
         """The means by the names of OUTPUTS, standard errors by those of ERROR_OUTPUTS, (n,)."""

@@ -13,7 +13,7 @@ measures them. Looks come at the same numbers of draws for every point, and what
 depends on nothing but its own draws: other points, blocks and workers change no bit of it.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_counts
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
-from sweep.model.outputs import DRAW_OUTPUTS, PROMISED
+from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
 from sweep.model.preparation import Parameters
 from sweep.model.realisations import Means, certain, random_effects, realise
 from sweep.model.shot import evaluate, statistics
@@ -49,8 +49,22 @@ class Promise(NamedTuple):
         return Promise(tolerance, confidence, self.interval)
 
 
+class Before(NamedTuple):
+    """Draws of n points that were taken before: further ones are added to them, bit for bit."""
+
+    number: np.ndarray
+    """(n,) int64: how many, 0 where there are none."""
+    counts: np.ndarray
+    """(names, n, batches) int64: over the batches that are to be filled, as of DRAW_OUTPUTS."""
+    means: Mapping[str, np.ndarray]
+    """(n,) by the names of OUTPUTS, and RUNNING; for points with random effects."""
+
+
 class Drawn(Protocol):
     """Points that can be drawn on."""
+
+    number: np.ndarray
+    """(n,) int64: draws of each so far."""
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> object:
         """Draw some of the points, from draw `first` on."""
@@ -80,6 +94,7 @@ def simulate(
     batch_sizes: Sequence[int],
     method: str,
     promise: Promise = Promise(),  # noqa: B008  # a tuple
+    before: Before | None = None,
 ) -> dict[str, np.ndarray]:
     """Outputs, their errors, and counts over batches of draws, with all effects.
 
@@ -92,15 +107,23 @@ def simulate(
         As of :func:`sweep.model.draws.draw`.
     promise : Promise
         What half-widths are held against.
+    before : Before, optional
+        What was drawn before, from ``first_draw`` on.
 
     Returns
     -------
     dict of ndarray
         (n,) by the names of OUTPUTS, ERROR_OUTPUTS and ACCURACY_OUTPUTS, (n, batches) int64 by
-        those of DRAW_OUTPUTS of :mod:`sweep.model.outputs`.
+        those of DRAW_OUTPUTS of :mod:`sweep.model.outputs`; where random effects are simulated
+        RUNNING, (n, columns).
     """
-    sample = Sample(parameters, effects, keys=keys, method=method)
-    counts = sample.take(np.arange(len(keys)), first_draw, batch_sizes)
+    sample = Sample(parameters, effects, keys=keys, method=method, before=before)
+    counts = before.counts.copy() if before else no_counts(len(keys), len(batch_sizes), method)
+    number, ends = sample.number.copy(), np.cumsum([0, *batch_sizes])
+    for done in np.unique(number):
+        points, batch = np.flatnonzero(number == done), np.searchsorted(ends, done, "right") - 1
+        if (rest := np.diff(ends[batch:].clip(done))).size:
+            counts[:, points, batch:] += sample.take(points, first_draw + done, rest)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
@@ -113,13 +136,15 @@ def simulate_until(
     limit: int,
     method: str,
     promise: Promise,
+    before: Before | None = None,
 ) -> dict[str, np.ndarray]:
     """Outputs, their errors, and counts, of as many draws of each point as keep a promise.
 
     Parameters
     ----------
-    parameters, effects, keys, method, promise
-        As of :func:`simulate`.
+    parameters, effects, keys, method, promise, before
+        As of :func:`simulate`; what was drawn before was drawn for a looser promise, or up to a
+        lower limit.
     batch : int
         Draws of which a look comes after a whole number.
     limit : int
@@ -130,18 +155,25 @@ def simulate_until(
     dict of (n,) ndarray
         As of :func:`simulate`, with all draws in one count.
     """
-    sample = Sample(parameters, effects, keys=keys, method=method)
+    sample = Sample(parameters, effects, keys=keys, method=method, before=before)
     settle(sample, np.arange(len(keys)), looks(batch, limit), promise)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
 def settle(sample: Drawn, points: np.ndarray, ends: Iterable[int], promise: Promise) -> None:
-    """Draw points until the promise is kept of each, or numbers of draws to look at end."""
-    first = 0
+    """Draw points until the promise is kept of each, or numbers of draws to look at end.
+
+    One that has more draws than a look is at was looked at there before, or need not be.
+    """
     for last in ends:
-        for start in range(first, last, PIECE):
-            sample.take(points, start, [min(PIECE, last - start)])
-        points, first = points[sample.missed(points, promise) > 0], last
+        number = sample.number[points]
+        for done in np.unique(number[number < last]):
+            for start in range(done, last, PIECE):
+                sample.take(points[number == done], start, [min(PIECE, last - start)])
+        looked_at = number <= last
+        is_open = ~looked_at
+        is_open[looked_at] = sample.missed(points[looked_at], promise) > 0
+        points = points[is_open]
         if not points.size:
             return
 
@@ -151,13 +183,14 @@ class Sample:
 
     Parameters
     ----------
-    parameters, effects, keys, method
+    parameters, effects, keys, method, before
         As of :func:`simulate`.
     """
 
     def __init__(
-        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str
-    ) -> None:
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str,
+        before: Before | None = None,
+    ) -> None:  # fmt: skip
         self._parameters, self._effects = parameters, effects
         self._keys, self._method = keys, method
         self.counts = no_counts(len(keys), 1, method)[..., 0]
@@ -166,6 +199,11 @@ class Sample:
         if self._means is None:
             values = evaluate(parameters, effects)
             self._outputs = {name: np.broadcast_to(v, (len(keys),)) for name, v in values.items()}
+        if before is not None:
+            self.number += before.number
+            self.counts += before.counts.sum(axis=-1)
+            if self._means is not None:
+                self._means.go_on_from(before.means)
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
         """Draw some of the points, from draw `first` on.
@@ -245,7 +283,7 @@ class Sample:
         if self._means is None:
             outputs = self._outputs | certain(self._outputs)
         else:
-            outputs = self._means.results()
+            outputs = self._means.results() | {RUNNING: self._means.running()}
         return outputs | {
             "n_draws": self.number,
             **{f"{name}_half_width": width for name, width in widths.items()},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -66,6 +67,11 @@ class Spec(Study):
             for section in SECTIONS
             for path, value in values_of(getattr(self, section), section).items()
         }
+
+    @cached_property
+    def has_random_effects(self) -> bool:
+        """Whether anything but noise may be random at any point."""
+        return any(without_draws(self.parameters(), self.axes, self.modes()))
 
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.

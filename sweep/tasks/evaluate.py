@@ -9,10 +9,10 @@ import numpy as np
 
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
 from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.study import NOTHING_KNOWN, Known, Results
+from sweep.tasks.study import Found, Known, Results
 
 if TYPE_CHECKING:
-    from sweep.model.sampling import Promise
+    from sweep.model.sampling import Before, Promise
     from sweep.spec import Spec
 
 #: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
@@ -32,7 +32,11 @@ DOMAIN = "sweep.draws"
 
 
 def evaluate_block(
-    spec: Spec, grid: Grid, block: int, called: Called, known: Known = NOTHING_KNOWN
+    spec: Spec,
+    grid: Grid,
+    block: int,
+    called: Called,
+    known: Known = Known(),  # noqa: B008
 ) -> Results:
     """Results of one block.
 
@@ -45,7 +49,7 @@ def evaluate_block(
     called
         What is simulated at each of its points, in C order over it.
     known
-        Points that are not computed, and their outputs.
+        What need not be computed: whole points, or their first draws.
 
     Returns
     -------
@@ -55,23 +59,22 @@ def evaluate_block(
     """
     extent, size = grid.extent(block), grid.block_size(block)
     results: Results = {EFFECTS: called.flags, ERROR: called.error}
-    for points, found in (known, *_computed(spec, grid, block, called, known.points)):
+    for points, found in (known.done, *_computed(spec, grid, block, called, known)):
         for name, values in found.items():
             room = (size, *values.shape[1:])
             results.setdefault(name, np.empty(room, values.dtype))[points] = values
     return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
 
-def _computed(
-    spec: Spec, grid: Grid, block: int, called: Called, but_for: np.ndarray
-) -> Iterator[Known]:
-    """Outputs of a block's points but for some, as many together as call for the same effects."""
+def _computed(spec: Spec, grid: Grid, block: int, called: Called, known: Known) -> Iterator[Found]:
+    """Outputs of a block's points that are not done, those together that call for the same."""
     parameters, order = grid.parameters(block), grid.geometry_order(block)
-    order = order[~np.isin(order, but_for)]
+    order = order[~np.isin(order, known.done.points)]
     for members, effects in called.some(order).groups():
         for points in np.split(order[members], range(_step(spec), len(members), _step(spec))):
-            found = evaluate_points(spec, select(parameters, points), len(points), effects)
-            yield Known(points, found)
+            before = drawn_before(spec, known.begun, points)
+            some = select(parameters, points)
+            yield Found(points, evaluate_points(spec, some, len(points), effects, before))
 
 
 def evaluate_points(
@@ -79,6 +82,7 @@ def evaluate_points(
     parameters: Mapping[str, Value],
     count: int,
     effects: Collection[str],
+    before: Before | None = None,
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
@@ -91,6 +95,8 @@ def evaluate_points(
     effects
         Names of the effects that are simulated in all of them. Outputs are means over the
         study's draws where random ones are among them.
+    before
+        Draws that there are already.
 
     Raises
     ------
@@ -98,7 +104,7 @@ def evaluate_points(
         An effect is random and the study has no draws.
     """
     if spec.draws.any:
-        return _drawn(spec, parameters, count, effects)
+        return _drawn(spec, parameters, count, effects, before)
     from sweep.model.realisations import random_effects
     from sweep.model.shot import evaluate
 
@@ -137,8 +143,34 @@ def draw_keys(spec: Spec, parameters: Mapping[str, Value], count: int) -> np.nda
     return point_keys(canonical_rows(physical, count), domain=DOMAIN, seed=spec.seed)
 
 
+def drawn_before(spec: Spec, begun: Found, points: np.ndarray) -> Before | None:
+    """Draws that there are of some points of a block; None where there are none."""
+    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS, RUNNING
+    from sweep.model.sampling import Before
+
+    _, theirs, ours = np.intersect1d(begun.points, points, return_indices=True)
+    if not ours.size:
+        return None
+
+    def laid_out(name: str) -> np.ndarray:
+        values = begun.results[name][theirs]
+        room = np.zeros((len(points), *values.shape[1:]), values.dtype)
+        room[ours] = values
+        return room
+
+    counts = np.stack([laid_out(name).reshape(len(points), -1) for name in DRAW_OUTPUTS])
+    further = max(1, len(batch_sizes(spec))) - counts.shape[-1]
+    counts = np.pad(counts, ((0, 0), (0, 0), (0, further)))
+    means = {name: laid_out(name) for name in (*OUTPUTS, RUNNING) if name in begun.results}
+    return Before(laid_out("n_draws"), counts, means)
+
+
 def _drawn(
-    spec: Spec, parameters: Mapping[str, Value], count: int, effects: Collection[str]
+    spec: Spec,
+    parameters: Mapping[str, Value],
+    count: int,
+    effects: Collection[str],
+    before: Before | None,
 ) -> Results:
     from sweep.model.sampling import Promise, simulate, simulate_until
 
@@ -148,14 +180,24 @@ def _drawn(
     if draws.whole_spectra:
         return _in_spectra(spec, parameters, effects, keys, promise)
     if draws.adaptive:
-        return simulate_until(
+        found = simulate_until(
             parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit,
-            method=draws.method, promise=promise,
+            method=draws.method, promise=promise, before=before,
         )  # fmt: skip
-    return simulate(
-        parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), method=draws.method,
-        promise=promise,
-    )  # fmt: skip
+    else:
+        found = simulate(
+            parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), method=draws.method,
+            promise=promise, before=before,
+        )  # fmt: skip
+    return no_sums(spec, count) | found
+
+
+def no_sums(spec: Spec, count: int) -> Results:
+    """Running sums of points that have none, where any point of the study may have some."""
+    from sweep.model.outputs import RUNNING
+    from sweep.model.realisations import RUNNING_COLUMNS
+
+    return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if spec.has_random_effects else {}
 
 
 def _in_spectra(

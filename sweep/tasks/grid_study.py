@@ -11,7 +11,7 @@ import numpy as np
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling, layouts
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
-from sweep.tasks.study import NOTHING_KNOWN, ArrayLayout, Known, Results
+from sweep.tasks.study import ArrayLayout, Known, Results
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
@@ -26,14 +26,21 @@ NO_COUNT = -1
 
 def outputs_of(spec: Spec) -> dict[str, Output]:
     """What the model yields for each point of a study, by name."""
-    from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+    from sweep.model.outputs import (
+        ACCURACY_OUTPUTS,
+        DRAW_OUTPUTS,
+        ERROR_OUTPUTS,
+        OUTPUTS,
+        RUNNING_OUTPUTS,
+    )
     from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
 
+    if not spec.draws.any:
+        return dict(OUTPUTS)
+    drawn = ACCURACY_OUTPUTS | DRAW_OUTPUTS
     if spec.draws.whole_spectra:
-        return SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
-    return OUTPUTS | (
-        ERROR_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS if spec.draws.any else {}
-    )  # fmt: skip
+        return SPECTRA_OUTPUTS | drawn
+    return OUTPUTS | ERROR_OUTPUTS | drawn | (RUNNING_OUTPUTS if spec.has_random_effects else {})
 
 
 def output_names(spec: Spec) -> list[str]:
@@ -41,14 +48,24 @@ def output_names(spec: Spec) -> list[str]:
     return sorted([*outputs_of(spec), EFFECTS, ERROR])
 
 
+def further_dims(spec: Spec) -> dict[str, tuple[str, int]]:
+    """Outputs that have a dimension besides the axes, with its name and size."""
+    from sweep.model.outputs import DRAW_OUTPUTS, RUNNING
+    from sweep.model.realisations import RUNNING_COLUMNS
+
+    batches = (BATCH, len(batch_sizes(spec)))
+    found = {} if spec.draws.adaptive else dict.fromkeys(DRAW_OUTPUTS, batches)
+    return found | {RUNNING: ("sum", RUNNING_COLUMNS)}
+
+
 class Earlier(Protocol):
     """Where results of a study may be had without computing them."""
 
     def known(self, block: int, called: Called) -> Known:
-        """Points of a block that are there, computed as they would be here."""
+        """What is there of a block, computed as it would be here."""
 
     def count(self, block: int) -> int:
-        """How many these are, if none is damaged."""
+        """Points of a block of which something is there, if nothing is damaged."""
 
 
 class GridStudy:
@@ -71,7 +88,7 @@ class GridStudy:
         self._look_up = look_up
         self.grid = Grid(spec)
         self.calling = Calling(spec, self.grid)
-        self._names = output_names(spec)
+        self._names, self._further = output_names(spec), further_dims(spec)
 
     @cached_property
     def earlier(self) -> Earlier | None:
@@ -131,23 +148,17 @@ class GridStudy:
         from sweep.model.outputs import ACCURACY_OUTPUTS
 
         output = outputs_of(self.spec)[name]
-        batches = (len(batch_sizes(self.spec)),) if self._in_batches(name) else ()
+        further = self._further.get(name)
         promise = self._promise() if name in ACCURACY_OUTPUTS and not output.whole else {}
         return ArrayLayout(
             name=name,
-            shape=self.grid.shape + batches,
-            chunks=self.grid.block_shape + batches,
-            dims=self.grid.dims + ((BATCH,) if batches else ()),
+            shape=self.grid.shape + ((further[1],) if further else ()),
+            chunks=self.grid.block_shape + ((further[1],) if further else ()),
+            dims=self.grid.dims + ((further[0],) if further else ()),
             dtype="int64" if output.whole else "float64",
             fill=NO_COUNT if output.whole else float("nan"),
             attributes=described(output.units, output.long_name, output.comment) | promise,
         )
-
-    def _in_batches(self, name: str) -> bool:
-        """Whether an output has a dimension over batches of draws."""
-        from sweep.model.outputs import DRAW_OUTPUTS
-
-        return name in DRAW_OUTPUTS and not self.spec.draws.adaptive
 
     def _promise(self) -> dict[str, float]:
         """Tolerance and confidence that half-widths are held against, but for those on axes."""
@@ -158,19 +169,19 @@ class GridStudy:
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """The block's chunk of every output."""
         position = self.grid.position(block)
-        return {name: position + ((0,) if self._in_batches(name) else ()) for name in self._names}
+        return {name: position + ((0,) if name in self._further else ()) for name in self._names}
 
     def owners(self) -> dict[str, np.ndarray]:
         """The blocks as they lie along the axes, for every output."""
         blocks = np.arange(self.n_blocks).reshape(self.grid.blocks_along)
         return {
-            name: blocks[..., None] if self._in_batches(name) else blocks for name in self._names
+            name: blocks[..., None] if name in self._further else blocks for name in self._names
         }
 
     def evaluate(self, block: int) -> Results:
         """Outputs of a block."""
         called = self.calling.of_block(block)
-        known = self.earlier.known(block, called) if self.earlier else NOTHING_KNOWN
+        known = self.earlier.known(block, called) if self.earlier else Known()
         return evaluate_block(self.spec, self.grid, block, called, known)
 
     def compile(self) -> None:

@@ -20,10 +20,11 @@ from sweep.storage.locations import Location, read_array
 from sweep.tasks import identity, store
 from sweep.tasks.calling import EFFECTS, ERROR, TOLERANCE, Called
 from sweep.tasks.errors import StoreError
+from sweep.tasks.evaluate import no_sums
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import digests
 from sweep.tasks.matching import Matching
-from sweep.tasks.study import NOTHING_KNOWN, Known, Results
+from sweep.tasks.study import NONE_FOUND, Found, Known, Results
 
 if TYPE_CHECKING:
     import zarr
@@ -57,6 +58,7 @@ class OlderStore:
     def __init__(self, path: Location, older: GridStudy, study: GridStudy) -> None:
         self._path, self._older, self._study = path, older, study
         self._digests = digests(path, older.n_blocks)
+        self._is_whole = are_alike(older.spec, study.spec)
         self._arrays: dict[str, zarr.Array] = {}
         self._block = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
 
@@ -66,23 +68,28 @@ class OlderStore:
         return Matching(older.grid, study.grid, ignored(older.spec, study.spec))
 
     def known(self, block: int, called: Called) -> Known:
-        """Points of a block of the larger study that need not be computed, with their outputs."""
-        points: list[np.ndarray] = []
-        found: list[Results] = []
+        """What is there of a block of the larger study."""
+        found: list[Found] = []
         for share in self._shares(block):
             if (older := self._block(share.block)) is None:
                 continue
             same = older[EFFECTS][share.place] == called.flags[share.points]
-            points.append(share.points[same])
-            found.append({name: values[share.place[same]] for name, values in older.items()})
-        if not points:
-            return NOTHING_KNOWN
-        outputs = found[0].keys() - {EFFECTS, ERROR}
-        results = {name: np.concatenate([each[name] for each in found]) for name in outputs}
-        return Known(np.concatenate(points), results)
+            results = {name: values[share.place[same]] for name, values in older.items()}
+            found.append(Found(share.points[same], results))
+        together = self._together(found)
+        return Known(done=together) if self._is_whole else Known(begun=together)
+
+    def _together(self, found: list[Found]) -> Found:
+        """Outputs found in several blocks, as the larger study has them."""
+        if not found:
+            return NONE_FOUND
+        points = np.concatenate([each.points for each in found])
+        outputs = found[0].results.keys() - {EFFECTS, ERROR}
+        results = {name: np.concatenate([each.results[name] for each in found]) for name in outputs}
+        return Found(points, no_sums(self._study.spec, points.size) | results)
 
     def count(self, block: int) -> int:
-        """Points of a block that `known` would tell of, if nothing is damaged."""
+        """Points of a block of which `known` would tell, if nothing is damaged."""
         called, number = self._study.calling.of_block(block), 0
         for share in self._shares(block):
             flags = self._chunk(EFFECTS, share.block)
@@ -141,7 +148,9 @@ def older_store(path: Location, study: GridStudy) -> OlderStore | None:
         held = identity.read_spec(path, attributes.get("spec", "{}"))
     except StoreError:
         return None
-    if not isinstance(held, Spec) or not same_draws(held, study.spec):
+    if not isinstance(held, Spec) or held.seed != study.spec.seed:
+        return None
+    if not (are_alike(held, study.spec) or goes_on(held, study.spec)):
         return None
     return OlderStore(path, GridStudy(held), study)
 
@@ -156,11 +165,25 @@ def ignored(older: Spec, spec: Spec) -> tuple[str, ...]:
     return (*ours, TOLERANCE) if fixed else tuple(ours)
 
 
-def same_draws(older: Spec, spec: Spec) -> bool:
-    """Whether points of two studies that are computed as finely have the same draws."""
-    if spec.draws != older.draws or spec.seed != older.seed:
-        return False
-    return not spec.draws.any or _tolerance(older) == _tolerance(spec)
+def are_alike(older: Spec, spec: Spec) -> bool:
+    """Whether points of two studies that are computed as finely have the same results."""
+    if not spec.draws.any:
+        return not older.draws.any
+    return older.draws == spec.draws and _tolerance(older) == _tolerance(spec)
+
+
+def goes_on(older: Spec, spec: Spec) -> bool:
+    """Whether draws of a study are the first ones of another.
+
+    Not of whole spectra: there what a user's own function sees depends on how draws are cut.
+    """
+    amount = {"number": spec.draws.number, "limit": spec.draws.limit}
+    return (
+        spec.draws.any
+        and not spec.draws.whole_spectra
+        and older.draws.adaptive == spec.draws.adaptive
+        and older.draws.model_copy(update=amount) == spec.draws
+    )
 
 
 def _tolerance(spec: Spec) -> float | None:

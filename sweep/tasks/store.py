@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MANIFEST = "template.jsonl"
 
 #: Version of the layout of stores.
-LAYOUT = 4
+LAYOUT = 5
 
 _libc = ctypes.CDLL(None, use_errno=True)
 

@@ -11,8 +11,8 @@ import numpy as np
 Results = dict[str, np.ndarray]
 
 
-class Known(NamedTuple):
-    """Results of some points of a block that need not be computed again."""
+class Found(NamedTuple):
+    """Results of some points of a block."""
 
     points: np.ndarray
     """(m,) int64: their numbers in C order over the block."""
@@ -20,7 +20,16 @@ class Known(NamedTuple):
     """(m, ...) each, by name."""
 
 
-NOTHING_KNOWN = Known(np.zeros(0, np.int64), {})
+NONE_FOUND = Found(np.zeros(0, np.int64), {})
+
+
+class Known(NamedTuple):
+    """What is known of a block before it is computed."""
+
+    done: Found = NONE_FOUND
+    """Points that need not be computed."""
+    begun: Found = NONE_FOUND
+    """Points that were drawn less often."""
 
 
 @dataclass(frozen=True, kw_only=True)
