@@ -123,7 +123,7 @@ def simulate(
     for done in np.unique(number):
         points, batch = np.flatnonzero(number == done), np.searchsorted(ends, done, "right") - 1
         if (rest := np.diff(ends[batch:].clip(done))).size:
-            counts[:, points, batch:] += sample.take(points, first_draw + done, rest)
+            counts[:, points, batch:] += sample.take(points, first_draw + done, rest.tolist())
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 

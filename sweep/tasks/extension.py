@@ -87,10 +87,12 @@ def what_is_there(path: Location, study: Study) -> str:
     """How many points of a larger study there are, here and in the store that it extends."""
     assert isinstance(study, GridStudy)  # others are refused
     done = committed(path, study)
-    there = study.points_in(done)
+    there, remark = study.points_in(done), ""
     if study.earlier is not None:
         there += sum(study.earlier.count(int(block)) for block in np.flatnonzero(~done))
-    return f"{there:,} of {study.points:,} points are there; {study.points - there:,} to compute"
+        remark = study.earlier.remark()
+    told = f"{there:,} of {study.points:,} points are there; {study.points - there:,} to compute"
+    return f"{told} ({remark})" if remark else told
 
 
 def _altered(older: Spec, spec: Spec) -> Iterator[str]:

@@ -67,6 +67,9 @@ class Earlier(Protocol):
     def count(self, block: int) -> int:
         """Points of a block of which something is there, if nothing is damaged."""
 
+    def remark(self) -> str:
+        """What is not simply taken from there, in words; may be empty."""
+
 
 class GridStudy:
     """A study over a grid of parameters.

@@ -8,6 +8,7 @@ of its blocks is held against the digest in its receipt first; one that is damag
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 #: Blocks of the older store that a process keeps in memory.
 BLOCKS_KEPT = 4
+
+#: What Zarr raises of a chunk that is not there, or not as it was written.
+DAMAGED = (OSError, ValueError, RuntimeError)
 
 
 class Share(NamedTuple):
@@ -59,6 +63,7 @@ class OlderStore:
         self._path, self._older, self._study = path, older, study
         self._digests = digests(path, older.n_blocks)
         self._is_whole = are_alike(older.spec, study.spec)
+        self._is_begun = not self._is_whole and goes_on(older.spec, study.spec)
         self._arrays: dict[str, zarr.Array] = {}
         self._block = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
 
@@ -92,12 +97,27 @@ class OlderStore:
         """Points of a block of which `known` would tell, if nothing is damaged."""
         called, number = self._study.calling.of_block(block), 0
         for share in self._shares(block):
-            flags = self._chunk(EFFECTS, share.block)
-            number += int(np.sum(flags[share.place] == called.flags[share.points]))
+            with suppress(*DAMAGED):
+                flags = self._chunk(EFFECTS, share.block)
+                number += int(np.sum(flags[share.place] == called.flags[share.points]))
         return number
+
+    def remark(self) -> str:
+        """What is not simply taken from it, in words; empty where all of it is."""
+        if not (self._is_whole or self._is_begun):
+            return "whole spectra are drawn anew"
+        said = ["points that are there are drawn further"] if self._is_begun else []
+        if self._other_tolerance:
+            said.append(
+                "with the tolerance all is computed more closely, and anew, but where "
+                "footprint.beamlets, accuracy.line_error and accuracy.leakage_error are numbers"
+            )
+        return "; ".join(said)
 
     def _shares(self, block: int) -> list[Share]:
         """The committed older blocks that have points of a block."""
+        if not (self._is_whole or self._is_begun):
+            return []
         grid = self._older.grid
         numbers = self._matching.of_block(block)
         points = np.flatnonzero((numbers >= 0) & self._same_resolution(block))
@@ -114,11 +134,16 @@ class OlderStore:
             if self._digests[b]
         ]
 
+    @property
+    def _other_tolerance(self) -> bool:
+        """Whether all points have another tolerance; one on an axis tells points apart."""
+        older, ours = _tolerance(self._older.spec), _tolerance(self._study.spec)
+        return older is not None and ours is not None and older != ours
+
     def _same_resolution(self, block: int) -> np.ndarray | bool:
         """Which points of a block are computed as finely here as there, (points,)."""
-        older, ours = _tolerance(self._older.spec), _tolerance(self._study.spec)
-        if older is None or ours is None or older == ours:
-            return True  # points are told apart by it, or have the same
+        if not self._other_tolerance:
+            return True
         return ~by_tolerance(self._study.grid.parameters(block))
 
     def _read(self, block: int) -> Results | None:
@@ -128,7 +153,7 @@ class OlderStore:
             if store.digest(self._path, objects).encode() != self._digests[block]:
                 return None
             return {name: self._chunk(name, block) for name in self._older.chunks(block)}
-        except OSError:
+        except DAMAGED:
             return None
 
     def _chunk(self, name: str, block: int) -> np.ndarray:
@@ -149,8 +174,6 @@ def older_store(path: Location, study: GridStudy) -> OlderStore | None:
     except StoreError:
         return None
     if not isinstance(held, Spec) or held.seed != study.spec.seed:
-        return None
-    if not (are_alike(held, study.spec) or goes_on(held, study.spec)):
         return None
     return OlderStore(path, GridStudy(held), study)
 

@@ -1,21 +1,24 @@
 """Stores extended to larger studies: the bytes of these run at once, and nothing computed twice."""
 
-import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small import STUDY, copied, everything, quiet, receipts, small, tree
+from small import STUDY, copied, everything, failing, quiet, small, tree
+from small_flights import small_scene
 
-from sweep.tasks import evaluate, succession
-from sweep.tasks.driver import extend, resume, run
+from sweep.model import sampling
+from sweep.tasks import evaluate, store
+from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.lock import Lock
 from sweep.tasks.verify import verify
 
@@ -53,7 +56,10 @@ MORE = {
     "appended": ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, 36),
     "prepended": ({**AXES, POWER: ["0.2 W", "1 W", "3 W"]}, 36),
     "in between": ({**AXES, ANGLE: ["20 deg", "35 deg", "50 deg", "80 deg", "90 deg"]}, 48),
-    "on two axes": ({**AXES, POWER: ["1 W", "2 W", "3 W"], ANGLE: ["20 deg", "50 deg", "90 deg", "9 deg"]}, 72),
+    "on two axes": (
+        {**AXES, POWER: ["1 W", "2 W", "3 W"], ANGLE: ["20 deg", "50 deg", "90 deg", "9 deg"]},
+        72,
+    ),
     "new axis": ({**AXES, REFLECTANCE: [0.01, 0.02]}, 72),
     "new axis and values": (
         {REFLECTANCE: [0.01, 0.02], **AXES, POWER: ["1 W", "2 W", "3 W"]},
@@ -113,13 +119,13 @@ def of(axes, block_points, **changes):
     target = STUDY["target"] | {
         "range": "2.0 km",
         "radial_velocity": "3.0 m/s",
-        "reflectance": 0.15,
+        "reflectance": 0.5,
     }
     return small(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
 @settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(pair=studies())
 def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
@@ -153,3 +159,276 @@ def test_points_whose_effects_are_others_in_the_larger_grid_are_computed_anew(tm
     new = sum(computed)
     assert 39 * 30 <= new < 79 * 30
     assert tree(store) == at_once(spec, tmp_path)
+
+
+COARSE = {**AXES, RANGE: ["1 km", "3 km"]}
+ROUGH = {"target": STUDY["target"] | {"roughness": "10 um"}, "footprint": {"beamlets": 1}}
+CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
+"""Errors that are numbers, and do not follow the tolerance."""
+
+
+@pytest.fixture
+def drawn(monkeypatch, computed):
+    """Draws that the model takes, call by call."""
+    calls: list[int] = []
+    real = sampling.Sample.take
+
+    def counted(self, points, first, batch_sizes):
+        calls.append(len(points) * sum(batch_sizes))
+        return real(self, points, first, batch_sizes)
+
+    monkeypatch.setattr(sampling.Sample, "take", counted)
+    return calls
+
+
+CALLED_FOR = ("footprint", "doppler", "doppler_spread", "range_walk", "image", "leakage")
+"""What points of the small study call for, whatever is random and however wide its grid."""
+
+
+def number_of_draws(store):
+    return int(zarr.open_array(store / "n_draws", mode="r")[...].sum())
+
+
+MORE_DRAWS = {
+    "a fixed number": ({"number": 70, "batch": 30}, {"number": 200, "batch": 30}, {}, {}),
+    "a limit": ({"limit": 70, "batch": 20}, {"limit": 300, "batch": 20}, {"tolerance": 0.05}, {}),
+    "a tolerance": (
+        {"limit": 300, "batch": 20},
+        {"limit": 300, "batch": 20},
+        {"tolerance": 0.2, **CLOSE},
+        {"tolerance": 0.06},
+    ),
+}
+
+
+@pytest.mark.parametrize("before, after, accuracy, tighter", MORE_DRAWS.values(), ids=MORE_DRAWS)
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+@pytest.mark.parametrize("scene", [{}, ROUGH], ids=["noise alone", "speckle"])
+def test_more_draws_go_on_from_those_that_are_there(
+    tmp_path, drawn, scene, method, before, after, accuracy, tighter
+):
+    older = small(axes=COARSE, draws=before | {"method": method}, accuracy=accuracy, **scene)
+    spec = small(
+        axes=COARSE, draws=after | {"method": method}, accuracy=accuracy | tighter, **scene
+    )
+    store = quiet(older, tmp_path / "store.zarr").store
+    there = number_of_draws(store)
+    drawn.clear()
+    assert larger(store, spec).complete
+    assert sum(drawn) == number_of_draws(store) - there
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+def test_more_draws_and_more_values_together(tmp_path, drawn):
+    draws = {"limit": 60, "batch": 20}
+    same = {"accuracy": {"tolerance": 0.09}, "effects": dict.fromkeys(CALLED_FOR, "on")}
+    store = quiet(small(axes=COARSE, draws=draws, **same), tmp_path / "store.zarr").store
+    spec = small(
+        axes={**COARSE, "target.roughness": ["0 m", "10 um"], ANGLE: ["9 deg", *AXES[ANGLE]]},
+        draws=draws | {"limit": 100},
+        **same,
+    )
+    there = number_of_draws(store)
+    drawn.clear()
+    assert larger(store, spec).complete
+    assert sum(drawn) == number_of_draws(store) - there
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+def test_an_axis_of_effects_that_are_drawn_takes_the_points_without_them(tmp_path, computed):
+    same = {"draws": {"number": 30}, "effects": {"doppler_spread": "on"}}
+    store = quiet(small(axes=COARSE, **same), tmp_path / "store.zarr").store
+    spec = small(axes={**COARSE, "target.roughness": ["0 m", "10 um"]}, **same)
+    computed.clear()
+    assert larger(store, spec).complete and sum(computed) == 12
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+def test_whole_spectra_are_drawn_anew_and_it_says_so(tmp_path, capsys):
+    changes = {"axes": {RANGE: ["1 km"]}, "target": STUDY["target"] | {"radial_velocity": "0 m/s"}}
+    draws = {"method": "spectra", "number": 10}
+    store = quiet(small(draws=draws, **changes), tmp_path / "store.zarr").store
+    spec = small(draws=draws | {"number": 20}, **changes)
+    assert extend(store, spec, scheduler="none").complete
+    assert "0 of 1 points are there; 1 to compute (whole spectra are" in capsys.readouterr().err
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+@pytest.mark.parametrize("errors, new", [({}, 12), (CLOSE, 0)], ids=["by tolerance", "given"])
+def test_a_tighter_tolerance_computes_what_follows_from_it(tmp_path, computed, errors, new):
+    older = small(axes=COARSE, accuracy={"tolerance": 1e-2, **errors})
+    store = quiet(older, tmp_path / "store.zarr").store
+    spec = small(axes=COARSE, accuracy={"tolerance": 5e-3, **errors})
+    computed.clear()
+    assert larger(store, spec).complete and sum(computed) == new
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undisturbed, computed):
+    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
+    log = store / ".sweep" / "receipts.jsonl"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
+    assert larger(store, spec).complete
+    assert sum(computed) == 108 - sum(GridStudy(small()).block_size(b) for b in range(5))
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["pd_shot", "effects"])
+def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name):
+    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["new axis"][0])
+    chunk = store / name / "c" / "0" / "1" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 4
+    chunk.write_bytes(content)
+    assert larger(store, spec).complete
+    size = next(
+        GridStudy(small()).block_size(b)
+        for b in range(12)
+        if GridStudy(small()).chunks(b)[name] == (0, 1, 0)
+    )
+    assert sum(computed) == 72 + size
+    assert tree(store) == at_once(spec, tmp_path)
+
+
+def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed):
+    store, new = copied(undisturbed, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
+    before, spec = everything(store), small(axes=MORE["in between"][0])
+    for file in [store, *store.rglob("*")]:
+        file.chmod(0o555 if file.is_dir() else 0o444)
+    outcome = larger(store, spec, to=new)
+    assert outcome.complete and outcome.store == new
+    assert everything(store) == before
+    assert tree(new) == at_once(spec, tmp_path)
+
+
+def test_changes_say_what_is_larger(tmp_path, undisturbed, computed):
+    store = copied(undisturbed, tmp_path)
+    outcome = larger(store, None, changes={f"axes.{POWER}": ["1 W", "2 W", "3 W"]})
+    assert outcome.complete and sum(computed) == 36
+    assert tree(store) == at_once(small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]}), tmp_path)
+
+
+def test_the_same_study_is_nothing_to_extend(tmp_path, undisturbed, computed, capsys):
+    store = copied(undisturbed, tmp_path)
+    assert extend(store, small(title="Again"), scheduler="none").blocks_computed == 0
+    assert "nothing to extend" in capsys.readouterr().err and not computed
+    assert tree(store) == tree(undisturbed)
+
+
+REFUSED = {
+    "another instrument": (
+        {"seed": 4, "target": STUDY["target"] | {"reflectance": 0.03}},
+        ["target.reflectance: 0.02 -> 0.03, and must stay", "seed: 3 -> 4, and must stay"],
+    ),
+    "an effect": ({"effects": {"leakage": "on"}}, ["effects.leakage: auto -> on, and must stay"]),
+    "fewer values": ({"axes": {**AXES, POWER: ["1 W", "2 W"]}}, [POWER + ": 3 W: lost"]),
+    "an axis less": ({"axes": {RANGE: AXES[RANGE], ANGLE: AXES[ANGLE]}}, [POWER + ": 3 W: lost"]),
+    "another axis": ({"axes": {**AXES, REFLECTANCE: [0.5]}}, [REFLECTANCE + ": 0.02: lost"]),
+    "draws where there were none": (
+        {"draws": {"number": 10}}, ["draws.number: 0 -> 10, and may only grow"],
+    ),
+    "a looser tolerance": (
+        {"accuracy": {"tolerance": 0.1}},
+        ["accuracy.tolerance: 0.001 -> 0.1, and may only become tighter"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_larger_study_is_refused_field_by_field(tmp_path, undisturbed, changes, told):
+    before = everything(undisturbed)
+    with pytest.raises(StoreError, match="needs a store of its own") as error:
+        larger(undisturbed, small(**changes))
+    assert all(line in str(error.value) for line in told)
+    assert everything(undisturbed) == before
+
+
+def test_flights_are_refused_with_what_to_do(tmp_path):
+    path = store.create(tmp_path / "flight.zarr", FlightStudy(small_scene(), tmp_path / "x"))
+    with pytest.raises(StoreError, match="eyepoints that are there are used"):
+        larger(path, None, changes={"draws.number": 9})
+
+
+def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed):
+    path = copied(undisturbed, tmp_path)
+    begun, other = (small(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W"))
+    assert larger(path, begun, evaluate=failing(set(range(99)), tmp_path / "log")).blocks_done == 0
+    with pytest.raises(StoreError, match=r"\[1, 3, 5\] W -> \[1, 3, 7\] W"):
+        larger(path, other)
+    assert tree(path) == tree(undisturbed)
+    assert larger(path, other, overwrite=True).complete
+    assert tree(path) == at_once(other, tmp_path)
+
+
+def test_one_that_is_written_is_not_extended(tmp_path, undisturbed):
+    path = copied(undisturbed, tmp_path)
+    lock = Lock(path)
+    with pytest.raises(StoreError, match="is being written by process"):
+        larger(path, small(axes=MORE["appended"][0]))
+    lock.release()
+
+
+#: A client of its own, which dies of SIGKILL at a moment of an extension.
+CLIENT = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from small import STUDY, small
+from sweep.tasks import driver, succession
+from sweep.tasks.journal import Journal
+
+store, moment = Path(sys.argv[2]), sys.argv[3]
+die = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+rename, commit = os.rename, Journal.commit
+blocks = []
+
+def committing(self, *receipts):
+    commit(self, *receipts)
+    blocks.extend(receipts)
+    if len(blocks) >= 3:
+        die()
+
+def renaming(old, new):
+    ahead = {"old": store, "new": succession.beside(store)}
+    if moment == f"before the {''.join(k for k, v in ahead.items() if v == Path(old))} one moves":
+        die()
+    rename(old, new)
+
+if moment == "three blocks":
+    Journal.commit = committing
+elif moment == "as the old one is removed":
+    succession.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
+else:
+    os.rename = renaming
+axes = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
+driver.extend(store, small(axes=axes), progress=False, scheduler="none")
+"""
+
+MOMENTS = (
+    "three blocks", "before the old one moves", "before the new one moves",
+    "as the old one is removed",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("again", ["extend", "resume"])
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
+    tmp_path, undisturbed, computed, moment, again
+):
+    path, spec = copied(undisturbed, tmp_path), small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]})
+    larger_tree = at_once(spec, tmp_path)
+    here = str(Path(__file__).parent)
+    ended = subprocess.run([sys.executable, "-c", CLIENT, here, str(path), moment], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    grid = GridStudy(spec).grid
+    whole = [tree(each) for each in tmp_path.iterdir() if each.name != "at_once.zarr"]
+    assert tree(undisturbed) in whole or larger_tree in whole
+    computed.clear()
+    if again == "extend":
+        assert larger(path, spec).complete
+    else:
+        assert resume(path, progress=False, scheduler="none").complete
+    assert tree(path) == larger_tree
+    assert {each.name for each in tmp_path.iterdir()} == {"at_once.zarr", path.name}
+    there = sum(map(grid.block_size, range(3))) // 3 if moment == "three blocks" else 36
+    assert sum(computed) == 36 - there
