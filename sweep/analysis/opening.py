@@ -10,6 +10,7 @@ from typing import Any
 import xarray as xr
 
 import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
+from sweep.model.outputs import RUNNING
 from sweep.storage.locations import JOURNAL, Location, located, zarr_store
 from sweep.storage.objects import ObjectStoreError
 from sweep.storage.receipts import read_receipts
@@ -64,7 +65,8 @@ def open(path: str | Location) -> xr.Dataset:
     path = located(path)
     attributes = read_attributes(path, GRID)
     consolidated = "consolidated_metadata" in _document(path)
-    dataset = in_pieces(xr.open_zarr(zarr_store(path), chunks=None, consolidated=consolidated))
+    dataset = xr.open_zarr(zarr_store(path), chunks=None, consolidated=consolidated)
+    dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})

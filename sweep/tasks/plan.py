@@ -11,9 +11,9 @@ import psutil
 
 from sweep.tasks import cluster
 from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import batch_sizes, compile_kernels, select
+from sweep.tasks.evaluate import compile_kernels, select
 from sweep.tasks.grid import Grid
-from sweep.tasks.grid_study import output_names
+from sweep.tasks.grid_study import further_dims, output_names
 from sweep.tasks.timing import timed
 
 if TYPE_CHECKING:
@@ -78,12 +78,9 @@ def plan(spec: Spec, *, workers: int | None = None) -> Plan:
 
 
 def point_bytes(spec: Spec, names: list[str]) -> int:
-    """Bytes of one point's results: 8 an output, 8 a batch of each count."""
-    from sweep.model.outputs import DRAW_OUTPUTS
-
-    counted = sum(name in DRAW_OUTPUTS for name in names)
-    batches = len(batch_sizes(spec)) or 1
-    return 8 * (len(names) - counted + counted * batches)
+    """Bytes of one point's results: 8 an output, or as often as that has a further dimension."""
+    further = further_dims(spec)
+    return 8 * sum(further[name][1] if name in further else 1 for name in names)
 
 
 def worker_memory(spec: Spec, grid: Grid, names: list[str]) -> int:

@@ -25,7 +25,7 @@ from sweep.cli import main
 from sweep.storage import logs, objects
 from sweep.storage.locations import JOURNAL, located
 from sweep.storage.sealing import read_lines, sealed, unsealed
-from sweep.tasks.driver import resume, run
+from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import LOCK, Holder, Lock, holder
 from sweep.tasks.status import status
@@ -76,6 +76,21 @@ def test_what_is_stored_opens_as_from_disk_and_says_how_far_it_is(memory, undist
     assert status(memory).complete
     told = CliRunner().invoke(main, ["status", memory])
     assert told.exit_code == 0 and "12 of 12 points" in told.output
+
+
+def test_a_store_is_extended_into_another_place(memory, tmp_path):
+    axes = {**six().to_yaml_mapping()["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
+    larger, place = six(axes=axes), {"scheduler": "none", "progress": False}
+    quiet(six(), memory)
+    with pytest.raises(StoreError, match=r"an object store has no renaming: .* --store"):
+        extend(memory, larger, **place)
+    there, here = memory.replace("small", "larger"), tmp_path / "here.zarr"
+    before = remote_tree(memory)
+    assert extend(memory, larger, to=there, **place).complete
+    assert extend(memory, larger, to=here, **place).complete
+    assert remote_tree(memory) == before
+    expected = tree(quiet(larger, tmp_path / "at_once.zarr").store)
+    assert remote_tree(there) == tree(here) == expected
 
 
 def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed, tmp_path):

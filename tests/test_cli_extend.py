@@ -1,0 +1,69 @@
+"""`sweep extend` as it is typed."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from sweep.cli import main
+
+sys.path.insert(0, str(Path(__file__).parent / "tasks"))
+
+from small import quiet, small, tree
+
+POWER = "axes.instrument.laser.power"
+
+
+def sweep(*arguments):
+    """The command in this process; an error that is not a user's mistake is raised."""
+    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch):
+    """The store of a study of four points, in the folder that one is in."""
+    monkeypatch.chdir(tmp_path)
+    return quiet(four("[1 W, 3 W]"), tmp_path / "four.zarr").store.name
+
+
+def four(powers):
+    """A study of two ranges and some powers."""
+    axes = {"target.range": ["1 km", "2 km"], "instrument.laser.power": powers[1:-1].split(", ")}
+    return small(axes=axes)
+
+
+def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
+    result = sweep("extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none")
+    assert result.exit_code == 0
+    assert "4 of 6 points are there; 2 to compute" in result.stderr
+    assert "four.zarr: 6 of 6 points, computed 1 of 1 blocks" in result.stdout
+    assert tree(Path(store)) == tree(quiet(four("[1 W, 2 W, 3 W]"), Path("again.zarr")).store)
+    again = sweep("extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none")
+    assert again.exit_code == 0 and "nothing to extend" in again.stderr
+
+
+def test_elsewhere_it_leaves_the_store(store):
+    before, change = tree(Path(store)), f"{POWER}=[1 W, 2 W, 3 W]"
+    result = sweep("extend", store, "--set", change, "--store", "b.zarr", "--scheduler", "none")
+    assert result.exit_code == 0 and "b.zarr: 6 of 6 points" in result.stdout
+    assert tree(Path(store)) == before
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        ([], "name the larger study, or what is to change in it with --set"),
+        (["--set", "draws.limit"], "is not NAME=VALUE, as in draws.limit=1e6"),
+        (["--set", f"{POWER}=[1 W"], "--set:2: is no valid YAML"),
+        (["--set", f"{POWER}=[1 W, 2 parsecs]"], "parsecs"),
+        (["--set", f"{POWER}=[1 W, 2 W]"], "instrument.laser.power: 3 W: lost, and must stay"),
+        (["--set", "seed=4"], "seed: 3 -> 4, and must stay as it is"),
+        (["--set", "seed=4"], "sweep run SPEC --store NEW"),
+    ],
+)
+def test_mistakes_are_told_in_words_and_nothing_changes(store, arguments, told):
+    before = tree(Path(store))
+    result = sweep("extend", store, *arguments)
+    assert result.exit_code == 2 and told in result.stderr and "Traceback" not in result.stderr
+    assert tree(Path(store)) == before and [p.name for p in Path().iterdir()] == [store]
