@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -31,6 +32,7 @@ def status(store: Location) -> None:
     """
     from sweep.tasks.progress import duration
     from sweep.tasks.status import status as read
+    from sweep.tasks.succession import beside
 
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"
@@ -52,6 +54,8 @@ def status(store: Location) -> None:
         click.echo("not running; all that is left has failed")
     else:
         click.echo(f"not running; sweep resume {store}  goes on.")
+    if isinstance(store, Path) and beside(store).exists():
+        click.echo(f"being extended: sweep status {beside(store)}  says how far that is.")
     for block, failure in sorted(s.failures.items()):
         click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
     if s.failures:

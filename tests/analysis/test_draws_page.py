@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 from drawn_studies import study
 
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, RUNNING_OUTPUTS
 from sweep.spec import Draws, Spec
 
 PAGE = (Path(__file__).parents[2] / "docs" / "draws.md").read_text(encoding="utf-8")
@@ -30,8 +30,8 @@ def test_every_field_and_every_array_is_listed():
     assert sorted(fields) == sorted(f"draws.{name}" for name in Draws.model_fields)
     arrays = {name.split("`")[1] for name, _ in cells("`") if "." not in name}
     assert arrays == {"n_draws", "pd_up_half_width", "accuracy_missed", "pd_up_error",
-                      "n_detected_up"}  # fmt: skip
-    assert arrays <= {*ACCURACY_OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS}
+                      "n_detected_up", "running_sums"}  # fmt: skip
+    assert arrays <= {*ACCURACY_OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS, *RUNNING_OUTPUTS}
 
 
 def test_the_table_keeps_what_the_text_says_of_it():

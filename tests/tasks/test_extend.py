@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 import zarr
-from hypothesis import HealthCheck, given, settings
+from click.testing import CliRunner
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from small import STUDY, copied, everything, failing, quiet, small, tree
 from small_flights import small_scene
 
+from sweep.cli import main
 from sweep.model import sampling
 from sweep.tasks import evaluate, store
 from sweep.tasks.driver import extend, resume
@@ -124,17 +126,33 @@ def of(axes, block_points, **changes):
     return small(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
-@settings(
-    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(pair=studies())
-def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
-    here = tmp_path_factory.mktemp("any")
+def see_that_it_extends(here, pair):
+    """The one study is extended to the other, to the bytes of the other run at once."""
     older, spec = (of(*each) for each in pair)
     store = quiet(older, here / "store.zarr").store
     assert larger(store, spec).complete
     assert tree(store) == at_once(spec, here)
     shutil.rmtree(here)
+
+
+@settings(max_examples=8, deadline=None)
+@given(pair=studies())
+def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
+    see_that_it_extends(tmp_path_factory.mktemp("any"), pair)
+
+
+@pytest.mark.slow
+@settings(max_examples=150, deadline=None)
+@given(pair=studies())
+def test_many_grids_extended_to_larger_ones(tmp_path_factory, pair):
+    see_that_it_extends(tmp_path_factory.mktemp("many"), pair)
+
+
+@pytest.mark.parametrize("processes", [True, False], ids=["processes", "threads"])
+def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed, processes):
+    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["in between"][0])
+    outcome = extend(store, spec, workers=2, processes=processes, progress=False)
+    assert outcome.complete and tree(store) == at_once(spec, tmp_path)
 
 
 #: Effects on demand: which ones a point is simulated with depends on the points around it.
@@ -353,6 +371,8 @@ def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed)
     path = copied(undisturbed, tmp_path)
     begun, other = (small(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W"))
     assert larger(path, begun, evaluate=failing(set(range(99)), tmp_path / "log")).blocks_done == 0
+    told = CliRunner().invoke(main, ["status", str(path)]).output
+    assert "complete" in told and "being extended: sweep status" in told
     with pytest.raises(StoreError, match=r"\[1, 3, 5\] W -> \[1, 3, 7\] W"):
         larger(path, other)
     assert tree(path) == tree(undisturbed)
