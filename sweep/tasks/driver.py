@@ -258,7 +258,10 @@ def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
             f"{path} holds eyepoints, which the studies that use them cast: run or resume one"
         )
     if PACKED in attributes:
-        raise StoreError(f"{path} is a packed copy of a complete store: there is nothing to resume")
+        raise StoreError(
+            f"{path} is a packed copy of a complete store: there is nothing to resume, "
+            "and what can be extended is the store that it was made of"
+        )
     return attributes, study
 
 
@@ -273,7 +276,7 @@ def _refuse_unsound(
 
 def _successor(path: Location, to: str | Location | None) -> Location:
     """Where a larger store is made."""
-    if to is not None:
+    if to is not None and located(to).absolute() != path:
         return located(to).absolute()
     if not isinstance(path, Path):
         raise StoreError(

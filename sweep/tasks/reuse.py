@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import zarr
 
 #: Blocks of the older store that a process keeps in memory.
-BLOCKS_KEPT = 4
+BLOCKS_KEPT = 2
 
 #: What Zarr raises of a chunk that is not there, or not as it was written.
 DAMAGED = (OSError, ValueError, RuntimeError)
@@ -201,11 +201,15 @@ def goes_on(older: Spec, spec: Spec) -> bool:
     Not of whole spectra: there what a user's own function sees depends on how draws are cut.
     """
     amount = {"number": spec.draws.number, "limit": spec.draws.limit}
+    loosened = (_tolerance(older) or 1.0) < (_tolerance(spec) or 0.0)
     return (
         spec.draws.any
         and not spec.draws.whole_spectra
         and older.draws.adaptive == spec.draws.adaptive
         and older.draws.model_copy(update=amount) == spec.draws
+        and older.draws.number <= spec.draws.number
+        and older.draws.limit <= spec.draws.limit
+        and not loosened
     )
 
 

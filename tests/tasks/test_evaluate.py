@@ -5,7 +5,8 @@ import pytest
 from small import small
 
 from sweep.model.effects.catalogue import CORE
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS, RUNNING
+from sweep.model.realisations import RUNNING_COLUMNS
 from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid
 
@@ -25,14 +26,15 @@ def points(**draws):
 def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     spec, parameters, count = points(**much, method=method)
     together = evaluate_points(spec, parameters, count, effects)
-    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
+    sums = {RUNNING: (RUNNING_COLUMNS,)} if effects == RANDOM else {}
+    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS, *sums}
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
         alone = evaluate_points(spec, select(parameters, np.array([i])), 1, effects)
         for name, values in alone.items():
             in_batches = name in DRAW_OUTPUTS and "number" in much
-            assert values.shape == ((1, 2) if in_batches else (1,))
+            assert values.shape == (1, *((2,) if in_batches else sums.get(name, ())))
             np.testing.assert_array_equal(values[0], together[name][i], err_msg=name)
 
 

@@ -319,6 +319,12 @@ def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed)
     assert tree(new) == at_once(spec, tmp_path)
 
 
+def test_its_own_place_named_is_its_own_place(tmp_path, undisturbed, computed):
+    path, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
+    assert larger(path, spec, to=path, overwrite=True).complete and sum(computed) == 36
+    assert tree(path) == at_once(spec, tmp_path)
+
+
 def test_changes_say_what_is_larger(tmp_path, undisturbed, computed):
     store = copied(undisturbed, tmp_path)
     outcome = larger(store, None, changes={f"axes.{POWER}": ["1 W", "2 W", "3 W"]})
