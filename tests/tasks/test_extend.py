@@ -1,5 +1,6 @@
 """Stores extended to larger studies: the bytes of these run at once, and nothing computed twice."""
 
+import os
 import shutil
 import signal
 import subprocess
@@ -22,6 +23,8 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.lock import Lock
+from sweep.tasks.progress import Silent
+from sweep.tasks.succession import beside
 from sweep.tasks.verify import verify
 
 AXES = STUDY["axes"]
@@ -392,6 +395,25 @@ def test_one_that_is_written_is_not_extended(tmp_path, undisturbed):
     with pytest.raises(StoreError, match="is being written by process"):
         larger(path, small(axes=MORE["appended"][0]))
     lock.release()
+
+
+class Interrupting(Silent):
+    """Progress that presses Ctrl-C as the first points are done."""
+
+    def advance(self, *, points, failed):
+        if points:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, computed):
+    path, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
+    for _ in range(2):
+        outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
+        assert outcome.stopped == "interrupted" and outcome.store == beside(path)
+        assert tree(path) == tree(undisturbed)
+    told = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
+    assert told.exit_code == 0 and f"{path}: 108 of 108 points" in told.stdout
+    assert sum(computed) == 36 and tree(path) == at_once(spec, tmp_path)
 
 
 #: A client of its own, which dies of SIGKILL at a moment of an extension.
