@@ -10,7 +10,6 @@ points; shots without them are one stretch, and pay for nothing.
 Shifts are about the middle of the record: there, lines and images keep their phases.
 """
 
-import math
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -19,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model import waveform
-from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE
+from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, weight
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_splitting import Split, split_lines
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
@@ -266,21 +265,11 @@ def reduce_lines(n, power, allowed, most, kernel, room):
     tolerance = 0.0
     if allowed > 0.0:
         peak = kernel[2][0] * kernel[2][0] if power else kernel[2][0]
-        tolerance = allowed / max(peak * _total(n, power, room), 1e-300)
+        tolerance = allowed / max(peak * weight(n, power, room), 1e-300)
     return equivalent_lines(
         room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, band, tolerance, most,
         kernel[3], room[4], room[5], room[6], room[7:12],
     )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def _total(n, power, room):
-    """Sum of the magnitudes of the weights of n lines."""
-    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
-    total = 0.0
-    for j in range(n):
-        total += re[j] if power else math.sqrt(re[j] * re[j] + im[j] * im[j])
-    return total
 
 
 @njit(cache=True, error_model="numpy")
