@@ -18,21 +18,16 @@ from numba import njit
 
 from sweep.model.elementary import fma
 from sweep.model.equivalent import chebyshev_moments, nodes_for
+from sweep.model.kernel_rows import FORM_WIDTH, HALVES, MOST_MOMENTS, MOST_PARTS
 from sweep.model.known_kernels import (
-    FORM_WIDTH,
-    HALVES,
-    MOST_MOMENTS,
-    MOST_PARTS,
-    at_sources,
-    form_of,
     is_real,
     kernels_beside,
     level_for,
     slot_for,
-    sources_of,
     total_strength,
     width_of,
 )
+from sweep.model.known_sources import at_sources, form_of, sources_of
 from sweep.model.lanes import COLUMNS, combine, dot
 from sweep.model.spectrum import fraction
 

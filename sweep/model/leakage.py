@@ -30,6 +30,7 @@ from sweep.model.runs import (
     near_bins,
     prepare_field,
     seen_from,
+    served_beside,
     stays_below,
     sum_afar,
 )
@@ -87,6 +88,12 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     clearance = CLEARANCE + poles
     reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
     alone = _all_beyond(total, float(clearance + reach), noise, image, kernel) <= noise[2]
+    if alone and reach > 0:
+        served = min(reach, served_beside(kind, kernel))
+        wider = near_bins(origin, lowest, highest, clearance + served, image, kernel)
+        if wider[2]:
+            near, mirrored, _ = wider
+            reach -= served
     sources = not alone or reach > 0 or (image and not mirrored)
     field = prepare_field(origin, n, kind, spread, sources, choices, kernel, room)
     if alone:

@@ -22,6 +22,7 @@ from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, weight
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_splitting import Split, split_lines
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
+from sweep.model.kernel_rows import digests
 from sweep.model.preparation import LINE_STEPS, Shots
 
 POINTS = 256
@@ -42,8 +43,8 @@ class Stretch(NamedTuple):
     """(m,) int64: row in the footprints."""
     scene: tuple
     """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
-    many count (3, u), which of the u each point has (m,); shifts [bins of fs/L] and their weights
-    (m, k). Empty where there is none."""
+    many count (3, u), which of the u each point has (m,), digests (3, u); shifts [bins of fs/L]
+    and their weights (m, k). Empty where there is none."""
     lines: int
     """Lines that one point may have at the most."""
 
@@ -133,7 +134,10 @@ def choices(shots: Shots, *, every_bin: bool = False) -> tuple[bool, bool, bool,
 def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     """Places and weights of the lines that each line is split into, by segment and point."""
     if not shots.phase_errors or not alike.point.size:
-        return (*np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64))
+        return (
+            *np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64),
+            np.empty((3, 0)),
+        )  # fmt: skip
 
     splits = []
     for level in np.unique(alike.level):
@@ -150,7 +154,7 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
         re[segment, some, :lines] = split.weight.real
         im[segment, some, :lines] = split.weight.imag
         number[segment, some] = split.number
-    return offset, re, im, number, alike.which
+    return offset, re, im, number, alike.which, digests(offset, re, im)
 
 
 def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> Split:

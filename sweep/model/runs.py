@@ -22,6 +22,7 @@ from sweep.model.bundles import (
 )
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
+from sweep.model.kernel_rows import REACHES
 from sweep.model.spectrum import set_tangents
 
 SOURCES, IMAGES = 13, 16
@@ -64,7 +65,7 @@ def detect(origin, n, kind, level, choices, kernel, room, exempt):
     re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     spread = lowest, highest
     poles = len(kernel[1][2])
-    clearance = CLEARANCE + poles
+    clearance = CLEARANCE + poles + served_beside(kind, kernel)
     total = math.sqrt(total) if power else total
     afar = total if power else sum_afar(re, im, n, total, spread, poles)
     centre = seen_from(origin, spread, kernel[0][0])
@@ -102,6 +103,12 @@ def bundle(n, kind, power, room):
     return far_field.strengths(
         room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, room[9]
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def served_beside(kind, kernel):
+    """Bins beyond the clearance in which known kernels take less time than sources, of many."""
+    return 0 if kind[1] < 2 else min(REACHES[1] // 4, kernel[0][0] // 128)
 
 
 @njit(cache=True, error_model="numpy")

@@ -265,7 +265,8 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 @njit(cache=True, error_model="numpy")
 def lent(scene, kernel, work):
     """Scene, kernel and workspace for the length of a call, their use uncounted."""
-    (offset, doppler, amplitude, phase), (apart, re, im, number, which), (shift, share) = scene
+    (offset, doppler, amplitude, phase), parts, (shift, share) = scene
+    apart, re, im, number, which, digest = parts
     sizes, shape, sidelobes, limits, tangent, known = kernel
     coefficients, numerator, poles, edge, table = shape
     window_sum, envelope, reach = sidelobes
@@ -273,7 +274,14 @@ def lent(scene, kernel, work):
     return (
         (
             (borrowed(offset), borrowed(doppler), borrowed(amplitude), borrowed(phase)),
-            (borrowed(apart), borrowed(re), borrowed(im), borrowed(number), borrowed(which)),
+            (
+                borrowed(apart),
+                borrowed(re),
+                borrowed(im),
+                borrowed(number),
+                borrowed(which),
+                borrowed(digest),
+            ),
             (borrowed(shift), borrowed(share)),
         ),
         (

@@ -1,4 +1,4 @@
-"""Powers of lines with phase errors as forms of few kernels, against records in the time domain."""
+"""Lines with phase errors as bundles with known kernels, against records in the time domain."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from windows import marked
 
 from sweep.model import modulation, segments
 from sweep.model.crossings import crossing_series
+from sweep.model.kernel_rows import digests
 from sweep.model.preparation import PhaseError
 
 WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop")
@@ -100,3 +101,46 @@ def test_bundles_too_wide_for_a_form_are_looked_at_bin_by_bin(table_4_1):
     missed, peak, form = apart(drifting(prepared(parameters), 1.0), 0)
     assert not form
     assert missed < AGREEMENT * peak
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_wide_bundles_stand_side_by_side(phases, table_4_1):
+    """Some tens of bins of lines, each in parts; bins between bundles as those on them."""
+    numbers = set()
+    for place in PLACES:
+        for grazing_angle in (0.06, 0.02, 0.004):
+            parameters = scene(
+                table_4_1, phases=phases, power=10.0, tnr=4.0, beamlets=37,
+                grazing_angle=grazing_angle, **PLACES[place],
+            )  # fmt: skip
+            shots = drifting(prepared(parameters), 1.5)
+            point = modulation.single(shots, 0)
+            room, exempt, series = segments.workspace(point.lines, shots.fft_size)
+            crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
+            shot = 0, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
+            chosen, kernel = modulation.choices(shots), shots.kernel()
+            _, _, (_, number, *_) = segments._smooth_lines(*shot, chosen[0], kernel, room)
+            low, count, *_ = segments.inspect_segment(*shot, chosen, kernel, room, exempt, series)
+            slow = exact(shots, 0, 0, NO_WIDTH)
+            peak = 0.5 * shots.beat_scale * shots.window.sum * shots.amplitude.sum()
+            assert abs(room[0, :count] - slow[low : low + count]).max() < AGREEMENT * peak
+            numbers.add(number)
+    assert max(numbers) > 5 and 1 in numbers
+
+
+def test_parts_are_known_by_what_they_are():
+    rng = np.random.default_rng(4)
+    place, re, im = rng.normal(size=(3, 2, 5))
+    known = digests(place, re, im)
+    wider = [np.pad(one, ((0, 0), (0, 3))) for one in (place, re, im)]
+    assert np.array_equal(digests(*wider), known)  # parts of no weight are none
+    assert (known >= 2).all() and (known == np.floor(known)).all()
+    seen = {*known}
+    for values in (place, re, im):
+        for k in range(5):
+            kept = values[0, k]
+            for other in (np.nextafter(kept, 9), -kept):
+                values[0, k] = other
+                seen.add(digests(place, re, im)[0])
+            values[0, k] = kept
+    assert len(seen) == 2 + 3 * 5 * 2

@@ -10,7 +10,7 @@ from test_optional_lines import prepared, scene
 
 from sweep.model import modulation, segments, spectra
 from sweep.model.crossings import crossing_series
-from sweep.model.known_kernels import HALVES
+from sweep.model.kernel_rows import HALVES
 from sweep.model.shot import find
 
 ROUNDING = 1e-11
