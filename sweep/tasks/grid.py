@@ -30,11 +30,9 @@ GEOMETRIC = (
 )
 GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
 
-#: Draws of all points of a block at most, which bounds its time: at 1 to 10 us a draw to less than
-#: an hour. And counts of draws, one a point and batch, which bound its memory: to some 200 MB.
-BLOCK_DRAWS = 1 << 28
-BLOCK_COUNTS = 1 << 22
-
+#: Seconds that a block takes at the most, as :func:`seconds_a_point` has it: what is lost where a
+#: worker dies. It also bounds the counts of draws, one a point and batch, to some 100 MB.
+BLOCK_SECONDS = 60.0
 
 #: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and
 #: what lists, copies or removes a store handles them one by one.
@@ -53,6 +51,25 @@ def is_geometric(axis: Axis) -> bool:
 def points_a_block(points: int) -> int:
     """Points that a block holds at most in a study of so many, where it does not say."""
     return max(BLOCK_POINTS, -(-points // MOST_BLOCKS))
+
+
+def seconds_a_point(spec: Spec) -> float:
+    """What the dearest point of a study takes of a core, by the study alone [s].
+
+    Measured on one machine and rounded up, which is all that a block's size asks for: results'
+    places must not depend on who computes them. A draw of a whole spectrum takes time by its bins,
+    all else by the beamlets; draws until a tolerance is met are reckoned with their limit.
+    """
+    dearest = {path: v for path, v in spec.parameters().items() if not isinstance(v, str)}
+    for axis in spec.axes:
+        for member in axis.members:
+            if isinstance(member.values, np.ndarray):
+                dearest[member.path] = member.values.max()
+    draws = spec.draws
+    once = 4e-5 + 2e-7 * float(dearest.get("footprint.beamlets", 0.0))
+    if draws.whole_spectra:
+        once += 2e-7 * float(dearest["instrument.processing.fft_size"])
+    return once * max(draws.number, draws.limit, 1)
 
 
 def block_shape(
@@ -89,12 +106,10 @@ def block_shape(
 def most_points(spec: Spec, points: int) -> int:
     """Points that a block of a study of so many may hold: what the spec says, or fits the study.
 
-    Less where each has many draws.
+    Less where each takes long.
     """
-    draws = spec.draws
-    batches = -(-draws.number // draws.batch)
-    bounds = (BLOCK_DRAWS // max(draws.number, draws.limit, 1), BLOCK_COUNTS // max(batches, 1))
-    return max(1, min(spec.storage.block_points or points_a_block(points), *bounds))
+    asked = spec.storage.block_points or points_a_block(points)
+    return max(1, min(asked, int(BLOCK_SECONDS / seconds_a_point(spec))))
 
 
 class Grid:

@@ -13,6 +13,7 @@ from sweep.tasks.grid import (
     block_shape,
     canonical_rows,
     points_a_block,
+    seconds_a_point,
 )
 
 
@@ -156,18 +157,30 @@ def test_files_stay_countable_however_large_a_study_is(points):
     assert points > BLOCK_POINTS * MOST_BLOCKS or size <= BLOCK_POINTS
 
 
+SPECTRA = {"number": 1000, "method": "spectra"}
+
+
 @pytest.mark.parametrize(
-    ("draws", "most"),
+    ("changes", "most"),
     [
         ({}, 50_000),
-        ({"number": 100}, 50_000),
-        ({"number": 1_000_000, "batch": 1_000_000}, 268),
-        ({"limit": 1_000_000}, 268),
-        ({"number": 1_000_000, "batch": 100}, 268),
-        ({"number": 100_000, "batch": 10}, 419),
+        ({"draws": {"number": 10}}, 50_000),
+        ({"draws": {"number": 1000}}, 1435),
+        ({"draws": {"number": 1000, "batch": 10}}, 1435),
+        ({"draws": {"limit": 1000}}, 1435),
+        ({"draws": {"number": 10**9}}, 1),
+        ({"footprint": STUDY["footprint"] | {"beamlets": 100_000}}, 2994),
+        ({"draws": SPECTRA}, 18),
     ],
 )
-def test_a_block_of_points_with_many_draws_holds_fewer(draws, most):
+def test_a_block_of_points_that_take_long_holds_fewer(changes, most):
+    """So that no block takes more than a minute or so: (40 us + 0.2 us a beamlet) a draw."""
     axes = {"target.range": {"linear": ["1 km", "2 km"], "number": 100_000}}
-    spec = small(axes=axes, draws=draws, storage={"block_points": 50_000})
+    spec = small(axes=axes, storage={"block_points": 50_000}, **changes)
     assert Grid(spec).block_shape == (most,)
+
+
+def test_the_dearest_value_of_an_axis_decides_how_large_blocks_are():
+    sizes = {"instrument.processing.fft_size": [2**12, 2**16, 2**14]}
+    spec = small(axes=STUDY["axes"] | sizes, draws=SPECTRA)
+    assert 1.1 > seconds_a_point(spec) / (1000 * 2e-7 * 2**16) > 1
