@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from sweep.cli.places import StorePath
 from sweep.cli.telling import INCOMPLETE, print_table
+from sweep.storage.locations import Location
+
+if TYPE_CHECKING:
+    from sweep.analysis.answers.comparison_table import Store
 
 DIFFERENT = 4
 
 
 @click.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=StorePath())
+@click.argument("b", type=StorePath())
 @click.option(
     "--figure",
     type=click.Path(dir_okay=False, path_type=Path),
     help="Draw the differences of pd into this file: .png, .pdf or .svg.",
 )
-def compare(a: Path, b: Path, figure: Path | None) -> None:
+def compare(a: Location, b: Location, figure: Path | None) -> None:
     """Say what differs between the studies in two stores A and B, and by how much: B less A.
 
-    Points are matched by the values of their parameters. Probabilities of detection agree at a
-    point where they differ by no more than is known of both: half-widths of what is drawn, and
-    what effects and beamlets that were left out may change.
+    Points of grids are matched by the values of their parameters, shots of flights by scanner,
+    time, beam, position and direction. Probabilities of detection agree where they differ by no
+    more than is known of both: half-widths of what is drawn, and what effects and beamlets that
+    were left out may change.
 
     Exit codes: 0 they agree wherever both are computed, 2 a mistake in what was asked, 3 nothing
     to compare is computed yet, 4 they differ.
@@ -41,27 +48,38 @@ def compare(a: Path, b: Path, figure: Path | None) -> None:
             f"{figure} ends in none of {', '.join(FORMATS)}", param_hint="--figure"
         )
     from sweep.analysis.answers import comparison_table
-    from sweep.analysis.opening import open as open_store
     from sweep.spec import difference
 
-    left, right = open_store(a), open_store(b)
-    for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
-        click.echo(line)
+    left, right = _opened(a), _opened(b)
     try:
         compared = comparison_table.compared(left, right)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    print_table(
-        f"{b.name} less {a.name}",
-        list(comparison_table.COLUMNS),
-        comparison_table.rows(compared),
-        "largest at",
-    )
+    for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
+        click.echo(line)
+    for scanner, found in compared.items():
+        if scanner:
+            click.echo(f"{scanner}: {comparison_table.met(found)}")
+        print_table(
+            f"{b.name} less {a.name}{scanner and ', '}{scanner}",
+            list(comparison_table.COLUMNS),
+            comparison_table.rows(found),
+            "largest at",
+        )
     if figure is not None:
         from sweep.analysis.answers import comparison_figure
 
         click.echo(comparison_figure.save(compared, figure))
-    verdict, words = comparison_table.verdict(compared)
+    verdict, words = comparison_table.verdict(compared.values())
     click.echo(words)
     if code := {"different": DIFFERENT, "nothing": INCOMPLETE}.get(verdict, 0):
         sys.exit(code)
+
+
+def _opened(path: Location) -> Store:
+    """A store of a grid as a dataset, of a flight as a tree."""
+    from sweep.analysis.opening import SCENE, kind_of, read_attributes
+    from sweep.analysis.opening import open as open_grid
+    from sweep.analysis.scenes.opening import open_scene
+
+    return open_scene(path) if kind_of(read_attributes(path)) == SCENE else open_grid(path)

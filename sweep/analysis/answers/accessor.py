@@ -1,4 +1,4 @@
-"""`ds.sweep`: answers from a dataset that `sweep.open` gave, in the field's words."""
+"""`ds.sweep` and `tree.sweep`: answers from what `sweep.open` and `sweep.open_scene` gave."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from sweep.analysis.answers import (
     comparison,
     contours,
     errors,
+    flight_comparison,
     limits,
     physical,
     probability,
     roc,
     summary,
 )
-from sweep.spec import Spec
+from sweep.spec import SceneSpec, Spec
+
+ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two of a kind"
 
 
 @xr.register_dataset_accessor("sweep")
@@ -112,9 +115,48 @@ class SweepAccessor:
         return errors.velocity_error(self._dataset)
 
     def compare(self, other: xr.Dataset) -> xr.Dataset:
-        """Differences from another study: :func:`.comparison.compare`."""
+        """Differences from another study: :func:`.comparison.compare`.
+
+        Raises
+        ------
+        ValueError
+            No point is in both; or the other is a flight.
+        """
+        if not isinstance(other, xr.Dataset):
+            raise ValueError(ONE_OF_EACH)
         return comparison.compare(self._dataset, other)
 
     def summary(self) -> xr.Dataset:
         """Mean, extremes and number of every output: :func:`.summary.summary`."""
         return summary.summary(self._dataset)
+
+
+@xr.register_datatree_accessor("sweep")
+class FlightAccessor:
+    """Answers from a flight's store, lazy but for the matching of shots.
+
+    Parameters
+    ----------
+    tree
+        As `sweep.open_scene` gives it.
+    """
+
+    def __init__(self, tree: xr.DataTree) -> None:
+        self._tree = tree
+
+    @property
+    def spec(self) -> Spec | SceneSpec:
+        """The study."""
+        return physical.study_of(self._tree)
+
+    def compare(self, other: xr.DataTree) -> xr.DataTree:
+        """Differences from another flight, shot by shot: :func:`.flight_comparison.compare`.
+
+        Raises
+        ------
+        ValueError
+            No shot is in both; or the other is a grid.
+        """
+        if not isinstance(other, xr.DataTree):
+            raise ValueError(ONE_OF_EACH)
+        return flight_comparison.compare(self._tree, other)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas
 import xarray as xr
 
-from sweep.analysis.answers.physical import parameter, si, spec_of
+from sweep.analysis.answers.physical import parameter, si, study_of
 from sweep.model.outputs import OUTPUTS, PROMISED
 from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
 
@@ -40,28 +42,34 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ValueError
         No point is in both.
     """
+    names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
+    return differences(ours, other, names, bounded=PROMISED)
+
+
+def differences(
+    ours: xr.Dataset, other: xr.Dataset, names: Sequence[str], *, bounded: Sequence[str]
+) -> xr.Dataset:
+    """Differences of variables where they meet; of those that are bounded, whether they agree."""
     left, right = _matched(ours, other)
-    result = xr.Dataset(attrs={"ours": _titled(ours), "other": _titled(other)})
-    names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in left and n in right]
+    result = xr.Dataset(attrs={"ours": titled(ours), "other": titled(other)})
     for name in names:
         result[name] = (right[name] - left[name]).assign_attrs(
             left[name].attrs, long_name=f"difference of {left[name].attrs.get('long_name', name)}"
         )
-    for name in PROMISED:
-        if name in names:
-            allowed = _unknown(left, name) + _unknown(right, name) + ROUNDING
-            result[f"{name}_allowed"] = allowed.assign_attrs(
-                units="1", long_name=f"largest difference of {name} within what is known of both"
-            )
-            result[f"{name}_agrees"] = (abs(result[name]) <= allowed).assign_attrs(
-                units="1", long_name=f"whether {name} agrees within what is known of both"
-            )
+    for name in (name for name in bounded if name in names):
+        allowed = _unknown(left, name) + _unknown(right, name) + ROUNDING
+        result[f"{name}_allowed"] = allowed.assign_attrs(
+            units="1", long_name=f"largest difference of {name} within what is known of both"
+        )
+        result[f"{name}_agrees"] = (abs(result[name]) <= allowed).assign_attrs(
+            units="1", long_name=f"whether {name} agrees within what is known of both"
+        )
     return result
 
 
-def _titled(dataset: xr.Dataset) -> str:
+def titled(store: xr.Dataset | xr.DataTree) -> str:
     """Title and number of a study."""
-    return f"{dataset.attrs.get('title', '')} ({str(dataset.attrs.get('study_id', ''))[:8]})"
+    return f"{store.attrs.get('title', '')} ({str(store.attrs.get('study_id', ''))[:8]})"
 
 
 def _unknown(dataset: xr.Dataset, name: str) -> xr.DataArray:
@@ -92,12 +100,12 @@ def _matched(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
 def _at_fixed(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
     """A dataset at the values of the parameters that the reference has off its axes."""
     paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
-    spec = spec_of(reference)
+    study = study_of(reference)
     for array in list(dataset.coords.values()):
         path = array.attrs.get("path", "")
         if not array.dims or path in paths or array.name not in dataset.dims:
             continue
-        value = parameter(reference, path, spec).values.item()
+        value = parameter(reference, path, study).values.item()
         values = si(array).values
         same = values == value if isinstance(value, str) else np.isclose(values, value, 1e-9, 0.0)
         if same.any():

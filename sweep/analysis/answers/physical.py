@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.spec import Spec
+from sweep.spec import SceneSpec, Spec, from_stored
 from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
 from sweep.units import QuantityError, read_quantity
@@ -17,18 +17,32 @@ CLOSE = 1e-9
 """Relative difference up to which a value is one on the grid."""
 
 
-def spec_of(dataset: xr.Dataset) -> Spec:
-    """The study that a dataset comes from.
+def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
+    """The study that a dataset, or a flight's tree, comes from.
 
     Raises
     ------
     ValueError
-        The dataset has lost its attributes, or is none of sweep's.
+        It has lost its attributes, or is none of sweep's.
     """
     text = dataset.attrs.get("spec")
     if not text:
         raise ValueError("the dataset lacks the attribute 'spec': take one that sweep.open gave")
-    return Spec.from_stored(text)
+    return from_stored(text)
+
+
+def spec_of(dataset: xr.Dataset) -> Spec:
+    """The study of a grid that a dataset comes from.
+
+    Raises
+    ------
+    ValueError
+        As :func:`study_of`; or it is a flight's.
+    """
+    study = study_of(dataset)
+    if not isinstance(study, Spec):
+        raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
+    return study
 
 
 def quantity(written: object, *, si_unit: str, name: str) -> float:
@@ -104,7 +118,7 @@ def si(array: xr.DataArray) -> xr.DataArray:
     return array * float(unit.factor) + float(unit.offset)
 
 
-def parameter(dataset: xr.Dataset, path: str, spec: Spec | None = None) -> xr.DataArray:
+def parameter(dataset: xr.Dataset, path: str, spec: Spec | SceneSpec | None = None) -> xr.DataArray:
     """SI value of a parameter at each point: along its axis, or one value for all.
 
     Parameters
