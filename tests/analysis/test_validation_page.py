@@ -1,5 +1,6 @@
 """The page that `make validation` writes, against the closed form and the specs of experiments."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -11,6 +12,18 @@ from sweep.spec import load
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "validation.md").read_text()
 SIZES = {"FFT size 2^16": 2**16, "FFT size 2^18": 2**18}
+
+
+def load_writer():
+    path = ROOT / "benchmarks" / "validation.py"
+    module = importlib.util.module_from_spec(
+        spec := importlib.util.spec_from_file_location("validation", path)
+    )
+    spec.loader.exec_module(module)
+    return module
+
+
+WRITER = load_writer()
 
 
 def rows(heading):
@@ -57,3 +70,32 @@ def test_every_experiment_on_the_page_is_there():
     named = set(re.findall(r"^\| Figs?\. [^|]+ \| ([a-z0-9_]+) \|", PAGE, re.MULTILINE))
     assert len(named) > 10
     assert all((ROOT / "experiments" / f"{name}.yaml").exists() for name in named)
+
+
+def test_what_explains_a_printed_number_follows_from_it():
+    closed = bin_probability(5.0)
+    told = {
+        float(f"{closed:.2g}"): "the same in 2 digits",
+        float(f"{closed:.1g}"): "the same in 1 digit,",
+        10 * closed * 1.01: r"a slip of the thesis: 0\.00472\d* is meant, \+1\.0 % from ours",
+        1.1 * closed: r"its noise is 1\.81 % above",
+    }
+    for printed, words in told.items():
+        assert re.match(words, WRITER.why(5.0, printed, closed))
+    # TNR is a ratio of magnitudes, whose squares grow with the noise's variance
+    assert bin_probability(5.0 / 1.0181**0.5) == pytest.approx(1.1 * closed, rel=5e-3)
+
+
+def test_bins_that_verdicts_are_held_against_are_the_published_ones():
+    parameters = load(ROOT / "experiments" / "single_shot_2000m.yaml").parameters()
+    assert WRITER.range_bin(parameters) == pytest.approx(0.3431, abs=1e-4)  # as the thesis has it
+    assert WRITER.velocity_bin(parameters) == pytest.approx(3.55e-3, abs=5e-6)
+    padded = parameters | {"instrument.processing.fft_size": 2**18}
+    assert WRITER.range_bin(padded) == WRITER.range_bin(parameters) / 2
+
+
+def test_no_verdict_is_a_fixed_word():
+    """Every one of the writer's verdicts comes from `agrees`, but for its own two words."""
+    text = (ROOT / "benchmarks" / "validation.py").read_text()
+    assert len(re.findall(r"\bagrees\b(?!\()", text)) == 1
+    assert text.count("does not agree") == 1
