@@ -18,8 +18,8 @@ SCALE = "viridis"
 NOT_COMPUTED = "0.75"
 """Grey of what is not there: nan, or a point not computed yet."""
 
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""Colours that stay apart for the colour-blind (Okabe and Ito 2008), for lines."""
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#785A2D")
+"""Colours for lines: of Okabe and Ito (2008), and a brown that red-blind eyes tell from them."""
 
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 
