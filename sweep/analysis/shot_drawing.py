@@ -53,7 +53,7 @@ def draw(
             whole.set_title(", ".join(filter(None, [segment.name, shot.label])), size=10)
             if j == 0:
                 whole.set_ylabel("amplitude (dB re 1 V)")
-    axes[0].legend(fontsize=7.5, loc="upper right", framealpha=0.9, ncols=2)
+    axes[0].legend(fontsize=7.5, loc="upper right", framealpha=0.9, ncols=3)
     for panel in axes[(rows - 1) * columns :]:
         panel.set_xlabel("frequency (MHz)")
     canvas.title(sheet, title)

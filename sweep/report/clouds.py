@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -35,8 +36,12 @@ NODES = 90
 SUNK = 0.012
 """How far the terrain is drawn below itself, of the picture's size: points lie on it, not in it."""
 
-LONGEST = 1.25
-"""Longest side of the picture in the lengths that the library counts in, which fits the sheet."""
+FIELD_OF_VIEW = math.radians(45)
+"""Angle from the lower to the upper edge of what the library shows of a scene."""
+
+ROOM, WIDER = 0.88, 1.2
+"""Share of the field of view that the picture takes, so that its labels have room; width of the
+narrowest sheets, a phone's, over their height."""
 
 VIEWS = {
     "at an angle": {"x": 1.1, "y": -1.3, "z": 0.6},
@@ -221,9 +226,39 @@ def _terrain(cloud: _Cloud, ground: Ground) -> Iterator[go.Surface]:
     )  # fmt: skip
 
 
+CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
+"""Where the eye looks."""
+
+
 def _camera(view: str) -> dict[str, dict[str, float]]:
-    up, centre = {"x": 0.0, "y": 0.0, "z": 1.0}, {"x": 0.0, "y": 0.0, "z": -0.1}
-    return {"eye": VIEWS[view], "up": up, "center": centre}
+    return {"eye": VIEWS[view], "up": {"x": 0.0, "y": 0.0, "z": 1.0}, "center": CENTRE}
+
+
+def _longest(sides: np.ndarray) -> float:
+    """Longest side at which all of a box is seen from every view, in the library's lengths.
+
+    Parameters
+    ----------
+    sides : (3,) ndarray
+        Of the box, in its longest.
+    """
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * sides
+    eyes = [np.array([view[axis] for axis in AXES]) for view in VIEWS.values()]
+    sizes = np.linspace(2.0, 0.1, 191)
+    fits = np.all([[_seen(size * corners, eye) for eye in eyes] for size in sizes], axis=1)
+    return float(sizes[np.argmax(fits)])
+
+
+def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:
+    """Whether an eye has (n, 3) corners within its field of view."""
+    ahead = np.array([CENTRE[axis] for axis in AXES]) - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = corners - eye
+    depth = away @ ahead
+    off = np.maximum(np.abs(away @ right) / WIDER, np.abs(away @ np.cross(right, ahead)))
+    return bool((off <= ROOM * math.tan(FIELD_OF_VIEW / 2) * depth).all())
 
 
 def _frame(clouds: list[_Cloud], *, path: bool = False) -> dict[str, object]:
@@ -237,8 +272,9 @@ def _frame(clouds: list[_Cloud], *, path: bool = False) -> dict[str, object]:
         room = 0.06 * np.ptp(values) + 2.0
         sides[f"scene.{axis}axis.range"] = [values.min() - room, values.max() + room]
         lengths[axis] = np.ptp(values) + 2 * room
-    longest = max(lengths.values())
-    return sides | {"scene.aspectratio": {a: LONGEST * n / longest for a, n in lengths.items()}}
+    shares = np.array([lengths[axis] for axis in AXES]) / max(lengths.values())
+    shown = _longest(shares) * shares
+    return sides | {"scene.aspectratio": dict(zip(AXES, shown.tolist(), strict=True))}
 
 
 def _layout() -> dict[str, object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas
@@ -72,10 +73,15 @@ def along(found: list[Seen]) -> Chart:
                 "quantity",
                 "Quantity",
                 [label(name) for name in quantities],
-                {label("pd_shot"): looks.CHANCES},
+                {label(name): _side(label(name), chance=name == "pd_shot") for name in quantities},
             ),
         ],
     )
+
+
+def _side(words: str, *, chance: bool) -> dict[str, Any]:
+    """What a choice of a quantity changes of a chart: name and limits at its side."""
+    return {"yaxis.title.text": looks.broken(words, 36)} | (looks.CHANCES if chance else {})
 
 
 def _thinned(seen: Seen, names: list[str], most: int) -> Thinned:
@@ -150,7 +156,7 @@ def navigation(found: list[Seen]) -> Chart | None:
         ),
         controls=[
             Control("statistic", "Shown", options,
-                    {option: looks.CHANCES for option in options if "share" in option})
+                    {option: _side(option, chance="share" in option) for option in options})
         ],
     )  # fmt: skip
 

@@ -127,7 +127,8 @@ class Cut {
     Plotly.react(this.plot, [trace], laid({
       margin: { l: 10, r: 16, t: 12, b: 50 }, font: layout.font, paper_bgcolor: layout.paper_bgcolor,
       plot_bgcolor: layout.plot_bgcolor, xaxis: layout[side + "axis"],
-      yaxis: { range: [map.zmin - room, map.zmax + room], automargin: true, zeroline: false },
+      yaxis: { range: [map.zmin - room, map.zmax + room], automargin: true, zeroline: false,
+        title: { text: layout.title.text.replaceAll(", ", ",<br>"), font: { size: 12 }, standoff: 8 } },
     }), CONFIG);
   }
 }
