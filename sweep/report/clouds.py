@@ -136,7 +136,7 @@ def chart(study: SceneStudy, found: list[Seen], fewer: int) -> Chart | None:
             Control("colour", "Colour", [_option(name) for name in COLOURS],
                     {_option(name): {"title": looks.title(label(name))} for name in COLOURS}),
             Control("view", "View", list(VIEWS),
-                    {name: {"scene.camera": _camera(name)} for name in VIEWS}),
+                    {name: {"scene.camera": _camera(name)} | _hidden(name) for name in VIEWS}),
             Control("frame", "Frame", ["whole flight", "ground"],
                     {"whole flight": _frame(clouds, path=True), "ground": _frame(clouds)}),
             Control("ground", "Terrain", ["shown", "hidden"] if ground else ["none"]),
@@ -232,6 +232,12 @@ CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
 
 def _camera(view: str) -> dict[str, dict[str, float]]:
     return {"eye": VIEWS[view], "up": {"x": 0.0, "y": 0.0, "z": 1.0}, "center": CENTRE}
+
+
+def _hidden(view: str) -> dict[str, bool]:
+    """The axis that a view looks along, whose labels would lie over each other, is not drawn."""
+    low, _, high = sorted(AXES, key=lambda axis: abs(VIEWS[view][axis]))
+    return {f"scene.{high}axis.visible": False} if VIEWS[view][low] == 0 else {}
 
 
 def _longest(sides: np.ndarray) -> float:

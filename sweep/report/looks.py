@@ -81,7 +81,7 @@ def layout(**further: Any) -> dict[str, Any]:
 
 def broken(words: str, width: int = 44) -> str:
     """Words in lines that fit beside a chart."""
-    return "<br>".join(textwrap.wrap(words, width))
+    return "<br>".join(textwrap.wrap(words, width, break_on_hyphens=False))
 
 
 def axis(title: str, **further: Any) -> dict[str, Any]:

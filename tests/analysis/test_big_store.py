@@ -21,21 +21,28 @@ def big_store():
     return module
 
 
-def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
-    monkeypatch.setattr(opening, "PIECE", 2**13)
-    sizes, peaks = [], []
-    # what is imported and kept on the first time is no part of it
-    for number, gigabytes in enumerate((0.002, 0.006, 0.024)):
-        path = tmp_path / f"{number}.zarr"
-        sizes.append(big_store.make(path, big_store.spec_of(gigabytes, block_points=500, powers=4)))
+def peak_of_reducing(big_store, path):
+    """Memory [B] that a reduction takes at most; of two, as imports and caches count in one."""
+    peaks = []
+    for _ in range(2):
         tracemalloc.start()
         found = big_store.reduce(path)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert found["points"] == sweep.open(path).attrs["points"]
         assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
-    # Dask's list of pieces alone: with one chunk a piece it takes half as much as the store.
-    assert peaks[2] - peaks[1] < 0.15 * (sizes[2] - sizes[1]), peaks
+    return min(peaks)
+
+
+def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
+    monkeypatch.setattr(opening, "PIECE", 2**13)
+    sizes, peaks = [], []
+    for gigabytes in (0.001, 0.006):
+        path = tmp_path / f"{gigabytes}.zarr"
+        sizes.append(big_store.make(path, big_store.spec_of(gigabytes, block_points=500, powers=4)))
+        peaks.append(peak_of_reducing(big_store, path))
+    # Dask's list of pieces alone: with one chunk a piece it takes twice as much as these stores.
+    assert peaks[1] - peaks[0] < 0.3 * (sizes[1] - sizes[0]), (peaks, sizes)
 
 
 def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(big_store, tmp_path, monkeypatch):
