@@ -3,6 +3,7 @@
 Filled by :mod:`sweep.model.known_kernels` and :mod:`sweep.model.known_sources`.
 """
 
+import mmap
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
@@ -72,12 +73,19 @@ def kernels_of(*key: Hashable) -> np.ndarray:
     """
     kept = _SCRATCH.__dict__.setdefault("kept", OrderedDict())
     if key not in kept:
-        rows = kept[key] = np.empty((ROWS, WIDTH))
-        rows[:, [KEY, HALF]] = 0.0
+        kept[key] = _untouched((ROWS, WIDTH))
     kept.move_to_end(key)
     while len(kept) > MOST_KEPT:
         kept.popitem(last=False)
     return kept[key]
+
+
+def _untouched(shape: tuple[int, int]) -> np.ndarray:
+    """Zeros that take no memory until they are touched, page by page and not by huge ones."""
+    memory = mmap.mmap(-1, 8 * shape[0] * shape[1])
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, float).reshape(shape)
 
 
 def digests(*values: np.ndarray) -> np.ndarray:
