@@ -23,13 +23,16 @@ ONE_THREAD = {
 }
 
 #: How often Dask looks at itself. By default it does so some 150 times a second in each worker,
-#: which takes a tenth of the processor's time from whatever else the worker does.
-CALM = {
+#: which takes a tenth of the processor's time from whatever else the worker does. And no pause near
+#: the memory's limit: tasks leave nothing behind that could be waited for, so a worker that paused
+#: would do so for ever. At the limit it is ended, and its blocks go elsewhere.
+CALM: dict[str, Any] = {
     "distributed.admin.tick.interval": "500ms",
     "distributed.admin.system-monitor.interval": "2s",
     "distributed.worker.profile.interval": "200ms",
     "distributed.worker.profile.cycle": "10s",
     "distributed.worker.memory.monitor-interval": "200ms",
+    "distributed.worker.memory.pause": False,
 }
 
 #: Seconds of work ahead for which a cluster between bounds takes another worker thread.
@@ -39,8 +42,8 @@ WORK_AHEAD = "1s"
 def environment(given: Mapping[str, str]) -> dict[str, str]:
     """Environment variables of workers: one thread a slot, calm, and those given."""
     calm = {
-        f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": interval
-        for name, interval in CALM.items()
+        f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
+        for name, setting in CALM.items()
     }
     return {**ONE_THREAD, **calm, **given}
 
