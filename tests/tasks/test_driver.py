@@ -18,7 +18,7 @@ from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.status import status
-from sweep.tasks.store import Arrays
+from sweep.tasks.store import Arrays, Written
 from sweep.tasks.worker import Terms, work
 
 
@@ -285,7 +285,7 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     def forgetful(self, block, results):
         if block == 3 and len(lost) < times:
             lost.append(block)
-            return "0" * 32
+            return Written("0" * 32, 1)
         return write(self, block, results)
 
     monkeypatch.setattr(Arrays, "write", forgetful)
