@@ -16,7 +16,7 @@ import sweep
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
 RUN = [DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-IN_SECONDS = ("read_results", "use_your_own_detector", "compare_two_designs")
+IN_SECONDS = ("read_results", "use_your_own_detector")
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
