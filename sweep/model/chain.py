@@ -4,6 +4,7 @@ A graph of this many nodes is all that a block of points is: what no scene calls
 """
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -44,7 +45,8 @@ def prepare(
         Names of the effects that are simulated.
     """
     for index, p in resolved_categories(DEFAULTS | dict(parameters), effects, SHARED):
-        yield index, assembled(p, index.size, Plane(p, index.size), effects)
+        shots = assembled(p, index.size, Plane(p, index.size), effects)
+        yield index, replace(shots, alike=True)
 
 
 def prepare_cast(parameters: Parameters, ground: Cast, effects: Collection[str] = CORE) -> Shots:

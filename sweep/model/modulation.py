@@ -43,8 +43,9 @@ class Stretch(NamedTuple):
     """(m,) int64: row in the footprints."""
     scene: tuple
     """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
-    many count (3, u), which of the u each point has (m,), digests (3, u); shifts [bins of fs/L]
-    and their weights (m, k). Empty where there is none."""
+    many count (3, u), which of the u each point has (m,), digests (3, u), nan where no other
+    points have the same; shifts [bins of fs/L] and their weights (m, k). Empty where there is
+    none."""
     lines: int
     """Lines that one point may have at the most."""
 
@@ -154,7 +155,8 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
         re[segment, some, :lines] = split.weight.real
         im[segment, some, :lines] = split.weight.imag
         number[segment, some] = split.number
-    return offset, re, im, number, alike.which, digests(offset, re, im)
+    known_as = digests(offset, re, im) if shots.alike else np.full(number.shape, np.nan)
+    return offset, re, im, number, alike.which, known_as
 
 
 def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> Split:

@@ -129,6 +129,8 @@ class Shots:
     phase: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
     """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
     phase_errors: tuple[PhaseError, ...] = ()
+    alike: bool = False
+    """Whether many shots have the same phase errors, as those of a flight do not."""
     gaussian_width: np.ndarray | None = None
     """(n,): FWHM [Hz] of the beat's Gaussian line."""
     pedestal: np.ndarray | float = 0.0

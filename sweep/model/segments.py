@@ -219,20 +219,26 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
 def _smooth_lines(segment, p, scene, at, power, kernel, room):
     """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
 
-    None where the lines have parts, and these are too many or spread too wide for bundles.
+    Lines in parts that many points share are bundles. Those of a point by itself would not be
+    worth its kernels: parts of amplitudes are lines of their own, and of powers there are none
+    here, as where they are too many or spread too wide for bundles.
     """
-    origin, n, fold = _lines_of(segment, p, scene, at, power, False, kernel, room)
     parts, own = scene[1], -1
     if parts[0].size and not is_whole(segment, at[1], parts):
         own = parts[4][at[1]]
+    alone = own >= 0 and math.isnan(parts[5][segment, own])
+    origin, n, fold = _lines_of(segment, p, scene, at, power, alone, kernel, room)
+    if alone and power:
+        return origin, 0, as_lines()
+    own = -1 if alone else own
     if own >= 0 or p[15] > 0.0:
         n, kind = take_bundles(
             n, power, (segment, own, fold), parts, allowed(p, power), kernel, room
         )  # fmt: skip
         if own >= 0 or kind[0] >= 0:
             return origin, n, kind
-    widened = power and scene[2][0].size > 0
-    most = n - 1 if widened else (n // 2 if p[15] > 0.0 else 0)
+    several = alone or (power and scene[2][0].size > 0)
+    most = n - 1 if several else (n // 2 if p[15] > 0.0 else 0)
     n = take_few(n, power, allowed(p, power), most, kernel, room)
     return origin, n, as_lines()
 
