@@ -51,15 +51,18 @@ WIDTH = TABLE + 2 * MOST_MOMENTS * (2 * REACHES[1] + 2 * COLUMNS + LANES)
 """Numbers that a row of scratch must hold."""
 
 MOST_KEPT = 4
-"""Kinds of kernels that a thread keeps; one takes some megabytes, 75 at the most."""
+"""Kinds of kernels that a thread keeps; pages that nothing is known on take no memory."""
 
 _SCRATCH = threading.local()
 
 LADDER = len(HALVES) + 1
 
-ROWS = 4 * LADDER
+WAYS = 4
+"""Kinds of parts of a segment's lines whose kernels are kept beside each other."""
+
+ROWS = (1 + 3 * WAYS) * LADDER
 """Rows of scratch, for each width and for bundles side by side: of whole lines, and of lines in
-parts for each segment."""
+parts for each segment and way."""
 
 
 def kernels_of(*key: Hashable) -> np.ndarray:

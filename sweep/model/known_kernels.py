@@ -52,6 +52,7 @@ from sweep.model.kernel_rows import (
     TABLE,
     TILE,
     TO_NODES,
+    WAYS,
     parts_of,
     to_nodes_of,
 )
@@ -89,7 +90,8 @@ def slot_for(segment, own, fold, width, power, parts, kernel):
     level, alone = width
     row = level if alone else LADDER - 1
     if own >= 0:
-        row += (segment + 1) * LADDER
+        way = int(parts[5][segment, own]) % WAYS
+        row += (1 + segment * WAYS + way) * LADDER
     slot = kernel[5][row]
     if slot[HALF] == 0.0:
         slot[REACH] = REACHES[0 if alone else 1]

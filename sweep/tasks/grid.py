@@ -225,10 +225,13 @@ class Grid:
         -------
         ndarray of int (n,)
             Numbers of the points in C order over the block, sorted so that radiometric axes run
-            fastest.
+            fastest, and velocities slowest: what a line becomes within a record follows from them.
         """
         numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
-        axes = sorted(range(len(self.shape)), key=lambda k: (not self.geometric[k], k))
+        moving = ["target.radial_velocity" in {m.path for m in axis.members} for axis in self._axes]
+        axes = sorted(
+            range(len(self.shape)), key=lambda k: (not self.geometric[k], not moving[k], k)
+        )
         return numbers.transpose(axes).ravel()
 
 
