@@ -27,7 +27,7 @@ from sweep.model.known_kernels import (
     total_strength,
     width_of,
 )
-from sweep.model.known_sources import at_sources, form_of, sources_of
+from sweep.model.known_sources import form_of, sources_of, strengths_afar
 from sweep.model.lanes import COLUMNS, combine, dot
 from sweep.model.spectrum import fraction
 
@@ -217,18 +217,28 @@ def _take_moments(n, power, half, number, first, spacing, size, room):
 @njit(cache=True, error_model="numpy")
 def _strengths(one, other, size, power, slot, start, room):
     """Strengths of a bundle's sources, from ``start`` on in rows STRENGTH_RE and STRENGTH_IM."""
-    re, im, work = room[STRENGTH_RE, start:], room[STRENGTH_IM, start:], room[5]
-    at_sources(one, size, power, slot, False, re)
+    re, im = room[STRENGTH_RE, start:], room[STRENGTH_IM, start:]
+    im[:COLUMNS] = 0.0
+    _sum_moments(one, other, size, power, slot, strengths_afar(power, slot), re, im, room[5])
+
+
+@njit(cache=True, error_model="numpy")
+def _sum_moments(one, other, size, power, slot, where, re, im, work):
+    """Moments times rows of a slot, COLUMNS numbers: real and imaginary, of powers real alone.
+
+    ``where`` is as :func:`sweep.model.known_kernels.kernels_beside` returns it.
+    """
+    at, imaginary, stride = where
+    combine(one, slot, size, at, stride, re)
     if power:
-        im[:COLUMNS] = 0.0
         return
-    at_sources(other, size, power, slot, False, im)
+    combine(other, slot, size, at, stride, im)
     if is_real(power, slot):
         return
-    at_sources(other, size, power, slot, True, work)
+    combine(other, slot, size, imaginary, stride, work)
     for i in range(COLUMNS):
         re[i] -= work[i]
-    at_sources(one, size, power, slot, True, work)
+    combine(one, slot, size, imaginary, stride, work)
     for i in range(COLUMNS):
         im[i] += work[i]
 
@@ -248,7 +258,8 @@ def add_near(first, image, kind, power, kernel, room, re, im):
             bin_ = first + start - side * (middle + k * spacing)
             if image:
                 bin_ = -(bin_ + COLUMNS - 1)
-            _hold(bin_, one, other, size, power, slot, kernel, room)
+            where = kernels_beside(bin_, power, slot, kernel)
+            _sum_moments(one, other, size, power, slot, where, room[5], room[6], room[8])
             _add(re[start : start + count], room[5], image, 1.0 if power else -1.0)
             if not power:
                 _add(im[start : start + count], room[6], image, 1.0 if image else -1.0)
@@ -263,25 +274,6 @@ def _add(out, values, mirrored, sign):
     else:
         for i in range(out.size):
             out[i] += sign * values[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _hold(first, one, other, size, power, slot, kernel, room):
-    """sum_m M_m g_m in COLUMNS bins, into rows 5 and 6."""
-    at, imaginary, stride = kernels_beside(first, power, slot, kernel)
-    re, im, work = room[5], room[6], room[8]
-    combine(one, slot, size, at, stride, re)
-    if power:
-        return
-    combine(other, slot, size, at, stride, im)
-    if is_real(power, slot):
-        return
-    combine(other, slot, size, imaginary, stride, work)
-    for i in range(COLUMNS):
-        re[i] -= work[i]
-    combine(one, slot, size, imaginary, stride, work)
-    for i in range(COLUMNS):
-        im[i] += work[i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -128,10 +128,12 @@ def _far_stride(power, slot):
 
 
 @njit(cache=True, error_model="numpy")
-def at_sources(moments, size, power, slot, imaginary, out):
-    """Strengths at the sources of moments, or their imaginary parts; into COLUMNS numbers."""
-    first = FAR + (MOST_SOURCES if imaginary else 0)
-    combine(moments, slot, size, first, _far_stride(power, slot), out)
+def strengths_afar(power, slot):
+    """Where the sources' strengths of moments of 1 are.
+
+    As of :func:`sweep.model.known_kernels.kernels_beside`.
+    """
+    return FAR, FAR + MOST_SOURCES, _far_stride(power, slot)
 
 
 @njit(cache=True, error_model="numpy")
