@@ -276,6 +276,7 @@ def explained(text: str, root: str) -> tuple[int, str]:
     bucket, at = root.partition("://")[2], _endpoint() or f"the service of {root.split(':')[0]}://"
     said = text.partition("\n\nDebug source")[0]
     status = re.search(r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", said)
+    answer = (status[1] or status[2]).strip() if status else ""
     if "NoSuchBucket" in text or "ContainerNotFound" in text:
         return errno.ENXIO, f"{at} has no bucket {bucket!r}: make it, or mend its name"
     if (
@@ -287,9 +288,9 @@ def explained(text: str, root: str) -> tuple[int, str]:
             "no credentials are set: give AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (workers "
             "need them too); AWS_SKIP_SIGNATURE=true reads what is public"
         )
-    if "401" in said or "403" in said or "PermissionDenied" in text:
+    if answer[:3] in ("401", "403") or "PermissionDenied" in text:
         return errno.EACCES, (
-            f"{at} refuses access{f' ({(status[1] or status[2]).strip()})' if status else ''}: "
+            f"{at} refuses access{f' ({answer})' if answer else ''}: "
             "check the credentials, and that they may list, read and write there"
         )
     if "imed out" in text or "Timeout" in text:
@@ -298,6 +299,6 @@ def explained(text: str, root: str) -> tuple[int, str]:
         return errno.ECONNREFUSED, (
             f"{at} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
         )
-    if status:
-        return errno.EIO, f"{at} keeps failing ({(status[1] or status[2]).strip()}): try again"
+    if answer:
+        return errno.EIO, f"{at} keeps failing ({answer}): try again"
     return errno.EIO, said

@@ -1,5 +1,6 @@
 """Studies in an object store, over a real S3 protocol, with faults put in its way."""
 
+import errno
 import hashlib
 import json
 import os
@@ -208,6 +209,14 @@ def test_what_is_wrong_is_said_in_one_line(faults, monkeypatch, spoil, said, com
     told = CliRunner().invoke(main, [command, "s3://absent/x.zarr"])
     assert told.exit_code == 2 and said in told.output
     assert told.output.count("\n") == 1 and "Traceback" not in told.output
+
+
+def test_figures_that_are_no_status_are_not_taken_for_one():
+    said = "Server error, status code: 503 Service Unavailable, after 2.403s"
+    number, words = objects.explained(said, "s3://bucket")
+    assert number == errno.EIO and words.endswith(
+        "keeps failing (503 Service Unavailable): try again"
+    )
 
 
 def test_an_address_without_a_key_is_refused():
