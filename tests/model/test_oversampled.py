@@ -1,5 +1,6 @@
 """The thesis's way on an oversampled grid against the closed form of the same lines."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -89,6 +90,16 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
             without = spectra.segment_spectrum(replace(shots, image=False), i, 1)[1]
             assert np.abs(without - exact).max() > 0.01 * exact.max()
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1):
+    shots = drawn(table_4_1, 12, phases=phases)
+    for i, segment in itertools.product(range(shots.size), range(3)):
+        _, whole = oversampled.spectrum(shots, i, segment)
+        _, folded = oversampled.spectrum(shots, i, segment, folded=True)
+        order = 2 if shots.incoherent else 1  # a root of rounding is much
+        assert np.abs(whole**order - folded**order).max() < 1e-14 * whole.max() ** order
 
 
 def test_the_same_detections_come_of_it(table_4_1):

@@ -34,6 +34,7 @@ MARKS = {
     of.IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
     of.CLOSED_FORM: ("X", canvas.LINES[5], "in closed form what the thesis's way has"),
     of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
+    of.IMPROVED: ("1", canvas.LINES[4], "the thesis's way, improved"),
     of.WRITTEN: ("*", canvas.LINES[6], "as written"),
 }
 """Marker, colour and words of each kind."""
@@ -119,7 +120,7 @@ def _short(setting: Setting) -> str:
     """What tells a setting from others of its kind."""
     if setting.kind == of.ADAPTIVE:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
-    if setting.kind == of.THESIS:
+    if setting.kind in (of.THESIS, of.IMPROVED):
         return setting.name.removeprefix("thesis ")
     if setting.kind in BY_NUMBER:
         return setting.name.split()[0]

@@ -14,7 +14,7 @@ EXACT = 1e-9
 """Error below which settings are alike: that of the reference itself."""
 
 WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
-CLOSED_FORM = "closed form"
+CLOSED_FORM, IMPROVED = "closed form", "thesis improved"
 BEAMLETS, IN_A_LINE = "beamlets", "in a line"
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COUNTED, IN_NOISE)
@@ -142,10 +142,13 @@ def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
     return found
 
 
-def against_thesis(settings: Sequence[Setting]) -> list[Duel]:
-    """The fastest adaptive setting that is as accurate as the thesis's way, for each form of it."""
+def against_thesis(settings: Sequence[Setting], kind: str = THESIS) -> list[Duel]:
+    """The fastest adaptive setting that is as accurate as the thesis's way, for each form of it.
+
+    `kind`: as it is described, or improved.
+    """
     found = []
-    for thesis in of_kinds(settings, THESIS):
+    for thesis in of_kinds(settings, kind):
         best = cheapest(of_kinds(settings, ADAPTIVE), thesis.error)
         if best is not None:
             found.append(Duel(best, thesis))

@@ -68,7 +68,7 @@ def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
     """What it comes to, in words."""
     attributes = dataset.attrs
     found = [_written(dataset, settings), *_fixed(of.against_fixed(settings))]
-    found += _thesis(of.against_thesis(settings)) + _like_for_like(settings)
+    found += _thesis(settings) + _like_for_like(settings)
     found.append(_reference(attributes))
     found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
     found += [_partial(attributes)] if attributes["stopped"] else []
@@ -113,22 +113,35 @@ def _fixed(duels: Sequence[Duel]) -> list[str]:
     ]
 
 
-def _thesis(duels: Sequence[Duel]) -> list[str]:
-    """Statement on adaptive settings against the thesis's way."""
+def _thesis(settings: Sequence[Setting]) -> list[str]:
+    """Statement on adaptive settings against the thesis's way, as described and improved."""
+    duels = of.against_thesis(settings)
     if not duels:
         return []
+    kept = " and ".join(
+        f"{'kept' if duel.times_faster >= of.TIMES_FASTER else 'NOT kept'} against {_name(duel)}"
+        for duel in duels
+    )
     told = [
-        f"{duel.adaptive.name} is {duel.times_faster:.2g} times as fast as {duel.other.name} "
+        f"Against the thesis's way at the error that it has: {_told(duels)}. "
+        f"At least {of.TIMES_FASTER:g} times as fast: {kept}."
+    ]
+    if improved := of.against_thesis(settings, of.IMPROVED):
+        told.append(f"Against what it can be improved to: {_told(improved)}.")
+    return told
+
+
+def _told(duels: Sequence[Duel]) -> str:
+    return "; ".join(
+        f"{duel.adaptive.name} is {duel.times_faster:.2g} times as fast as {_name(duel)} "
         f"(error {error(duel.other.error)})"
         for duel in duels
         if duel.other
-    ]
-    least = min(duel.times_faster for duel in duels)
-    kept = "kept" if least >= of.TIMES_FASTER else "NOT kept"
-    return [
-        "Against the thesis's way at the error that it has: " + "; ".join(told) + ". "
-        f"At least {of.TIMES_FASTER:g} times as fast: {kept}."
-    ]
+    )
+
+
+def _name(duel: Duel) -> str:
+    return duel.other.name if duel.other else ""
 
 
 def _like_for_like(settings: Sequence[Setting]) -> list[str]:
@@ -136,7 +149,7 @@ def _like_for_like(settings: Sequence[Setting]) -> list[str]:
     told = [
         f"{closed.times_faster(thesis):.2g} times as fast as {thesis.name}"
         for closed in of.of_kinds(settings, of.CLOSED_FORM)
-        for thesis in of.of_kinds(settings, of.THESIS)
+        for thesis in of.of_kinds(settings, of.THESIS, of.IMPROVED)
     ]
     if not told:
         return []

@@ -57,7 +57,7 @@ class Bench(Protocol):
 
     unit: str
     most_times: int
-    """Points that may be timed for each of the sample."""
+    """Points of the longest stretch that may be timed."""
 
     @property
     def spec(self) -> Declared:
@@ -78,7 +78,7 @@ class Bench(Protocol):
         """Effects that a rung calls for anywhere in the sample."""
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample, timed on so many points for each, as far as it can be."""
+        """A rung on a part of the sample, timed on stretches of so many points, if it can be."""
 
     def forget(self) -> None:
         """Drop what trials of one part share; its time counts for each of them."""
@@ -96,7 +96,7 @@ def look_of(rung: Rung) -> Look:
 
     if not rung.cells:
         return shot.find
-    return partial(oversampled.find, degree=rung.degree, size=rung.cells)
+    return partial(oversampled.find, degree=rung.degree, size=rung.cells, folded=rung.folded)
 
 
 def of_lines(names: frozenset[str]) -> tuple[str, ...]:

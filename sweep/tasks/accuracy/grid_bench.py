@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from time import thread_time
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,9 @@ from sweep.tasks.grid import Grid
 if TYPE_CHECKING:
     from sweep.spec import Spec
 
+#: Places of a part at which stretches of a block are timed.
+PLACES = 12
+
 
 class GridBench:
     """A sample of the points of a grid.
@@ -34,7 +38,7 @@ class GridBench:
     """
 
     unit = "points"
-    most_times = 64
+    most_times = 512
 
     def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
         self.spec = spec
@@ -61,33 +65,28 @@ class GridBench:
     def effects(self, rung: Rung) -> frozenset[str]:
         """Effects that a rung calls for anywhere in the sample."""
         if rung.name not in self._names:
-            flags, _, _ = self._planned(rung, np.arange(self.size))
+            flags, _ = self._planned(rung, self._numbers)
             names = (name for flag in np.unique(flags) for name in names_of(int(flag)))
             self._names[rung.name] = frozenset(names)
         return self._names[rung.name]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample, with `times` points of its tile for each.
+        """A rung on a part of the sample; timed on stretches of so many points, or on the part.
 
-        A plan serves a whole tile, so that a point takes its share of the time.
+        What a point costs depends on those beside it, as they share what is worked out for them:
+        a stretch is what the point's block computes next to it.
         """
-        calling = self._calling_of(rung)
-        flags, planning, numbers = self._planned(rung, part, times)
-        outputs: dict[str, np.ndarray] = {}
-        spent = 0.0
-        for members, effects in self._groups(rung, flags):
-            chosen = numbers[members].ravel()
-            parameters = calling.tiles.grid.parameters_at(chosen)
-            begun = thread_time()
-            found = self._evaluated(rung, calling.tiles.grid.spec, parameters, len(chosen), effects)
-            spent += thread_time() - begun
-            for name, values in found.items():
-                room = (len(part), *values.shape[1:])
-                outputs.setdefault(name, np.empty(room, values.dtype))[members] = values[::times]
-        draws = int(calling.tiles.grid.spec.draws.number)
+        numbers = self._numbers[part]
+        outputs, spent, planning = self._run(rung, numbers)
+        timed = len(part)
+        if times > 1:
+            stretches = self._stretches(rung, numbers[:: -(-len(part) // PLACES)], times)
+            _, spent, planning = self._run(rung, stretches)
+            timed = stretches.size
         planning = planning if rung.plans else 0.0
-        seconds = spent / numbers.size + planning
-        return Trial(seen_in(outputs, rung.estimate, draws), seconds, planning)
+        draws = int(self._calling_of(rung).tiles.grid.spec.draws.number)
+        seen = seen_in(outputs, rung.estimate, draws)
+        return Trial(seen, spent / timed + planning, planning)
 
     def forget(self) -> None:
         """Nothing is shared."""
@@ -98,9 +97,10 @@ class GridBench:
         from sweep.model.effects.catalogue import EFFECTS
 
         random = {effect.name for effect in EFFECTS if effect.is_random}
-        flags, _, numbers = self._planned(rung, np.array([place]))
+        number = self._numbers[[place]]
+        flags, _ = self._planned(rung, number)
         effects = [n for n in names_of(int(flags[0])) if n not in NOT_IN_TRUTH | random]
-        parameters = self._calling_of(rung).tiles.grid.parameters_at(numbers.ravel())
+        parameters = self._calling_of(rung).tiles.grid.parameters_at(number)
         # Records walk by themselves, whatever effects are named.
         in_time = shot.evaluate(parameters, effects, look=truth.find)
         return seen_in(in_time, MEAN, 0), seen_in(shot.evaluate(parameters, effects), MEAN, 0)
@@ -121,29 +121,56 @@ class GridBench:
             self._calling[rung.name] = Calling(spec, Grid(spec))  # type: ignore[arg-type]
         return self._calling[rung.name]
 
-    def _planned(
-        self, rung: Rung, part: np.ndarray, times: int = 1
-    ) -> tuple[np.ndarray, float, np.ndarray]:
-        """Flags (n,), time that planning takes a point, and numbers of points (n, times)."""
+    def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
+        """Outputs of points, the time they take together, and that of planning one of them."""
+        grid = self._calling_of(rung).tiles.grid
+        flags, planning = self._planned(rung, numbers)
+        outputs: dict[str, np.ndarray] = {}
+        spent = 0.0
+        for members, effects in self._groups(rung, flags):
+            parameters = grid.parameters_at(numbers[members])
+            begun = thread_time()
+            found = self._evaluated(rung, grid.spec, parameters, len(members), effects)
+            spent += thread_time() - begun
+            for name, values in found.items():
+                room = (len(numbers), *values.shape[1:])
+                outputs.setdefault(name, np.empty(room, values.dtype))[members] = values
+        return outputs, spent, planning
+
+    def _stretches(self, rung: Rung, numbers: np.ndarray, times: int) -> np.ndarray:
+        """Points and those that their blocks compute beside them: at other ranges, then others."""
+        grid = self._calling_of(rung).tiles.grid
+        paths = [{member.path for member in axis.members} for axis in grid.spec.axes]
+        order = sorted(
+            range(len(paths)),
+            key=lambda k: (not grid.geometric[k], paths[k] == {"target.range"}),
+        )
+        found = []
+        for number in numbers:
+            point = np.unravel_index(number, grid.shape) if grid.shape else ()
+            along = [int(p) // side for p, side in zip(point, grid.block_shape, strict=True)]
+            block = np.ravel_multi_index(along, grid.blocks_along) if along else 0
+            place = tuple(map(int, point))
+            found.append(neighbours(place, grid.block(int(block)), grid.shape, times, order))
+        return np.concatenate(found)
+
+    def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+        """Flags of points (n,), and the time that planning takes one.
+
+        A plan serves a whole tile, so that a point takes its share.
+        """
         tiles = self._calling_of(rung).tiles
-        shape = tiles.grid.shape
-        index = np.unravel_index(self._numbers[part], shape) if shape else ()
+        index = np.unravel_index(numbers, tiles.grid.shape) if tiles.grid.shape else ()
         along = [i // side for i, side in zip(index, tiles.shape, strict=True)]
-        own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(part), np.int64)
-        numbers, where = np.unique(own, return_inverse=True)
-        flags = np.empty(len(numbers), np.uint32)
+        own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(numbers), int)
+        met, where = np.unique(own, return_inverse=True)
+        flags = np.empty(len(met), np.uint32)
         begun = thread_time()
-        for chosen, plan in self._calling_of(rung).plans(numbers):
+        for chosen, plan in self._calling_of(rung).plans(met):
             flags[chosen] = flags_of(plan.kept)
         spent = thread_time() - begun
-        boxes = [tiles.points(int(tile)) for tile in numbers]
-        served = sum(int(np.prod([s.stop - s.start for s in box])) for box in boxes)
-        places = zip(*index, strict=True) if shape else [()] * len(part)
-        around = [
-            neighbours(tuple(map(int, point)), boxes[tile], shape, times)
-            for point, tile in zip(places, where, strict=True)
-        ]
-        return flags[where], spent / served, np.array(around)
+        served = sum(math.prod(s.stop - s.start for s in tiles.points(int(tile))) for tile in met)
+        return flags[where], spent / served
 
     def _groups(
         self, rung: Rung, flags: np.ndarray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -28,6 +27,9 @@ PARTS = 2
 
 LONG_ENOUGH = 0.15
 """Time of a trial [s] from which on its calls cost little beside the points themselves."""
+
+TOO_LONG = 8
+"""Of these, in which stretches are cut: they cost the dearest settings nothing to speak of."""
 
 FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 """Shares of the time limit by which the first round, and then the truth, ends."""
@@ -56,7 +58,7 @@ class Measured:
     planning: np.ndarray
     """(rungs, rounds): a point."""
     times: np.ndarray
-    """(rungs,): points timed for each."""
+    """(rungs,): points of a stretch that is timed."""
     truth: dict[int, tuple[Seen, Seen]] = field(default_factory=dict)
     """By place in the sample: in the time domain, and as the reference has it."""
     truth_beamlets: int = 0
@@ -160,21 +162,21 @@ class Measurement:
         self._begun = time.monotonic()
 
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
-        """Rounds that fit in; before that, how many points each rung needs to be timed well.
+        """Rounds that fit in; before that, how long the stretches are to time rungs well.
 
-        As many for all of them, but for those that would take far longer.
+        As long for all of them, but for those that would take far longer.
         """
-        took = [self._timed(i, parts[0]) for i in range(len(self._rungs))]
-        times, written = 1, took[0]
-        while written < LONG_ENOUGH / 2 and times < self._bench.most_times:
+        times = 1
+        while self._timed(0, parts[0]) < LONG_ENOUGH / 2 and times < self._bench.most_times:
             times *= 2
             self._times[0] = times
-            written = self._timed(0, parts[0])
-        if times > 1:
-            for i, alone in enumerate(took):
-                self._times[i] = min(times, 1 << max(0, int(math.log2(4 * LONG_ENOUGH / alone))))
-            took = [self._timed(i, parts[0]) for i in range(len(self._rungs))]
-        spent = sum(took)
+        shorter = max(1, times // TOO_LONG)
+        self._times[:] = shorter
+        took = np.array([self._timed(i, parts[0]) for i in range(len(self._rungs))])
+        fitting = TOO_LONG * LONG_ENOUGH * shorter / took
+        cut = np.exp2(np.floor(np.log2(fitting))).clip(1, times)
+        self._times[:] = cut
+        spent = float((took * cut / shorter).sum())
         left = self._limit - (time.monotonic() - self._begun)
         return max(1, min(MOST_ROUNDS, int(0.75 * left / (spent * len(parts)))))
 

@@ -167,7 +167,7 @@ class Content:
             _array("kind", ("rung",), _texts(rung.kind for rung in rungs)),
             _array("tolerance", ("rung",), np.array([_tolerance(r) for r in rungs]), "1",
                    "tolerance of an adaptive setting"),
-            _array("times", ("rung",), measured.times, "1", "points timed for each of the sample"),
+            _array("times", ("rung",), measured.times, "1", "points of each stretch that is timed"),
             _array("seconds", ("rung", "round"), measured.seconds, "s",
                    "time a point on one core, planning included"),
             _array("planning", ("rung", "round"), measured.planning, "s",

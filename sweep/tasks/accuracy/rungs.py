@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
     Declared = Spec | SceneSpec
 
-WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE, CLOSED_FORM, THESIS, REFERENCE = (
-    "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line", "closed form",
-    "thesis", "reference",
+WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE = (
+    "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line"
 )  # fmt: skip
+CLOSED_FORM, THESIS, IMPROVED, REFERENCE = "closed form", "thesis", "thesis improved", "reference"
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 """Kinds of rungs."""
 
@@ -75,9 +75,9 @@ class Rung:
     of_lines
         Whether only what the thesis's way can have is simulated: no effects within a record, no
         leakage.
-    cells, degree
-        Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit
-        (:mod:`sweep.model.oversampled`); else 0.
+    cells, degree, folded
+        Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit,
+        whether it goes back to the bins alone (:mod:`sweep.model.oversampled`); else 0.
     estimate
         What is read off draws.
     """
@@ -89,6 +89,7 @@ class Rung:
     of_lines: bool = False
     cells: int = 0
     degree: int = 0
+    folded: bool = False
     estimate: str = MEAN
 
     def of(self, spec: Declared) -> Declared:
@@ -197,17 +198,20 @@ def _numbers(spec: Declared) -> Iterator[Rung]:
 
 
 def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
-    """The thesis's way: in the nearest of 2^11 or 2^12 cells, or shared out among ten.
+    """The thesis's way: in the nearest of 2^11 or 2^12 cells; and with what would improve it.
 
     Before them the same beamlets with the same effects in closed form, like for like.
     """
     like: dict[str, Any] = {"overrides": overrides, "plans": False, "of_lines": True}
     yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, **like)
-    for cells, degree in ((11, 0), (12, 0), (12, 9)):
-        how = f", degree {degree}" if degree else ""
+    for power in (11, 12):
+        yield Rung(name=f"thesis 2^{power}", kind=THESIS, cells=1 << power, **like)
+    for power, degree in ((11, 0), (12, 0), (12, 9)):
+        how = f"folded, degree {degree}" if degree else "folded"
         yield Rung(
-            name=f"thesis 2^{cells}{how}", kind=THESIS, cells=1 << cells, degree=degree, **like
-        )
+            name=f"thesis 2^{power}, {how}", kind=IMPROVED, cells=1 << power, degree=degree,
+            folded=True, **like,
+        )  # fmt: skip
 
 
 def _drawn_ladder(spec: Declared) -> Ladder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.stats import qmc
@@ -58,7 +59,11 @@ def by_chance(shape: tuple[int, ...], number: int, seed: int) -> np.ndarray:
 
 
 def neighbours(
-    point: tuple[int, ...], box: tuple[slice, ...], shape: tuple[int, ...], number: int
+    point: tuple[int, ...],
+    box: tuple[slice, ...],
+    shape: tuple[int, ...],
+    number: int,
+    order: Sequence[int],
 ) -> np.ndarray:
     """Numbers of a point of a grid and of those that follow it in a box, round the box's end.
 
@@ -70,11 +75,16 @@ def neighbours(
         Slices of the box along each axis; points of the whole grid along each axis.
     number
         Points wanted, the first of them `point` itself; repeated where the box has fewer.
+    order
+        The axes, that along which points follow each other last.
     """
     if not shape:
         return np.zeros(number, np.int64)
-    extent = tuple(s.stop - s.start for s in box)
-    own = np.ravel_multi_index([p - s.start for p, s in zip(point, box, strict=True)], extent)
-    places = np.unravel_index((own + np.arange(number)) % math.prod(extent), extent)
-    along = [p + s.start for p, s in zip(places, box, strict=True)]
-    return np.asarray(np.ravel_multi_index(along, shape))
+    first = np.array([s.start for s in box])
+    extent = np.array([s.stop - s.start for s in box])
+    turned = list(order)
+    own = np.ravel_multi_index((np.array(point) - first)[turned], extent[turned])
+    places = np.unravel_index((own + np.arange(number)) % extent.prod(), extent[turned])
+    along = np.empty((len(shape), number), np.int64)
+    along[turned] = places
+    return np.asarray(np.ravel_multi_index(tuple(along + first[:, None]), shape))
