@@ -89,7 +89,7 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     """
     segment, own, fold = whose
     lowest, highest = extent(room[DELTA], n)
-    level, number, first, spacing = _side_by_side(lowest, highest, power)
+    level, number, first, spacing = side_by_side(lowest, highest, power)
     relative = allowed / max(kernel[2][0] ** (2 if power else 1) * weight(n, power, room), 1e-300)
     if own < 0 and _better_alone(n, highest - lowest, level, number, power, relative, kernel):
         return n, as_lines()
@@ -103,7 +103,7 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     room_for_one = max(sources.size, size + 1, FORM_WIDTH if form else 0)
     if size > MOST_MOMENTS or number * room_for_one + COLUMNS > room.shape[1]:
         return 0 if own >= 0 else n, as_lines()
-    _take_moments(n, power, HALVES[level], number, first, spacing, size, room)
+    take_moments(n, power, HALVES[level], number, first, spacing, size, room)
     total = 0.0
     for k in range(number):
         one, other = moments_of(k, size, room)
@@ -129,7 +129,7 @@ def extent(delta, n):
 
 
 @njit(cache=True, error_model="numpy")
-def _side_by_side(lowest, highest, power):
+def side_by_side(lowest, highest, power):
     """Level of bundles, their number, the bin of the first, bins from one to the next."""
     level = level_for(max(highest, -lowest))
     if 0 <= level <= WIDEST[1 if power else 0]:
@@ -178,7 +178,7 @@ def moments_of(k, size, room):
 
 
 @njit(cache=True, error_model="numpy")
-def _take_moments(n, power, half, number, first, spacing, size, room):
+def take_moments(n, power, half, number, first, spacing, size, room):
     """Moments of n lines, sorted into bundles."""
     delta, re, im, x = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], room[4]
     even, odd = room[5], room[6]
@@ -260,13 +260,13 @@ def add_near(first, image, kind, power, kernel, room, re, im):
                 bin_ = -(bin_ + COLUMNS - 1)
             where = kernels_beside(bin_, power, slot, kernel)
             _sum_moments(one, other, size, power, slot, where, room[5], room[6], room[8])
-            _add(re[start : start + count], room[5], image, 1.0 if power else -1.0)
+            add(re[start : start + count], room[5], image, 1.0 if power else -1.0)
             if not power:
-                _add(im[start : start + count], room[6], image, 1.0 if image else -1.0)
+                add(im[start : start + count], room[6], image, 1.0 if image else -1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _add(out, values, mirrored, sign):
+def add(out, values, mirrored, sign):
     """Adds values, or the same from the other end of COLUMNS on."""
     if mirrored:
         for i in range(out.size):

@@ -3,6 +3,7 @@
 Filled by :mod:`sweep.model.known_kernels` and :mod:`sweep.model.known_sources`.
 """
 
+import math
 import mmap
 import threading
 from collections import OrderedDict
@@ -50,8 +51,8 @@ TABLE = FAR + MOST_MOMENTS * FORM_WIDTH
 WIDTH = TABLE + 2 * MOST_MOMENTS * (2 * REACHES[1] + 2 * COLUMNS + LANES)
 """Numbers that a row of scratch must hold."""
 
-MOST_KEPT = 4
-"""Kinds of kernels that a thread keeps; pages that nothing is known on take no memory."""
+MOST_KEPT = 8
+"""Pieces of scratch that a thread keeps; pages that nothing is known on take no memory."""
 
 _SCRATCH = threading.local()
 
@@ -65,27 +66,30 @@ ROWS = (1 + 3 * WAYS) * LADDER
 parts for each segment and way."""
 
 
-def kernels_of(*key: Hashable) -> np.ndarray:
-    """Scratch of this thread for what has been worked out of kernels, (ROWS, WIDTH).
+def kernels_of(*key: Hashable, shape: tuple[int, ...] = (ROWS, WIDTH)) -> np.ndarray:
+    """Scratch of this thread for what has been worked out of kernels, zeros at first.
 
     Parameters
     ----------
     *key
         All that kernels of whole lines depend on. Those of lines in parts are known by the parts'
         digest.
+    shape : tuple of int
+        Its own of each kind of scratch.
     """
+    key = *key, shape
     kept = _SCRATCH.__dict__.setdefault("kept", OrderedDict())
     if key not in kept:
-        kept[key] = _untouched((ROWS, WIDTH))
+        kept[key] = _untouched(shape)
     kept.move_to_end(key)
     while len(kept) > MOST_KEPT:
         kept.popitem(last=False)
     return kept[key]
 
 
-def _untouched(shape: tuple[int, int]) -> np.ndarray:
+def _untouched(shape: tuple[int, ...]) -> np.ndarray:
     """Zeros that take no memory until they are touched, page by page and not by huge ones."""
-    memory = mmap.mmap(-1, 8 * shape[0] * shape[1])
+    memory = mmap.mmap(-1, 8 * math.prod(shape))
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
         memory.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(memory, float).reshape(shape)

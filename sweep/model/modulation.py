@@ -20,6 +20,13 @@ from numba import njit
 from sweep.model import waveform
 from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, weight
 from sweep.model.effects.gaussian_line import gaussian_shifts
+from sweep.model.effects.line_modes import (
+    NUMBER,
+    NUMBERS,
+    PLACES,
+    in_modes,
+    is_plain,
+)
 from sweep.model.effects.line_splitting import Split, split_lines
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.kernel_rows import digests
@@ -43,26 +50,27 @@ class Stretch(NamedTuple):
     """(m,) int64: row in the footprints."""
     scene: tuple
     """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
-    many count (3, u), which of the u each point has (m,), digests (3, u), nan where no other
-    points have the same; shifts [bins of fs/L] and their weights (m, k). Empty where there is
-    none."""
+    many count (3, u), none of a line in modes, which of the u each point has (m,), digests (3, u),
+    nan where no other points have the same; shifts [bins of fs/L] and their weights (m, k); lines
+    in modes (3, u, numbers). Empty where there is none."""
     lines: int
     """Lines that one point may have at the most."""
 
 
 def stretches(shots: Shots) -> Iterator[Stretch]:
     """Points in stretches, in their order; one at least."""
-    alike = _alike(shots)
+    levels = _levels(shots)
+    alike = _alike(shots, levels)
     plain = shots.gaussian_width is None and alike.point.size <= POINTS
     step = max(shots.size, 1) if plain else POINTS
     table, shared = shots.point_table(), _parts(shots, alike) if plain else None
     for first in range(0, max(shots.size, 1), step):
-        yield _stretch(shots, table, first, min(first + step, shots.size), shared)
+        yield _stretch(shots, table, first, min(first + step, shots.size), levels, shared)
 
 
 def single(shots: Shots, i: int) -> Stretch:
     """Point ``i`` alone."""
-    return _stretch(shots, shots.point_table(), i, i + 1)
+    return _stretch(shots, shots.point_table(), i, i + 1, _levels(shots))
 
 
 class Alike(NamedTuple):
@@ -76,8 +84,10 @@ class Alike(NamedTuple):
     """(u,) int64: place in :data:`SPLIT_TOLERANCES`."""
 
 
-def _alike(shots: Shots) -> Alike:
+def _alike(shots: Shots, levels: np.ndarray) -> Alike:
     """Points of which no two have the same phase errors; which of these each point has."""
+    if _by_modes(shots):
+        return Alike(np.arange(shots.size), np.arange(shots.size), levels)
     values = [
         np.broadcast_to(np.asarray(one, float), shots.size)
         for error in shots.phase_errors
@@ -86,7 +96,6 @@ def _alike(shots: Shots) -> Alike:
     ]
     if not values:
         return Alike(*np.empty((3, 0), np.int64))
-    levels = _levels(shots)
     varying = [v for v in (levels, *values) if v.size and (v != v[0]).any()]
     if not varying:
         one = np.zeros(min(shots.size, 1), np.int64)
@@ -106,12 +115,17 @@ def _levels(shots: Shots) -> np.ndarray:
 
 
 def _stretch(
-    shots: Shots, table: np.ndarray, first: int, last: int, shared: tuple | None = None
+    shots: Shots,
+    table: np.ndarray,
+    first: int,
+    last: int,
+    levels: np.ndarray,
+    shared: tuple | None = None,
 ) -> Stretch:
     part, index = slice(first, last), np.arange(first, last)
-    parts = shared
-    if parts is None:
-        parts = _parts(shots, Alike(index, np.arange(index.size), _levels(shots)[part]))
+    if shared is None:
+        shared = _parts(shots, Alike(index, np.arange(index.size), levels[part]))
+    parts, modes = shared
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
     times = max(parts[0].shape[2], shifts[0].shape[1])
@@ -119,7 +133,7 @@ def _stretch(
         part,
         np.ascontiguousarray(table[:, part]),
         shots.row[part],
-        (shots.footprint, parts, shifts),
+        (shots.footprint, parts, shifts, modes),
         max(beamlets, MOST_NODES) * times if times else beamlets,
     )
 
@@ -132,23 +146,29 @@ def choices(shots: Shots, *, every_bin: bool = False) -> tuple[bool, bool, bool,
     return shots.incoherent, shots.image, shots.leakage, every_bin
 
 
-def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
-    """Places and weights of the lines that each line is split into, by segment and point."""
-    if not shots.phase_errors or not alike.point.size:
-        return (
-            *np.empty((3, 3, 0, 0)), np.empty((3, 0), np.int64), np.empty(0, np.int64),
-            np.empty((3, 0)),
-        )  # fmt: skip
+def _by_modes(shots: Shots) -> bool:
+    """Whether each shot's phase error is its own, and its lines add as powers."""
+    closed = not shots.window.table.size and shots.window.length == shots.fft_size
+    return bool(shots.phase_errors) and shots.incoherent and not shots.alike and closed
 
-    splits = []
-    for level in np.unique(alike.level):
-        some = np.flatnonzero(alike.level == level)
-        for segment in map(int, np.flatnonzero(shots.segments)):
+
+def _parts(shots: Shots, alike: Alike) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Places and weights of the lines that each line is split into, by segment and point; modes."""
+    size = alike.point.size if shots.phase_errors else 0
+    modes, splits = np.zeros((3, size if _by_modes(shots) else 0, NUMBERS)), []
+    for segment in map(int, np.flatnonzero(shots.segments)) if size else ():
+        left = np.arange(size)
+        if modes.size:
+            phase = _total_phase(_errors(shots, alike.point, segment), PLACES)
+            modes[segment] = in_modes(phase, np.array(SPLIT_TOLERANCES)[alike.level])
+            left = np.flatnonzero(modes[segment, :, NUMBER] == 0)
+        for level in np.unique(alike.level[left]):
+            some = left[alike.level[left] == level]
             split = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
             splits.append((segment, some, split))
-    most = max(split.offset.shape[1] for _, _, split in splits)
-    offset, re, im = np.zeros((3, 3, alike.point.size, most))
-    number = np.zeros((3, alike.point.size), np.int64)
+    most = max((split.offset.shape[1] for _, _, split in splits), default=min(size, 1))
+    offset, re, im = np.zeros((3, 3, size, most))
+    number = np.zeros((3, size), np.int64)
     for segment, some, split in splits:
         lines = split.offset.shape[1]
         offset[segment, some, :lines] = split.offset
@@ -156,15 +176,20 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
         im[segment, some, :lines] = split.weight.imag
         number[segment, some] = split.number
     known_as = digests(offset, re, im) if shots.alike else np.full(number.shape, np.nan)
-    return offset, re, im, number, alike.which, known_as
+    return (offset, re, im, number, alike.which, known_as), modes
+
+
+def _errors(shots: Shots, points: np.ndarray, segment: int) -> tuple:
+    """Phase errors of some points in a segment, as :func:`_total_phase` takes them."""
+    return tuple(
+        (error.phase, waveform.SIGNS[segment], tuple(error.chosen(segment, points).items()))
+        for error in shots.phase_errors
+    )
 
 
 def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> Split:
     """Lines that each line of some points is split into; what one point has is remembered."""
-    errors = tuple(
-        (error.phase, waveform.SIGNS[segment], tuple(error.chosen(segment, points).items()))
-        for error in shots.phase_errors
-    )
+    errors = _errors(shots, points, segment)
     if points.size > 1:
         return split_lines(partial(_total_phase, errors), tolerance=tolerance)
     alone = tuple(
@@ -199,7 +224,7 @@ def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, error_model="numpy")
-def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
+def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     """Lines in rows DELTA .. after what befalls them, as far as that leaves them plain lines.
 
     Amplitudes are split into parts, powers shifted; few lines stand for many before.
@@ -212,7 +237,7 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
         -1 where the lines are seen as their images, which conjugates their weights.
     allowed : float
         As of :func:`reduce_lines`.
-    parts, shifts, power, kernel, room
+    scene, power, kernel, room
         As of :class:`Stretch` and :func:`sweep.model.segments.segment_spectrum`.
 
     Returns
@@ -220,8 +245,9 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
     int
         Number of lines.
     """
+    _, parts, shifts, _ = scene
     count = shifts[0].shape[1] if power else parts[0].shape[2]
-    if count == 0 or (not power and is_whole(segment, i, parts)):
+    if count == 0 or (not power and is_whole(segment, i, scene)):
         return n
     fft_size, length = kernel[0]
     bins = fold * fft_size / length
@@ -252,9 +278,12 @@ def modulate(segment, i, n, fold, parts, shifts, power, allowed, kernel, room):
 
 
 @njit(cache=True, error_model="numpy")
-def is_whole(segment, i, parts):
+def is_whole(segment, i, scene):
     """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
+    parts, modes = scene[1], scene[3]
     own = parts[4][i]
+    if parts[3][segment, own] == 0:
+        return is_plain(modes[segment, own])
     whole = parts[3][segment, own] == 1 and parts[0][segment, own, 0] == 0.0
     return whole and parts[1][segment, own, 0] == 1.0 and parts[2][segment, own, 0] == 0.0
 

@@ -20,6 +20,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 from sweep.model.ground import Ground
 from sweep.model.kernel_rows import kernels_of
+from sweep.model.mode_kernels import mode_kernels_of
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -37,17 +38,14 @@ CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
-
 LEAKAGE_SHARE = 0.02
 """Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
-
 
 AUTOMATIC = -1.0
 """Stands for an error that follows from the tolerance."""
 
 LINE_SHARE = 0.1
 """The same, for errors of bins over sigma: pd changes by half as much in each segment."""
-
 
 LINE_STEPS = 5
 """Steps that take few lines for many, at the most: each may err by as much of the whole."""
@@ -222,16 +220,18 @@ class Shots:
     def kernel(self) -> tuple:
         """What the spectrum needs to know of window and FFT, as the compiled code takes it.
 
-        The last is the thread's own: kernels that are worked out when they are met.
+        The last two are the thread's own: kernels that are worked out when they are met.
         """
         w = self.window
+        key = self.fft_size, w.length, w.coefficients, w.edge, self.incoherent
         return (
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach),
             node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
             tangents(self.fft_size),
-            kernels_of(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),
+            kernels_of(*key),
+            mode_kernels_of(*key),
         )
 
     def counted_bins(self, exempted: np.ndarray) -> np.ndarray:

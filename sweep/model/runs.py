@@ -22,7 +22,8 @@ from sweep.model.bundles import (
 )
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
-from sweep.model.kernel_rows import REACHES
+from sweep.model.kernel_rows import REACHES, ROWS
+from sweep.model.mode_bundles import add_modes_near
 from sweep.model.spectrum import set_tangents
 
 SOURCES, IMAGES = 13, 16
@@ -260,6 +261,9 @@ def add_afar(t, image, field, power, kernel, room, re, im):
 @njit(cache=True, error_model="numpy")
 def _add_beside(first, row, n, image, field, power, kernel, room, re, im):
     """The same in bins first, first + 1 .. next to n lines, or images, with their places in row."""
+    if field[5][0] >= ROWS:
+        add_modes_near(first, image, field[5], kernel, room, re)
+        return
     if field[5][0] >= 0:
         add_near(first, image, field[5], power, kernel, room, re, im)
         return

@@ -16,16 +16,18 @@ from sweep.model.bundles import (
 )
 from sweep.model.crossings import MOST_TERMS, crossing_series, largest
 from sweep.model.detection import assess, mark
+from sweep.model.effects.line_modes import NUMBER
 from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
 from sweep.model.leakage import inspect
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
+from sweep.model.mode_bundles import take_modes
 from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
 from sweep.model.preparation import LINE_STEPS
-from sweep.model.runs import detect, reach_of, smooth
-from sweep.model.spectrum import bin_magnitudes, split_magnitudes
+from sweep.model.runs import detect, smooth
+from sweep.model.single_bins import bins_above, extent_of, magnitudes_of, parts_at
 
 SIGNS = (1.0, 0.0, -1.0)
 
@@ -64,18 +66,16 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     power, image = choices[0], choices[1]
     origin, n, fold = _lines_of(segment, p, scene, at, power, True, kernel, room)
     few = reduce_lines(n, power, allowed(p, power), n - 1, kernel, room)
-    _, parts, shifts = scene
-    reach = _extent(segment, at[1], fold, few, parts, shifts, power, kernel, room)
-    low, high = _bins_above(level, reach, origin, kernel)
+    split, further = parts_at(segment, at[1], fold, scene, kernel)
+    reach = extent_of(at[1], few, split, further, scene[2], power, kernel, room)
+    low, high = bins_above(level, reach, origin, kernel)
     while True:
-        _magnitudes(
-            low, high, origin, few, segment, at[1], fold, parts, shifts, choices, kernel, room
-        )
+        magnitudes_of(low, high, origin, few, at[1], fold, split, scene[2], choices, kernel, room)
         most = largest(room[0, : high - low + 1])
         if most >= level:
             break
         level = most
-        first, last = _bins_above(level * (0.5 if image else 1.0), reach, origin, kernel)
+        first, last = bins_above(level * (0.5 if image else 1.0), reach, origin, kernel)
         if first >= low and last <= high:
             break
         low, high = min(low, first), max(high, last)
@@ -99,7 +99,7 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
     Those that add as amplitudes are replaced by their parts, if asked for. Returns their origin,
     their number, and -1 where they are seen as their images, else 1.
     """
-    footprint, parts, shifts = scene
+    footprint, parts, shifts, _ = scene
     row, sizes = at[0], kernel[0]
     offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
     phase = footprint[3][segment, row]  # without phases a row of none
@@ -114,59 +114,9 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
         fold = folding(which, chirp, record)
         if power or split:
             n = modulate(
-                segment, at[1], n, fold, parts, shifts, power, allowed(p, power), kernel, room
+                segment, at[1], n, fold, scene, power, allowed(p, power), kernel, room
             )  # fmt: skip
     return origin, n, fold
-
-
-@njit(cache=True, error_model="numpy")
-def _magnitudes(
-    low, high, origin, n, segment, i, fold, parts, shifts, choices, kernel, room
-):  # fmt: skip
-    """|X| of bins low .. high of n lines in rows 4 to 6, into row 0."""
-    sizes, shape, _, _, tangent, _ = kernel
-    power, image = choices[0], choices[1]
-    delta, re, im = room[4], room[5], room[6]
-    if power and parts[0].size:
-        own = parts[4][i]
-        number = parts[3][segment, own]
-        place = room[10, :number]
-        for k in range(number):
-            place[k] = fold * parts[0][segment, own, k] * sizes[0] / sizes[1]
-        split = place, parts[1][segment, own, :number], parts[2][segment, own, :number]
-        split_magnitudes(
-            low, high, origin, delta, re, n, split, fold, sizes, shape, tangent, room[0],
-            room[11:19], image,
-        )  # fmt: skip
-    elif not power and shifts[0].size:
-        _average(low, high, origin, n, i, fold, shifts, image, kernel, room)
-    else:
-        bin_magnitudes(
-            low, high, origin, delta, re, im, n, sizes, shape, power, tangent, room[0], room[1],
-            room[7:10], image,
-        )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
-    """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
-    sizes, shape, _, _, tangent, _ = kernel
-    total, moved = room[0, : high - low + 1], room[10]
-    total[:] = 0.0
-    for m in range(shifts[0].shape[1]):
-        share = shifts[1][i, m]
-        if share > 0.0:
-            apart = fold * shifts[0][i, m] * sizes[0] / sizes[1]
-            for j in range(n):
-                moved[j] = room[4, j] + apart
-            bin_magnitudes(
-                low, high, origin, moved, room[5], room[6], n, sizes, shape, False, tangent,
-                room[1], room[2], room[7:10], image,
-            )  # fmt: skip
-            for k in range(total.size):
-                total[k] += share * (room[1, k] * room[1, k])
-    for k in range(total.size):
-        total[k] = math.sqrt(total[k])
 
 
 @njit(cache=True, error_model="numpy")
@@ -224,12 +174,17 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
     here, as where they are too many or spread too wide for bundles.
     """
     parts, own = scene[1], -1
-    if parts[0].size and not is_whole(segment, at[1], parts):
+    if parts[0].size and not is_whole(segment, at[1], scene):
         own = parts[4][at[1]]
     alone = own >= 0 and math.isnan(parts[5][segment, own])
     origin, n, fold = _lines_of(segment, p, scene, at, power, alone, kernel, room)
     if alone and power:
-        return origin, 0, as_lines()
+        if scene[3][segment, own, NUMBER] == 0.0:
+            return origin, 0, as_lines()
+        n, kind = take_modes(
+            n, (segment, own, fold), scene[3], allowed(p, power), kernel, room
+        )  # fmt: skip
+        return origin, n, kind
     own = -1 if alone else own
     if own >= 0 or p[15] > 0.0:
         n, kind = take_bundles(
@@ -271,9 +226,9 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 @njit(cache=True, error_model="numpy")
 def lent(scene, kernel, work):
     """Scene, kernel and workspace for the length of a call, their use uncounted."""
-    (offset, doppler, amplitude, phase), parts, (shift, share) = scene
+    (offset, doppler, amplitude, phase), parts, (shift, share), modes = scene
     apart, re, im, number, which, digest = parts
-    sizes, shape, sidelobes, limits, tangent, known = kernel
+    sizes, shape, sidelobes, limits, tangent, known, (rows, place, strength) = kernel
     coefficients, numerator, poles, edge, table = shape
     window_sum, envelope, reach = sidelobes
     room, exempt, series = work
@@ -289,6 +244,7 @@ def lent(scene, kernel, work):
                 borrowed(digest),
             ),
             (borrowed(shift), borrowed(share)),
+            borrowed(modes),
         ),
         (
             sizes,
@@ -297,58 +253,10 @@ def lent(scene, kernel, work):
             borrowed(limits),
             borrowed(tangent),
             borrowed(known),
+            (borrowed(rows), borrowed(place), borrowed(strength)),
         ),
         (borrowed(room), borrowed(exempt), borrowed(series)),
     )
-
-
-@njit(cache=True, error_model="numpy")
-def _extent(segment, i, fold, n, parts, shifts, power, kernel, room):
-    """Summed weight of n lines in rows 4 to 6 as |X| may have it, and their lowest and highest.
-
-    Parts and shifts that are not lines of their own yet are reckoned with.
-    """
-    delta, re, im = room[4], room[5], room[6]
-    total = 0.0
-    lowest, highest = delta[0], delta[0]
-    for j in range(n):
-        total += abs(re[j]) if power else math.hypot(re[j], im[j])
-        lowest, highest = min(lowest, delta[j]), max(highest, delta[j])
-    total = math.sqrt(total) if power else total
-    below, above = 0.0, 0.0
-    if power and parts[0].size:
-        each = 0.0
-        own = parts[4][i]
-        for k in range(parts[3][segment, own]):
-            apart = fold * parts[0][segment, own, k]
-            each += math.hypot(parts[1][segment, own, k], parts[2][segment, own, k])
-            below, above = min(below, apart), max(above, apart)
-        total *= each
-    elif not power and shifts[0].size:
-        for k in range(shifts[0].shape[1]):
-            if shifts[1][i, k] > 0.0:
-                below, above = min(below, shifts[0][i, k]), max(above, shifts[0][i, k])
-    bins = kernel[0][0] / kernel[0][1]
-    return total, lowest + below * bins, highest + above * bins
-
-
-@njit(cache=True, error_model="numpy")
-def _bins_above(level, extent, origin, kernel):
-    """First and last bin, within 0..N/2, that lines of an extent can lift above a level."""
-    fft_size, length = kernel[0]
-    window_sum, envelope, reach = kernel[2]
-    total, lowest, highest = extent
-    beyond = reach_of(level, total * window_sum, envelope, reach) * fft_size / length + 2.0
-    half = fft_size // 2
-    low, high = origin + lowest - beyond, origin + highest + beyond
-    # Lines beyond DC or Nyquist are seen as their images, which fold back into the band.
-    if low < 0:
-        high = max(high, -low)
-    if high > half:
-        low = min(low, fft_size - high)
-    first = 0 if low < 0 else min(math.floor(low), half)
-    last = half if high > half else max(math.ceil(high), 0)
-    return first, max(first, last)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

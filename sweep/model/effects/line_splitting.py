@@ -124,6 +124,41 @@ def split_lines(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
     )
 
 
+def fitted(
+    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    rows: np.ndarray,
+    lines: int,
+    spacing: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lines of which real functions of the record are made up, whatever their error.
+
+    Parameters
+    ----------
+    values : callable
+        Functions (n, m) at places x (m,), given ``rows``.
+    rows : (n,) ndarray
+        Which functions.
+    lines, spacing
+        Lines, and bins of fs/L from one to the next.
+
+    Returns
+    -------
+    offset, weight, error : (lines,), (n, lines) complex, (n,)
+        As of :class:`Split`.
+    """
+    fit = _fit(lines, spacing)
+    weight = np.zeros((rows.size, lines), complex)
+    modes = np.zeros((rows.size, fit.to_modes.shape[1]), complex)
+    for value, to_modes in zip(values(fit.nodes, rows).T, fit.to_modes, strict=True):
+        modes += value[:, None] * to_modes  # in an order of its own
+    for mode, from_modes in zip(modes.T, fit.from_modes, strict=True):
+        weight += mode[:, None] * from_modes
+    seen = np.zeros((rows.size, fit.checks.size), complex)
+    for share, line in zip(weight.T, fit.at_checks.T, strict=True):
+        seen += share[:, None] * line
+    return fit.offset, weight, abs(seen - values(fit.checks, rows)).max(axis=1)
+
+
 def _assembled(fits: list, size: int) -> Split:
     """Rows put back in order, ended with zero weights to one length."""
     most = max((offset.shape[1] for index, offset, *_ in fits if index.size), default=1)
