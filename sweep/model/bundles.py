@@ -14,8 +14,7 @@ of a line without parts, and costs the same however many lines and parts there a
 
 import math
 
-from numba import njit
-
+from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.equivalent import chebyshev_moments, nodes_for
 from sweep.model.kernel_rows import FORM_WIDTH, HALVES, MOST_MOMENTS, MOST_PARTS
@@ -53,13 +52,13 @@ WIDEST, SIDE_BY_SIDE = (9, 6), (7, 6)
 """Levels: of a bundle by itself at the most, of bundles side by side; of amplitudes, of powers."""
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def as_lines():
     """What stands in a bundle's place where lines are taken one by one."""
     return -1, 0, 0, 1, 0, False, (0.0, 0.0, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def take_bundles(n, power, whose, parts, allowed, kernel, room):
     """Takes n lines in rows DELTA .. as bundles, and puts the sources of these in their place.
 
@@ -118,7 +117,7 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     return number * sources.size, (row, number, first, spacing, size, form, spread)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan", "nsz"})
+@borrowing(fastmath={"nnan", "nsz"})
 def extent(delta, n):
     """Lowest and highest of n positions; whole vectors at a time, which changes no bit of it."""
     lowest, highest = delta[0], delta[0]
@@ -128,7 +127,7 @@ def extent(delta, n):
     return lowest, highest
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def side_by_side(lowest, highest, power):
     """Level of bundles, their number, the bin of the first, bins from one to the next."""
     level = level_for(max(highest, -lowest))
@@ -141,7 +140,7 @@ def side_by_side(lowest, highest, power):
     return level, last - first + 1, first * spacing, spacing
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def weight(n, power, room):
     """Bound on the sum of the magnitudes of the weights of n lines: root of n times their squares.
 
@@ -159,7 +158,7 @@ def weight(n, power, room):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _better_alone(n, spread, level, number, power, relative, kernel):
     """Whether whole lines are few, close together, or farther apart than moments are worth."""
     band = math.pi * (2.0 if power else 1.0)
@@ -168,7 +167,7 @@ def _better_alone(n, spread, level, number, power, relative, kernel):
     return number * nodes_for(band * HALVES[level], relative, kernel[3]) > 3 * n
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def moments_of(k, size, room):
     """Real and imaginary moments of the k-th bundle."""
     stride = size + (size & 1)
@@ -177,7 +176,7 @@ def moments_of(k, size, room):
     ]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def take_moments(n, power, half, number, first, spacing, size, room):
     """Moments of n lines, sorted into bundles."""
     delta, re, im, x = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], room[4]
@@ -214,7 +213,7 @@ def take_moments(n, power, half, number, first, spacing, size, room):
         start = stop
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _strengths(one, other, size, power, slot, start, room):
     """Strengths of a bundle's sources, from ``start`` on in rows STRENGTH_RE and STRENGTH_IM."""
     re, im = room[STRENGTH_RE, start:], room[STRENGTH_IM, start:]
@@ -222,7 +221,7 @@ def _strengths(one, other, size, power, slot, start, room):
     _sum_moments(one, other, size, power, slot, strengths_afar(power, slot), re, im, room[5])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _sum_moments(one, other, size, power, slot, where, re, im, work):
     """Moments times rows of a slot, COLUMNS numbers: real and imaginary, of powers real alone.
 
@@ -243,7 +242,7 @@ def _sum_moments(one, other, size, power, slot, where, re, im, work):
         im[i] += work[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_near(first, image, kind, power, kernel, room, re, im):
     """Adds what bundles, or their images, hold in bins first, first + 1 .. next to them.
 
@@ -265,7 +264,7 @@ def add_near(first, image, kind, power, kernel, room, re, im):
                 add(im[start : start + count], room[6], image, 1.0 if image else -1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add(out, values, mirrored, sign):
     """Adds values, or the same from the other end of COLUMNS on."""
     if mirrored:
@@ -276,7 +275,7 @@ def add(out, values, mirrored, sign):
             out[i] += sign * values[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def constant_of(n, kind, room):
     """What the window's first sample adds to every bin, of forms of n sources in all."""
     number = kind[1]
@@ -288,7 +287,7 @@ def constant_of(n, kind, room):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_forms_afar(t, tangents, n, kind, numerator, poles, side, room, out):
     """Adds the forms of n sources at points where t is tan(pi q / N), but for their constants.
 
@@ -310,7 +309,7 @@ def add_forms_afar(t, tangents, n, kind, numerator, poles, side, room, out):
                 out[start + i] += sums[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _values(form, rows, size, side, inner, out):
     """sum_i K_i (sum_j<=i F_ij K_j + side F_i) of rows of kernels, COLUMNS elements each."""
     linear = size * (size + 1) // 2

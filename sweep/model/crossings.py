@@ -12,8 +12,7 @@ costs one polynomial in x, which vectorises.
 
 import math
 
-from numba import njit
-
+from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.marcum import excess_crossing
 
@@ -29,7 +28,7 @@ _EXPONENTIAL = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Of e^-z, to 1e-16 for z <= 1/4."""
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def crossing_series(beta, series):
     """c_n y^n / n! over the chance that noise alone stays below ``beta``, into ``series``.
 
@@ -47,14 +46,14 @@ def crossing_series(beta, series):
         series[n] = total * power
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _terms(x, y):
     """Terms that leave less than 1e-16 of the sum for amplitudes up to x (<= y)."""
     root = math.sqrt(x * y)
     return int(8.0 + 1.3 * root + 5.0 * math.sqrt(root) + 4.0 * math.sqrt(x))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def added_crossings(x, count, beta, series, out):
     """Chances (Q_1 - e^-y) / (1 - e^-y) of ``count`` bins, 0..1.
 
@@ -88,7 +87,7 @@ def added_crossings(x, count, beta, series, out):
         _polynomial(x[first:last], 1.0 / y, series, terms, scale, halvings, out[first:last])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan"})
+@borrowing(fastmath={"nnan"})
 def largest(x):
     """Largest of some numbers, at least 0."""
     most = 0.0
@@ -97,7 +96,7 @@ def largest(x):
     return most
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _polynomial(x, inverse, series, terms, scale, halvings, out):
     """e^-x sum d_n (x inverse)^n, n = 1 .. terms; e^-x as a power of e^(-x scale)."""
     for i in range(x.size):
@@ -124,7 +123,7 @@ def _polynomial(x, inverse, series, terms, scale, halvings, out):
         out[i] *= x[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def any_crossing(chances, first, last):
     """1 - prod(1 - chance) over chances first .. last - 1, with all its digits."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
@@ -144,7 +143,7 @@ def any_crossing(chances, first, last):
     return a
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def silence(chance):
     """-ln(1 - chance): what adds up over bins."""
     if chance < 1e-4:
@@ -152,7 +151,7 @@ def silence(chance):
     return -math.log1p(-chance)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def weighted_silence(chances, weights):
     """Sum of the weighted -ln(1 - chance)."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.crossings import (
     MOST_TERMS,
     STRETCH,
@@ -27,7 +27,7 @@ def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
     return tnr * bin_deviation * RAYLEIGH_DEVIATION
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def mark(magnitude, count, level, exempt):
     """Detection in a run of bins, and the bins that it keeps from raising a false alarm.
 
@@ -70,7 +70,7 @@ def mark(magnitude, count, level, exempt):
     return peak, exempted
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan"})
+@borrowing(fastmath={"nnan"})
 def _survey(magnitude, level):
     """Largest magnitude, and how many reach a level."""
     largest, above = magnitude[0], 0
@@ -80,7 +80,7 @@ def _survey(magnitude, level):
     return largest, above
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _exempt(first, last, count, exempt):
     """Marks the bins of a group and the two beside it; how many they are."""
     first, last = max(first - 1, 0), min(last + 1, count - 1)
@@ -88,7 +88,7 @@ def _exempt(first, last, count, exempt):
     return last - first + 1
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def assess(magnitude, count, sigma, level, floor, exempt):
     """Detection and leakage in a run of bins around a segment's lines, bin by bin.
 
@@ -127,7 +127,7 @@ def assess(magnitude, count, sigma, level, floor, exempt):
     return peak, exempted, some
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def detect_rows(magnitude, first, bins, deviation, level, out):
     """Detections in spectra without noise that are given bin by bin.
 

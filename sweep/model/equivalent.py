@@ -10,8 +10,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.lanes import dot
 
@@ -56,7 +56,7 @@ def _node_limits(tolerance: float) -> np.ndarray:
     return limits
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def equivalent_lines(
     delta, re, im, n, power, band, tolerance, most, limits, out_delta, out_re, out_im, work
 ):  # fmt: skip
@@ -99,7 +99,7 @@ def equivalent_lines(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def nodes_for(turn, tolerance, limits):
     """Nodes that serve lines within +-``turn`` radians of the kernel's band, or one more than any.
 
@@ -114,7 +114,7 @@ def nodes_for(turn, tolerance, limits):
     return nodes
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def put_on_nodes(
     delta, re, im, n, power, middle, half, nodes, out_delta, out_re, out_im, work
 ):  # fmt: skip
@@ -152,7 +152,7 @@ def put_on_nodes(
     return nodes
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def chebyshev_moments(x, re, im, n, number, power, even, odd, out_re, out_im):
     """Sums over n weights of T_0(x) .. T_number-1(x); for ``power`` the imaginary ones are 0.
 

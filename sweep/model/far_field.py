@@ -22,8 +22,8 @@ and the like of the images: a smooth function of k, whose poles are the lines. T
 import math
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.equivalent import put_on_nodes
 from sweep.model.spectrum import fraction
@@ -56,7 +56,7 @@ for _n in range(1, _LARGEST_ORDER + 1):
     _GAUSS[:, _n, :_n] = np.polynomial.legendre.leggauss(_n)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan"})
+@borrowing(fastmath={"nnan"})
 def strengths(delta, re, im, n, power, sines):
     """Turns C_b of n lines into C_b sin(pi delta_b), |C_b|^2 into |C_b|^2 sin^2(pi delta_b).
 
@@ -91,7 +91,7 @@ def strengths(delta, re, im, n, power, sines):
     return total, lowest, highest
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _tangent(z, square):
     """tan(pi z / N) N / pi for small angles, ``square`` (pi / N)^2."""
     w = square * z * z
@@ -99,7 +99,7 @@ def _tangent(z, square):
     return fma(z * w, series, z)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def kernel_beside(q, delta, coefficients, square):
     """K pi / N at q - delta bins: c_0 cot + sum (-1)^m c_m / 2 (cot + cot, m bins off each side).
 
@@ -118,7 +118,7 @@ def kernel_beside(q, delta, coefficients, square):
     return above / below
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _add_tile(tile, first, delta, re, im, n, image, fft_size, coefficients, power, out_re, out_im):
     """Adds the kernels of n lines, or images, to the bins of one tile: as many as it is long."""
     square = (math.pi / fft_size) ** 2
@@ -138,7 +138,7 @@ def _add_tile(tile, first, delta, re, im, n, image, fft_size, coefficients, powe
                 out_im[i] = fma(b, k, out_im[i])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_near_field(
     first, delta, re, im, n, image, fft_size, coefficients, power, tile, out_re, out_im
 ):
@@ -186,13 +186,13 @@ def add_near_field(
             out_im[start + i] += sum_im[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _clear(re, im):
     re[:] = 0.0
     im[:] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def far_sources(
     delta, re, im, n, spread, centre, offset, fft_size, poles, power, tangent, out, work
 ):
@@ -241,7 +241,7 @@ def far_sources(
     return lines, images
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def seen_at(places, n, centre, offset, fft_size, tangent, out, mirrored):
     """Tan of n places as bins see them, and of their images; as of :func:`far_sources`.
 
@@ -256,7 +256,7 @@ def seen_at(places, n, centre, offset, fft_size, tangent, out, mirrored):
         mirrored[j] = (mirror + small) / (1.0 - mirror * small)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def sources_needed(half, n, poles):
     """Sources that serve from the clearance on, for a bundle of this half width [bins]."""
     if half <= 0.0:
@@ -267,7 +267,7 @@ def sources_needed(half, n, poles):
     return min(n, 1 + int(digits / rate))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _two_sources(delta, re, im, n, middle, half, out):
     """Two sources at Chebyshev nodes with the sum and the first moment of n."""
     place = half * math.sqrt(0.5)
@@ -284,7 +284,7 @@ def _two_sources(delta, re, im, n, middle, half, out):
     return 2
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_far_field(t, sources, number, numerator, poles, power, out_re, out_im):
     """Adds the kernels of sources, or of images, at points; t is tan(pi q / N) there."""
     for j in range(number):
@@ -300,7 +300,7 @@ def add_far_field(t, sources, number, numerator, poles, power, out_re, out_im):
                 out_im[i] = fma(b, k, out_im[i])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def edge_field(strength, n, edge, power):
     """What the window's first sample adds to every bin, of lines and images: real.
 
@@ -312,7 +312,7 @@ def edge_field(strength, n, edge, power):
     return 2.0 * edge * total * (edge if power else 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def half_bin_cotangent(whole, half, fft_size, tangent):
     """cot(pi q / N) for q = whole, or half a bin more, 0 < q <= N/2."""
     t = tangent[whole]
@@ -323,7 +323,7 @@ def half_bin_cotangent(whole, half, fft_size, tangent):
     return (1.0 - t * small) / (t + small)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def far_points(side, near, far, steepness, v, weight, first):
     """Gauss points and weights of a sum over bins out to DC or Nyquist.
 
@@ -360,7 +360,7 @@ def far_points(side, near, far, steepness, v, weight, first):
     return first
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def points_to_bins(v, weight, fft_size):
     """Turns cotangents and weights into tangents and weights [bins]."""
     scale = fft_size / math.pi
@@ -369,7 +369,7 @@ def points_to_bins(v, weight, fft_size):
         v[i] = 1.0 / v[i]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _order(steepness, share):
     """Gauss points of a stretch that begins at a share of the near end's v."""
     order = 4 + int(0.6 * steepness * share)

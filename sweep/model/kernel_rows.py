@@ -10,8 +10,8 @@ from collections import OrderedDict
 from collections.abc import Hashable
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.lanes import COLUMNS, LANES
 
 HALVES = tuple(0.6 * 1.35**level for level in range(10))
@@ -106,13 +106,13 @@ def digests(*values: np.ndarray) -> np.ndarray:
     return (total >> np.uint64(12)).astype(float) + 2.0
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def to_nodes_of(slot):
     """Of moments of 1, (moments, nodes); 0 where there are no more."""
     return slot[TO_NODES:PARTS].reshape((MOST_MOMENTS, MOST_MOMENTS))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def parts_of(slot):
     """Places, real and imaginary strengths, (parts, nodes) each."""
     of_all = slot[PARTS:AT_NODES].reshape((3, MOST_PARTS, MOST_MOMENTS))

@@ -26,8 +26,7 @@ a row of scratch for all lines with the same parts; fewer moments serve a looser
 
 import math
 
-from numba import njit
-
+from sweep.model.compiling import borrowing, owning
 from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.equivalent import CHEBYSHEV, nodes_for
 from sweep.model.far_field import kernel_beside
@@ -59,7 +58,7 @@ from sweep.model.kernel_rows import (
 from sweep.model.lanes import COLUMNS, LANES, combine
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def level_for(farthest):
     """Least level of the ladder that holds lines so far from the bin [bins], or -1."""
     for level in range(len(HALVES)):
@@ -68,7 +67,7 @@ def level_for(farthest):
     return -1
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def slot_for(segment, own, fold, width, power, parts, kernel):
     """Row of scratch for lines of a level and their parts, and its number.
 
@@ -105,7 +104,7 @@ def slot_for(segment, own, fold, width, power, parts, kernel):
     return slot, row
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _nodes(slot, half, power, kernel):
     """Nodes, and the weights at them of moments of 1."""
     slot[HALF] = half
@@ -126,7 +125,7 @@ def _nodes(slot, half, power, kernel):
             to_nodes[m, j] = now
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _take_parts(slot, segment, own, fold, parts):
     """Places and strengths u_p of the parts of lines at the nodes."""
     size, number = int(slot[SIZE]), 1
@@ -155,13 +154,13 @@ def _take_parts(slot, segment, own, fold, parts):
     slot[ASIDE], slot[EACH] = aside, each
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def width_of(slot):
     """Half width of lines and their parts [bins]; sum of the parts' magnitudes."""
     return slot[HALF] + slot[ASIDE], slot[EACH]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def total_strength(re, im, size, power, slot, work):
     """Bound on the sum of the magnitudes of the strengths of moments; two rows of scratch."""
     total = 0.0
@@ -178,7 +177,7 @@ def total_strength(re, im, size, power, slot, work):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def kernels_beside(first, power, slot, kernel):
     """Where the rows of g_m of bins first .. first + COLUMNS - 1 are.
 
@@ -203,19 +202,19 @@ def kernels_beside(first, power, slot, kernel):
     return TABLE + start, TABLE + start + MOST_MOMENTS * stride, stride
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _stride(slot):
     """Elements from row to row of the table: kept ones, and some for bins beyond the reach."""
     return 2 * int(slot[REACH]) + 2 * COLUMNS + LANES
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def is_real(power, slot):
     """Whether kernels have no imaginary part: those of powers, and of whole lines."""
     return power or slot[KEY] == 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _work_out(first, column, power, slot, kernel):
     """g_m of LANES bins from ``first`` on, into columns of the table."""
     to_nodes, real, size = to_nodes_of(slot), is_real(power, slot), int(slot[SIZE])
@@ -240,7 +239,7 @@ def _work_out(first, column, power, slot, kernel):
                     into[k] = fma(factor, im[k], into[k])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _at_node(first, j, power, slot, kernel, re, im):
     """A_j, or what stands in its place for powers, in LANES bins."""
     place, strength_re, strength_im = parts_of(slot)

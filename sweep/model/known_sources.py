@@ -5,8 +5,7 @@ Chebyshev nodes over the lines and their parts; of powers of lines in parts ever
 form is such a sum.
 """
 
-from numba import njit
-
+from sweep.model.compiling import borrowing, owning
 from sweep.model.elementary import fma
 from sweep.model.equivalent import CHEBYSHEV
 from sweep.model.far_field import sources_needed
@@ -35,7 +34,7 @@ from sweep.model.kernel_rows import (
 from sweep.model.lanes import COLUMNS, LANES, combine
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def sources_of(power, slot, kernel):
     """Places of the sources [bins] that moments are seen as from afar."""
     if slot[SEEN] == 0.0:
@@ -44,7 +43,7 @@ def sources_of(power, slot, kernel):
     return slot[SOURCES : SOURCES + int(slot[PLACES])]
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def _see_from_afar(power, slot, kernel):
     half, size = slot[HALF] + slot[ASIDE], int(slot[SIZE])
     number = min(sources_needed(half, MOST_MOMENTS, len(kernel[1][2])), MOST_SOURCES)
@@ -67,7 +66,7 @@ def _see_from_afar(power, slot, kernel):
                 into[k] = fma(factor, row[k], into[k])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _node_from_afar(j, number, half, slot, re, im):
     """Strengths of the sources that a line at a node is seen as: its parts, interpolated."""
     place, strength_re, strength_im = parts_of(slot)
@@ -90,7 +89,7 @@ def _node_from_afar(j, number, half, slot, re, im):
             im[i] = fma(b, share[i], im[i])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _coefficients(power, j, number, edge, slot, re, im, out):
     """What a line at a node adds to what is seen from afar; how many numbers that is.
 
@@ -116,18 +115,18 @@ def _coefficients(power, j, number, edge, slot, re, im, out):
     return k + 1
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _is_form(power, slot):
     return power and slot[KEY] != 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _far_stride(power, slot):
     """Elements from moment to moment of what is seen from afar."""
     return FORM_WIDTH if _is_form(power, slot) else 2 * MOST_SOURCES + LANES
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def strengths_afar(power, slot):
     """Where the sources' strengths of moments of 1 are.
 
@@ -136,7 +135,7 @@ def strengths_afar(power, slot):
     return FAR, FAR + MOST_SOURCES, _far_stride(power, slot)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def form_of(moments, size, number, slot, out):
     """The form of moments; into ``out``, up to FORM_WIDTH numbers, the constant last."""
     width = number * (number + 1) // 2 + number + 1

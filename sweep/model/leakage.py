@@ -10,10 +10,10 @@ than the accuracy asked for.
 import math
 
 import numpy as np
-from numba import njit
 
 from sweep.model import far_field
 from sweep.model.bundles import STRENGTH_IM, STRENGTH_RE
+from sweep.model.compiling import borrowing
 from sweep.model.crossings import (
     added_crossings,
     any_crossing,
@@ -42,7 +42,7 @@ SMOOTHNESS = 1e-7
 """Largest last correction at the near end of an integral, relative to all that leaks."""
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     """Run of bins, detection and leakage of a segment's lines.
 
@@ -119,7 +119,7 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
         reach *= 2
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _all_beyond(total, first, noise, image, kernel):
     """Bound on the chance that any bin ``first`` or more bins from the lines adds to leakage.
 
@@ -152,7 +152,7 @@ def _all_beyond(total, first, noise, image, kernel):
     return bound / -math.expm1(-y)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _chances(count, noise, kernel, room, exempt, series):
     """Added chances of a run of bins, into row 4."""
     sigma, level, _ = noise
@@ -160,7 +160,7 @@ def _chances(count, noise, kernel, room, exempt, series):
     added_crossings(room[3], count, level / sigma, series, room[4])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _least_reach(total, spread, noise, crossing, kernel):
     """Bins beyond the near ones that the run has to take in: see the module."""
     sigma, level, _ = noise
@@ -175,7 +175,7 @@ def _least_reach(total, spread, noise, crossing, kernel):
     return int(min((max(math.ceil(least), 0.0) + 2 * APRON + 7) // 8 * 8, half_size))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _leakage(low, count, peak, field, noise, choices, kernel, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
     sigma, level, _ = noise
@@ -211,7 +211,7 @@ def _leakage(low, count, peak, field, noise, choices, kernel, room, exempt, seri
     return some - (1.0 - some) * math.expm1(-tail), True
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _half_squares(magnitude, exempt, scale, x):
     """a^2/2 of bins; 0 of those that can't raise a false alarm."""
     for i in range(magnitude.size):
@@ -221,7 +221,7 @@ def _half_squares(magnitude, exempt, scale, x):
             x[i] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _near_end(side, count, chance, exempt):
     """Correction of an integral at its near end, its last term's size, -d ln f / dq; if there."""
     step = 1 if side > 0 else -1
@@ -241,7 +241,7 @@ def _near_end(side, count, chance, exempt):
     return terms[0] + terms[1] + terms[2], last, steepness, True
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _points_beyond(side, low, count, centre, steepness, image, kernel, room, points):
     """Adds the points and weights of one side's integral to rows 9 and 10.
 
@@ -277,7 +277,7 @@ def _points_beyond(side, low, count, centre, steepness, image, kernel, room, poi
     return points
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _far_chances(points, field, scale, beta, power, kernel, room, series):
     """Added chances at the points of the integrals, into row 4; the largest a^2/2 there."""
     _, _, _, edge_re, edge_im, _ = field

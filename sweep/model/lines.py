@@ -4,6 +4,7 @@ import math
 
 from numba import njit
 
+from sweep.model.compiling import borrowing
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.elementary import (
     fraction_of_cycle,
@@ -13,7 +14,7 @@ from sweep.model.elementary import (
 )
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def folded_origin(centre, fft_size):
     """Bin nearest to where a line at ``centre`` bins appears, and what folding made of it.
 
@@ -31,7 +32,7 @@ def folded_origin(centre, fft_size):
     return math.floor(sign * (centre - turns) + 0.5), turns, sign
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def segment_lines(
     segment, chirp, optics, record, offset, doppler, amplitude, phases, delta, re, im, power=False
 ):  # fmt: skip
@@ -100,7 +101,7 @@ def segment_lines(
     return origin
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def folding(segment, chirp, record):
     """-1 where the lines of a segment are seen as their images, else +1; see `segment_lines`."""
     _, centre_frequency = _axis(segment, chirp)
@@ -125,7 +126,7 @@ def _beat(motion, offset, doppler):
     return carrier * doppler - per_metre * shift
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _powers(motion, centre_line, poles, scale, offset, doppler, amplitude, delta, re, im):
     """Positions of the lines and |C_b|^2."""
     centre_frequency, delta_0, fold, bins = centre_line

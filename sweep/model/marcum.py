@@ -15,9 +15,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.elementary import fma
 
 _LARGEST_SERIES_PRODUCT = 30.0
@@ -77,7 +77,7 @@ def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
     return MarcumQ(*(value.reshape(a.shape) for value in values))
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def _marcum_q1_flat(a, b):
     """Rows q, p, log q and log p of shape (4, n)."""
     values = np.empty((4, a.size))
@@ -86,7 +86,7 @@ def _marcum_q1_flat(a, b):
     return values
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def marcum_q1_scalar(a, b):
     """Marcum Q of one pair: (q, p, log_q, log_p); all nan outside the domain.
 
@@ -109,7 +109,7 @@ def marcum_q1_scalar(a, b):
     return tail, 1.0 - tail, log_tail, math.log1p(-tail)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def marcum_q1_pair(a, b):
     """Marcum Q of one pair without the logarithms: (q, p); nan outside the domain."""
     if not (a >= 0.0 and b >= 0.0) or (math.isinf(a) and math.isinf(b)):
@@ -125,7 +125,7 @@ def marcum_q1_pair(a, b):
     return tail, 1.0 - tail
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def excess_crossing(a, b):
     """Q1(a, b) - Q1(0, b): what a bin's own signal adds to its chance to cross; nan outside.
 
@@ -159,7 +159,7 @@ def excess_crossing(a, b):
     return -math.expm1(-high) - p
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _excess_sum(x, w, terms):
     """sum_{m=1}^{terms} w^m / m!^2 M(1, m+1, x), from the last term on, M by its recurrence."""
     kummer = 1.0
@@ -170,21 +170,21 @@ def _excess_sum(x, w, terms):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _half_square(x):
     """x^2 / 2 in two doubles; the low part is 0 where exp(-x^2/2) is, and may overflow else."""
     high = 0.5 * x * x
     return high, (fma(0.5 * x, x, -high) if high < 1e3 else 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _exp_minus(high, low):
     """exp(-(high + low)) for a low part far below 1."""
     value = math.exp(-high)
     return value - value * low
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _smaller_tail(a, b):
     """The tail to compute, as lead^2 scale exp(-(high + low)) + pole, and whether it is 1 - Q1.
 
@@ -207,7 +207,7 @@ def _smaller_tail(a, b):
     return high, low, 1.0, _midpoint_rule(a, b, d, is_p), pole, is_p
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _bessel_series(a, b, is_p):
     """(lead, scale) with lead^2 scale = exp(d^2/2) times Q1, or 1 - Q1 if `is_p`; ab < 30.
 
@@ -231,7 +231,7 @@ def _bessel_series(a, b, is_p):
     return 1.0, fma(square, tail, n) * norm
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _midpoint_rule(a, b, d, is_p):
     """exp(d^2/2) times the tail less its pole; ab >= 30, d = |a - b|.
 

@@ -6,8 +6,6 @@ each: bins next to the lines see the sum of the nodes' powers; bins far from the
 sources as of shared parts.
 """
 
-from numba import njit
-
 from sweep.model.bundles import (
     DELTA,
     FORM,
@@ -21,6 +19,7 @@ from sweep.model.bundles import (
     take_moments,
     weight,
 )
+from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import CENTRE, EVENS, IM, MODES, NUMBER, RE
 from sweep.model.kernel_rows import FORM_WIDTH, HALVES, MOST_MOMENTS, ROWS
 from sweep.model.lanes import COLUMNS, LANES, combine, dot
@@ -45,7 +44,7 @@ SHARE = STRENGTH_IM
 _A = 2 * MOST_MOMENTS
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def take_modes(n, whose, modes, allowed, kernel, room):
     """Takes n lines in rows DELTA .. as bundles in modes; 0 where they spread too wide for that.
 
@@ -96,7 +95,7 @@ def take_modes(n, whose, modes, allowed, kernel, room):
     return number * places, (ROWS + row, number, first, spacing, size, True, spread)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _take_shares(numbers, fold, size, slot, room):
     """a_k, of odd modes times i, and S of each node, into row SHARE."""
     own = room[SHARE, _A:]
@@ -110,7 +109,7 @@ def _take_shares(numbers, fold, size, slot, room):
              room[5])  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _mix(own, slot, at, stride, re, im, work):
     """Sum over modes of a_k times rows of a slot, COLUMNS numbers."""
     evens, odds = int(own[0]), int(own[1])
@@ -126,7 +125,7 @@ def _mix(own, slot, at, stride, re, im, work):
             im[i] += work[i]
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def _see_from_afar(size, places, slot, room):
     """Amplitudes of the sources that each node is seen as, into the row of kernels.
 
@@ -142,7 +141,7 @@ def _see_from_afar(size, places, slot, room):
     return whole
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _bounds(slot, room):
     """Bound on the power that a line's sidelobes show: a factor of sin^2(pi nu), and a summand.
 
@@ -159,7 +158,7 @@ def _bounds(slot, room):
     return factor, summand
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _form(strong, size, places, whole, edge, room, out):
     """The form of one bundle's sources, as :func:`sweep.model.bundles.add_forms_afar` has it."""
     rows, scaled, turned = room[FORM + 1], room[5], room[6]
@@ -186,7 +185,7 @@ def _form(strong, size, places, whole, edge, room, out):
     out[linear + places] = edge * edge * constant
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_modes_near(first, image, kind, kernel, room, out):
     """Adds what bundles in modes, or their images, hold in bins next to them.
 

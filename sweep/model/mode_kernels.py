@@ -17,8 +17,8 @@ import math
 from collections.abc import Hashable
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import IM, MODES, RE, modes
 from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.equivalent import CHEBYSHEV, POWER_TOLERANCES, nodes_for
@@ -61,7 +61,7 @@ def mode_kernels_of(*key: Hashable) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return kernels_of(*key, shape=(_NUMBERS,)), modes().offset, modes().strength
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def modes_row(level, alone, relative, kernel):
     """Row for bundles of a level, by themselves or not, to a tolerance of their power."""
     limits = kernel[3]
@@ -80,7 +80,7 @@ def modes_row(level, alone, relative, kernel):
     return row
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def slot_of(row, kernel):
     """A row of scratch."""
     if row < _ROWS:
@@ -89,7 +89,7 @@ def slot_of(row, kernel):
     return kernel[6][0][start : start + _WIDTHS[1]]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _prepare(slot, half, size, kernel):
     """All but what the bins next to lines need."""
     _, offset, strength = kernel[6]
@@ -120,13 +120,13 @@ def _prepare(slot, half, size, kernel):
     _take_bounds(slot, kernel)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _off_bins(at):
     """A place, off a bin by the last digit if it is on one: there are then both sine and pole."""
     return at + max(3e-16 * abs(at), 1e-30) if at == math.floor(at) else at
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _shares(x, number, out):
     """Shares that sources at Chebyshev nodes have in one at x."""
     before, now = out[COLUMNS : 2 * COLUMNS], out[2 * COLUMNS : 3 * COLUMNS]
@@ -140,7 +140,7 @@ def _shares(x, number, out):
         there, before_there = 2.0 * x * there - before_there, there
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _take_bounds(slot, kernel):
     """How much more than a line, at most, each mode shows anywhere beside it."""
     _, offset, strength = kernel[6]
@@ -162,7 +162,7 @@ def _take_bounds(slot, kernel):
         y = max(y + 1.0, 1.2 * y)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def bound_of(numbers, kernel):
     """Bound on what a line in modes shows anywhere beside it, relative to the line by itself."""
     slot = slot_of(modes_row(0, True, 1.0, kernel), kernel)
@@ -172,7 +172,7 @@ def bound_of(numbers, kernel):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def columns_beside(first, slot, kernel):
     """Where F_k of the first node and mode in bins first .. first + COLUMNS - 1 are.
 
@@ -192,7 +192,7 @@ def columns_beside(first, slot, kernel):
     return TABLE + start, 2 * reach + 2 * COLUMNS + LANES
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _work_out(first, column, slot, kernel):
     """F_k of LANES bins from ``first`` on, into columns of the table."""
     _, offset, strength = kernel[6]

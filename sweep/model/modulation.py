@@ -15,10 +15,10 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model import waveform
 from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, weight
+from sweep.model.compiling import borrowing
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_modes import (
     NUMBER,
@@ -223,7 +223,7 @@ def _shifts(shots: Shots, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return shifts.offset, shifts.weight
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     """Lines in rows DELTA .. after what befalls them, as far as that leaves them plain lines.
 
@@ -277,7 +277,7 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     return lines
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def is_whole(segment, i, scene):
     """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
     parts, modes = scene[1], scene[3]
@@ -288,7 +288,7 @@ def is_whole(segment, i, scene):
     return whole and parts[1][segment, own, 0] == 1.0 and parts[2][segment, own, 0] == 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def reduce_lines(n, power, allowed, most, kernel, room):
     """Few lines that are equivalent to those in rows DELTA .., into rows 4 to 6; how many.
 
@@ -307,7 +307,7 @@ def reduce_lines(n, power, allowed, most, kernel, room):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def take_few(n, power, allowed, most, kernel, room):
     """Puts equivalent lines in the place of n lines; how many there are then."""
     few = reduce_lines(n, power, allowed, most, kernel, room)

@@ -9,7 +9,6 @@ sure of the largest bin.
 import math
 
 import numpy as np
-from numba import njit
 
 from sweep.model import far_field
 from sweep.model.bundles import (
@@ -20,6 +19,7 @@ from sweep.model.bundles import (
     add_near,
     constant_of,
 )
+from sweep.model.compiling import borrowing
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
 from sweep.model.kernel_rows import REACHES, ROWS
@@ -30,13 +30,13 @@ SOURCES, IMAGES = 13, 16
 """First of three rows each that hold the sources of lines and of images."""
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def smooth(kernel):
     """Whether spectra are smooth between lines: closed form of the window, no padding."""
     return kernel[1][4].size == 0 and kernel[0][0] == kernel[0][1]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def reach_of(level, weights, envelope, reach):
     """Bins [of fs/L] beyond which lines of the given summed weight stay below ``level``."""
     if not weights > 0.0:
@@ -53,7 +53,7 @@ def reach_of(level, weights, envelope, reach):
     return reach[low]
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def detect(origin, n, kind, level, choices, kernel, room, exempt):
     """Run of bins and detection of a segment's lines, whatever leaks beside them.
 
@@ -93,7 +93,7 @@ def detect(origin, n, kind, level, choices, kernel, room, exempt):
             return low, count, peak, exempted
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def bundle(n, kind, power, room):
     """Turns lines into strengths, unless they are sources of bundles.
 
@@ -106,13 +106,13 @@ def bundle(n, kind, power, room):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def served_beside(kind, kernel):
     """Bins beyond the clearance in which known kernels take less time than sources, of many."""
     return 0 if kind[1] < 2 else min(REACHES[1] // 4, kernel[0][0] // 128)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _lifted(level, total, afar, spread, centre, image, kernel):
     """Bins beside the lines that they and their images may lift to a level."""
     poles, half_size = len(kernel[1][2]), kernel[0][0] // 2
@@ -124,7 +124,7 @@ def _lifted(level, total, afar, spread, centre, image, kernel):
     return math.ceil(min(max(near, poles + 2.0), float(half_size)))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def stays_below(level, weight, spread, centre, image, kernel):
     """Bins beyond which lines and images of a summed weight stay below a level.
 
@@ -138,7 +138,7 @@ def stays_below(level, weight, spread, centre, image, kernel):
     return crossing + 1.5
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def sum_afar(re, im, n, total, spread, poles):
     """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
 
@@ -153,14 +153,14 @@ def sum_afar(re, im, n, total, spread, poles):
     return min(total, math.hypot(sum_re, sum_im) + differ * total)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def seen_from(origin, spread, fft_size):
     """Bin in the middle of where a bundle of lines is seen, 0..N/2."""
     centre = abs(origin + math.floor(0.5 * (spread[0] + spread[1]) + 0.5))
     return fft_size - centre if centre > fft_size // 2 else centre
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def near_bins(origin, lowest, highest, apart, image, kernel):
     """First and last bin ``apart`` from a line; whether images are near; whether angles small."""
     fft_size = kernel[0][0]
@@ -184,7 +184,7 @@ def near_bins(origin, lowest, highest, apart, image, kernel):
     return (low, high), mirrored, fits
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def prepare_field(origin, n, kind, spread, sources, choices, kernel, room):
     """What the far field needs.
 
@@ -215,7 +215,7 @@ def prepare_field(origin, n, kind, spread, sources, choices, kernel, room):
     return centre, lines, images, edge_re, edge_im, kind
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room):
     """|X| of a run of bins into row 0: all lines where they are near, few sources elsewhere."""
     fft_size, half_size = kernel[0][0], kernel[0][0] // 2
@@ -245,7 +245,7 @@ def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room
         re[i] = math.sqrt(square if square > 0.0 else 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def add_afar(t, image, field, power, kernel, room, re, im):
     """Adds what lines, or their images, hold in bins far from them; t is tan(pi q / N) there."""
     _, numerator, poles, _, _ = kernel[1]
@@ -258,7 +258,7 @@ def add_afar(t, image, field, power, kernel, room, re, im):
         add_far_field(t, room[row : row + 3], used, numerator, poles, power, re, im)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _add_beside(first, row, n, image, field, power, kernel, room, re, im):
     """The same in bins first, first + 1 .. next to n lines, or images, with their places in row."""
     if field[5][0] >= ROWS:

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from sweep.model.bundles import (
     DELTA,
@@ -14,6 +13,7 @@ from sweep.model.bundles import (
     as_lines,
     take_bundles,
 )
+from sweep.model.compiling import borrowing, owning
 from sweep.model.crossings import MOST_TERMS, crossing_series, largest
 from sweep.model.detection import assess, mark
 from sweep.model.effects.line_modes import NUMBER
@@ -35,7 +35,7 @@ SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Rows of the result: what is found in each segment's spectrum."""
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     """|X| of the bins in which a segment's lines stand above a level, into room's first row.
 
@@ -82,7 +82,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     return low, high - low + 1
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def allowed(p, power):
     """Error of a bin, or of its power, that one step of taking few lines for many may make.
 
@@ -92,7 +92,7 @@ def allowed(p, power):
     return error * p[10] if power else error
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _lines_of(segment, p, scene, at, power, split, kernel, room):
     """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into rows DELTA ..
 
@@ -119,7 +119,7 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
     return origin, n, fold
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series):
     """What a segment's spectrum shows, without noise.
 
@@ -165,7 +165,7 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
     return inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _smooth_lines(segment, p, scene, at, power, kernel, room):
     """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
 
@@ -198,7 +198,7 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
     return origin, n, as_lines()
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def inspect_bins(segment, p, scene, at, choices, kernel, room, exempt):
     """The same, bin by bin."""
     sigma, level, floor = p[10], p[11], p[12]
@@ -223,7 +223,7 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def lent(scene, kernel, work):
     """Scene, kernel and workspace for the length of a call, their use uncounted."""
     (offset, doppler, amplitude, phase), parts, (shift, share), modes = scene
@@ -259,7 +259,7 @@ def lent(scene, kernel, work):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@owning(nogil=True)
 def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
     """Every point's segments: detection probability, peak, exempt bins, leakage.
 

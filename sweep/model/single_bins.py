@@ -6,15 +6,14 @@ smooth bundles are faster (:mod:`sweep.model.runs`).
 
 import math
 
-from numba import njit
-
+from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import CENTRE, lines_of
 from sweep.model.mode_kernels import bound_of
 from sweep.model.runs import reach_of
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def parts_at(segment, i, fold, scene, kernel):
     """Parts of the lines of a point, and how much farther and stronger lines are for them.
 
@@ -47,7 +46,7 @@ def parts_at(segment, i, fold, scene, kernel):
     return (place, re, im), (each, below, above)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel, room):
     """|X| of bins low .. high of n lines in rows 4 to 6, into row 0.
 
@@ -70,7 +69,7 @@ def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel,
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
     """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
     sizes, shape, _, _, tangent, _, _ = kernel
@@ -92,7 +91,7 @@ def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
         total[k] = math.sqrt(total[k])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def extent_of(i, n, split, further, shifts, power, kernel, room):
     """Summed weight of n lines in rows 4 to 6 as |X| may have it, and their lowest and highest.
 
@@ -115,7 +114,7 @@ def extent_of(i, n, split, further, shifts, power, kernel, room):
     return total, lowest + below * bins, highest + above * bins
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def bins_above(level, extent, origin, kernel):
     """First and last bin, within 0..N/2, that lines of an extent can lift above a level."""
     fft_size, length = kernel[0]

@@ -20,8 +20,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.window import OVERSAMPLING
 
@@ -34,7 +34,7 @@ def tangents(fft_size: int) -> np.ndarray:
     return np.tan(np.pi * np.arange(fft_size // 2 + 1) / fft_size)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _cotangent(theta):
     """cot(theta), by its series where that is exact to rounding."""
     if abs(theta) < 0.1:
@@ -44,7 +44,7 @@ def _cotangent(theta):
     return 1.0 / math.tan(theta)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _closed_kernel(y, sine, length, coefficients):
     """S(y) term by term from exact differences: right next to the line, given sin(pi y)."""
     step = math.pi / length
@@ -59,7 +59,7 @@ def _closed_kernel(y, sine, length, coefficients):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _table_kernel(y, table):
     """S(y) for |y| <= L/2 by a ten-point Lagrange polynomial through the table: about 4e-14."""
     position = abs(y) * OVERSAMPLING
@@ -77,7 +77,7 @@ def _table_kernel(y, table):
     return top / bottom
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _near(first, count, delta, fft_size, margin):
     """Bins [low, high) of first .. first + count - 1 within a margin of q = -delta, modulo N."""
     turn = math.floor((first + 0.5 * count + delta) / fft_size + 0.5)
@@ -86,7 +86,7 @@ def _near(first, count, delta, fft_size, margin):
     return low, max(low, min(math.floor(centre + margin) + 1, count))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, power, out_re, out_im):
     """Adds n lines at q = -mirror delta to the bins near each, every kernel value by itself.
 
@@ -121,7 +121,7 @@ def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, powe
                 out_im[i] += parity * (b * real + a * imaginary)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def fraction(tangent, offset, numerator, poles):
     """K at tan(a + b), given the two tangents, as one fraction (one division)."""
     n = tangent + offset
@@ -137,7 +137,7 @@ def fraction(tangent, offset, numerator, poles):
     return d * top / bottom
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _add_far(
     first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge, power,
     t, sine_q, cosine_q, out_re, out_im,
@@ -171,7 +171,7 @@ def _add_far(
                 out_im[i] += 0.0 if near else b * kernel + a_edge * side
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def set_tangents(first, count, fft_size, tangent, t):
     """tan(pi q / N) for q = first .. first + count - 1, from the table of :func:`tangents`."""
     if first >= -(fft_size // 2) and first + count <= tangent.size:
@@ -187,7 +187,7 @@ def set_tangents(first, count, fft_size, tangent, t):
         q = q + 1 if q + 1 < fft_size else 0
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
     """tan(pi q / N), sin(pi q r), cos(pi q r) for q = first .. first + count - 1."""
     fft_size, length = sizes
@@ -203,7 +203,7 @@ def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
             sine_q[i], cosine_q[i] = sincos_cycles(turns)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def bin_magnitudes(
     low, high, origin, delta, re, im, n, sizes, shape, power, tangent, out_re, out_im, work,
     image=True,
@@ -256,7 +256,7 @@ def bin_magnitudes(
             out_re[i] = math.sqrt(out_re[i] * out_re[i] + out_im[i] * out_im[i])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def split_magnitudes(
     low, high, origin, delta, weight, n, parts, fold, sizes, shape, tangent, out, room, image
 ):
@@ -304,14 +304,14 @@ def split_magnitudes(
         out[i] = math.sqrt(max(out[i], 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _prepare(first, count, sizes, shape, tangent, work):
     """What far kernels need to know of bins; a tabulated window has none of them."""
     if not shape[4].size:
         _prepare_bins(first, count, sizes, tangent, work[0], work[1], work[2])
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def _add(first, count, mirror, delta, re, im, n, sizes, shape, power, work, out_re, out_im):
     """Adds n lines, or their images, to prepared bins."""
     _, numerator, poles, edge, table = shape

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_splitting import fitted
 from sweep.model.elementary import sincos_cycles
 from sweep.model.lanes import COLUMNS, combine
@@ -145,14 +146,14 @@ def _keep(re, im, size, tolerance, errors, out):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
 def is_plain(numbers):
     """Whether a line in modes is just a line, where it was."""
     alone = numbers[NUMBER] == 1.0 and numbers[NUMBER + 1] == 0.0
     return alone and numbers[CENTRE] == 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@owning()
 def lines_of(numbers, offset, strength):
     """Pure lines that a line in modes is: places [bins of fs/L], real and imaginary weights.
 
