@@ -22,7 +22,7 @@ BYTES_A_POINT = 8 * 27 + 4
 """27 arrays of floats and one of flags."""
 
 
-def spec_of(gigabytes, block_points=CHUNK, powers=100):
+def spec_of(gigabytes, block_points=CHUNK, powers=100, figures=()):
     """A study of about so many GB of results."""
     from sweep.spec import load
 
@@ -36,7 +36,7 @@ def spec_of(gigabytes, block_points=CHUNK, powers=100):
             "target.grazing_angle": {"linear": ["20 deg", "90 deg"], "number": ANGLES},
         },
         "storage": {"block_points": block_points},
-        "figures": [],
+        "figures": list(figures),
     }
     return type(spec).from_mapping(mapping)
 

@@ -31,7 +31,7 @@ class Cut:
 
     def of(self, found: Points) -> Points:
         """Points of the cut, each once."""
-        return once(found.where(self.held, [self.value])) if self.held else found
+        return found.where(self.held, [self.value]).once() if self.held else found
 
 
 def coordinate_of(spec: Spec, path: str) -> Member | None:
@@ -93,21 +93,14 @@ def _constant(values: np.ndarray) -> int:
     return int(np.argmax(different)) if different.any() else values.size
 
 
-def once(found: Points) -> Points:
-    """Points without repetition of all their coordinates."""
-    columns = [c.values for c in found.coordinates.values() if not c.index]
-    codes = np.stack([np.unique(c, return_inverse=True)[1].ravel() for c in columns])
-    return found.at(np.sort(np.unique(codes, axis=1, return_index=True)[1]))
-
-
 def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) -> Points:
     """Points farther than a distance (or at it), where range is on an axis."""
     member = coordinate_of(spec, RANGE)
     if member is None:
         return found
     least = float(spec.coordinate_value(RANGE, distance))
-    ranges = found.coordinates[member.name].values
-    return found.at(ranges >= least if included else ranges > least)
+    ranges = found.column(member.name).values
+    return found.along_axis(member.name, ranges >= least if included else ranges > least)
 
 
 def bands(spec: Spec, along: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.analysis import noise_only
-from sweep.analysis.cuts import NEAREST, Cut, beyond, cuts, si_value
+from sweep.analysis.cuts import NEAREST, beyond, cuts, si_value
 from sweep.analysis.leakage import Leakage, leakage
 from sweep.analysis.selection import Points, split
+from sweep.analysis.tallies import tallied
 from sweep.model.shot import evaluate
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
 
-VARIABLES = ["pfa_shot", "pfa_segment", "p_leakage_up", "p_leakage_down"]
 MOST_ROWS = 100
 
 
@@ -91,7 +91,7 @@ def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, An
     return [
         (
             name,
-            {m.path: si_value(m, part.coordinates[m.name].values[0]) for m in members},
+            {m.path: si_value(m, part.column(m.name).values[0]) for m in members},
             part,
         )
         for name, part in split(found, names, MOST_ROWS)[0]
@@ -106,28 +106,25 @@ def entries(
     Parameters
     ----------
     found, spec
-        Points of a study with `VARIABLES`, and the study.
+        Points of a study, and the study.
     by
         Coordinate of the rows.
     printed
         Published figures, a row for each row and a column for each cut.
     """
-    result = []
-    for i, (name, setting, part) in enumerate(settings(found, spec, by)):
-        alone = reference(spec, setting)
-        for j, cut in enumerate(cuts(spec)):
-            points = beyond(cut.of(part), spec, NEAREST)
-            published = printed[i][j] if i < len(printed) and j < len(printed[i]) else math.nan
-            result.append(_entry(points, spec, cut, name, alone, float(published)))
-    return result
-
-
-def _entry(
-    found: Points, spec: Spec, cut: Cut, row: str, alone: Reference, printed: float
-) -> Entry:
-    mean = float(np.nanmean(found.variables["pfa_shot"])) if found.size else math.nan
-    units = found.coordinates[cut.along].units if cut.along else ""
-    return Entry(
-        row, cut.name, cut.along, units, found.size, alone, mean, printed,
-        leakage(found, spec, cut.along),
-    )  # fmt: skip
+    settled = settings(found, spec, by)
+    alone = [reference(spec, setting) for _, setting, _ in settled]
+    places = [(i, j) for i in range(len(settled)) for j in range(len(cuts(spec)))]
+    groups = [
+        (beyond(cut.of(part), spec, NEAREST), cut) for _, _, part in settled for cut in cuts(spec)
+    ]
+    means = [tally.mean for tally in tallied([points for points, _ in groups], "pfa_shot")]
+    leaked = leakage([(points, cut.along) for points, cut in groups], spec)
+    return [
+        Entry(
+            settled[i][0], cut.name, cut.along,
+            points.column(cut.along).units if cut.along else "", points.size, alone[i], mean,
+            float(printed[i][j]) if i < len(printed) and j < len(printed[i]) else math.nan, leak,
+        )
+        for (i, j), (points, cut), mean, leak in zip(places, groups, means, leaked, strict=True)
+    ]  # fmt: skip

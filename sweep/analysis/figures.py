@@ -8,11 +8,11 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis import canvas, false_alarms, labels, mean_table, slices, surface_figure, tables
+from sweep.analysis import canvas, labels, mean_table, slices, surface_figure, tables
 from sweep.analysis.defaults import default_figures
 from sweep.analysis.opening import ACCURACY, SCENE, kind_of, read_attributes
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.selection import Points, confined, points
+from sweep.analysis.selection import Points, confined
 from sweep.analysis.tabular import Page
 from sweep.spec import FalseAlarmTable, Figure, Slices, Spec, Surface, Table, ThresholdTable
 from sweep.storage.locations import Location, beside, located
@@ -42,9 +42,10 @@ class Study:
         done, number = attributes["points_committed"], attributes["points"]
         return note if done >= number else f"{note}: {done:,} of {number:,} points computed"
 
-    def points(self, *variables: str) -> Points:
-        """All points, with some variables."""
-        return points(self.dataset, list(variables))
+    @property
+    def points(self) -> Points:
+        """All points."""
+        return Points.of(self.dataset)
 
     def words(self, variable: str) -> str:
         """A variable's name in words, with its units."""
@@ -109,7 +110,7 @@ def _made(study: Study, figure: Figure, directory: Path, form: str) -> list[Path
 
 
 def _sheet(study: Study, figure: Surface | Slices) -> canvas.Sheet:
-    found = confined(study.points(figure.variable), study.spec, figure.where)
+    found = confined(study.points, study.spec, figure.where)
     held = [
         f"{labels.coordinate(name)} {value}"
         for name, value in figure.where.items()
@@ -131,21 +132,10 @@ def _sheet(study: Study, figure: Surface | Slices) -> canvas.Sheet:
 
 def made_page(study: Study, figure: Table | FalseAlarmTable | ThresholdTable) -> Page:
     """Tables of one that a study asks for."""
-    title = figure.title or study.spec.title
+    found, spec = study.points, study.spec
+    title = figure.title or spec.title
     if isinstance(figure, Table):
-        return mean_table.mean_page(
-            study.points(figure.variable),
-            study.spec,
-            figure.model_dump(),
-            str(study.dataset[figure.variable].attrs.get("units", "")),
-            title,
-        )
-    if isinstance(figure, ThresholdTable):
-        found = study.points("pfa_bin")
-        return tables.threshold_page(
-            found, study.spec, by=figure.by, printed=figure.printed, title=title
-        )
-    found = study.points(*false_alarms.VARIABLES)
-    return tables.false_alarm_page(
-        found, study.spec, by=figure.by, printed=figure.printed, title=title
-    )
+        units = str(study.dataset[figure.variable].attrs.get("units", ""))
+        return mean_table.mean_page(found, spec, figure.model_dump(), units, title)
+    make = tables.threshold_page if isinstance(figure, ThresholdTable) else tables.false_alarm_page
+    return make(found, spec, by=figure.by, printed=figure.printed, title=title)

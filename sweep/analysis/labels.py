@@ -69,3 +69,8 @@ def coordinate(name: str) -> str:
 def joined(parts: list[str]) -> str:
     """Parts of a caption as sentences, empty ones left out."""
     return " ".join(part[0].upper() + part[1:].rstrip(".") + "." for part in parts if part)
+
+
+def is_words(values: np.ndarray) -> bool:
+    """Whether a coordinate's values are words."""
+    return values.dtype.kind not in "fiu"

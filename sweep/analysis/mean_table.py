@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from sweep.analysis import labels
 from sweep.analysis.cuts import beyond
 from sweep.analysis.selection import Points, confined
 from sweep.analysis.tabular import Block, Cell, Page
+from sweep.analysis.tallies import Search, Tally, for_median, median, pieces, search, tallied
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -34,12 +35,22 @@ def mean_page(found: Points, spec: Spec, figure: Mapping[str, Any], units: str, 
     if figure["minimum_range"]:
         found = beyond(found, spec, f"{figure['minimum_range']!r} m", included=True)
     columns = found.distinct(figure["columns"]) if figure["columns"] else [None]
-    records = []
-    for i, (row, of_row) in enumerate(found.apart(figure["rows"])):
-        for j, column in enumerate(columns):
-            part = of_row.where(figure["columns"], [column]) if figure["columns"] else of_row
-            published = _published(figure["printed"], i, j)
-            records.append(_mean_record(part, figure, row, column, published))
+    named = [
+        (row, column, of_row.where(figure["columns"], [column]) if figure["columns"] else of_row)
+        for row, of_row in found.apart(figure["rows"])
+        for column in columns
+    ]
+    statistics = _statistics([part for _, _, part in named], figure["variable"])
+    records = [
+        _record(
+            part,
+            figure,
+            (row, column),
+            own,
+            _published(figure["printed"], *divmod(k, len(columns))),
+        )
+        for k, ((row, column, part), own) in enumerate(zip(named, statistics, strict=True))
+    ]
     names = list(dict.fromkeys(str(r["column"]) for r in records))
     blocks = [
         _matrix(f"{heading} of {figure['variable']}{_units(units)}", key, records, names, figure)
@@ -62,27 +73,40 @@ def _published(printed: Any, row: int, column: int) -> float:
     return float(values[column]) if column < len(values) else math.nan
 
 
-def _mean_record(
-    part: Points, figure: Mapping[str, Any], row: object, column: object, printed: float
-) -> dict[str, Cell]:
-    values = part.variables[figure["variable"]]
-    known = values[np.isfinite(values)]
-    mean = float(known.mean()) if known.size else math.nan
-    names = (figure["rows"], row), (figure["columns"], column)
+def _statistics(parts: list[Points], variable: str) -> list[tuple[Tally, float]]:
+    """Tally and median of a variable over each part."""
+    tallies = tallied(parts, variable)
+    searches = [for_median(tally.number) for tally in tallies]
+
+    def read() -> Iterator[tuple[Search, np.ndarray, None]]:
+        for number, _, values in pieces(parts, [variable]):
+            own = values[variable]
+            yield searches[number], own[np.isfinite(own)], None
+
+    search(searches, read)
+    return [(tally, median(found)) for tally, found in zip(tallies, searches, strict=True)]
+
+
+def _record(
+    part: Points, figure: Mapping[str, Any], place: tuple[object, object],
+    statistics: tuple[Tally, float], printed: float,
+) -> dict[str, Cell]:  # fmt: skip
+    tally, middle = statistics
+    names = zip((figure["rows"], figure["columns"]), place, strict=True)
     labelled = [
-        labels.quantity(value, part.coordinates[name].units) if value is not None else "all"
+        labels.quantity(value, part.column(name).units) if value is not None else "all"
         for name, value in names
     ]
     return {
         "row": labelled[0],
         "column": f"{labels.coordinate(figure['columns'])} {labelled[1]}".strip(),
-        "points": int(known.size),
-        "mean": mean,
-        "median": float(np.median(known)) if known.size else math.nan,
-        "lowest": float(known.min()) if known.size else math.nan,
-        "highest": float(known.max()) if known.size else math.nan,
+        "points": tally.number,
+        "mean": tally.mean,
+        "median": middle,
+        "lowest": tally.least if tally.number else math.nan,
+        "highest": tally.largest if tally.number else math.nan,
         "printed": printed,
-        "printed_over_mean": printed / mean if mean else math.nan,
+        "printed_over_mean": printed / tally.mean if tally.mean else math.nan,
     }
 
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import xarray as xr
+
+Chances = TypeVar("Chances", np.ndarray, xr.DataArray)
 
 
 def bin_exponent(tnr: float) -> float:
@@ -39,6 +42,24 @@ def segment_probability(bin_probability: np.ndarray, bins: float) -> np.ndarray:
 def shot_probability(tnr: float, bins: float) -> float:
     """Probability that both of two segments of so many bins raise a false alarm, 0..1."""
     return float(segment_probability(np.asarray(bin_probability(tnr)), bins)) ** 2
+
+
+def shot_with_leakage(
+    pfa_segment: Chances, pfa_shot: Chances, p_leakage_up: Chances, p_leakage_down: Chances
+) -> Chances:
+    """Probability that noise or leakage raises an extra group in both chirp segments, 0..1.
+
+    Parameters
+    ----------
+    pfa_segment, pfa_shot
+        Of noise alone: in the up-chirp, and in both. The latter is a product, as the segments'
+        numbers of bins differ.
+    p_leakage_up, p_leakage_down
+        Of leakage in each.
+    """
+    down = pfa_shot / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
+    up = pfa_segment + p_leakage_up * (1 - pfa_segment)
+    return up * (down + p_leakage_down * (1 - down))
 
 
 def variance_excess_of_bin(probability: float, tnr: float) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import textwrap
 
+import dask
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import canvas, labels, surface
+from sweep.analysis.cells import HIGHEST, LOWEST, MEAN
 from sweep.analysis.selection import Points, split
 
 MOST_LINES = 8
@@ -20,14 +22,9 @@ MOST_PANELS = 6
 COLUMNS = 500
 """Stretches into which a long line is cut, a mean and a worst value of each."""
 
+KINDS = (MEAN, LOWEST, HIGHEST)
+
 WIDTH, PANEL_HEIGHT = 10.0, 3.6
-
-
-def stretches(x: np.ndarray, values: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """A long line in fewer points: `kind` ("mean", "lowest", "highest") of each stretch."""
-    grid = surface.Grid(x, np.zeros(1), values[np.newaxis])
-    short = surface.reduced(grid, kind, COLUMNS, 1)
-    return short.x, short.values[0]
 
 
 def draw(
@@ -48,20 +45,29 @@ def draw(
     parts, without_panel = split(found, others, MOST_PANELS)
     lines, without_line = split(found, [by] if by else [], MOST_LINES)
     names = [name for name, _ in lines]
-    packed = len(found.distinct(x)) > 2 * COLUMNS
+    drawn = [
+        (i, names.index(line), own)
+        for i, (_, part) in enumerate(parts)
+        for line, own in split(part, [by] if by else [], MOST_LINES)[0]
+        if line in names
+    ]
+    values = _values([own for _, _, own in drawn], x, variable)
+    packed = any(LOWEST in own for _, own in values)
     apart = len(lines) > (1 if packed else MOST_TOGETHER)
     factor, units = surface.shown_along(found, x)
-    rows = len(parts) * (len(lines) if apart else 1)
+    a_part = len(lines) if apart else 1
+    rows = len(parts) * a_part
     height = 1.75 if apart else PANEL_HEIGHT
     sheet, axes = canvas.panels(WIDTH, height * rows + 1.4, rows, 1, sharex=True, sharey=True)
-    for i, (name, part) in enumerate(parts):
-        own = axes[i * len(lines) : (i + 1) * len(lines)] if apart else [axes[i]] * len(lines)
-        by_name = dict(split(part, [by] if by else [], MOST_LINES)[0])
-        for j, line in enumerate(names):
-            if line in by_name:
-                _line(own[j], by_name[line], (x, factor), variable, j, line)
-        for panel in dict.fromkeys(own):
-            _finish(panel, found, variable, name, legend=not apart and bool(by))
+    for (i, j, _), (along, own) in zip(drawn, values, strict=True):
+        panel = axes[i * a_part + (j if apart else 0)]
+        _line(panel, surface.place(along, factor), own, j, names[j])
+    wide = surface.scale(
+        variable, np.concatenate([line for _, own in values for line in own.values()])
+    )
+    for i, panel in enumerate(axes):
+        decades = isinstance(wide, surface.LogNorm)
+        _finish(panel, variable, parts[i // a_part][0], decades, legend=not apart and bool(by))
     _label(axes[-1], found, x, factor)
     axes[-1].set_xlabel(labels.with_units(labels.coordinate(x), units))
     sheet.supylabel(textwrap.fill(long_name, 44), fontsize=10)
@@ -71,30 +77,48 @@ def draw(
     return sheet
 
 
+def _values(
+    lines: list[Points], x: str, variable: str
+) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Where each line's points or stretches lie, and its values there by kind."""
+    sides = [line.side(x) for line in lines]
+    most = [COLUMNS if side.values.size > 2 * COLUMNS else 2 * COLUMNS for side in sides]
+    kinds = [
+        KINDS if side.together(m) > 1 else KINDS[:1] for side, m in zip(sides, most, strict=True)
+    ]
+    lazy = [
+        line.cells(variable, [(side, m)], kind).data
+        for line, side, m, own in zip(lines, sides, most, kinds, strict=True)
+        for kind in own
+    ]
+    flat = iter(dask.compute(*lazy))
+    return [
+        (side.middles(m), {kind: np.asarray(next(flat), float) for kind in own})
+        for side, m, own in zip(sides, most, kinds, strict=True)
+    ]
+
+
 def _line(
-    axes: Axes, part: Points, x: tuple[str, float], variable: str, index: int, name: str
+    axes: Axes, along: np.ndarray, values: dict[str, np.ndarray], index: int, name: str
 ) -> None:
     """One line; of a long one the mean of each stretch, over the band that its points fill."""
-    along, values = part.along(x[0], variable)
-    along = surface.place(along, x[1])
     colour = canvas.LINES[index % len(canvas.LINES)]
     dash = canvas.DASHES[index % len(canvas.DASHES)]
-    if along.size > 2 * COLUMNS:
-        low, high = (stretches(along, values, kind)[1] for kind in ("lowest", "highest"))
-        along, values = stretches(along, values, "mean")
+    if LOWEST in values:
+        low, high = values[LOWEST], values[HIGHEST]
         axes.fill_between(along, low, high, color=colour, alpha=0.22, linewidth=0, step="mid")
         dash = "-"
     markers = "o" if along.size <= 40 else ""
     axes.plot(
-        along, values, color=colour, linestyle=dash, linewidth=1.3, marker=markers, markersize=3.5,
-        label=name,
+        along, values[MEAN], color=colour, linestyle=dash, linewidth=1.3, marker=markers,
+        markersize=3.5, label=name,
     )  # fmt: skip
 
 
 def _label(axes: Axes, found: Points, x: str, factor: float) -> None:
     """Limits, scale and words of the coordinate along which lines run."""
-    distinct = np.unique(found.coordinates[x].values)
-    if surface.is_words(distinct):
+    distinct = np.unique(found.column(x).values)
+    if labels.is_words(distinct):
         axes.set_xticks(np.arange(distinct.size), [str(word) for word in distinct])
     elif distinct.size > 1:
         values = distinct * factor
@@ -102,13 +126,11 @@ def _label(axes: Axes, found: Points, x: str, factor: float) -> None:
         axes.set_xscale("log" if surface.is_geometric(values) else "linear")
 
 
-def _finish(axes: Axes, found: Points, variable: str, name: str, *, legend: bool) -> None:
+def _finish(axes: Axes, variable: str, name: str, decades: bool, *, legend: bool) -> None:
     """Limits, grid, legend and title of one panel."""
-    values = found.variables[variable]
-    norm = surface.scale(variable, values)
     if variable.startswith("pd_"):
         axes.set_ylim(-0.03, 1.03)
-    elif isinstance(norm, surface.LogNorm):
+    elif decades:
         axes.set_yscale("log")
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)

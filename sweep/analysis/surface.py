@@ -6,13 +6,16 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import dask
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import canvas, labels
+from sweep.analysis.cells import Side
 from sweep.analysis.selection import Points
 
 MOST_COLUMNS, MOST_ROWS = 1100, 500
@@ -33,13 +36,55 @@ class Grid:
     values: np.ndarray
 
 
-def gridded(found: Points, x: str, y: str, variable: str) -> Grid:
-    """A variable on the grid of all values of two coordinates."""
-    columns, column = np.unique(found.coordinates[x].values, return_inverse=True)
-    rows, row = np.unique(found.coordinates[y].values, return_inverse=True)
+def grids(
+    parts: Sequence[Points],
+    variable: str,
+    x: str,
+    y: str,
+    kinds: Sequence[str],
+    most: Sequence[int],
+) -> list[Grid]:
+    """A variable over two coordinates, of every part and kind: the kinds of the first part first.
+
+    Parameters
+    ----------
+    parts, variable, x, y
+        Points, with the variable and the coordinates.
+    kinds
+        "mean", "lowest" or "highest" of the values that share a cell; nan only where all are.
+    most
+        Most cells along x and along y.
+    """
+    made = [_spread(part, variable, x, y) for part in parts]
+    sides = [((up, most[1]), (across, most[0])) for _, across, up in made]
+    lazy = [
+        found.cells(variable, pair, kind).data
+        for (found, _, _), pair in zip(made, sides, strict=True)
+        for kind in kinds
+    ]
+    layers = iter(dask.compute(*lazy))
+    return [
+        Grid(across.middles(columns), up.middles(rows), np.asarray(next(layers), float))
+        for (up, rows), (across, columns) in sides
+        for _ in kinds
+    ]
+
+
+def _spread(found: Points, variable: str, x: str, y: str) -> tuple[Points, Side, Side]:
+    """Points over two axes, and the places along x and along y."""
+    if found.axis_of(x) != found.axis_of(y):
+        return found, found.side(x), found.side(y)
+    columns, column = np.unique(found.column(x).values, return_inverse=True)
+    rows, row = np.unique(found.column(y).values, return_inverse=True)
+    both = found.axis_of(x)
+    along = Side(both, found.axes[both].positions, found.axes[both].positions)
     values = np.full((rows.size, columns.size), np.nan)
-    values[row.ravel(), column.ravel()] = found.variables[variable]
-    return Grid(columns, rows, values)
+    values[row.ravel(), column.ravel()] = found.cells(
+        variable, [(along, along.values.size)], "mean"
+    )
+    plane = Points.of(xr.Dataset({variable: (("y", "x"), values)}))
+    across, up = Side("x", np.arange(columns.size), columns), Side("y", np.arange(rows.size), rows)
+    return plane, across, up
 
 
 def worst(variable: str) -> str:
@@ -47,76 +92,6 @@ def worst(variable: str) -> str:
     if variable.startswith(("pd_", "snr_")):
         return "lowest"
     return "highest" if variable.startswith(_CHANCES_OF_HARM) else ""
-
-
-def reduced(grid: Grid, kind: str, columns: int, rows: int) -> Grid:
-    """A grid of no more than so many cells.
-
-    Parameters
-    ----------
-    grid
-        The whole grid.
-    kind
-        "lowest", "highest" or "mean" of the values that share a cell; nan only where all are.
-    columns, rows
-        Most cells along x and along y.
-    """
-    by = together(grid.y.size, rows), together(grid.x.size, columns)
-    return Grid(middles(grid.x, by[1]), middles(grid.y, by[0]), in_cells(grid.values, kind, by))
-
-
-def together(number: int, most: int) -> int:
-    """How many neighbours a cell stands for, so that there are `most` cells or fewer."""
-    return -(-number // most)
-
-
-def middles(along: np.ndarray, by: int) -> np.ndarray:
-    """Mean value of a coordinate in each cell of `by` neighbours; of words the first."""
-    if by == 1:
-        return along
-    starts = np.arange(0, along.size, by)
-    if is_words(along):
-        return along[starts]
-    return np.add.reduceat(along, starts) / np.diff(starts, append=along.size)
-
-
-def in_cells(values: np.ndarray, kind: str, by: Sequence[int]) -> np.ndarray:
-    """Values with neighbours taken together, `by` along each axis, the last ones fewer.
-
-    Parameters
-    ----------
-    values, by
-        As many dimensions as numbers.
-    kind
-        "lowest", "highest" or "mean" of the values that share a cell; nan only where all are.
-    """
-    starts = [np.arange(0, size, number) for size, number in zip(values.shape, by, strict=True)]
-    return told(gathered(tallied(values, kind), kind, starts), kind)
-
-
-def tallied(values: np.ndarray, kind: str) -> np.ndarray:
-    """What is gathered of values (...), in a further last dimension."""
-    if kind != "mean":
-        return values[..., np.newaxis]
-    missing = np.isnan(values)
-    return np.stack([np.where(missing, 0.0, values), ~missing], axis=-1)
-
-
-def gathered(tallies: np.ndarray, kind: str, starts: Sequence[np.ndarray]) -> np.ndarray:
-    """Tallies of cells that begin at some places along each axis, from those of their values."""
-    ufunc = {"mean": np.add, "lowest": np.fmin, "highest": np.fmax}[kind]
-    for axis, places in enumerate(starts):
-        if places.size < tallies.shape[axis]:
-            tallies = ufunc.reduceat(tallies, places, axis=axis)
-    return tallies
-
-
-def told(tallies: np.ndarray, kind: str) -> np.ndarray:
-    """Values of cells (...) from their tallies."""
-    if kind != "mean":
-        return tallies[..., 0]
-    total, number = tallies[..., 0], tallies[..., 1]
-    return np.where(number > 0, total / np.maximum(number, 1.0), np.nan)
 
 
 def edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
@@ -158,20 +133,15 @@ def colours() -> Colormap:
     return colormaps[canvas.SCALE].with_extremes(bad=canvas.NOT_COMPUTED)
 
 
-def is_words(values: np.ndarray) -> bool:
-    """Whether a coordinate's values are words."""
-    return values.dtype.kind not in "fiu"
-
-
 def place(values: np.ndarray, factor: float) -> np.ndarray:
     """Where values stand on an axis: in the units shown, words one after the other."""
-    return np.arange(values.size) if is_words(values) else values * factor
+    return np.arange(values.size) if labels.is_words(values) else values * factor
 
 
 def shown_along(found: Points, x: str) -> tuple[float, str]:
     """Factor and units in which a coordinate is shown."""
-    column = found.coordinates[x]
-    if is_words(column.values):
+    column = found.column(x)
+    if labels.is_words(column.values):
         return 1.0, ""
     return labels.shown_in(np.unique(column.values), column.units)
 
@@ -192,7 +162,7 @@ def paint(axes: Axes, grid: Grid, factors: tuple[float, float], norm: Normalize)
     axes.set_yscale("log" if geometric[1] else "linear")
     axes.set_facecolor(canvas.NOT_COMPUTED)
     for names, ticks in ((grid.x, axes.set_xticks), (grid.y, axes.set_yticks)):
-        if is_words(names):
+        if labels.is_words(names):
             ticks(np.arange(names.size), [str(name) for name in names])
 
 

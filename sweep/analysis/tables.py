@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sweep.analysis import labels, noise_only
 from sweep.analysis.cuts import NEAREST, beyond
 from sweep.analysis.false_alarms import Entry, entries, reference, settings
 from sweep.analysis.leakage import HELD
 from sweep.analysis.selection import Points
 from sweep.analysis.tabular import Block, Cell, Page, percent
+from sweep.analysis.tallies import tallied
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -24,7 +23,7 @@ def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), t
     Parameters
     ----------
     found, spec
-        Points with the variables of `false_alarms.VARIABLES`, and the study.
+        Points, and the study.
     by
         Coordinate of the rows.
     printed
@@ -149,24 +148,24 @@ def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), tit
     Parameters
     ----------
     found, spec
-        Points with `pfa_bin`, and the study.
+        Points, and the study.
     by, printed, title
         Coordinate of the rows; published figures, one for each; what stands over the page.
     """
     records: list[dict[str, Cell]] = []
-    for i, (name, setting, part) in enumerate(settings(found, spec, by)):
+    settled = settings(found, spec, by)
+    means = tallied([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")
+    for i, (name, setting, _) in enumerate(settled):
         alone = reference(spec, setting)
         closed = noise_only.bin_probability(alone.tnr)
         published = float(printed[i]) if i < len(printed) else math.nan
-        values = beyond(part, spec, NEAREST).variables["pfa_bin"]
-        known = values[np.isfinite(values)]
         records.append(
             {
                 "setting": name,
                 "tnr": alone.tnr,
                 "closed_form": closed,
                 "noise_only": alone.model_bin,
-                "study_mean": float(known.mean()) if known.size else math.nan,
+                "study_mean": means[i].mean,
                 "printed": published,
                 "printed_over_closed_form": published / closed,
                 "printed_variance_excess": noise_only.variance_excess_of_bin(published, alone.tnr),

@@ -13,14 +13,15 @@ import xarray as xr
 
 from sweep.analysis import labels, noise_only
 from sweep.analysis.answers.physical import parameter
+from sweep.analysis.cells import HIGHEST, MEAN, Side
 from sweep.analysis.cuts import RANGE, coordinate_of
 from sweep.analysis.figures import Study
+from sweep.analysis.selection import Points
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.flags import names_of
 from sweep.report import looks, wording
-from sweep.report.cells import HIGHEST, MEAN, Side, reduced
-from sweep.report.choosing import Part, parts
+from sweep.report.choosing import parts
 from sweep.report.lines import STRETCHES
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Spec
@@ -49,7 +50,7 @@ class Track:
     """Points of one part of a study along its main coordinate, or its only point."""
 
     words: str
-    part: Part
+    part: Points
     side: Side | None
 
     def places(self, most: int) -> np.ndarray:
@@ -62,8 +63,8 @@ class Track:
     def position(self, place: int) -> dict[str, int]:
         """Position along every axis of one of its places."""
         if self.side is None:
-            return self.part.at()
-        return self.part.at(self.side) | {self.side.dim: int(self.side.positions[place])}
+            return self.part.first()
+        return self.part.first(self.side) | {self.side.dim: int(self.side.positions[place])}
 
 
 def main_coordinate(spec: Spec) -> str:
@@ -78,8 +79,8 @@ def main_coordinate(spec: Spec) -> str:
 def tracks(study: Study) -> tuple[list[Track], int]:
     """Tracks along the main coordinate, and how many are left out."""
     name = main_coordinate(study.spec)
-    found, fewer = parts(study.spec, [name] if name else [], {})
-    return [Track(p.words, p, p.side(study.spec, name) if name else None) for p in found], fewer
+    found, fewer = parts(study, [name] if name else [], {})
+    return [Track(words, p, p.side(name) if name else None) for words, p in found], fewer
 
 
 def parameters_at(spec: Spec, position: Mapping[str, int]) -> dict[str, Any]:
@@ -100,8 +101,8 @@ def effects_at(study: Study, track: Track, places: np.ndarray) -> list[list[str]
 def _values_at(study: Study, variable: str, track: Track, places: np.ndarray) -> np.ndarray:
     """A variable at places along a track."""
     if track.side is None:
-        return np.asarray(study.dataset[variable].isel(track.part.at()).values)
-    array = study.dataset[variable].isel(track.part.at(track.side))
+        return np.asarray(study.dataset[variable].isel(track.part.first()).values)
+    array = study.dataset[variable].isel(track.part.first(track.side))
     return np.asarray(array.isel({track.side.dim: track.side.positions[places]}).values)
 
 
@@ -292,9 +293,7 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
     known = [variable for variable in ALARMS if variable in study.dataset]
     wanted = [(t, v, k) for t in found for v in known for k in kinds]
     lazy = [
-        reduced(study.dataset[v], [(t.side, STRETCHES)], t.part.at(t.side), k).data
-        for t, v, k in wanted
-        if t.side is not None
+        t.part.cells(v, [(t.side, STRETCHES)], k).data for t, v, k in wanted if t.side is not None
     ]
     values = [np.asarray(value, np.float32) for value in dask.compute(*lazy)]
     ruler = wording.Ruler.of(study, main_coordinate(study.spec), _values(found))

@@ -10,10 +10,11 @@ import numpy as np
 import plotly.graph_objects as go
 
 from sweep.analysis import surface
+from sweep.analysis.cells import MEAN, Side
 from sweep.analysis.figures import Study
+from sweep.analysis.selection import Points
 from sweep.report import looks, wording
-from sweep.report.cells import MEAN, Side, reduced
-from sweep.report.choosing import Part, axis_of, parts
+from sweep.report.choosing import parts
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Surface
 
@@ -28,14 +29,15 @@ CELLS = 400_000
 class _Map:
     """One part of a study over two sides."""
 
-    part: Part
+    words: str
+    part: Points
     x: Side
     y: Side
 
 
 def fits(study: Study, figure: Surface) -> bool:
     """Whether a figure's coordinates span a plane: two that vary together do not."""
-    return axis_of(study.spec, figure.x) is not axis_of(study.spec, figure.y)
+    return study.points.axis_of(figure.x) != study.points.axis_of(figure.y)
 
 
 def chart(study: Study, figure: Surface, share: float) -> Chart | None:
@@ -48,15 +50,15 @@ def chart(study: Study, figure: Surface, share: float) -> Chart | None:
     share
         Part of the page's cells that it may take.
     """
-    found, fewer = parts(study.spec, [figure.x, figure.y], figure.where)
+    found, fewer = parts(study, [figure.x, figure.y], figure.where)
     if not found:
         return None
-    maps = [_Map(p, p.side(study.spec, figure.x), p.side(study.spec, figure.y)) for p in found]
+    maps = [_Map(words, p, p.side(figure.x), p.side(figure.y)) for words, p in found]
     worst = surface.worst(figure.variable)
     most = _most(maps, CELLS * share / (len(maps) * (1 + bool(worst))))
     each = math.prod(side.together(m) for side, m in zip((maps[0].x, maps[0].y), most, strict=True))
     kinds = [MEAN, worst] if each > 1 and worst else [MEAN]
-    layers = _layers(study, figure.variable, maps, kinds, most)
+    layers = _layers(figure.variable, maps, kinds, most)
     scale = wording.Scale.of(figure.variable, study.words(figure.variable), layers)
     across = wording.Ruler.of(study, figure.x, maps[0].x.values)
     up = wording.Ruler.of(study, figure.y, maps[0].y.values)
@@ -67,7 +69,7 @@ def chart(study: Study, figure: Surface, share: float) -> Chart | None:
             z=scale.shown(layer).astype(np.float32),
             zmin=scale.low, zmax=scale.high, colorscale="Viridis",
             colorbar=looks.COLOUR_BAR,
-            name=one.part.words, meta=when(part=one.part.words, cell=kind),
+            name=one.words, meta=when(part=one.words, cell=kind),
         )
         for (one, kind), layer in zip(((m, k) for m in maps for k in kinds), layers, strict=True)
     ]  # fmt: skip
@@ -92,7 +94,7 @@ def chart(study: Study, figure: Surface, share: float) -> Chart | None:
             ),
         ),
         controls=[
-            Control("part", "Shown for", [part.words for part in found]),
+            Control("part", "Shown for", [words for words, _ in found]),
             Control("cell", "Each cell shows the", kinds),
         ],
         cut=True,
@@ -108,12 +110,11 @@ def _most(maps: list[_Map], cells: float) -> tuple[int, int]:
 
 
 def _layers(
-    study: Study, variable: str, maps: list[_Map], kinds: list[str], most: tuple[int, int]
+    variable: str, maps: list[_Map], kinds: list[str], most: tuple[int, int]
 ) -> list[np.ndarray]:
     """Cells of every map and kind, (rows, columns) each."""
-    array = study.dataset[variable]
     lazy = [
-        reduced(array, [(m.y, most[1]), (m.x, most[0])], m.part.at(m.x, m.y), kind).data
+        m.part.cells(variable, [(m.y, most[1]), (m.x, most[0])], kind).data
         for m in maps
         for kind in kinds
     ]

@@ -9,10 +9,11 @@ import numpy as np
 import plotly.graph_objects as go
 
 from sweep.analysis import slices
+from sweep.analysis.cells import HIGHEST, LOWEST, MEAN, Side
 from sweep.analysis.figures import Study
+from sweep.analysis.selection import Points, split
 from sweep.report import looks, wording
-from sweep.report.cells import HIGHEST, LOWEST, MEAN, Side, reduced
-from sweep.report.choosing import Part, parts
+from sweep.report.choosing import parts
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Slices
 
@@ -30,7 +31,7 @@ class _Line:
     shown_for: str
     name: str
     number: int
-    part: Part
+    part: Points
     side: Side
 
 
@@ -45,20 +46,20 @@ def chart(study: Study, figure: Slices) -> Chart | None:
         The study, and what it asks for.
     """
     names = [figure.x, figure.by] if figure.by else [figure.x]
-    found, fewer = parts(study.spec, names, figure.where)
+    found, fewer = parts(study, names, figure.where)
     if not found:
         return None
     lines: list[_Line] = []
-    for part in found:
-        own, lacking = part.lines(study.spec, figure.by, slices.MOST_LINES)
+    for shown_for, part in found:
+        own, lacking = split(part, names[1:], slices.MOST_LINES)
         fewer += lacking
-        for number, line in enumerate(own):
-            name = line.words if figure.by else ""
-            side = line.side(study.spec, figure.x)
-            lines.append(_Line(part.words, name, number, line, side))
+        lines += [
+            _Line(shown_for, name, number, line, line.side(figure.x))
+            for number, (name, line) in enumerate(own)
+        ]
     packed = max(line.side.together(STRETCHES) for line in lines)
     kinds = (MEAN, LOWEST, HIGHEST) if packed > 1 else (MEAN,)
-    values = _values(study, figure.variable, lines, kinds)
+    values = _values(figure.variable, lines, kinds)
     along = wording.Ruler.of(study, figure.x, max((ln.side.values for ln in lines), key=np.size))
     traces = [t for line, own in zip(lines, values, strict=True) for t in _traces(line, own, along)]
     words = study.words(figure.variable)
@@ -69,17 +70,16 @@ def chart(study: Study, figure: Slices) -> Chart | None:
             [wording.held(figure), _reduction(packed), wording.left_out(fewer)]
         ),
         figure=go.Figure(traces, _layout(figure.variable, words, along, values)),
-        controls=[Control("part", "Shown for", [part.words for part in found])],
+        controls=[Control("part", "Shown for", [words for words, _ in found])],
     )
 
 
 def _values(
-    study: Study, variable: str, lines: list[_Line], kinds: tuple[str, ...]
+    variable: str, lines: list[_Line], kinds: tuple[str, ...]
 ) -> list[dict[str, np.ndarray]]:
     """Values of each line, of each kind."""
-    array = study.dataset[variable]
     lazy = [
-        reduced(array, [(line.side, STRETCHES)], line.part.at(line.side), kind).data
+        line.part.cells(variable, [(line.side, STRETCHES)], kind).data
         for line in lines
         for kind in kinds
     ]

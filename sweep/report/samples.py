@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pandas
 
+from sweep.analysis.cells import known
 from sweep.analysis.figures import Study
 from sweep.analysis.scenes.quantities import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.scenes.recording import Thinned
-from sweep.report.cells import known
 from sweep.report.clouds import Seen
 from sweep.report.page import Table
 

@@ -28,7 +28,7 @@ class Ruler:
     def of(cls, study: Study, name: str, values: np.ndarray) -> Ruler:
         """The ruler of a coordinate with such values."""
         units = str(study.dataset[name].attrs.get("units", "")) if name in study.dataset else ""
-        if surface.is_words(values):
+        if labels.is_words(values):
             return cls(labels.coordinate(name), 1.0, "", "category")
         factor, units = labels.shown_in(values, units)
         kind = "log" if surface.is_geometric(values) else "linear"

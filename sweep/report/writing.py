@@ -22,9 +22,6 @@ from sweep.report.rendering import rendered
 from sweep.spec import Slices, Surface
 from sweep.storage.locations import Location, located
 
-MOST_IN_TABLES = 20_000_000
-"""Points of a study up to which the tables that it asks for are made: they hold all in memory."""
-
 Say = Callable[[str], None]
 """Is told what is being made."""
 
@@ -137,12 +134,8 @@ def _tables(study: Study, say: Say) -> Iterator[Item]:
     for figure in study.spec.figures or default_figures(study.spec):
         if isinstance(figure, Surface | Slices):
             continue
-        heading = figure.title or figure.stem
-        say(heading)
-        if study.dataset.attrs["points"] > MOST_IN_TABLES:
-            yield Text(heading, ["Too large for this page: sweep figures makes it."], "")
-        else:
-            yield from _sheets(made_page(study, figure), figure.stem)
+        say(figure.title or figure.stem)
+        yield from _sheets(made_page(study, figure), figure.stem)
 
 
 def _sheets(page: TablePage, stem: str) -> Iterator[Table]:

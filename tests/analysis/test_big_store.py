@@ -8,8 +8,15 @@ import pytest
 from zarr.storage import LocalStore
 
 import sweep
-from sweep.analysis import opening
+from sweep.analysis import canvas, opening, slices, surface
+from sweep.analysis.figures import draw
 
+FIGURES = [
+    {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
+    {"kind": "slices", "variable": "snr_up", "x": "range", "by": "power",
+     "where": {"grazing_angle": "20 deg"}},
+    {"kind": "table", "variable": "pd_shot", "rows": "power"},
+]  # fmt: skip
 FILE = Path(__file__).parents[2] / "benchmarks" / "big_store.py"
 
 
@@ -21,28 +28,52 @@ def big_store():
     return module
 
 
-def peak_of_reducing(big_store, path):
-    """Memory [B] that a reduction takes at most; of two, as imports and caches count in one."""
-    peaks = []
-    for _ in range(2):
-        tracemalloc.start()
-        found = big_store.reduce(path)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-        assert found["points"] == sweep.open(path).attrs["points"]
-        assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
-    return min(peaks)
+def stores(big_store, directory, gigabytes, block_points):
+    """Stores with their sizes [B]."""
+    made = {}
+    for size in gigabytes:
+        spec = big_store.spec_of(size, block_points=block_points, powers=4, figures=FIGURES)
+        made[directory / f"{size}.zarr"] = big_store.make(directory / f"{size}.zarr", spec)
+    return made
+
+
+def peak_of(work, *given):
+    """Memory [B] that work takes at most, once imports and caches are there."""
+    work(*given)
+    tracemalloc.start()
+    work(*given)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def growth(work, sizes, monkeypatch):
+    """Memory that work takes more where a store is larger, as a share of what it is larger by."""
+    monkeypatch.setattr(opening, "PIECE", 2**13)
+    peaks = [peak_of(work, path) for path in sizes]
+    less, more = sizes.values()
+    return (peaks[1] - peaks[0]) / (more - less)
 
 
 def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
-    monkeypatch.setattr(opening, "PIECE", 2**13)
-    sizes, peaks = [], []
-    for gigabytes in (0.001, 0.006):
-        path = tmp_path / f"{gigabytes}.zarr"
-        sizes.append(big_store.make(path, big_store.spec_of(gigabytes, block_points=500, powers=4)))
-        peaks.append(peak_of_reducing(big_store, path))
+    def reduce(path):
+        found = big_store.reduce(path)
+        assert found["points"] == sweep.open(path).attrs["points"]
+        assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
+
     # Dask's list of pieces alone: with one chunk a piece it takes twice as much as these stores.
-    assert peaks[1] - peaks[0] < 0.3 * (sizes[1] - sizes[0]), (peaks, sizes)
+    sizes = stores(big_store, tmp_path, (0.001, 0.006), 500)
+    assert growth(reduce, sizes, monkeypatch) < 0.3
+
+
+def test_neither_does_that_of_its_figures(big_store, tmp_path, monkeypatch):
+    # as many cells of both, and what they are drawn in left out
+    monkeypatch.setattr(surface, "MOST_COLUMNS", 20)
+    monkeypatch.setattr(slices, "COLUMNS", 5)
+    monkeypatch.setattr(canvas, "save", lambda sheet, path: path)
+    sizes = stores(big_store, tmp_path, (0.006, 0.024), 2000)
+    # what grows is what a handful of pieces takes; with all points in memory it was 0.37
+    assert growth(lambda path: draw(path, tmp_path), sizes, monkeypatch) < 0.15
 
 
 def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(big_store, tmp_path, monkeypatch):

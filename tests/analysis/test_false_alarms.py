@@ -2,11 +2,12 @@ import csv
 
 import numpy as np
 import pytest
+import xarray as xr
 from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
 
 from sweep.analysis import cuts, false_alarms, leakage, tables
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.selection import Column, Points, points
+from sweep.analysis.selection import Points
 
 PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4.62e-9, 4.45e-9))
 
@@ -14,7 +15,7 @@ PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4
 @pytest.fixture(scope="module")
 def power(tmp_path_factory):
     path = stored(tmp_path_factory.mktemp("power"), POWERS)
-    return points(open_store(path), false_alarms.VARIABLES), study(POWERS), open_store(path)
+    return Points.of(open_store(path)), study(POWERS), open_store(path)
 
 
 @pytest.fixture(scope="module")
@@ -83,21 +84,20 @@ def test_the_printed_figures_imply_an_excess_between_a_tenth_and_one_percent(ent
     assert entries[0].excess(4.45e-9) == pytest.approx(0.0029, abs=1e-4)
 
 
-def made_points(ranges, up, down):
-    noise = np.full(len(ranges), 1e-4)
-    variables = {
-        "p_leakage_up": np.array(up),
-        "p_leakage_down": np.array(down),
-        "pfa_segment": noise,
-        "pfa_shot": noise * 2e-4,
-    }
-    return Points(variables, {"range": Column(np.array(ranges), "m")})
+def leaked(ranges, up, down, **further):
+    """The leakage of made points along range."""
+    noise = np.full(np.shape(up), 1e-4)
+    values = {"p_leakage_up": up, "p_leakage_down": down, "pfa_segment": noise,
+              "pfa_shot": noise * 2e-4}  # fmt: skip
+    variables = {name: ([*further, "range"], np.asarray(v, float)) for name, v in values.items()}
+    dataset = xr.Dataset(variables, {"range": ("range", ranges, {"units": "m"})})
+    spec = study({"target.range": [f"{x} m" for x in ranges]})
+    (found,) = leakage.leakage([(Points.of(dataset.chunk(**further)), "range")], spec)
+    return found
 
 
 def test_leakage_is_told_by_mean_median_and_the_points_that_hold_it():
-    spec = study({"target.range": ["5 m", "20 m", "300 m", "4 km"]})
-    found = made_points([5.0, 20.0, 300.0, 4000.0], [0.0, 0.0, 0.06, 0.02], [0.0, 0.0, 0.03, 0.0])
-    result = leakage.leakage(found, spec, "range")
+    result = leaked([5.0, 20.0, 300.0, 4000.0], [0.0, 0.0, 0.06, 0.02], [0.0, 0.0, 0.03, 0.0])
     assert result.mean == pytest.approx((0.02, 0.0075))
     assert result.median == pytest.approx((0.01, 0.0))
     assert (result.holders, result.holders_from, result.holders_to) == (2, 300.0, 4000.0)
@@ -105,17 +105,31 @@ def test_leakage_is_told_by_mean_median_and_the_points_that_hold_it():
     assert result.shares == pytest.approx(expected)
 
 
+def test_the_holders_of_leakage_are_the_fewest_points_whatever_the_pieces():
+    rng = np.random.default_rng(3)
+    ranges = np.geomspace(5.0, 5000.0, 40)
+    up = np.round(10 ** rng.uniform(-12, -1, (30, 40)), 13)  # with values that come several times
+    total = np.sort(up.ravel())[::-1]
+    fewest = int(np.searchsorted(np.cumsum(total), 0.9 * total.sum())) + 1
+    results = [leaked(ranges, up, np.zeros_like(up), power=size) for size in (30, 7)]
+    assert results[0] == results[1] and results[0].holders == fewest
+    held = np.nonzero(up >= total[fewest - 1])[1]
+    assert (results[0].holders_from, results[0].holders_to) == (
+        ranges[held.min()],
+        ranges[held.max()],
+    )
+    assert results[0].median[0] == np.median(up)
+
+
 def test_a_shot_counts_noise_or_leakage_in_each_of_both_segments():
-    spec = study({"target.range": ["5 m", "20 m"]})
-    result = leakage.leakage(made_points([5.0, 20.0], [0.5, 0.0], [0.1, 0.0]), spec, "range")
+    result = leaked([5.0, 20.0], [0.5, 0.0], [0.1, 0.0])
     up, down = 1 - 0.5 * (1 - 1e-4), 1 - 0.9 * (1 - 2e-4)
     assert result.shot_mean == pytest.approx((up * down + 1e-4 * 2e-4) / 2, rel=1e-12)
 
 
 def test_points_not_computed_have_no_leakage_to_tell():
-    spec = study({"target.range": ["5 m", "20 m"]})
     nothing = [np.nan, np.nan]
-    result = leakage.leakage(made_points([5.0, 20.0], nothing, nothing), spec, "range")
+    result = leaked([5.0, 20.0], nothing, nothing)
     assert np.isnan(result.mean[0]) and result.holders == 0
 
 
@@ -155,7 +169,7 @@ def test_the_page_of_a_study_that_nobody_printed_has_no_column_for_it(power):
 
 def test_thresholds_have_the_chances_of_table_4_2(tmp_path):
     axes = {"instrument.processing.tnr": [1, 5, 10, 15], "target.range": ["1 km", "3 km"]}
-    found = points(open_store(stored(tmp_path, axes)), ["pfa_bin"])
+    found = Points.of(open_store(stored(tmp_path, axes)))
     printed = (0.8, 0.047, 5.06e-10, 1.17e-21)
     page = tables.threshold_page(found, study(axes), by="tnr", printed=printed, title="Table 4.2")
     for record, expected in zip(page.records, (0.807, 4.68e-3, 4.79e-10, 1.07e-21), strict=True):
@@ -171,7 +185,7 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
         "instrument.processing.fft_size": ["2^16", "2^17"],
         "target.range": {"log": ["10 m", "1 km"], "number": 3},
     }
-    found = points(open_store(stored(tmp_path, axes)), false_alarms.VARIABLES)
+    found = Points.of(open_store(stored(tmp_path, axes)))
     result = false_alarms.entries(found, study(axes), by="power")
     assert [e.row for e in result][:2] == [
         "power 1 W, FFT size 2^16",
@@ -182,7 +196,7 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
 
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
     dataset = open_store(stored(tmp_path, SURFACE))
-    found = points(dataset, ["pfa_shot"])
+    found = Points.of(dataset)
     near = cuts.beyond(found, study(SURFACE), "10 m")
     assert near.size == 23 * 9
     assert cuts.beyond(found, study(SURFACE), "10 m", included=True).size == 24 * 9

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import xarray as xr
 from drawn_studies import POWERS, SURFACE, stored, study
 from matplotlib.collections import PolyCollection
 
@@ -7,7 +8,7 @@ from sweep.analysis import slices
 from sweep.analysis.defaults import default_figures
 from sweep.analysis.figures import draw
 from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.selection import Column, Points
+from sweep.analysis.selection import Points
 
 ASKED = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -121,12 +122,11 @@ def test_the_default_surface_has_range_across_and_angle_up():
     assert [(f.x, f.y) for f in default_figures(study(turned))] == [("range", "grazing_angle")] * 2
 
 
-def line_points(values, by=None):
-    size = len(values)
-    coordinates = {"range": Column(np.arange(1.0, size + 1), "m")}
-    if by is not None:
-        coordinates["power"] = Column(np.asarray(by), "W")
-    return Points({"pd_shot": np.asarray(values, float)}, coordinates)
+def line_points(values, **by):
+    values = np.asarray(values, float)
+    coordinates = {"range": ("range", np.arange(1.0, values.shape[-1] + 1), {"units": "m"})}
+    coordinates |= {name: (name, along, {"units": "W"}) for name, along in by.items()}
+    return Points.of(xr.Dataset({"pd_shot": ([*by, "range"], values)}, coordinates))
 
 
 def sliced(found, by=""):
@@ -154,14 +154,7 @@ def test_one_dip_in_ten_thousand_points_of_a_line_reaches_down_in_its_band():
 
 
 def test_each_value_of_by_has_its_line_in_the_order_of_the_study():
-    found = line_points([1.0, 0.5, 0.25])
-    three = Points(
-        {"pd_shot": np.concatenate([k * found.variables["pd_shot"] for k in (1.0, 0.5, 0.1)])},
-        {
-            "range": Column(np.tile(found.coordinates["range"].values, 3), "m"),
-            "power": Column(np.repeat([5, 1, 3], 3), "W"),
-        },
-    )
+    three = line_points(np.outer([1.0, 0.5, 0.1], [1.0, 0.5, 0.25]), power=[5, 1, 3])
     (panel,) = sliced(three, by="power").axes
     texts = [text.get_text() for text in panel.get_legend().get_texts()]
     assert texts == ["power 5 W", "power 1 W", "power 3 W"]

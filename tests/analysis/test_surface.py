@@ -1,17 +1,33 @@
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.colors import LogNorm
 
-from sweep.analysis import canvas, surface, surface_figure
-from sweep.analysis.selection import Column, Points
+from sweep.analysis import canvas, cells, surface, surface_figure
+from sweep.analysis.selection import Points
+
+UNITS = {"range": "m", "grazing_angle": "deg"}
 
 
-def points_on(x, y, values, **others):
+def points_of(values, **axes):
+    """Points with values over coordinates: each a name, or a zipped axis with several."""
+    coordinates = {}
+    for dim, along in axes.items():
+        members = along if isinstance(along, dict) else {dim: along}
+        for name, column in members.items():
+            coordinates[name] = (dim, np.asarray(column), {"units": UNITS.get(name, "")})
+    variables = {"pd_shot": (list(axes), np.asarray(values, float))}
+    return Points.of(xr.Dataset(variables, coordinates))
+
+
+def points_on(x, y, values):
     """Points on the grid of x and y, values (len(y), len(x))."""
-    across, up = np.meshgrid(x, y)
-    coordinates = {"range": Column(across.ravel(), "m"), "grazing_angle": Column(up.ravel(), "deg")}
-    coordinates |= {name: Column(column, "") for name, column in others.items()}
-    return Points({"pd_shot": np.asarray(values, float).ravel()}, coordinates)
+    return points_of(values, grazing_angle=y, range=x)
+
+
+def grid_of(found):
+    (grid,) = surface.grids([found], "pd_shot", "range", "grazing_angle", ["mean"], (99, 99))
+    return grid
 
 
 def drawn(found, **changes):
@@ -32,42 +48,48 @@ def painted(sheet, value):
 
 
 def test_a_grid_is_put_together_whatever_the_order_of_its_points():
-    found = points_on([1.0, 2.0, 4.0], [10.0, 20.0], [[1, 2, 3], [4, 5, 6]])
-    shuffled = found.at(np.random.default_rng(1).permutation(6))
-    grid = surface.gridded(shuffled, "range", "grazing_angle", "pd_shot")
-    assert grid.x.tolist() == [1, 2, 4]
-    assert grid.values.tolist() == [[1, 2, 3], [4, 5, 6]]
+    order = np.array([2, 0, 1])
+    found = points_on(np.array([1.0, 2.0, 4.0])[order], [20.0, 10.0], [[6, 4, 5], [3, 1, 2]])
+    assert grid_of(found).x.tolist() == [1, 2, 4]
+    assert grid_of(found).values.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_a_point_that_is_not_there_is_nan_in_the_grid():
-    found = points_on([1.0, 2.0], [10.0, 20.0], [[1, 2], [3, 4]]).at(np.array([0, 1, 3]))
-    grid = surface.gridded(found, "range", "grazing_angle", "pd_shot")
-    assert np.isnan(grid.values[1, 0]) and np.isfinite(grid.values).sum() == 3
+def test_coordinates_that_vary_together_span_a_plane_with_holes():
+    pairs = {"range": [1.0, 2.0, 2.0], "grazing_angle": [10.0, 10.0, 20.0]}
+    grid = grid_of(points_of([1, 2, 4], pairs=pairs))
+    assert (grid.x.tolist(), grid.y.tolist()) == ([1, 2], [10, 20])
+    assert np.isnan(grid.values[1, 0]) and grid.values[0].tolist() == [1, 2]
+    assert grid.values[1, 1] == 4
 
 
 @pytest.mark.parametrize("kind,expected", [("mean", 0.9), ("lowest", 0.0), ("highest", 1.0)])
 def test_points_that_share_a_cell_have_their_mean_lowest_or_highest(kind, expected):
     values = np.ones((1, 1000))
     values[0, 437] = 0.0
-    grid = surface.Grid(np.arange(1000.0), np.zeros(1), values)
-    cells = surface.reduced(grid, kind, 100, 10)
-    assert cells.values.shape == (1, 100)
-    assert cells.values[0, 43] == pytest.approx(expected)
-    assert cells.x[43] == pytest.approx(434.5)
-    assert np.delete(cells.values[0], 43).tolist() == [1.0] * 99
+    found = points_on(np.arange(1000.0), [10.0], values)
+    (grid,) = surface.grids([found], "pd_shot", "range", "grazing_angle", [kind], (100, 10))
+    assert grid.values.shape == (1, 100)
+    assert grid.values[0, 43] == pytest.approx(expected)
+    assert grid.x[43] == pytest.approx(434.5)
+    assert np.delete(grid.values[0], 43).tolist() == [1.0] * 99
+
+
+def along(values, kind, most):
+    """Values in cells along an axis."""
+    size = len(values)
+    side = cells.Side("x", np.arange(size), np.arange(float(size)))
+    found = cells.reduced(xr.DataArray(values, dims="x"), [(side, most)], {}, kind)
+    return found.values.tolist(), side.middles(most).tolist()
 
 
 def test_a_last_cell_of_fewer_points_has_the_mean_of_those():
-    grid = surface.Grid(np.arange(7.0), np.zeros(1), np.arange(7.0)[np.newaxis])
-    cells = surface.reduced(grid, "mean", 3, 1)
-    assert cells.values[0].tolist() == cells.x.tolist() == [1.0, 4.0, 6.0]
+    assert along(np.arange(7.0), "mean", 3) == ([1.0, 4.0, 6.0], [1.0, 4.0, 6.0])
 
 
-def test_a_cell_is_grey_only_where_none_of_its_points_is_computed():
-    values = np.array([[np.nan, np.nan, np.nan, 2.0]])
-    for kind in ("mean", "lowest", "highest"):
-        cells = surface.reduced(surface.Grid(np.arange(4.0), np.zeros(1), values), kind, 2, 1)
-        assert np.isnan(cells.values[0, 0]) and cells.values[0, 1] == 2.0
+@pytest.mark.parametrize("kind", ["mean", "lowest", "highest"])
+def test_a_cell_is_grey_only_where_none_of_its_points_is_computed(kind):
+    values, _ = along(np.array([np.nan, np.nan, np.nan, 2.0]), kind, 2)
+    assert np.isnan(values[0]) and values[1] == 2.0
 
 
 def test_one_dip_in_ten_thousand_ranges_is_seen_in_the_picture():
@@ -89,12 +111,7 @@ def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
 
 
 def test_what_else_varies_has_a_panel_for_each_value():
-    found = points_on([1.0, 2.0], [10.0, 20.0], [[1, 2], [3, 4]])
-    both = Points(
-        {"pd_shot": np.tile(found.variables["pd_shot"], 2)},
-        {n: Column(np.tile(c.values, 2), c.units) for n, c in found.coordinates.items()}
-        | {"tnr": Column(np.repeat([1, 10], 4), "")},
-    )
+    both = points_of(np.ones((2, 2, 2)), tnr=[1, 10], grazing_angle=[10.0, 20.0], range=[1.0, 2.0])
     titles = [axes.get_title() for axes in drawn(both).axes]
     assert titles[:2] == ["TNR 1", "TNR 10"]
 
@@ -121,11 +138,10 @@ def test_probabilities_of_detection_span_0_to_1_and_tiny_chances_a_logarithm():
 
 
 def test_words_stand_one_after_the_other_along_an_axis():
-    coordinates = {
-        "window": Column(np.array(["hann", "hamming"] * 2), ""),
-        "grazing_angle": Column(np.repeat([10.0, 20.0], 2), "deg"),
-    }
-    panel = drawn(Points({"pd_shot": np.linspace(0, 1, 4)}, coordinates), x="window").axes[0]
+    found = points_of(
+        np.linspace(0, 1, 4).reshape(2, 2), grazing_angle=[10.0, 20.0], window=["hann", "hamming"]
+    )
+    panel = drawn(found, x="window").axes[0]
     assert [label.get_text() for label in panel.get_xticklabels()] == ["hamming", "hann"]
 
 
@@ -135,13 +151,7 @@ def test_a_sheet_is_saved_as_a_png(tmp_path):
 
 
 def test_parameters_that_vary_together_make_no_panels_and_others_do():
-    coordinates = {
-        "range": Column(np.array([1.0, 2.0, 1.0, 2.0]), "m"),
-        "power": Column(np.array([1.0, 3.0, 1.0, 3.0]), "W"),
-        "tnr": Column(np.array([5, 5, 10, 10]), ""),
-        "place": Column(np.array([0, 1, 0, 1]), "", index=True),
-    }
-    found = Points({"pd_shot": np.arange(4.0)}, coordinates)
+    found = points_of(np.ones((2, 2)), tnr=[5, 10], pairs={"range": [1.0, 2.0], "power": [1, 3]})
     assert found.further(["range"]) == ["tnr"]
     assert found.further(["range", "tnr"]) == []
     assert found.further(["tnr"]) == ["range"]

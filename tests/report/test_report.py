@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reported import EXPERIMENTS, GRID
 
+from sweep.analysis.cells import HIGHEST, LOWEST, MEAN, Side, reduced
 from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
 from sweep.model.shot import evaluate
 from sweep.report import detector
-from sweep.report.cells import HIGHEST, LOWEST, MEAN, Side, reduced
 from sweep.report.choosing import parts
 from sweep.report.writing import write
 from sweep.spec import Spec
@@ -61,13 +61,19 @@ def test_parts_of_zipped_axes_are_told_apart():
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
     spec = Spec.from_mapping(GRID | {"axes": axes, "figures": []}, base=EXPERIMENTS)
-    found, left_out = parts(spec, ["range", "power"], {})
+    coordinates = {
+        member.name: (axis.name, member.display, {"units": member.units})
+        for axis in spec.axes
+        for member in axis.members
+    }
+    study = Study(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 6)))}, coordinates), spec)
+    found, left_out = parts(study, ["range", "power"], {})
     assert left_out == 0
-    assert [part.words for part in found] == ["grazing angle 15°", "grazing angle 85°"]
-    assert found[1].side(spec, "range").positions.tolist() == [3, 4, 5]
-    (held,), _ = parts(spec, ["range", "power"], {"grazing_angle": "85 deg"})
-    assert held.side(spec, "range").values.tolist() == [1, 2, 3]
-    assert parts(spec, ["range"], {"grazing_angle": "86 deg"}) == ([], 0)
+    assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
+    assert found[1][1].side("range").positions.tolist() == [3, 4, 5]
+    ((_, held),), _ = parts(study, ["range", "power"], {"grazing_angle": "85 deg"})
+    assert held.side("range").values.tolist() == [1, 2, 3]
+    assert parts(study, ["range"], {"grazing_angle": "86 deg"}) == ([], 0)
 
 
 def _spec_in(page):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
+from sweep.analysis import noise_only
 from sweep.analysis.answers.physical import parameter, quantity, spec_of
 
 SEGMENTS_OF_A_SHOT = 3
@@ -95,8 +96,5 @@ def _of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
     noise = dataset["pfa_shot"]
     if not leakage:
         return noise
-    up = dataset["pfa_segment"]
-    # pfa_shot is the product of both segments', whose bins differ in number.
-    down = (noise / up).where(up > 0, up)
-    more_up, more_down = dataset["p_leakage_up"], dataset["p_leakage_down"]
-    return (up + more_up * (1 - up)) * (down + more_down * (1 - down))
+    segments = (dataset["p_leakage_up"], dataset["p_leakage_down"])
+    return noise_only.shot_with_leakage(dataset["pfa_segment"], noise, *segments)

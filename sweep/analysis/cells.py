@@ -1,4 +1,4 @@
-"""Arrays of any size reduced to as many cells as a page can hold, chunk by chunk."""
+"""Arrays of any size reduced to as many cells as a picture or a page can hold, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import dask.array
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import surface
+from sweep.analysis import labels
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
 
@@ -35,11 +35,11 @@ class Side:
 
     def together(self, most: int) -> int:
         """How many neighbours a cell stands for, so that there are `most` cells or fewer."""
-        return 1 if surface.is_words(self.values) else surface.together(self.values.size, most)
+        return 1 if labels.is_words(self.values) else together(self.values.size, most)
 
     def middles(self, most: int) -> np.ndarray:
         """Mean value of the coordinate in each cell."""
-        return surface.middles(self.values, self.together(most))
+        return middles(self.values, self.together(most))
 
 
 def reduced(
@@ -50,7 +50,7 @@ def reduced(
     Parameters
     ----------
     array
-        Of a store, in its chunks.
+        Of a store, in its chunks; or in memory.
     sides
         Each with the largest number of its cells.
     at
@@ -68,7 +68,7 @@ def reduced(
     by = [side.together(most) for side, most in sides]
     if max(by) == 1:
         return array
-    return xr.DataArray(_in_cells(array.data, kind, by), dims=array.dims)
+    return xr.DataArray(_in_cells(array.chunk().data, kind, by), dims=array.dims)
 
 
 def _in_cells(data: dask.array.Array, kind: str, by: Sequence[int]) -> dask.array.Array:
@@ -81,8 +81,8 @@ def _in_cells(data: dask.array.Array, kind: str, by: Sequence[int]) -> dask.arra
     )  # fmt: skip
     numbers = [np.concatenate(own) for own in cells]
     return tallies.rechunk(-1).map_blocks(
-        lambda whole: surface.told(
-            surface.gathered(whole, kind, [np.unique(n, return_index=True)[1] for n in numbers]),
+        lambda whole: told(
+            gathered(whole, kind, [np.unique(n, return_index=True)[1] for n in numbers]),
             kind,
         ),
         dtype=float, drop_axis=data.ndim, chunks=tuple((int(n[-1]) + 1,) for n in numbers),
@@ -106,9 +106,49 @@ def _of_piece(values: np.ndarray, kind: str, by: Sequence[int], block_info: Any)
         np.maximum(np.arange(-(place % number), size, number), 0)
         for place, number, size in zip(places, by, values.shape, strict=True)
     ]
-    return surface.gathered(surface.tallied(values, kind), kind, starts)
+    return gathered(tallied(values, kind), kind, starts)
 
 
 def known(array: xr.DataArray) -> xr.DataArray:
     """An array as floats; nan where a count is not made yet."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
+
+
+def together(number: int, most: int) -> int:
+    """How many neighbours a cell stands for, so that there are `most` cells or fewer."""
+    return -(-number // most)
+
+
+def middles(along: np.ndarray, by: int) -> np.ndarray:
+    """Mean value of a coordinate in each cell of `by` neighbours; of words the first."""
+    if by == 1:
+        return along
+    starts = np.arange(0, along.size, by)
+    if labels.is_words(along):
+        return along[starts]
+    return np.add.reduceat(along, starts) / np.diff(starts, append=along.size)
+
+
+def tallied(values: np.ndarray, kind: str) -> np.ndarray:
+    """What is gathered of values (...), in a further last dimension."""
+    if kind != "mean":
+        return values[..., np.newaxis]
+    missing = np.isnan(values)
+    return np.stack([np.where(missing, 0.0, values), ~missing], axis=-1)
+
+
+def gathered(tallies: np.ndarray, kind: str, starts: Sequence[np.ndarray]) -> np.ndarray:
+    """Tallies of cells that begin at some places along each axis, from those of their values."""
+    ufunc = {"mean": np.add, "lowest": np.fmin, "highest": np.fmax}[kind]
+    for axis, places in enumerate(starts):
+        if places.size < tallies.shape[axis]:
+            tallies = ufunc.reduceat(tallies, places, axis=axis)
+    return tallies
+
+
+def told(tallies: np.ndarray, kind: str) -> np.ndarray:
+    """Values of cells (...) from their tallies."""
+    if kind != "mean":
+        return tallies[..., 0]
+    total, number = tallies[..., 0], tallies[..., 1]
+    return np.where(number > 0, total / np.maximum(number, 1.0), np.nan)
