@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 
-import dask
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
 
-from sweep.analysis import canvas, labels, surface
-from sweep.analysis.cells import HIGHEST, LOWEST, MEAN
+from sweep.analysis import along, canvas, labels, surface
 from sweep.analysis.selection import Points, split
 
 MOST_LINES = 8
@@ -19,11 +16,6 @@ MOST_TOGETHER = 4
 """Lines that one panel can hold and still be read; more have panels of their own."""
 
 MOST_PANELS = 6
-COLUMNS = 500
-"""Stretches into which a long line is cut, a mean and a worst value of each."""
-
-KINDS = (MEAN, LOWEST, HIGHEST)
-
 WIDTH, PANEL_HEIGHT = 10.0, 3.6
 
 
@@ -51,20 +43,17 @@ def draw(
         for line, own in split(part, [by] if by else [], MOST_LINES)[0]
         if line in names
     ]
-    values = _values([own for _, _, own in drawn], x, variable)
-    packed = any(LOWEST in own for _, own in values)
+    made = along.lines([own for _, _, own in drawn], x, variable)
+    packed = any(line.together > 1 for line in made)
     apart = len(lines) > (1 if packed else MOST_TOGETHER)
     factor, units = surface.shown_along(found, x)
     a_part = len(lines) if apart else 1
     rows = len(parts) * a_part
     height = 1.75 if apart else PANEL_HEIGHT
     sheet, axes = canvas.panels(WIDTH, height * rows + 1.4, rows, 1, sharex=True, sharey=True)
-    for (i, j, _), (along, own) in zip(drawn, values, strict=True):
-        panel = axes[i * a_part + (j if apart else 0)]
-        _line(panel, surface.place(along, factor), own, j, names[j])
-    wide = surface.scale(
-        variable, np.concatenate([line for _, own in values for line in own.values()])
-    )
+    for (i, j, _), line in zip(drawn, made, strict=True):
+        _line(axes[i * a_part + (j if apart else 0)], line, factor, j, names[j])
+    wide = surface.scale(variable, np.concatenate([line.mean for line in made]))
     for i, panel in enumerate(axes):
         decades = isinstance(wide, surface.LogNorm)
         _finish(panel, variable, parts[i // a_part][0], decades, legend=not apart and bool(by))
@@ -72,46 +61,26 @@ def draw(
     axes[-1].set_xlabel(labels.with_units(labels.coordinate(x), units))
     sheet.supylabel(textwrap.fill(long_name, 44), fontsize=10)
     canvas.title(sheet, title)
-    remarks = _remarks(packed, len(found.distinct(x)), without_panel + without_line)
+    left_out = without_panel + without_line
+    remarks = [*dict.fromkeys(line.remark for line in made)]
+    remarks += [f"{left_out} further values are not drawn"] if left_out else []
     canvas.caption(sheet, labels.joined([*remarks, note]))
     return sheet
 
 
-def _values(
-    lines: list[Points], x: str, variable: str
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Where each line's points or stretches lie, and its values there by kind."""
-    sides = [line.side(x) for line in lines]
-    most = [COLUMNS if side.values.size > 2 * COLUMNS else 2 * COLUMNS for side in sides]
-    kinds = [
-        KINDS if side.together(m) > 1 else KINDS[:1] for side, m in zip(sides, most, strict=True)
-    ]
-    lazy = [
-        line.cells(variable, [(side, m)], kind).data
-        for line, side, m, own in zip(lines, sides, most, kinds, strict=True)
-        for kind in own
-    ]
-    flat = iter(dask.compute(*lazy))
-    return [
-        (side.middles(m), {kind: np.asarray(next(flat), float) for kind in own})
-        for side, m, own in zip(sides, most, kinds, strict=True)
-    ]
-
-
-def _line(
-    axes: Axes, along: np.ndarray, values: dict[str, np.ndarray], index: int, name: str
-) -> None:
-    """One line; of a long one the mean of each stretch, over the band that its points fill."""
+def _line(axes: Axes, line: along.Line, factor: float, index: int, name: str) -> None:
+    """One line over its band."""
     colour = canvas.LINES[index % len(canvas.LINES)]
     dash = canvas.DASHES[index % len(canvas.DASHES)]
-    if LOWEST in values:
-        low, high = values[LOWEST], values[HIGHEST]
-        axes.fill_between(along, low, high, color=colour, alpha=0.22, linewidth=0, step="mid")
-        dash = "-"
-    markers = "o" if along.size <= 40 else ""
+    x = surface.place(line.x, factor)
+    if line.low is not None and line.high is not None:
+        axes.fill_between(
+            x, line.low, line.high, color=colour, alpha=0.22, linewidth=0,
+            step="mid" if line.together > 1 else None,
+        )  # fmt: skip
     axes.plot(
-        along, values[MEAN], color=colour, linestyle=dash, linewidth=1.3, marker=markers,
-        markersize=3.5, label=name,
+        x, line.mean, color=colour, linestyle="-" if line.together > 1 else dash, linewidth=1.3,
+        marker="o" if x.size <= 40 else "", markersize=3.5, label=name,
     )  # fmt: skip
 
 
@@ -139,17 +108,3 @@ def _finish(axes: Axes, variable: str, name: str, decades: bool, *, legend: bool
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     names = [name] if legend else [name, *lines]
     axes.set_title(", ".join(filter(None, names)), size=9, loc="left")
-
-
-def _remarks(packed: bool, points: int, left_out: int) -> list[str]:
-    """What a reader has to know of how it was drawn."""
-    remarks = []
-    if packed:
-        each = math.ceil(points / COLUMNS)
-        remarks.append(
-            f"line: mean of {each} neighbouring points; band: from the lowest of them to the "
-            "highest, so that no narrow dip is hidden"
-        )
-    if left_out:
-        remarks.append(f"{left_out} further values are not drawn")
-    return remarks

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import dask
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from sweep.analysis import labels, noise_only
+from sweep.analysis import along, labels, noise_only
+from sweep.analysis.answers import alarms
 from sweep.analysis.answers.physical import parameter
-from sweep.analysis.cells import HIGHEST, MEAN, Side
+from sweep.analysis.cells import Side
 from sweep.analysis.cuts import RANGE, coordinate_of
 from sweep.analysis.figures import Study
 from sweep.analysis.selection import Points
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.flags import names_of
-from sweep.report import looks, wording
+from sweep.report import lines, looks, wording
 from sweep.report.choosing import parts
-from sweep.report.lines import STRETCHES
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Spec
 
@@ -40,7 +39,17 @@ IN_A_BIN = np.logspace(-0.05, -16, 90)
 DRAWS = 400
 """Draws of each point whose characteristic is random."""
 
-ALARMS = ("pfa_bin", "pfa_segment", "pfa_shot", "p_leakage_up", "p_leakage_down")
+WITH_LEAKAGE = "pfa_shot_with_leakage"
+
+_SHORT = {
+    "pfa_bin": "noise, one bin",
+    "pfa_segment": "noise, a segment",
+    "pfa_shot": "noise, both",
+    "p_leakage_up": "leakage, up",
+    "p_leakage_down": "leakage, down",
+    WITH_LEAKAGE: "either, both",
+}
+"""Variables in as few words as a legend has room for."""
 
 _RANDOM = {effect.name for effect in EFFECTS if effect.is_random}
 
@@ -171,7 +180,7 @@ def _named(study: Study, track: Track, place: int) -> str:
 
 def _places_of_interest(study: Study, track: Track) -> np.ndarray:
     """Places along a track whose probability of detection is near to those looked for."""
-    chosen = track.places(4 * STRETCHES)
+    chosen = track.places(4 * along.STRETCHES)
     pd = np.ravel(_values_at(study, "pd_shot", track, chosen))
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
@@ -288,54 +297,44 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
     """False alarms of noise and of leakage along the main coordinate; none without one."""
     if found[0].side is None:
         return None
-    packed = max(t.side.together(STRETCHES) for t in found if t.side)
-    kinds = (MEAN, HIGHEST) if packed > 1 else (MEAN,)
-    known = [variable for variable in ALARMS if variable in study.dataset]
-    wanted = [(t, v, k) for t in found for v in known for k in kinds]
-    lazy = [
-        t.part.cells(v, [(t.side, STRETCHES)], k).data for t, v, k in wanted if t.side is not None
-    ]
-    values = [np.asarray(value, np.float32) for value in dask.compute(*lazy)]
-    ruler = wording.Ruler.of(study, main_coordinate(study.spec), _values(found))
-    traces = [
-        go.Scatter(
-            x=ruler.shown(t.side.middles(STRETCHES)), y=np.where(value > 0, value, np.nan),
-            name=_short(study, v), meta=when(ALARMS.index(v), part=t.words, cell=k), mode="lines",
-            line={"dash": looks.DASHES[ALARMS.index(v)], "width": 2},
-        )
-        for (t, v, k), value in zip(wanted, values, strict=True)
-        if t.side is not None
-    ]  # fmt: skip
-    own = [f"{_short(study, v)}: {wording.spread(y)}" for (_, v, k), y in zip(wanted, values,
-           strict=True) if k == MEAN][: len(known)]  # fmt: skip
+    name = main_coordinate(study.spec)
+    whole = alarms.of_a_shot(study.dataset, leakage=True)
+    chances = study.dataset[[v for v in _SHORT if v != WITH_LEAKAGE]].assign({WITH_LEAKAGE: whole})
+    named: list[lines.Named] = []
+    made: list[along.Line] = []
+    for number, (variable, words) in enumerate(_SHORT.items()):
+        own = [lines.Named(t.words, words, number, replace(t.part, dataset=chances)) for t in found]
+        named += own
+        made += along.lines([line.points for line in own], name, variable)
+    ruler = wording.Ruler.of(study, name, _values(found))
     closed = noise_only.bin_probability(float(study.spec.parameters()[TNR]))
     return Chart(
         heading="False alarms",
-        alt=f"Lines of probabilities of false alarms and leakage over {ruler.words}. "
-        f"{'; '.join(own)}.",
+        alt=lines.alternative(
+            "probabilities of false alarms and leakage", ruler.words, named, made
+        ),
         caption=wording.sentences(
             [f"A bin of noise alone crosses with probability {closed:.3g} in closed form"
              if "tnr" not in study.dataset.coords else "",
-             f"Each stretch of a line stands for {packed} neighbouring points" * (packed > 1),
+             *lines.remarks(made),
              "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
+             "Either: by noise or by leakage; both: in the up- and in the down-chirp of a shot",
              wording.left_out(fewer)]
         ),
         figure=go.Figure(
-            traces,
-            looks.layout(xaxis=ruler.axis,
-                         yaxis=looks.upright("probability", type="log")),
+            [t for own, line in zip(named, made, strict=True)
+             for t in lines.traces(own, _above_zero(line), ruler)],
+            looks.layout(xaxis=ruler.axis, yaxis=looks.upright("probability", type="log")),
         ),
-        controls=[
-            Control("part", "Shown for", [track.words for track in found]),
-            Control("cell", "Each stretch shows the", kinds),
-        ],
+        controls=[Control("part", "Shown for", [track.words for track in found])],
     )  # fmt: skip
 
 
-def _short(study: Study, variable: str) -> str:
-    """A variable in as few words as a legend has room for."""
-    return {
-        "pfa_bin": "noise, one bin", "pfa_segment": "noise, a segment",
-        "pfa_shot": "noise, both chirps", "p_leakage_up": "leakage, up-chirp",
-        "p_leakage_down": "leakage, down-chirp",
-    }[variable]  # fmt: skip
+def _above_zero(line: along.Line) -> along.Line:
+    """The line where it is above zero, which an axis of decades has no place for."""
+
+    def above(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else np.where(values > 0, values, np.nan)
+
+    mean = np.where(line.mean > 0, line.mean, np.nan)
+    return replace(line, mean=mean, low=above(line.low), high=above(line.high))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import dask
 import numpy as np
 import plotly.graph_objects as go
 
-from sweep.analysis import slices
-from sweep.analysis.cells import HIGHEST, LOWEST, MEAN, Side
+from sweep.analysis import along, slices
 from sweep.analysis.figures import Study
 from sweep.analysis.selection import Points, split
 from sweep.report import looks, wording
@@ -17,22 +17,18 @@ from sweep.report.choosing import parts
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Slices
 
-STRETCHES = 500
-"""Stretches that a long line is cut into."""
-
 MARKED = 40
 """Points up to which each has a mark."""
 
 
 @dataclass(frozen=True)
-class _Line:
-    """One line of one part of a study; `number` is its place among the part's lines."""
+class Named:
+    """A line of one part of a study; `number` is its place among the part's lines."""
 
     shown_for: str
     name: str
     number: int
-    part: Points
-    side: Side
+    points: Points
 
 
 def chart(study: Study, figure: Slices) -> Chart | None:
@@ -45,101 +41,90 @@ def chart(study: Study, figure: Slices) -> Chart | None:
     study, figure
         The study, and what it asks for.
     """
-    names = [figure.x, figure.by] if figure.by else [figure.x]
-    found, fewer = parts(study, names, figure.where)
+    by = [figure.by] if figure.by else []
+    found, fewer = parts(study, [figure.x, *by], figure.where)
     if not found:
         return None
-    lines: list[_Line] = []
-    for shown_for, part in found:
-        own, lacking = split(part, names[1:], slices.MOST_LINES)
-        fewer += lacking
-        lines += [
-            _Line(shown_for, name, number, line, line.side(figure.x))
-            for number, (name, line) in enumerate(own)
-        ]
-    packed = max(line.side.together(STRETCHES) for line in lines)
-    kinds = (MEAN, LOWEST, HIGHEST) if packed > 1 else (MEAN,)
-    values = _values(figure.variable, lines, kinds)
-    along = wording.Ruler.of(study, figure.x, max((ln.side.values for ln in lines), key=np.size))
-    traces = [t for line, own in zip(lines, values, strict=True) for t in _traces(line, own, along)]
+    named, lacking = lines_of(found, by)
+    made = along.lines([own.points for own in named], figure.x, figure.variable)
+    ruler = wording.Ruler.of(study, figure.x, longest(named, figure.x))
     words = study.words(figure.variable)
     return Chart(
         heading=figure.title or words,
-        alt=_alt(words, along, lines, values),
+        alt=alternative(words, ruler.span(longest(named, figure.x)), named, made),
         caption=wording.sentences(
-            [wording.held(figure), _reduction(packed), wording.left_out(fewer)]
+            [wording.held(figure), *remarks(made), wording.left_out(fewer + lacking)]
         ),
-        figure=go.Figure(traces, _layout(figure.variable, words, along, values)),
-        controls=[Control("part", "Shown for", [words for words, _ in found])],
+        figure=go.Figure(
+            [t for own, line in zip(named, made, strict=True) for t in traces(own, line, ruler)],
+            _layout(figure.variable, words, ruler, made),
+        ),
+        controls=[Control("part", "Shown for", [part for part, _ in found])],
     )
 
 
-def _values(
-    variable: str, lines: list[_Line], kinds: tuple[str, ...]
-) -> list[dict[str, np.ndarray]]:
-    """Values of each line, of each kind."""
-    lazy = [
-        line.part.cells(variable, [(line.side, STRETCHES)], kind).data
-        for line in lines
-        for kind in kinds
-    ]
-    flat = iter(np.asarray(value, np.float32) for value in dask.compute(*lazy))
-    return [{kind: next(flat) for kind in kinds} for _ in lines]
+def lines_of(found: Sequence[tuple[str, Points]], by: list[str]) -> tuple[list[Named], int]:
+    """Lines of every part, and how many are left out."""
+    named: list[Named] = []
+    fewer = 0
+    for shown_for, part in found:
+        own, lacking = split(part, by, slices.MOST_LINES)
+        fewer += lacking
+        named += [Named(shown_for, name, k, points) for k, (name, points) in enumerate(own)]
+    return named, fewer
 
 
-def _traces(line: _Line, values: dict[str, np.ndarray], along: wording.Ruler) -> list[go.Scatter]:
-    """The line, over the band that its points fill where it is reduced."""
-    x = along.shown(line.side.middles(STRETCHES))
-    meta = when(line.number, part=line.shown_for)
-    marked = x.size <= MARKED
-    look = {"dash": looks.DASHES[line.number % len(looks.DASHES)], "width": 2}
+def longest(named: Sequence[Named], x: str) -> np.ndarray:
+    """Values of the coordinate along the longest line."""
+    return max((own.points.side(x).values for own in named), key=np.size)
+
+
+def traces(own: Named, line: along.Line, ruler: wording.Ruler, **choices: str) -> list[go.Scatter]:
+    """The line, over its band where it has one; shown at some choices as well as for its part."""
+    x = ruler.shown(line.x)
+    meta = when(own.number, part=own.shown_for, **choices)
+    look = {"dash": looks.DASHES[own.number % len(looks.DASHES)], "width": 2}
+    common: dict[str, Any] = {"legendgroup": own.name}
     drawn = go.Scatter(
-        x=x, y=values[MEAN], name=line.name, meta=meta, line=look,
-        mode="lines+markers" if marked else "lines", legendgroup=line.name,
-        showlegend=bool(line.name),
+        x=x, y=line.mean.astype(np.float32), name=own.name, meta=meta, line=look,
+        mode="lines+markers" if x.size <= MARKED else "lines", showlegend=bool(own.name), **common,
     )  # fmt: skip
-    if LOWEST not in values:
+    if line.low is None or line.high is None:
         return [drawn]
-    known = np.isfinite(values[MEAN])
+    known = np.isfinite(line.low) & np.isfinite(line.high)
+    there, back = np.flatnonzero(known), np.flatnonzero(known)[::-1]
     band = go.Scatter(
-        x=np.concatenate([x[known], x[known][::-1]]),
-        y=np.concatenate([values[HIGHEST][known], values[LOWEST][known][::-1]]),
-        fill="toself", mode="none", hoverinfo="skip", legendgroup=line.name, showlegend=False,
-        meta=meta | {"band": True},
+        x=np.concatenate([x[there], x[back]]),
+        y=np.concatenate([line.high[there], line.low[back]]).astype(np.float32),
+        fill="toself", mode="none", hoverinfo="skip", showlegend=False, meta=meta | {"band": True},
+        **common,
     )  # fmt: skip
     return [band, drawn]
 
 
 def _layout(
-    variable: str, words: str, along: wording.Ruler, values: list[dict[str, np.ndarray]]
+    variable: str, words: str, ruler: wording.Ruler, made: Sequence[along.Line]
 ) -> dict[str, object]:
     """Axes: probabilities of detection from 0 to 1, what spans decades by decades."""
     up = looks.upright(words)
     if variable.startswith("pd_"):
         up |= {"range": [-0.03, 1.03]}
     else:
-        scale = wording.Scale.of(variable, words, [own[MEAN] for own in values])
+        scale = wording.Scale.of(variable, words, [line.mean for line in made])
         up |= {"type": "log" if scale.decades else "linear"}
-    return looks.layout(xaxis=along.axis, yaxis=up)
+    return looks.layout(xaxis=ruler.axis, yaxis=up)
 
 
-def _alt(
-    words: str, along: wording.Ruler, lines: list[_Line], values: list[dict[str, np.ndarray]]
-) -> str:
-    first = lines[0].shown_for
+def alternative(words: str, span: str, named: Sequence[Named], made: Sequence[along.Line]) -> str:
+    """What the lines of the first part show, in words."""
     told = [
-        f"{line.name or 'the line'}: {wording.spread(own[MEAN])}"
-        for line, own in zip(lines, values, strict=True)
-        if line.shown_for == first
+        f"{own.name or 'the line'}: {wording.spread(line.mean)}"
+        for own, line in zip(named, made, strict=True)
+        if own.shown_for == named[0].shown_for
     ]
-    span = along.span(max((line.side.values for line in lines), key=np.size))
     return f"Lines of {words} over {span}. {'; '.join(told)}."
 
 
-def _reduction(each: int) -> str:
-    if each == 1:
-        return ""
-    return (
-        f"Reduced for this page: a line is the mean of {each} neighbouring points, the band about "
-        "it goes from the lowest of them to the highest, so that no narrow dip is hidden"
-    )
+def remarks(made: Sequence[along.Line]) -> list[str]:
+    """How lines are drawn, once each."""
+    return [*dict.fromkeys(line.remark for line in made)]

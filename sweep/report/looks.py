@@ -71,6 +71,7 @@ def layout(**further: Any) -> dict[str, Any]:
             "y": 1.02,
             "yanchor": "bottom",
             "itemsizing": "constant",
+            "font": {"size": 11},
         },
         "hovermode": "closest",
         "uirevision": "kept",

@@ -37,7 +37,7 @@ class Ruler:
     def shown(self, values: np.ndarray) -> np.ndarray:
         """Values as they are shown, in the digits that a screen can show."""
         if self.kind == "category":
-            return values.astype(str)
+            return np.array([str(value) for value in values])
         return (values * self.factor).astype(np.float32)
 
     @property

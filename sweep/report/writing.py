@@ -16,7 +16,7 @@ from sweep.analysis.mean_table import outputs_page
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, kind_of, read_attributes
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.tabular import Page as TablePage
-from sweep.report import asked, clouds, detector, flights, heat_maps, lines, samples
+from sweep.report import asked, clouds, detector, flights, heat_maps, lines, reach, samples
 from sweep.report.page import Chart, Page, Section, Table, Text
 from sweep.report.rendering import rendered
 from sweep.spec import Slices, Surface
@@ -69,8 +69,10 @@ def write(store: str | Location, file: str | Path, say: Say = lambda text: None)
 def _grid_page(store: Location, say: Say) -> Page:
     study = Study.of(store)
     dataset, spec = study.dataset, study.spec
-    figures = list(_figures(study, say))
+    figures: list[Item | None] = list(_figures(study, say))
     tables = list(_tables(study, say))
+    say("the maximum range")
+    figures.append(reach.chart(study))
     say("the detector")
     tracks, fewer = detector.tracks(study)
     trades: list[Item | None] = [detector.noise_budget(study, tracks, fewer)]

@@ -8,7 +8,7 @@ import pytest
 from zarr.storage import LocalStore
 
 import sweep
-from sweep.analysis import canvas, opening, slices, surface
+from sweep.analysis import along, canvas, opening, surface
 from sweep.analysis.figures import draw
 
 FIGURES = [
@@ -69,7 +69,7 @@ def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
 def test_neither_does_that_of_its_figures(big_store, tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
     monkeypatch.setattr(surface, "MOST_COLUMNS", 20)
-    monkeypatch.setattr(slices, "COLUMNS", 5)
+    monkeypatch.setattr(along, "STRETCHES", 5)
     monkeypatch.setattr(canvas, "save", lambda sheet, path: path)
     sizes = stores(big_store, tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37

@@ -45,7 +45,7 @@ def false_alarms_per_second(
         shots = quantity(rate, si_unit="Hz", name="the rate of shots")
         if not shots > 0:
             raise ValueError("the rate of shots is a positive number")
-    alarms = (shots * _of_a_shot(dataset, leakage)).rename("false_alarms_per_second")
+    alarms = (shots * of_a_shot(dataset, leakage)).rename("false_alarms_per_second")
     text = "noise and leaked signal" if leakage else "noise alone"
     return alarms.assign_attrs(
         units="s-1", long_name="false alarms a second", comment=f"shots with false alarms by {text}"
@@ -88,8 +88,14 @@ def false_alarms_per_kilometre(
     )
 
 
-def _of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Probability of a false alarm in both chirp segments, or mean number of false alarms."""
+def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
+    """Probability of a false alarm in both chirp segments; where spectra are drawn their number.
+
+    Parameters
+    ----------
+    dataset, leakage
+        As of :func:`false_alarms_per_second`.
+    """
     if "pfa_shot" not in dataset:
         # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
         return dataset["false_alarms"]

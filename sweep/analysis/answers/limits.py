@@ -16,7 +16,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 from sweep.analysis.answers.physical import coordinate
-from sweep.analysis.answers.probability import half_width, named
+from sweep.analysis.answers.probability import confidence, half_width, named
 
 FOUND, NEVER, ALWAYS, NOT_COMPUTED = range(4)
 REASONS = "found never_reached never_lost not_computed"
@@ -96,7 +96,7 @@ def limit(
             ends = _answers(moved, None, ordered[x.name], dim, pd)
             found |= {f"{key}_{end}": a for key, a in ends.items() if not key.endswith("reason")}
     result = xr.Dataset(found).assign_attrs(dataset.attrs)
-    return _described(result, x, segment, pd)
+    return _described(result, x, segment, pd, confidence(dataset, reach))
 
 
 def _ordered(dataset: xr.Dataset, x: xr.DataArray, from_highest: bool) -> tuple[xr.Dataset, str]:
@@ -214,7 +214,9 @@ def _value(place: xr.DataArray, x: xr.DataArray) -> xr.DataArray:
     )
 
 
-def _described(result: xr.Dataset, x: xr.DataArray, segment: str, level: float) -> xr.Dataset:
+def _described(
+    result: xr.Dataset, x: xr.DataArray, segment: str, level: float, sure: dict[str, float]
+) -> xr.Dataset:
     """Units and words of the answers."""
     words = {
         "unbroken": f"farthest {x.name} up to which pd of the {segment} stays {level:g} or more",
@@ -230,4 +232,5 @@ def _described(result: xr.Dataset, x: xr.DataArray, segment: str, level: float) 
         else:
             end = {"low": ", lower end", "high": ", upper end"}.get(str(name).split("_")[-1], "")
             array.attrs = {"units": x.attrs.get("units", ""), "long_name": words[kind] + end}
+            array.attrs |= sure if end else {}
     return result

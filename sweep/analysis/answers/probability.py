@@ -52,12 +52,12 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     for name, words in (("low", "lower"), ("high", "upper")):
         result[name].attrs = {
             "units": "1", "long_name": f"{words} end of the interval of {pd.attrs['long_name']}",
-            **_confidence(dataset, reach),
+            **confidence(dataset, reach),
         }  # fmt: skip
     return result
 
 
-def _confidence(dataset: xr.Dataset, reach: xr.DataArray | None) -> dict[str, float]:
+def confidence(dataset: xr.Dataset, reach: xr.DataArray | None) -> dict[str, float]:
     """How sure an interval is, where that is one number; certain where nothing is drawn."""
     if reach is None:
         return {"confidence": 1.0}
