@@ -11,16 +11,8 @@ import click
 
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.assignments import assignments
-from sweep.cli.options import (
-    BLOCK_TIMEOUT,
-    CLUSTER,
-    DURABLE,
-    PERFORMANCE_REPORT,
-    SCHEDULER,
-    WORKERS,
-)
+from sweep.cli.options import ALLOW_CODE, FORMAT, WORKERS, computing
 from sweep.cli.places import StorePath, shown
-from sweep.cli.spectra import ALLOW_CODE
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
@@ -99,25 +91,9 @@ def main() -> None:
     type=StorePath(),
     help="Where to, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
 )
-@WORKERS
-@SCHEDULER
-@CLUSTER
 @click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
-@ALLOW_CODE
-@BLOCK_TIMEOUT
-@DURABLE
-@PERFORMANCE_REPORT
-def run(
-    spec: Path,
-    store: Location | None,
-    workers: int | None,
-    scheduler: str | None,
-    cluster: Path | None,
-    overwrite: bool,
-    block_timeout: float | None,
-    durable: bool,
-    performance_report: Path | None,
-) -> None:
+@computing
+def run(spec: Path, store: Location | None, overwrite: bool, **how: Any) -> None:
     """Compute the study SPEC into a Zarr store.
 
     A table at the end says how probable detection is; where the study draws, another says at how
@@ -135,17 +111,7 @@ def run(
 
     study, path = load(spec), store or _default_store(spec)
     warn_before(study, path)
-    outcome = driver.run(
-        study,
-        store=path,
-        workers=workers,
-        scheduler=scheduler,
-        cluster=cluster,
-        overwrite=overwrite,
-        block_timeout=block_timeout,
-        durable=durable,
-        performance_report=performance_report,
-    )
+    outcome = driver.run(study, store=path, overwrite=overwrite, **how)
     conclude(outcome, shown(outcome.store))
 
 
@@ -161,24 +127,8 @@ def _default_store(spec: Path) -> Path:
     help="Go on only if the store holds this study.",
 )
 @click.option("--retry-failed", is_flag=True, help="Also try again what failed before.")
-@WORKERS
-@SCHEDULER
-@CLUSTER
-@ALLOW_CODE
-@BLOCK_TIMEOUT
-@DURABLE
-@PERFORMANCE_REPORT
-def resume(
-    store: Location,
-    spec: Path | None,
-    retry_failed: bool,
-    workers: int | None,
-    scheduler: str | None,
-    cluster: Path | None,
-    block_timeout: float | None,
-    durable: bool,
-    performance_report: Path | None,
-) -> None:
+@computing
+def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -> None:
     """Compute what STORE lacks: what was interrupted, what was lost.
 
     Blocks that failed twice are left out, lest they cost every later run a worker, until
@@ -191,18 +141,8 @@ def resume(
     from sweep.spec import load
     from sweep.tasks import driver
 
-    outcome = driver.resume(
-        store,
-        spec=load(spec) if spec else None,
-        retry_failed=retry_failed,
-        workers=workers,
-        scheduler=scheduler,
-        cluster=cluster,
-        block_timeout=block_timeout,
-        durable=durable,
-        performance_report=performance_report,
-    )
-    conclude(outcome, store)
+    asked = load(spec) if spec else None
+    conclude(driver.resume(store, spec=asked, retry_failed=retry_failed, **how), store)
 
 
 @main.command()
@@ -244,13 +184,7 @@ def plan(spec: Path, workers: int | None) -> None:
     type=click.Path(file_okay=False, path_type=Path),
     help="Directory of the figure [results/<name of the spec>].",
 )
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(["png", "pdf", "svg"]),
-    default="png",
-    help="PNG, or PDF or SVG for print [png].",
-)
+@FORMAT
 def shot(
     spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None, form: str
 ) -> None:
@@ -344,13 +278,7 @@ def accuracy(
     type=click.Path(file_okay=False, path_type=Path),
     help="Directory of the figures [NAME-figures beside NAME.zarr].",
 )
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(["png", "pdf", "svg"]),
-    default="png",
-    help="Format of the pictures [png]; pdf and svg for print.",
-)
+@FORMAT
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
     from sweep.tasks.studies import check

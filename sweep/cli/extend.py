@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from sweep.cli.assignments import assignments
-from sweep.cli.options import (
-    BLOCK_TIMEOUT,
-    CLUSTER,
-    DURABLE,
-    PERFORMANCE_REPORT,
-    SCHEDULER,
-    WORKERS,
-)
+from sweep.cli.options import computing
 from sweep.cli.places import StorePath, shown
-from sweep.cli.spectra import ALLOW_CODE
 from sweep.cli.telling import conclude
 from sweep.storage.locations import Location
 
@@ -39,26 +32,15 @@ from sweep.storage.locations import Location
     type=StorePath(),
     help="Where the larger store goes; the old one then stays [in its place].",
 )
-@WORKERS
-@SCHEDULER
-@CLUSTER
 @click.option("--overwrite", is_flag=True, help="Begin anew where an extension was begun.")
-@ALLOW_CODE
-@BLOCK_TIMEOUT
-@DURABLE
-@PERFORMANCE_REPORT
+@computing
 def extend(
     store: Location,
     spec: Path | None,
     fields: tuple[str, ...],
     to: Location | None,
-    workers: int | None,
-    scheduler: str | None,
-    cluster: Path | None,
     overwrite: bool,
-    block_timeout: float | None,
-    durable: bool,
-    performance_report: Path | None,
+    **how: Any,
 ) -> None:
     """Extend STORE to a larger study, and compute only what is new.
 
@@ -87,12 +69,7 @@ def extend(
         load(spec) if spec else None,
         changes=written(texts),
         to=to,
-        workers=workers,
-        scheduler=scheduler,
-        cluster=cluster,
         overwrite=overwrite,
-        block_timeout=block_timeout,
-        durable=durable,
-        performance_report=performance_report,
+        **how,
     )
     conclude(outcome, shown(to or store))

@@ -1,8 +1,10 @@
-"""Options of the commands that compute: how, and what is told of it."""
+"""Options that several commands have: how they compute, and the format of pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -34,3 +36,37 @@ PERFORMANCE_REPORT = click.option(
 DURABLE = click.option(
     "--durable", is_flag=True, help="Blocks count once they are on the disk: safe from power loss."
 )
+
+FORMAT = click.option(
+    "--format",
+    "form",
+    type=click.Choice(["png", "pdf", "svg"]),
+    default="png",
+    help="Format of the pictures [png]; pdf and svg for print.",
+)
+
+
+def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:
+    from sweep.tasks.user_code import allow
+
+    allow(modules)
+
+
+ALLOW_CODE = click.option(
+    "--allow-code",
+    multiple=True,
+    metavar="MODULE",
+    expose_value=False,
+    callback=_allow,
+    help="Let the study run detectors and estimators of this Python module; as often as needed.",
+)
+
+
+def computing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of all that compute, which it hands on as they are."""
+    options = (
+        WORKERS, SCHEDULER, CLUSTER, ALLOW_CODE, BLOCK_TIMEOUT, DURABLE, PERFORMANCE_REPORT,
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command

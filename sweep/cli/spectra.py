@@ -1,4 +1,4 @@
-"""`sweep spectra`: spectra for code of one's own; and leave for a study to run such code."""
+"""`sweep spectra`: spectra for code of one's own."""
 
 from __future__ import annotations
 
@@ -9,22 +9,6 @@ import click
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
-
-
-def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:
-    from sweep.tasks.user_code import allow
-
-    allow(modules)
-
-
-ALLOW_CODE = click.option(
-    "--allow-code",
-    multiple=True,
-    metavar="MODULE",
-    expose_value=False,
-    callback=_allow,
-    help="Let the study run detectors and estimators of this Python module; as often as needed.",
-)
 
 
 def declared(path: Path) -> Spec:
