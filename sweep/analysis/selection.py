@@ -238,6 +238,11 @@ def split(found: Points, names: Sequence[str], most: int) -> tuple[list[tuple[st
             for text, part in parts
             for value, piece in part.apart(name)
         ]
+    return spread(parts, most)
+
+
+def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, Points]], int]:
+    """At most so many parts, spread over all, and the number of those left out."""
     if len(parts) <= most:
         return parts, 0
     return [parts[round(i * (len(parts) - 1) / (most - 1))] for i in range(most)], len(parts) - most

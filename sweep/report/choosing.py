@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from sweep.analysis.figures import Study
-from sweep.analysis.selection import Points, confined, split
+from sweep.analysis.selection import Points, confined, split, spread
 
 MOST_PARTS = 6
 """Values that a chart offers to choose from, at the most."""
@@ -24,7 +24,14 @@ def parts(
         Coordinates that a part has many values of: along the figure's sides and lines.
     where
         Values that coordinates are confined to, as written. There is no part where the study has
-        none of them.
+        none of them. Parts with a single value of a coordinate that is shown are none where
+        others have several, as along zipped axes.
     """
     found = confined(study.points, study.spec, where)
-    return split(found, found.further(shown), MOST_PARTS) if found.size else ([], 0)
+    if not found.size:
+        return [], 0
+    every, _ = split(found, found.further(shown), found.size)
+    several = [
+        (words, part) for words, part in every if all(len(part.distinct(n)) > 1 for n in shown)
+    ]
+    return spread(several or every, MOST_PARTS)

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from sweep.analysis import along, labels
 from sweep.analysis.cuts import GRAZING_ANGLE, RANGE, coordinate_of
 from sweep.analysis.figures import Study
-from sweep.analysis.selection import Points, split
+from sweep.analysis.selection import Points, split, spread
 from sweep.analysis.slices import MOST_LINES
 from sweep.report import lines, looks, wording
 from sweep.report.choosing import MOST_PARTS
@@ -58,7 +58,7 @@ def _pieces(study: Study, name: str) -> tuple[list[tuple[str, Points]], int]:
     found = study.points
     apart, _ = split(found, found.axes[found.axis_of(name)].further([name]), found.size)
     several = [(words, own) for words, own in apart if len(own.distinct(name)) > 1]
-    return several[:MOST_PARTS], max(0, len(several) - MOST_PARTS)
+    return spread(several, MOST_PARTS)
 
 
 def _reach(piece: Points, name: str, factor: float) -> Points:

@@ -58,6 +58,7 @@ def test_parts_of_zipped_axes_are_told_apart():
     cut = {"zip": [
         {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "15 deg"},
         {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
+        {"target.range": "3 km", "target.grazing_angle": ["30 deg", "50 deg", "70 deg"]},
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
     spec = Spec.from_mapping(GRID | {"axes": axes, "figures": []}, base=EXPERIMENTS)
@@ -66,7 +67,7 @@ def test_parts_of_zipped_axes_are_told_apart():
         for axis in spec.axes
         for member in axis.members
     }
-    study = Study(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 6)))}, coordinates), spec)
+    study = Study(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates), spec)
     found, left_out = parts(study, ["range", "power"], {})
     assert left_out == 0
     assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
