@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import dask
 import numpy as np
 import xarray as xr
 
 from sweep.analysis.answers.probability import SEGMENTS, detection_probability, half_width
-from sweep.analysis.cells import HIGHEST, LOWEST, MEAN
+from sweep.analysis.cells import HIGHEST, LOWEST, MEAN, Side
 from sweep.analysis.selection import Points
 
 STRETCHES = 500
@@ -54,41 +55,45 @@ class Line:
         return f"band: interval of each point{sure}" if self.low is not None else ""
 
 
-def lines(found: Sequence[Points], x: str, variable: str) -> list[Line]:
-    """A variable along a coordinate.
+def lines(found: Sequence[tuple[Points, str]], x: str) -> list[Line]:
+    """Variables along a coordinate, all in one reading.
 
     Parameters
     ----------
     found
-        Points of each line, all of one dataset; where coordinates beside `x` vary, their first
-        place is taken.
-    x, variable
-        The coordinate, and the variable: with its intervals where it is a probability of detection
-        that is drawn, or has variables of its own for them, ``.._low`` and ``.._high``.
+        Points of each line, and its variable; where coordinates beside `x` vary, their first place
+        is taken. A variable has intervals where it is a probability of detection that is drawn,
+        or has variables of its own for them, ``.._low`` and ``.._high``.
+    x
+        The coordinate.
     """
-    kinds, confidence, drawn = _kinds(found[0].dataset, variable)
-    made = [(replace(own, dataset=kinds), own.side(x)) for own in found]
-    most = [STRETCHES * (1 if side.values.size > 2 * STRETCHES else 2) for _, side in made]
-    shown = [
-        (MEAN, LOWEST, HIGHEST) if drawn or side.together(number) > 1 else (MEAN,)
-        for (_, side), number in zip(made, most, strict=True)
-    ]
-    lazy = [
-        own.cells(kind, [(side, number)], kind).data
-        for (own, side), number, wanted in zip(made, most, shown, strict=True)
-        for kind in wanted
-    ]
-    computed = iter(dask.compute(*lazy))
+    made = [_Asked(own, variable, own.side(x)) for own, variable in found]
+    computed = iter(dask.compute(*(array for one in made for array in one.lazy())))
     result = []
-    for (_, side), number, wanted in zip(made, most, shown, strict=True):
-        values = {kind: np.asarray(next(computed), float) for kind in wanted}
+    for one in made:
+        values = {kind: np.asarray(next(computed), float) for kind in one.shown}
         result.append(
             Line(
-                side.middles(number), values[MEAN], values.get(LOWEST), values.get(HIGHEST),
-                side.together(number), confidence,
+                one.side.middles(one.most), values[MEAN], values.get(LOWEST), values.get(HIGHEST),
+                one.side.together(one.most), one.confidence,
             )
         )  # fmt: skip
     return result
+
+
+class _Asked:
+    """A line before it is computed."""
+
+    def __init__(self, found: Points, variable: str, side: Side) -> None:
+        kinds, self.confidence, drawn = _kinds(found.dataset, variable)
+        self.side, self._found = side, replace(found, dataset=kinds)
+        self.most = STRETCHES * (1 if side.values.size > 2 * STRETCHES else 2)
+        several = drawn or side.together(self.most) > 1
+        self.shown = (MEAN, LOWEST, HIGHEST) if several else (MEAN,)
+
+    def lazy(self) -> list[Any]:
+        """Arrays of what is shown, not computed."""
+        return [self._found.cells(kind, [(self.side, self.most)], kind).data for kind in self.shown]
 
 
 def _kinds(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float, bool]:

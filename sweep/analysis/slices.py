@@ -43,7 +43,7 @@ def draw(
         for line, own in split(part, [by] if by else [], MOST_LINES)[0]
         if line in names
     ]
-    made = along.lines([own for _, _, own in drawn], x, variable)
+    made = along.lines([(own, variable) for _, _, own in drawn], x)
     packed = any(line.together > 1 for line in made)
     apart = len(lines) > (1 if packed else MOST_TOGETHER)
     factor, units = surface.shown_along(found, x)

@@ -304,8 +304,9 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
     made: list[along.Line] = []
     for number, (variable, words) in enumerate(_SHORT.items()):
         own = [lines.Named(t.words, words, number, replace(t.part, dataset=chances)) for t in found]
+        # a reading each: together their chunks would wait for each other in memory
+        made += along.lines([(line.points, variable) for line in own], name)
         named += own
-        made += along.lines([line.points for line in own], name, variable)
     ruler = wording.Ruler.of(study, name, _values(found))
     closed = noise_only.bin_probability(float(study.spec.parameters()[TNR]))
     return Chart(

@@ -46,7 +46,7 @@ def chart(study: Study, figure: Slices) -> Chart | None:
     if not found:
         return None
     named, lacking = lines_of(found, by)
-    made = along.lines([own.points for own in named], figure.x, figure.variable)
+    made = along.lines([(own.points, figure.variable) for own in named], figure.x)
     ruler = wording.Ruler.of(study, figure.x, longest(named, figure.x))
     words = study.words(figure.variable)
     return Chart(

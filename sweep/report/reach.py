@@ -107,10 +107,9 @@ def _chart(
 ) -> Chart:  # fmt: skip
     x, by = over
     named, _ = lines.lines_of(parts, by)
-    made = {
-        choice: [line for own in named for line in along.lines([own.points], x, answer)]
-        for choice, answer in ANSWERS.items()
-    }
+    pairs = [(own.points, answer) for answer in ANSWERS.values() for own in named]
+    both = along.lines(pairs, x)
+    made = dict(zip(ANSWERS, (both[: len(named)], both[len(named) :]), strict=True))
     ruler = wording.Ruler.of(study, x, lines.longest(named, x))
     return Chart(
         heading=f"Maximum range at a pd of {PD:g}",
