@@ -15,7 +15,7 @@ from sweep.model.equivalent import (
     node_limits,
 )
 from sweep.model.lines import folded_origin, segment_lines
-from sweep.model.segments import reach_of
+from sweep.model.runs import reach_of
 from sweep.model.spectra import segment_spectrum
 from sweep.model.spectrum import bin_magnitudes, tangents
 from sweep.model.window import COSINE_SUMS, samples, window
