@@ -51,8 +51,8 @@ TABLE = FAR + MOST_MOMENTS * FORM_WIDTH
 WIDTH = TABLE + 2 * MOST_MOMENTS * (2 * REACHES[1] + 2 * COLUMNS + LANES)
 """Numbers that a row of scratch must hold."""
 
-MOST_KEPT = 8
-"""Pieces of scratch that a thread keeps; pages that nothing is known on take no memory."""
+MOST_KEPT = 4
+"""Kinds of kernels that a thread keeps; pages that nothing is known on take no memory."""
 
 _SCRATCH = threading.local()
 
@@ -66,21 +66,20 @@ ROWS = (1 + 3 * WAYS) * LADDER
 parts for each segment and way."""
 
 
-def kernels_of(*key: Hashable, shape: tuple[int, ...] = (ROWS, WIDTH)) -> np.ndarray:
-    """Scratch of this thread for what has been worked out of kernels, zeros at first.
+def kernels_of(*key: Hashable, further: int = 0) -> np.ndarray:
+    """Scratch of this thread for what has been worked out of kernels, (ROWS + further, WIDTH).
 
     Parameters
     ----------
     *key
         All that kernels of whole lines depend on. Those of lines in parts are known by the parts'
         digest.
-    shape : tuple of int
-        Its own of each kind of scratch.
+    further : int
+        Rows besides; those of a key are always as many. All are zero at first.
     """
-    key = *key, shape
     kept = _SCRATCH.__dict__.setdefault("kept", OrderedDict())
     if key not in kept:
-        kept[key] = _untouched(shape)
+        kept[key] = _untouched((ROWS + further, WIDTH))
     kept.move_to_end(key)
     while len(kept) > MOST_KEPT:
         kept.popitem(last=False)

@@ -53,7 +53,7 @@ def take_modes(n, whose, modes, allowed, kernel, room):
     n : int
     whose : (int, int, float)
         Segment; place in ``modes``; -1 where the lines are seen as their images, else 1.
-    modes : (3, u, NUMBERS) float64
+    modes : (3, u, >= NUMBERS) float64
         Of :func:`sweep.model.effects.line_modes.in_modes`.
     allowed : float
         Error of a bin's power.

@@ -19,11 +19,19 @@ from collections.abc import Hashable
 import numpy as np
 
 from sweep.model.compiling import borrowing, owning
-from sweep.model.effects.line_modes import IM, MODES, RE, modes
+from sweep.model.effects.line_modes import IM, LINES, MODES, RE, modes
 from sweep.model.elementary import fma, sincos_cycles
 from sweep.model.equivalent import CHEBYSHEV, POWER_TOLERANCES, nodes_for
 from sweep.model.far_field import kernel_beside, sources_needed
-from sweep.model.kernel_rows import HALVES, MOST_MOMENTS, MOST_SOURCES, REACHES, kernels_of
+from sweep.model.kernel_rows import (
+    HALVES,
+    MOST_MOMENTS,
+    MOST_SOURCES,
+    REACHES,
+    ROWS,
+    WIDTH,
+    kernels_of,
+)
 from sweep.model.lanes import COLUMNS, LANES
 
 ASIDE = 0.5
@@ -46,19 +54,29 @@ _WIDTHS = tuple(
     TABLE + MOST_MOMENTS * MODES * (2 * reach + 2 * COLUMNS + LANES) + COLUMNS for reach in REACHES
 )
 
-_NUMBERS = _ROWS * _WIDTHS[0] + len(POWER_TOLERANCES) * _WIDTHS[1]
-"""Of all rows: of bundles by themselves, and of bundles side by side."""
+_FIRST = ROWS * WIDTH + COLUMNS * (MODES + 1)
+"""Where rows begin, of all numbers of scratch, and what the modes are made of ends."""
+
+_NUMBERS = _FIRST + _ROWS * _WIDTHS[0] + len(POWER_TOLERANCES) * _WIDTHS[1]
 
 
-def mode_kernels_of(*key: Hashable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scratch of this thread for kernels of modes; the modes' offsets and strengths.
+def with_modes(*key: Hashable) -> np.ndarray:
+    """Scratch of :func:`sweep.model.kernel_rows.kernels_of`, with rows for modes at its end."""
+    kernels = kernels_of(*key, further=-(-_NUMBERS // WIDTH) - ROWS)
+    own = kernels[ROWS:].reshape(-1)
+    if own[0] == 0.0:
+        for k, values in enumerate((modes().offset, *modes().strength)):
+            own[k * LINES : (k + 1) * LINES] = values
+    return kernels
 
-    Parameters
-    ----------
-    *key
-        As of :func:`sweep.model.kernel_rows.kernels_of`.
-    """
-    return kernels_of(*key, shape=(_NUMBERS,)), modes().offset, modes().strength
+
+@owning()
+def modes_in(kernel):
+    """Offsets and strengths of :func:`sweep.model.effects.line_modes.modes`."""
+    flat = kernel[5].reshape(-1)
+    start = ROWS * WIDTH
+    strength = flat[start + LINES : start + LINES + MODES * LINES]
+    return flat[start : start + LINES], strength.reshape((MODES, LINES))
 
 
 @borrowing()
@@ -83,16 +101,18 @@ def modes_row(level, alone, relative, kernel):
 @owning()
 def slot_of(row, kernel):
     """A row of scratch."""
+    flat = kernel[5].reshape(-1)
     if row < _ROWS:
-        return kernel[6][0][row * _WIDTHS[0] : (row + 1) * _WIDTHS[0]]
-    start = _ROWS * _WIDTHS[0] + (row - _ROWS) * _WIDTHS[1]
-    return kernel[6][0][start : start + _WIDTHS[1]]
+        start = _FIRST + row * _WIDTHS[0]
+        return flat[start : start + _WIDTHS[0]]
+    start = _FIRST + _ROWS * _WIDTHS[0] + (row - _ROWS) * _WIDTHS[1]
+    return flat[start : start + _WIDTHS[1]]
 
 
 @borrowing()
 def _prepare(slot, half, size, kernel):
     """All but what the bins next to lines need."""
-    _, offset, strength = kernel[6]
+    offset, strength = modes_in(kernel)
     number = min(sources_needed(half + ASIDE, MOST_MOMENTS, len(kernel[1][2])), MOST_SOURCES)
     slot[PLACES] = number
     for i in range(number):
@@ -143,7 +163,7 @@ def _shares(x, number, out):
 @borrowing()
 def _take_bounds(slot, kernel):
     """How much more than a line, at most, each mode shows anywhere beside it."""
-    _, offset, strength = kernel[6]
+    offset, strength = modes_in(kernel)
     window_sum, envelope, reach = kernel[2]
     coefficients, fft_size = kernel[1][0], kernel[0][0]
     square, scale = (math.pi / fft_size) ** 2, fft_size / math.pi
@@ -195,7 +215,7 @@ def columns_beside(first, slot, kernel):
 @borrowing()
 def _work_out(first, column, slot, kernel):
     """F_k of LANES bins from ``first`` on, into columns of the table."""
-    _, offset, strength = kernel[6]
+    offset, strength = modes_in(kernel)
     coefficients, fft_size = kernel[1][0], kernel[0][0]
     square, scale = (math.pi / fft_size) ** 2, fft_size / math.pi
     stride = 2 * int(slot[REACH]) + 2 * COLUMNS + LANES

@@ -50,9 +50,9 @@ class Stretch(NamedTuple):
     """(m,) int64: row in the footprints."""
     scene: tuple
     """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
-    many count (3, u), none of a line in modes, which of the u each point has (m,), digests (3, u),
-    nan where no other points have the same; shifts [bins of fs/L] and their weights (m, k); lines
-    in modes (3, u, numbers). Empty where there is none."""
+    many count (3, u), which of the u each point has (m,), digests (3, u), nan where no other points
+    have the same; shifts [bins of fs/L] and their weights (m, k). Empty where there is none.
+    Of lines in modes no parts count, and real weights are what they are known by."""
     lines: int
     """Lines that one point may have at the most."""
 
@@ -123,9 +123,9 @@ def _stretch(
     shared: tuple | None = None,
 ) -> Stretch:
     part, index = slice(first, last), np.arange(first, last)
-    if shared is None:
-        shared = _parts(shots, Alike(index, np.arange(index.size), levels[part]))
-    parts, modes = shared
+    parts = shared
+    if parts is None:
+        parts = _parts(shots, Alike(index, np.arange(index.size), levels[part]))
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
     times = max(parts[0].shape[2], shifts[0].shape[1])
@@ -133,7 +133,7 @@ def _stretch(
         part,
         np.ascontiguousarray(table[:, part]),
         shots.row[part],
-        (shots.footprint, parts, shifts, modes),
+        (shots.footprint, parts, shifts),
         max(beamlets, MOST_NODES) * times if times else beamlets,
     )
 
@@ -152,8 +152,8 @@ def _by_modes(shots: Shots) -> bool:
     return bool(shots.phase_errors) and shots.incoherent and not shots.alike and closed
 
 
-def _parts(shots: Shots, alike: Alike) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Places and weights of the lines that each line is split into, by segment and point; modes."""
+def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
+    """Places and weights of the lines that each line is split into, by segment and point."""
     size = alike.point.size if shots.phase_errors else 0
     modes, splits = np.zeros((3, size if _by_modes(shots) else 0, NUMBERS)), []
     for segment in map(int, np.flatnonzero(shots.segments)) if size else ():
@@ -166,7 +166,8 @@ def _parts(shots: Shots, alike: Alike) -> tuple[tuple[np.ndarray, ...], np.ndarr
             some = left[alike.level[left] == level]
             split = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
             splits.append((segment, some, split))
-    most = max((split.offset.shape[1] for _, _, split in splits), default=min(size, 1))
+    most = max((split.offset.shape[1] for _, _, split in splits), default=0)
+    most = max(most, NUMBERS) if modes.size else most
     offset, re, im = np.zeros((3, 3, size, most))
     number = np.zeros((3, size), np.int64)
     for segment, some, split in splits:
@@ -175,8 +176,10 @@ def _parts(shots: Shots, alike: Alike) -> tuple[tuple[np.ndarray, ...], np.ndarr
         re[segment, some, :lines] = split.weight.real
         im[segment, some, :lines] = split.weight.imag
         number[segment, some] = split.number
+    if modes.size:
+        re[:, :, :NUMBERS] = np.where((number == 0)[..., None], modes, re[:, :, :NUMBERS])
     known_as = digests(offset, re, im) if shots.alike else np.full(number.shape, np.nan)
-    return (offset, re, im, number, alike.which, known_as), modes
+    return offset, re, im, number, alike.which, known_as
 
 
 def _errors(shots: Shots, points: np.ndarray, segment: int) -> tuple:
@@ -245,7 +248,7 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     int
         Number of lines.
     """
-    _, parts, shifts, _ = scene
+    _, parts, shifts = scene
     count = shifts[0].shape[1] if power else parts[0].shape[2]
     if count == 0 or (not power and is_whole(segment, i, scene)):
         return n
@@ -280,10 +283,10 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
 @borrowing()
 def is_whole(segment, i, scene):
     """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
-    parts, modes = scene[1], scene[3]
+    parts = scene[1]
     own = parts[4][i]
     if parts[3][segment, own] == 0:
-        return is_plain(modes[segment, own])
+        return is_plain(parts[1][segment, own])
     whole = parts[3][segment, own] == 1 and parts[0][segment, own, 0] == 0.0
     return whole and parts[1][segment, own, 0] == 1.0 and parts[2][segment, own, 0] == 0.0
 

@@ -19,8 +19,7 @@ from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 from sweep.model.ground import Ground
-from sweep.model.kernel_rows import kernels_of
-from sweep.model.mode_kernels import mode_kernels_of
+from sweep.model.mode_kernels import with_modes
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -220,18 +219,16 @@ class Shots:
     def kernel(self) -> tuple:
         """What the spectrum needs to know of window and FFT, as the compiled code takes it.
 
-        The last two are the thread's own: kernels that are worked out when they are met.
+        The last is the thread's own: kernels that are worked out when they are met.
         """
         w = self.window
-        key = self.fft_size, w.length, w.coefficients, w.edge, self.incoherent
         return (
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach),
             node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
             tangents(self.fft_size),
-            kernels_of(*key),
-            mode_kernels_of(*key),
+            with_modes(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),
         )
 
     def counted_bins(self, exempted: np.ndarray) -> np.ndarray:

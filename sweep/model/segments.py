@@ -16,7 +16,6 @@ from sweep.model.bundles import (
 from sweep.model.compiling import borrowing, owning
 from sweep.model.crossings import MOST_TERMS, crossing_series, largest
 from sweep.model.detection import assess, mark
-from sweep.model.effects.line_modes import NUMBER
 from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
@@ -99,7 +98,7 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
     Those that add as amplitudes are replaced by their parts, if asked for. Returns their origin,
     their number, and -1 where they are seen as their images, else 1.
     """
-    footprint, parts, shifts, _ = scene
+    footprint, parts, shifts = scene
     row, sizes = at[0], kernel[0]
     offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
     phase = footprint[3][segment, row]  # without phases a row of none
@@ -179,10 +178,10 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
     alone = own >= 0 and math.isnan(parts[5][segment, own])
     origin, n, fold = _lines_of(segment, p, scene, at, power, alone, kernel, room)
     if alone and power:
-        if scene[3][segment, own, NUMBER] == 0.0:
+        if parts[3][segment, own] > 0:
             return origin, 0, as_lines()
         n, kind = take_modes(
-            n, (segment, own, fold), scene[3], allowed(p, power), kernel, room
+            n, (segment, own, fold), parts[1], allowed(p, power), kernel, room
         )  # fmt: skip
         return origin, n, kind
     own = -1 if alone else own
@@ -226,9 +225,9 @@ def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.nda
 @borrowing()
 def lent(scene, kernel, work):
     """Scene, kernel and workspace for the length of a call, their use uncounted."""
-    (offset, doppler, amplitude, phase), parts, (shift, share), modes = scene
+    (offset, doppler, amplitude, phase), parts, (shift, share) = scene
     apart, re, im, number, which, digest = parts
-    sizes, shape, sidelobes, limits, tangent, known, (rows, place, strength) = kernel
+    sizes, shape, sidelobes, limits, tangent, known = kernel
     coefficients, numerator, poles, edge, table = shape
     window_sum, envelope, reach = sidelobes
     room, exempt, series = work
@@ -244,7 +243,6 @@ def lent(scene, kernel, work):
                 borrowed(digest),
             ),
             (borrowed(shift), borrowed(share)),
-            borrowed(modes),
         ),
         (
             sizes,
@@ -253,7 +251,6 @@ def lent(scene, kernel, work):
             borrowed(limits),
             borrowed(tangent),
             borrowed(known),
-            (borrowed(rows), borrowed(place), borrowed(strength)),
         ),
         (borrowed(room), borrowed(exempt), borrowed(series)),
     )

@@ -8,7 +8,7 @@ import math
 
 from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import CENTRE, lines_of
-from sweep.model.mode_kernels import bound_of
+from sweep.model.mode_kernels import bound_of, modes_in
 from sweep.model.runs import reach_of
 from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
@@ -24,15 +24,16 @@ def parts_at(segment, i, fold, scene, kernel):
     further : (float, float, float)
         Bound on what parts show beside the line, relative to it; their lowest and highest place.
     """
-    _, parts, _, modes = scene
+    parts = scene[1]
     each, below, above = 1.0, 0.0, 0.0
     if not parts[0].size:
         return (parts[0][0, 0], parts[0][0, 0], parts[0][0, 0]), (each, below, above)
     bins, own = fold * kernel[0][0] / kernel[0][1], parts[4][i]
     number = parts[3][segment, own]
     if number == 0:
-        place, re, im = lines_of(modes[segment, own], kernel[6][1], kernel[6][2])
-        each, below = bound_of(modes[segment, own], kernel), bins * modes[segment, own, CENTRE]
+        numbers, (offset, strength) = parts[1][segment, own], modes_in(kernel)
+        place, re, im = lines_of(numbers, offset, strength)
+        each, below = bound_of(numbers, kernel), bins * numbers[CENTRE]
         above = below
     else:
         place = parts[0][segment, own, :number].copy()
@@ -52,7 +53,7 @@ def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel,
 
     ``split``: the lines' parts (:func:`parts_at`) where powers add; else they are lines already.
     """
-    sizes, shape, _, _, tangent, _, _ = kernel
+    sizes, shape, _, _, tangent, _ = kernel
     power, image = choices[0], choices[1]
     delta, re, im = room[4], room[5], room[6]
     if power and split[0].size:
@@ -72,7 +73,7 @@ def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel,
 @borrowing()
 def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
     """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
-    sizes, shape, _, _, tangent, _, _ = kernel
+    sizes, shape, _, _, tangent, _ = kernel
     total, moved = room[0, : high - low + 1], room[10]
     total[:] = 0.0
     for m in range(shifts[0].shape[1]):
