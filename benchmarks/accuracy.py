@@ -80,9 +80,12 @@ study, in one process, on one core: the spec as it is written; effects on demand
 tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a
 tolerance calls for anywhere; fixed numbers of beamlets, where they add as powers; numbers of
 draws, where the study draws; and the way that the thesis describes. All take turns on parts of
-the sample, round after round, so that whatever slows the machine slows them alike. Times are those
-that the processor spends on the work. The best round counts for them, and ratios are medians of
-those within each round. Planning is counted with what it plans; storing is not counted.
+the sample, round after round, so that whatever slows the machine slows them alike. What a point
+costs depends on those that are computed beside it, as they share what is worked out for them: so
+times are taken on stretches of the blocks that the study computes, some hundreds of points each,
+around points of the sample. They are those that the processor spends on the work. The best round
+counts for them, and ratios are medians of those within each round. Planning is counted with what it
+plans; storing is not counted.
 
 The **error** of a setting at a point is the largest difference, over the segments and the shot,
 of a probability of detection from the reference's: all effects on, and the finest footprint of
@@ -92,11 +95,13 @@ errors random, it is that of 95 % of them. The reference itself is held against 
 sample by sample, at some of the same points.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
-cells a bin, and convolves it with the window's transform by an FFT of 2^11 or 2^12. It is written
-to be as fast as that can fairly be (`sweep/model/oversampled.py`: batches of real or complex
-FFTs, the way back only at the bins), has no leakage and no range walk to compute, and shares
-preparation and detection with the rest. With a deposit of degree 9 the lines are where they
-belong. The same beamlets with the same effects in closed form stand beside it.
+cells a bin, convolves it with the window's transform by an FFT of 2^11 or 2^12, and samples that at
+the bins. Two things would improve it, and stand beside it: a way back to the bins alone, by an FFT
+of a sixteenth of the size (`folded`), and lines shared out among ten cells, by which they are where
+they belong (`degree 9`). All are compiled, transform many spectra at once and real numbers where
+powers add (`sweep/model/oversampled.py`), have no leakage and no range walk to compute, and share
+preparation and detection with the rest. The same beamlets with the same effects in closed form
+stand beside them too.
 
 Two things are asked of the adaptive settings, and the answers below are computed: at equal error
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5

@@ -12,5 +12,8 @@ from numba import njit
 borrowing = partial(njit, cache=True, error_model="numpy", _nrt=False)
 """For kernels that neither make arrays nor hand any back."""
 
+inlined = partial(borrowing, forceinline=True)
+"""For those that one other calls for each segment, and that are handed more than they look at."""
+
 owning = partial(njit, cache=True, error_model="numpy", _nrt=True)
 """For those that do, among kernels that borrow: else they would be compiled as these."""

@@ -255,9 +255,12 @@ def categories(
     if not varying:
         yield np.arange(size), arrays
         return
-    codes = [np.unique(arrays[path], return_inverse=True)[1] for path in varying]
-    _, member = np.unique(np.stack(codes), axis=1, return_inverse=True)
-    member = member.ravel()
+    member = np.zeros(size, np.int64)
+    for path in varying:
+        if (arrays[path] == arrays[path][0]).all():  # the rule, and found without sorting
+            continue
+        different, code = np.unique(arrays[path], return_inverse=True)
+        member = np.unique(member * different.size + code, return_inverse=True)[1]
     for group in range(member.max() + 1):
         index = np.flatnonzero(member == group)
         chosen = {path: a[index] if a.ndim else a for path, a in arrays.items()}

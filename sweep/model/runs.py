@@ -19,7 +19,7 @@ from sweep.model.bundles import (
     add_near,
     constant_of,
 )
-from sweep.model.compiling import borrowing
+from sweep.model.compiling import borrowing, inlined
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
 from sweep.model.kernel_rows import REACHES, ROWS
@@ -30,7 +30,7 @@ SOURCES, IMAGES = 13, 16
 """First of three rows each that hold the sources of lines and of images."""
 
 
-@borrowing()
+@inlined()
 def smooth(kernel):
     """Whether spectra are smooth between lines: closed form of the window, no padding."""
     return kernel[1][4].size == 0 and kernel[0][0] == kernel[0][1]
@@ -93,7 +93,7 @@ def detect(origin, n, kind, level, choices, kernel, room, exempt):
             return low, count, peak, exempted
 
 
-@borrowing()
+@inlined()
 def bundle(n, kind, power, room):
     """Turns lines into strengths, unless they are sources of bundles.
 
@@ -106,13 +106,13 @@ def bundle(n, kind, power, room):
     )  # fmt: skip
 
 
-@borrowing()
+@inlined()
 def served_beside(kind, kernel):
     """Bins beyond the clearance in which known kernels take less time than sources, of many."""
     return 0 if kind[1] < 2 else min(REACHES[1] // 4, kernel[0][0] // 128)
 
 
-@borrowing()
+@inlined()
 def _lifted(level, total, afar, spread, centre, image, kernel):
     """Bins beside the lines that they and their images may lift to a level."""
     poles, half_size = len(kernel[1][2]), kernel[0][0] // 2
@@ -124,7 +124,7 @@ def _lifted(level, total, afar, spread, centre, image, kernel):
     return math.ceil(min(max(near, poles + 2.0), float(half_size)))
 
 
-@borrowing()
+@inlined()
 def stays_below(level, weight, spread, centre, image, kernel):
     """Bins beyond which lines and images of a summed weight stay below a level.
 
@@ -160,7 +160,7 @@ def seen_from(origin, spread, fft_size):
     return fft_size - centre if centre > fft_size // 2 else centre
 
 
-@borrowing()
+@inlined()
 def near_bins(origin, lowest, highest, apart, image, kernel):
     """First and last bin ``apart`` from a line; whether images are near; whether angles small."""
     fft_size = kernel[0][0]

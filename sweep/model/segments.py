@@ -13,7 +13,7 @@ from sweep.model.bundles import (
     as_lines,
     take_bundles,
 )
-from sweep.model.compiling import borrowing, owning
+from sweep.model.compiling import borrowing, inlined, owning
 from sweep.model.crossings import MOST_TERMS, crossing_series, largest
 from sweep.model.detection import assess, mark
 from sweep.model.elementary import borrowed
@@ -164,7 +164,7 @@ def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series
     return inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
 
 
-@borrowing()
+@inlined()
 def _smooth_lines(segment, p, scene, at, power, kernel, room):
     """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
 

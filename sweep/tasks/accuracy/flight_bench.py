@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from sweep.spec.world import World
     from sweep.tasks.accuracy.bench import Look
 
-#: Tiles that are computed together and that there are in all, at the least, where the flight has
-#: them; places along the axes at which each scanner is looked at.
-TOGETHER, LEAST_TILES, PLACES = 2, 4, 2
+#: Tiles that are computed together, so many that a call costs nothing beside them, as in a study's
+#: blocks, where the flight has them; places along the axes at which each scanner is looked at.
+TOGETHER, PLACES = 8, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class FlightBench:
         for name, stretches in study.scanners.items():
             axes = stretches.axes
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
-            wanted = max(points / TILE_SHOTS, LEAST_TILES) / len(study.scanners) / len(places)
+            wanted = points / TILE_SHOTS / len(study.scanners) / len(places)
             for place in places:
                 index = _spread_shots(stretches, max(TOGETHER, math.ceil(wanted)))
                 part = Part(name, tuple(int(i) for i in place), 0, 0)
