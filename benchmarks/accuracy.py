@@ -87,12 +87,13 @@ around points of the sample. They are those that the processor spends on the wor
 counts for them, and ratios are medians of those within each round. Planning is counted with what it
 plans; storing is not counted.
 
-The **error** of a setting at a point is the largest difference, over the segments and the shot,
-of a probability of detection from the reference's: all effects on, and the finest footprint of
-all. The error that a setting is said to have is the largest over the points, for that is what a
-tolerance promises; the figures show as well what 90 % of the points stay below. Where draws make
-errors random, it is that of 95 % of them. The reference itself is held against the time domain,
-sample by sample, at some of the same points.
+The **error** of a setting is what a tolerance promises to bound: the largest, over the points,
+of the differences from the reference in a probability of detection, of the segments and the
+shot, in log10 of a probability of false alarm, and in the magnitude of a peak's bin over itself
+or sigma. The reference has all effects on and the finest footprint of all. The figures show as
+well what 90 % and half of the points stay below in pd. Where draws make errors random, the error
+is that of pd at 95 % of the points. The reference itself is held against the time domain, sample
+by sample, at some of the same points.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
 cells a bin, convolves it with the window's transform by an FFT of 2^11 or 2^12, and samples that at

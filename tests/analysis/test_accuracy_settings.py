@@ -118,6 +118,16 @@ def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
     assert "can be improved to: auto at 0.001 is 6 times as fast as thesis 2^12, folded" in told
 
 
+def test_what_counts_is_the_largest_of_all_that_is_promised(dataset):
+    dataset["magnitude_error"] = 10 * dataset.pd_error
+    dataset["log10_pfa_error"] = 0.0 * dataset.pd_error
+    named = {s.name: s for s in settings.settings_in(dataset)}
+    assert named["auto at 0.001"].error == pytest.approx(5e-3)
+    assert named["auto at 0.001"].quantile(1.0) == pytest.approx(5e-4)
+    dataset["magnitude_error"] = np.nan * dataset.pd_error  # as of detections counted
+    assert settings.settings_in(dataset)[2].error == pytest.approx(5e-4)
+
+
 def test_where_errors_are_random_most_of_the_points_count(dataset):
     dataset.standard_error[:] = 0.01
     found = settings.settings_in(dataset)[1]

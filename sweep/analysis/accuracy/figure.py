@@ -59,7 +59,7 @@ def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
 
 
 def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
-    """A mark at the error that counts, a line down to the one of 90 %, a dot at the median."""
+    """A mark at the error that counts, a line down to pd's of 90 %, a dot at its median."""
     time = 1e6 * setting.seconds
     worst, most, half = (_shown(setting.quantile(q)) for q in (setting.likely, 0.9, 0.5))
     if most > FLOOR:
@@ -151,7 +151,7 @@ def _finish(axes: Axes, least: float) -> None:
     axes.xaxis.set_major_formatter(plain)
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
     axes.set_xlabel("time a point on one core (µs)")
-    axes.set_ylabel("error of a probability of detection")
+    axes.set_ylabel("error, largest of pd, log10 pfa, magnitudes; line: pd at 90 %, dot: median")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -53,8 +53,14 @@ class Setting:
 
     @property
     def error(self) -> float:
-        """That which counts: the largest over points, or over most of them."""
-        return self.quantile(self.likely)
+        """That which counts: the largest over the points, of all that a tolerance promises.
+
+        Where it is random, that of pd at most of the points.
+        """
+        if self.likely < 1.0:
+            return self.quantile(self.likely)
+        promised = self.quantile(1.0), self.log10_pfa_error, self.magnitude_error
+        return float(np.fmax.reduce(promised))
 
     def quantile(self, share: float) -> float:
         """Error of pd that this share of the points stays below."""

@@ -25,7 +25,7 @@ MOST_ROUNDS = 9
 PARTS = 2
 """Parts of a sample, at the least: whole ones are kept where it is broken off."""
 
-LONG_ENOUGH = 0.15
+LONG_ENOUGH = 0.4
 """Time of a trial [s] from which on its calls cost little beside the points themselves."""
 
 TOO_LONG = 8
