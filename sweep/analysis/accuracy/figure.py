@@ -61,7 +61,7 @@ def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
 def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
     """A mark at the error that counts, a line down to pd's of 90 %, a dot at its median."""
     time = 1e6 * setting.seconds
-    worst, most, half = (_shown(setting.quantile(q)) for q in (setting.likely, 0.9, 0.5))
+    worst, most, half = map(_shown, (setting.error, setting.quantile(0.9), setting.quantile(0.5)))
     if most > FLOOR:
         axes.plot([time, time], [most, worst], color=colour, linewidth=1.0, alpha=0.6, zorder=2)
         axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
@@ -82,7 +82,7 @@ def _join(axes: Axes, settings: Sequence[Setting], colour: str) -> None:
 
 
 def _place(setting: Setting) -> float:
-    return _shown(setting.quantile(setting.likely))
+    return _shown(setting.error)
 
 
 def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
