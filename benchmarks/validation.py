@@ -12,7 +12,7 @@ import numpy as np
 
 import sweep
 from sweep.analysis import labels, noise_only
-from sweep.analysis.false_alarms import VARIABLES, entries
+from sweep.analysis.false_alarms import entries
 from sweep.analysis.figures import Study
 from sweep.analysis.shot_figure import chosen
 from sweep.analysis.shot_spectra import simulated
@@ -125,7 +125,7 @@ def alarms(name, number):
     """One of Tables 4.3 to 4.5."""
     study = Study.of(results(name))
     (figure,) = [f for f in study.spec.figures if f.kind == "false_alarm_table"]
-    found = entries(study.points(*VARIABLES), study.spec, by=figure.by, printed=figure.printed)
+    found = entries(study.points, study.spec, by=figure.by, printed=figure.printed)
     rows = [
         [e.row, e.column, f"{e.reference.closed_form:.3e}", f"{e.mean:.3e}", f"{e.printed:.3e}",
          f"{100 * (e.printed / e.mean - 1):+.1f} %", f"{100 * e.excess(e.printed):.2f} %",
