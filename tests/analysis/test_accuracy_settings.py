@@ -151,7 +151,7 @@ def test_marks_stand_at_times_and_errors(dataset):
     marks = {
         tuple(np.ravel(line.get_data()))
         for line in axes.lines
-        if line.get_marker() in "os^DPXv1*" and len(line.get_xdata()) == 1
+        if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
     }
     expected = {
         (us, max(max(e), figure.FLOOR)) for _, kind, _, us, e in MADE_UP if kind != "reference"

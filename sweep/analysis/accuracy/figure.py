@@ -34,7 +34,7 @@ MARKS = {
     of.IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
     of.CLOSED_FORM: ("X", canvas.LINES[5], "in closed form what the thesis's way has"),
     of.THESIS: ("v", canvas.LINES[4], "the thesis's way"),
-    of.IMPROVED: ("1", canvas.LINES[4], "the thesis's way, improved"),
+    of.IMPROVED: ("p", canvas.LINES[4], "the thesis's way, improved"),
     of.WRITTEN: ("*", canvas.LINES[6], "as written"),
 }
 """Marker, colour and words of each kind."""
@@ -120,7 +120,7 @@ def _short(setting: Setting) -> str:
     """What tells a setting from others of its kind."""
     if setting.kind == of.ADAPTIVE:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
-    if setting.kind in (of.THESIS, of.IMPROVED):
+    if setting.kind == of.THESIS:
         return setting.name.removeprefix("thesis ")
     if setting.kind in BY_NUMBER:
         return setting.name.split()[0]
@@ -151,7 +151,7 @@ def _finish(axes: Axes, least: float) -> None:
     axes.xaxis.set_major_formatter(plain)
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
     axes.set_xlabel("time a point on one core (µs)")
-    axes.set_ylabel("error, largest of pd, log10 pfa, magnitudes; line: pd at 90 %, dot: median")
+    axes.set_ylabel("largest error of pd, log10 pfa and magnitudes")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
@@ -164,7 +164,7 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} %"
     parts = [
         f"mark: {worst} of {labels.counted(attributes['points'], attributes['unit'][:-1])}; "
-        f"bar: that of 90 % of them; dot: median; {FLOOR:g} and less at the foot",
+        f"bar and dot: 90 % and half of them, in pd alone; {FLOOR:g} and less at the foot",
         f"best of {labels.counted(dataset.sizes['round'], 'round')}; "
         f"reference: {attributes['reference']}",
     ]
