@@ -1,7 +1,7 @@
 """How kernels are compiled: once, kept on disk, without a count of who uses the arrays.
 
 A kernel that is handed arrays, or slices them, would else count each of them up and down, in every
-call: two thirds of the time where there are few lines. So kernels borrow: what called them from
+call: half of the time where there are few lines. So kernels borrow: what called them from
 outside compiled code holds on to all arrays meanwhile (:func:`sweep.model.segments.lent`).
 """
 

@@ -206,6 +206,22 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     assert np.array_equal(whole.ravel()[numbers], seen.pd[:, 3])
 
 
+def test_what_is_timed_lies_in_the_points_own_block_at_other_ranges_first():
+    bench = GridBench(small(footprint=COHERENT), 8)
+    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
+    grid = bench._calling_of(rung).tiles.grid
+    (range_,) = [
+        k for k, axis in enumerate(grid.spec.axes) if axis.members[0].path == "target.range"
+    ]
+    for number in bench._numbers:
+        stretch = bench._stretches(rung, np.array([number]), 3)
+        places = np.array(np.unravel_index(stretch, grid.shape))
+        blocks = places // np.array(grid.block_shape)[:, None]
+        assert stretch[0] == number and (blocks == blocks[:, :1]).all()
+        along = min(3, grid.block_shape[range_])
+        assert len(set(places[range_, :along])) == along
+
+
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))
