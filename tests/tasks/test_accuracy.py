@@ -206,20 +206,20 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     assert np.array_equal(whole.ravel()[numbers], seen.pd[:, 3])
 
 
-def test_what_is_timed_lies_in_the_points_own_block_at_other_ranges_first():
-    bench = GridBench(small(footprint=COHERENT), 8)
+def test_what_is_timed_lies_in_the_points_own_block_at_other_powers_and_ranges_first():
+    bench = GridBench(small(footprint=COHERENT, storage={"block_points": 24}), 8)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     grid = bench._calling_of(rung).tiles.grid
-    (range_,) = [
-        k for k, axis in enumerate(grid.spec.axes) if axis.members[0].path == "target.range"
-    ]
+    assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
     for number in bench._numbers:
-        stretch = bench._stretches(rung, np.array([number]), 3)
-        places = np.array(np.unravel_index(stretch, grid.shape))
+        first = np.unravel_index(number, grid.shape)
+        beside = bench._stretches(rung, np.array([number]), 24)
+        places = np.array(np.unravel_index(beside, grid.shape))
         blocks = places // np.array(grid.block_shape)[:, None]
-        assert stretch[0] == number and (blocks == blocks[:, :1]).all()
-        along = min(3, grid.block_shape[range_])
-        assert len(set(places[range_, :along])) == along
+        assert beside[0] == number and len(set(beside)) == 24 and (blocks == blocks[:, :1]).all()
+        left = 8 - 2 * (first[1] % 4) - first[0]  # of its own grazing angle
+        assert (places[2, :left] == first[2]).all() and places[2, left] != first[2]
+        assert len(set(map(tuple, places[:2, :left].T))) == left
 
 
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
