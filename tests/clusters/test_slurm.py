@@ -17,15 +17,15 @@ from sweep.tasks.driver import run
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
-#: Blocks of about a tenth of a second: time enough to kill something in their midst.
+#: Blocks of some tenths of a second: time enough for another job in the place of a killed one.
 SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109},
-    "draws": {"number": 3000, "method": "noise", "batch": 1000},
-    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 150}},
+    "draws": {"number": 100_000, "method": "noise", "batch": 1000},
+    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 60}},
     "storage": {"block_points": 1},
 }
-BLOCKS = 150
+BLOCKS = 60
 WAIT = 120.0
 
 
