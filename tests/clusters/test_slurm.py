@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109},
-    "draws": {"number": 100_000, "method": "noise", "batch": 1000},
+    "draws": {"number": 1_000_000, "method": "noise", "batch": 1000},
     "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 60}},
     "storage": {"block_points": 1},
 }
