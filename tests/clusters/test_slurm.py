@@ -17,15 +17,16 @@ from sweep.tasks.driver import run
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
-#: Blocks of some tenths of a second: time enough for another job in the place of a killed one.
+#: Blocks of some tenths of a second (nearer, where more bins count, of minutes): time enough for
+#: another job in the place of a killed one.
 SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109},
     "draws": {"number": 1_000_000, "method": "noise", "batch": 1000},
-    "axes": {"target.range": {"linear": ["10 m", "5 km"], "number": 60}},
+    "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 40}},
     "storage": {"block_points": 1},
 }
-BLOCKS = 60
+BLOCKS = 40
 WAIT = 120.0
 
 
