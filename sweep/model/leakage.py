@@ -87,7 +87,9 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     crossing = stays_below(noise[1], total * kernel[2][0], highest - lowest, centre, image, kernel)
     clearance = CLEARANCE + poles
     reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
-    alone = _all_beyond(total, float(clearance + reach), noise, image, kernel) <= noise[2]
+    mirror = min(centre, half_size - centre) - 0.5 * (highest - lowest) - 1.0
+    mirror = mirror if image else math.inf
+    alone = _all_beyond(total, float(clearance + reach), mirror, noise, kernel) <= noise[2]
     if alone and reach > 0:
         served = min(reach, served_beside(kind, kernel))
         wider = near_bins(origin, lowest, highest, clearance + served, image, kernel)
@@ -120,36 +122,41 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
 
 
 @borrowing()
-def _all_beyond(total, first, noise, image, kernel):
+def _all_beyond(total, first, mirror, noise, kernel):
     """Bound on the chance that any bin ``first`` or more bins from the lines adds to leakage.
 
     With x = a^2/2, y = b^2/2 and z = a b a bin's own is at most
 
         x dQ_1/dx = x y e^{-y} g,    g = I_1(z) / (z/2) <= e^{z^2/8}, 2 e^z / sqrt(2 pi z^3)
 
-    (and no less than at shorter distances); bins count by steps of a factor of four. Images are
-    no nearer than the lines.
+    so that all of them together have at most y e^{-y} g(nearest) times the sum of x. Images are no
+    nearer to a bin than the lines, nor than ``mirror``; infinite where there are none.
     """
-    sigma, level, allowed = noise
-    half_size = kernel[0][0] // 2
-    window_sum, envelope, reach = kernel[2]
-    weight = total * window_sum / sigma * (2.0 if image else 1.0)
+    sigma, level, _ = noise
+    weight = total * kernel[2][0] / sigma
     b = level / sigma
     y = 0.5 * b * b
-    bound, distance = 0.0, first
-    while distance < half_size and bound <= allowed:
-        place = np.searchsorted(reach, max(distance - 1.5, 0.0), "right") - 1
-        a = weight * envelope[max(place, 0)]
-        z = a * b
-        if z > 2.0 * y:
-            return np.inf
-        growth = z * z / 8.0
-        if z > 1.0:
-            growth = min(growth, z + math.log(2.0 / math.sqrt(2.0 * math.pi * z * z * z)))
-        after = min(4.0 * distance, float(half_size))
-        bound += 2.0 * (after - distance) * 0.5 * a * a * y * math.exp(growth - y)
-        distance = after
-    return bound / -math.expm1(-y)
+    nearest, squares = _envelope_beyond(first, kernel)
+    if mirror < math.inf:
+        image, image_squares = _envelope_beyond(max(first, mirror), kernel)
+        image_squares += max(mirror - first, 0.0) * image * image
+        nearest += image
+        squares = (math.sqrt(squares) + math.sqrt(image_squares)) ** 2
+    z = weight * nearest * b
+    if z > 2.0 * y:
+        return np.inf
+    growth = z * z / 8.0
+    if z > 1.0:
+        growth = min(growth, z + math.log(2.0 / math.sqrt(2.0 * math.pi * z * z * z)))
+    return weight * weight * squares * y * math.exp(growth - y) / -math.expm1(-y)
+
+
+@borrowing()
+def _envelope_beyond(first, kernel):
+    """Window's envelope ``first`` bins away; sum of its squares in all bins from there on."""
+    _, envelope, reach, beyond = kernel[2]
+    place = max(np.searchsorted(reach, max(first - 1.5, 0.0), "right") - 1, 0)
+    return envelope[place], envelope[place] * envelope[place] + beyond[place]
 
 
 @borrowing()
@@ -164,7 +171,7 @@ def _chances(count, noise, kernel, room, exempt, series):
 def _least_reach(total, spread, noise, crossing, kernel):
     """Bins beyond the near ones that the run has to take in: see the module."""
     sigma, level, _ = noise
-    window_sum, envelope, reach = kernel[2]
+    window_sum, envelope, reach, _ = kernel[2]
     half_size = kernel[0][0] // 2
     clearance = CLEARANCE + len(kernel[1][2])
     weight = total * window_sum

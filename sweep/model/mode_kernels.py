@@ -164,7 +164,7 @@ def _shares(x, number, out):
 def _take_bounds(slot, kernel):
     """How much more than a line, at most, each mode shows anywhere beside it."""
     offset, strength = modes_in(kernel)
-    window_sum, envelope, reach = kernel[2]
+    window_sum, envelope, reach, _ = kernel[2]
     coefficients, fft_size = kernel[1][0], kernel[0][0]
     square, scale = (math.pi / fft_size) ** 2, fft_size / math.pi
     y = 0.0

@@ -37,7 +37,7 @@ CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
-LEAKAGE_SHARE = 0.02
+LEAKAGE_SHARE = 0.1
 """Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
 
 AUTOMATIC = -1.0
@@ -225,7 +225,7 @@ class Shots:
         return (
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
-            (w.sum, w.envelope, w.reach),
+            (w.sum, w.envelope, w.reach, w.beyond),
             node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
             tangents(self.fft_size),
             with_modes(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),

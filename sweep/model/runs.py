@@ -130,7 +130,7 @@ def stays_below(level, weight, spread, centre, image, kernel):
 
     The envelope is of sin(pi y) K(y): K itself falls to it within a bin.
     """
-    _, envelope, reach = kernel[2]
+    _, envelope, reach, _ = kernel[2]
     crossing = reach_of(0.9 * level, weight, envelope, reach)
     far = min(centre, kernel[0][0] // 2 - centre) - 0.5 * spread - 1.0
     if image and far < 32.0 * crossing:  # else images add less than a tenth

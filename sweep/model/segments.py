@@ -229,7 +229,7 @@ def lent(scene, kernel, work):
     apart, re, im, number, which, digest = parts
     sizes, shape, sidelobes, limits, tangent, known = kernel
     coefficients, numerator, poles, edge, table = shape
-    window_sum, envelope, reach = sidelobes
+    window_sum, envelope, reach, beyond = sidelobes
     room, exempt, series = work
     return (
         (
@@ -247,7 +247,7 @@ def lent(scene, kernel, work):
         (
             sizes,
             (coefficients, numerator, poles, edge, borrowed(table)),
-            (window_sum, borrowed(envelope), borrowed(reach)),
+            (window_sum, borrowed(envelope), borrowed(reach), borrowed(beyond)),
             borrowed(limits),
             borrowed(tangent),
             borrowed(known),

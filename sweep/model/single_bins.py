@@ -119,7 +119,7 @@ def extent_of(i, n, split, further, shifts, power, kernel, room):
 def bins_above(level, extent, origin, kernel):
     """First and last bin, within 0..N/2, that lines of an extent can lift above a level."""
     fft_size, length = kernel[0]
-    window_sum, envelope, reach = kernel[2]
+    window_sum, envelope, reach, _ = kernel[2]
     total, lowest, highest = extent
     beyond = reach_of(level, total * window_sum, envelope, reach) * fft_size / length + 2.0
     half = fft_size // 2

@@ -15,7 +15,7 @@ keeps its relative accuracy in the far sidelobes, where its terms cancel.
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import mpmath
 import numpy as np
@@ -73,6 +73,12 @@ class Window:
     table: np.ndarray
     reach: np.ndarray
     envelope: np.ndarray
+
+    @cached_property
+    def beyond(self) -> np.ndarray:
+        """At least the integral of envelope^2 from each reach to L/2 [bins of fs/L], (m,)."""
+        steps = np.append(np.diff(self.reach), 0.0) * self.envelope**2
+        return np.cumsum(steps[::-1])[::-1].copy()
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
