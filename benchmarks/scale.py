@@ -46,28 +46,23 @@ class Line:
         return {"array": np.arange(self.n_blocks)}
 
 
-def receipt(block):
+def receipt(block, points=65_536):
     """A receipt as workers give it."""
     from sweep.tasks import versions
     from sweep.tasks.journal import Receipt
 
     return Receipt(
-        block=block, points=65_536, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
+        block=block, points=points, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
         write_seconds=0.0123, host="node-0123", pid=12_345, versions=versions.software(),
     )  # fmt: skip
 
 
 def filled(directory, n_blocks):
     """A store's log, and its chunks as names of a few files, of so many blocks all done."""
-    from sweep.storage.sealing import closed
-
     store = Path(directory) / "line.zarr"
     (store / ".sweep").mkdir(parents=True)
-    record = {**vars(receipt(0)), "time": round(time.time(), 3)}
-    rest = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
     with open(store / ".sweep" / "receipts.jsonl", "wb") as log:
-        for block in range(n_blocks):
-            log.write(closed(f'{{"block":{block},{rest}'.encode()))
+        log.writelines(receipt_lines(n_blocks))
     chunks = store / "array" / "c"
     chunks.mkdir(parents=True)
     for block in range(n_blocks if n_blocks <= MOST_FILES else 0):
@@ -77,6 +72,15 @@ def filled(directory, n_blocks):
         else:
             os.link(chunk, chunks / str(block))
     return store
+
+
+def receipt_lines(n_blocks, points=65_536):
+    """Lines of a log, of so many blocks all done."""
+    from sweep.storage.sealing import closed
+
+    record = {**vars(receipt(0, points)), "time": round(time.time(), 3)}
+    rest = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
+    return (closed(f'{{"block":{block},{rest}'.encode()) for block in range(n_blocks))
 
 
 def timed(what):

@@ -270,6 +270,8 @@ class Session:
                 return unwritable(self._path, FileNotFoundError())
 
     def _compile(self) -> None:
+        if self._pool.terms.evaluate:  # in place of the model
+            return
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
 

@@ -16,8 +16,9 @@ import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -189,7 +190,7 @@ class Written(NamedTuple):
 
 
 class Arrays:
-    """Arrays of a store for writing blocks, each opened when it is first written and kept open.
+    """Arrays of a store for writing blocks, opened when they are first written and kept open.
 
     Parameters
     ----------
@@ -251,11 +252,16 @@ class Arrays:
 
     def _array(self, name: str) -> tuple[zarr.Array[Any], chunks.Chunked]:
         if name not in self._arrays:
-            import zarr
-
-            opened = zarr.open_array(zarr_store(self.path / name), mode="r+")
+            opened = cast("zarr.Array[Any]", self._group[name])
             self._arrays[name] = opened.with_config(WRITTEN_WHOLE), chunks.Chunked.of(opened)
         return self._arrays[name]
+
+    @cached_property
+    def _group(self) -> zarr.Group:
+        """The store, its metadata read once for all arrays."""
+        import zarr
+
+        return zarr.open_group(zarr_store(self.path), mode="r+")
 
 
 def block_objects(study: Study, block: int) -> list[str]:

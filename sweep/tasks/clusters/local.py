@@ -36,7 +36,7 @@ def start(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
         options |= listening | {"scheduler_port": port}
     name = "distributed.nanny.pre-spawn-environ"
     environment = {**dask.config.get(name), **common.environment(cluster.environment)}
-    with dask.config.set({name: environment}):
+    with dask.config.set({**common.CALM, name: environment}):
         try:
             return LocalCluster(dashboard_address=dashboard, **options)
         except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
