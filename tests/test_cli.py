@@ -78,14 +78,29 @@ def test_the_summary_counts_what_the_store_holds(here):
     from sweep.tasks.summary import summary
 
     sweep("run", "small.yaml", "--scheduler", "none")
-    heading, rows = summary(here / "results" / "small.zarr")
-    assert heading == "range [m]"
+    heading, rows, share = summary(here / "results" / "small.zarr")
+    assert heading == "range [m]" and share == 1
     shot = xr.open_zarr(here / "results" / "small.zarr").pd_shot
     assert [row.points for row in rows] == [8] * 10 + [80]
     first = shot.isel(range=slice(0, 4)).values
     assert rows[0].detected == np.count_nonzero(first > 0.9) / 8
     assert rows[-1].pd_shot == np.median(shot.values)
     assert 0 < rows[-1].detected < 1
+
+
+def test_the_table_of_a_large_study_is_by_some_of_its_blocks_and_says_so(here, monkeypatch):
+    from sweep.tasks import summary
+
+    sweep("run", "small.yaml", "--scheduler", "none")
+    _, whole, _ = summary.summary(here / "results" / "small.zarr")
+    monkeypatch.setattr(summary, "MOST_BLOCKS", 4)
+    _, rows, share = summary.summary(here / "results" / "small.zarr")
+    assert share == 4 / 10
+    assert rows[-1].points == 4 * 8 and whole[-1].points == 10 * 8
+    kept = {row.part: row for row in whole}
+    assert sum(row.points > 0 for row in rows[:-1]) == 4  # a block is a part of this study
+    assert all(row == kept[row.part] for row in rows[:-1] if row.points)
+    assert "by 40 % of the blocks" in sweep("resume", "results/small.zarr").stdout
 
 
 def test_a_second_run_is_refused_and_says_how_to_go_on_or_begin_anew(here):

@@ -71,10 +71,11 @@ def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
     """Title, headings and rows of a grid's summary."""
     from sweep.tasks.summary import DETECTED, summary
 
-    part, rows = summary(store)
+    part, rows, share = summary(store)
     headings = [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"]
     return (
-        "Probability of detection",
+        "Probability of detection"
+        + (f", by {100 * share:.2g} % of the blocks" if share < 1 else ""),
         headings,
         [
             [

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.storage.locations import Location, located, read_array
+from sweep.storage.locations import Location, located
 from sweep.tasks import studies
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.pieces import done_blocks, pieces
 
 if TYPE_CHECKING:
     from sweep.spec import Axis, Spec
@@ -44,37 +45,61 @@ def accuracy_table(store: str | Location) -> list[AccuracyRow]:
     StoreError
         Where there is no store of sweep's.
     """
-    _, study = studies.read(located(store))
+    path = located(store)
+    _, study = studies.read(path)
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
         return []
-    return list(_rows(located(store), study.spec))
+    return list(_rows(path, study))
 
 
-def _rows(store: Location, spec: Spec) -> Iterator[AccuracyRow]:
+def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
     from sweep.model.outputs import PROMISED
 
-    def read(name: str) -> np.ndarray:
-        return np.asarray(read_array(store / name)[...])
+    spec, found = study.spec, {name: _Worst() for name in PROMISED}
+    names = ["n_draws", *(f"{name}_half_width" for name in PROMISED)]
+    tolerance = np.broadcast_to(_tolerance(spec), study.grid.shape)
+    for place, (draws, *widths) in pieces(store, study, names, done_blocks(store, study)):
+        for worst, width in zip(found.values(), widths, strict=True):
+            worst.add(width, tolerance[place], draws, tuple(part.start for part in place))
+    for name, worst in found.items():
+        if worst.points:
+            yield AccuracyRow(
+                name=name,
+                points=worst.points,
+                met=worst.met,
+                half_width=worst.half_width,
+                tolerance=worst.tolerance,
+                where=_place(spec.axes, worst.index),
+                draws=worst.draws,
+                needed=_needed(worst.draws, worst.half_width, worst.tolerance),
+            )
 
-    draws = read("n_draws")
-    tolerance = _tolerance(spec)
-    for name in PROMISED:
-        width = read(f"{name}_half_width")
-        if not (known := np.isfinite(width)).any():
-            continue
+
+@dataclass
+class _Worst:
+    """Points whose half-width is known, and that which is furthest above its tolerance."""
+
+    points: int = 0
+    met: int = 0
+    over: float = -math.inf
+    half_width: float = math.nan
+    tolerance: float = math.nan
+    draws: int = 0
+    index: tuple[int, ...] = ()
+
+    def add(
+        self, width: np.ndarray, tolerance: np.ndarray, draws: np.ndarray, start: tuple[int, ...]
+    ) -> None:
+        """Take in some points of the grid, the first of which is at ``start``."""
+        known = np.isfinite(width)
         over = np.where(known, width - tolerance, -np.inf)
-        worst = np.unravel_index(np.argmax(over), over.shape)
-        allowed = float(np.broadcast_to(tolerance, over.shape)[worst])
-        yield AccuracyRow(
-            name=name,
-            points=int(known.sum()),
-            met=int((over <= 0).sum() - (~known).sum()),
-            half_width=float(width[worst]),
-            tolerance=allowed,
-            where=_place(spec.axes, worst),
-            draws=int(draws[worst]),
-            needed=_needed(int(draws[worst]), float(width[worst]), allowed),
-        )
+        self.points += int(known.sum())
+        self.met += int((over <= 0).sum() - (~known).sum())
+        at = np.unravel_index(np.argmax(over), over.shape)
+        if over[at] > self.over:
+            self.over, self.half_width = float(over[at]), float(width[at])
+            self.tolerance, self.draws = float(tolerance[at]), int(draws[at])
+            self.index = tuple(first + int(i) for first, i in zip(start, at, strict=True))
 
 
 def _tolerance(spec: Spec) -> np.ndarray:
@@ -93,12 +118,12 @@ def _needed(draws: int, half_width: float, tolerance: float) -> float:
     return math.ceil(draws * (half_width / tolerance) ** 2) if tolerance > 0 else math.inf
 
 
-def _place(axes: tuple[Axis, ...], index: tuple[np.intp, ...]) -> str:
+def _place(axes: tuple[Axis, ...], index: tuple[int, ...]) -> str:
     """A point of the grid in the user's units."""
     words = []
     for axis, i in zip(axes, index, strict=True):
         for member in axis.members:
-            value = member.display[int(i)]
+            value = member.display[i]
             shown = value if isinstance(value, str) else f"{value:.4g}"
             words.append(f"{member.name} {shown} {member.units}".strip())
     return ", ".join(words) or "the point"

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.storage.locations import Location, located, read_array
+from sweep.storage.locations import Location, located
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.pieces import done_blocks, pieces
 
 if TYPE_CHECKING:
     from sweep.spec import Axis
@@ -22,6 +23,10 @@ DETECTED = 0.9
 
 #: Rows of the table beside the one for the whole grid.
 MOST_ROWS = 10
+
+#: Points and blocks that are looked at; of larger studies, blocks drawn by chance.
+MOST_POINTS = 1 << 23
+MOST_BLOCKS = 1000
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class Row:
     pd_doppler: float
 
 
-def summary(store: str | Location) -> tuple[str, list[Row]]:
+def summary(store: str | Location) -> tuple[str, list[Row], float]:
     """Heading and rows of the table.
 
     Returns
@@ -44,6 +49,8 @@ def summary(store: str | Location) -> tuple[str, list[Row]]:
         Name and unit of the slowest axis; empty without axes.
     rows : list of Row
         One for each part of that axis, and a last one for the whole grid.
+    share : float
+        Of the blocks that are done, what was looked at.
 
     Raises
     ------
@@ -55,13 +62,37 @@ def summary(store: str | Location) -> tuple[str, list[Row]]:
     if not isinstance(study, GridStudy):
         raise StoreError(f"{path} holds no study over a grid")
     spec, grid = study.spec, study.grid
-    shot, doppler = (np.asarray(read_array(path / name)[...]) for name in ("pd_shot", "pd_doppler"))
-    rows = [
-        _row(name, shot[part], doppler[part])
-        for name, part in (_parts(spec.axes[0]) if grid.shape else ())
-    ]
-    heading = _heading(spec.axes[0]) if grid.shape else ""
-    return heading, [*rows, _row("all", shot, doppler)]
+    done = done_blocks(path, study)
+    blocks = _some(done, int(np.prod(grid.block_shape)))
+    parts = list(_parts(spec.axes[0])) if grid.shape else [("all", slice(None))]
+    found: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in parts]
+    for place, values in pieces(path, study, ("pd_shot", "pd_doppler"), blocks):
+        both = np.stack(values)
+        for into, (_, part) in zip(found, parts, strict=True):
+            into.append(_within(both, place, part))
+    of_parts = [np.concatenate(each, axis=1) for each in found]
+    rows = [_row("all", *np.concatenate(of_parts, axis=1))]
+    share = len(blocks) / max(len(done), 1)
+    if not grid.shape:
+        return "", rows, share
+    told = [_row(name, *values) for (name, _), values in zip(parts, of_parts, strict=True)]
+    return _heading(spec.axes[0]), [*told, *rows], share
+
+
+def _within(values: np.ndarray, place: tuple[slice, ...], part: slice) -> np.ndarray:
+    """Of two arrays of a block, what lies in a part of the first axis, (2, points)."""
+    if place:
+        start = place[0].start
+        values = values[:, max(part.start - start, 0) : max(part.stop - start, 0)]
+    return values.reshape(2, -1)
+
+
+def _some(done: np.ndarray, block_points: int) -> np.ndarray:
+    """Blocks to look at, rising: all, or as many as may be, drawn by chance but always the same."""
+    most = min(MOST_BLOCKS, max(MOST_POINTS // block_points, 1))
+    if len(done) <= most:
+        return done
+    return np.sort(np.random.default_rng(0).choice(done, most, replace=False))
 
 
 def _heading(axis: Axis) -> str:
