@@ -82,7 +82,7 @@ tolerance calls for anywhere; fixed numbers of beamlets, where they add as power
 draws, where the study draws; and the way that the thesis describes. All take turns on parts of
 the sample, round after round, so that whatever slows the machine slows them alike. What a point
 costs depends on those that are computed beside it, as they share what is worked out for them: so
-times are taken on stretches of the blocks that the study computes, some hundreds of points each,
+times are taken on stretches of the blocks that the study computes, some thousands of points each,
 around points of the sample. They are those that the processor spends on the work. The best round
 counts for them, and ratios are medians of those within each round. Planning is counted with what it
 plans; storing is not counted.

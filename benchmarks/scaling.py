@@ -1,6 +1,6 @@
 """What more workers bring: the published range-angle study on one, two, ... workers, in turns.
 
-Run with `make scaling`, seven minutes on two cores, on a quiet machine. Workers are up and have
+Run with `make scaling`, five minutes on two cores, on a quiet machine. Workers are up and have
 imported the model before the clock starts: a study long enough to need them has them up for most
 of its time. Rounds take turns, as the machine drifts; ratios are within a round. What the machine
 itself lets be had is told by plain loops over the same blocks in as many processes, nothing stored.
@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=cores())
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--points", type=int, default=2_700_000)
-    parser.add_argument("--block-points", type=int, default=27_000)
+    parser.add_argument("--block-points", type=int, default=13_500)
     asked = parser.parse_args()
     numbers = [n for n in (2**i for i in range(20)) if n <= asked.most]
     spec = study(asked.points, asked.block_points)

@@ -38,7 +38,7 @@ class GridBench:
     """
 
     unit = "points"
-    most_times = 2048
+    most_times = 8192
 
     def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
         self.spec = spec

@@ -25,11 +25,14 @@ MOST_ROUNDS = 9
 PARTS = 2
 """Parts of a sample, at the least: whole ones are kept where it is broken off."""
 
-LONG_ENOUGH = 0.4
-"""Time of a trial [s] from which on its calls cost little beside the points themselves."""
+LONG_ENOUGH = 0.01
+"""Share of the time limit that a trial takes: its calls then cost little beside its points."""
 
-TOO_LONG = 8
-"""Of these, in which stretches are cut: they cost the dearest settings nothing to speak of."""
+TOO_LONG = 2
+"""Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
+
+FIRST_TRIED = 8
+"""How much shorter the stretches are by which settings are known to be dear."""
 
 FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 """Shares of the time limit by which the first round, and then the truth, ends."""
@@ -166,14 +169,14 @@ class Measurement:
 
         As long for all of them, but for those that would take far longer.
         """
-        times = 1
-        while self._timed(0, parts[0]) < LONG_ENOUGH / 2 and times < self._bench.most_times:
+        times, enough = 1, LONG_ENOUGH * self._limit
+        while self._timed(0, parts[0]) < enough / 2 and times < self._bench.most_times:
             times *= 2
             self._times[0] = times
-        shorter = max(1, times // TOO_LONG)
+        shorter = max(1, times // FIRST_TRIED)
         self._times[:] = shorter
         took = np.array([self._timed(i, parts[0]) for i in range(len(self._rungs))])
-        fitting = TOO_LONG * LONG_ENOUGH * shorter / took
+        fitting = TOO_LONG * enough * shorter / took
         cut = np.exp2(np.floor(np.log2(fitting))).clip(1, times)
         self._times[:] = cut
         spent = float((took * cut / shorter).sum())
