@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=cores())
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--points", type=int, default=2_700_000)
-    parser.add_argument("--block-points", type=int, default=13_500)
+    parser.add_argument("--block-points", type=int, default=45_000)
     asked = parser.parse_args()
     numbers = [n for n in (2**i for i in range(20)) if n <= asked.most]
     spec = study(asked.points, asked.block_points)
