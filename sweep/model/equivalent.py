@@ -15,7 +15,10 @@ from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.lanes import dot
 
-AMPLITUDE_TOLERANCES = (1e-13, 1e-11, 1e-9, 1e-7, 1e-5)
+AMPLITUDE_TOLERANCES = (
+    1e-13, 3e-13, 1e-12, 3e-12, 1e-11, 3e-11, 1e-10, 3e-10, 1e-9, 3e-9, 1e-8, 3e-8, 1e-7, 3e-7,
+    1e-6, 3e-6, 1e-5, 3e-5, 1e-4,
+)  # fmt: skip
 """Errors of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
 
 POWER_TOLERANCES = (1e-18, 1e-15, 1e-13, 1e-11, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5)

@@ -200,7 +200,7 @@ def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most(
             *line, 109, False, np.pi, tolerance, most, limits, few, re, im, work
         )
 
-    counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1.0)]
+    counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-4, 1.0)]
     assert counts[0] == counts[1] and counts[-1] == counts[-2]
     assert (np.diff(counts[1:-1]) < 0).all()
     assert number(1e-9, counts[3]) == counts[3] and number(1e-9, counts[3] - 1) == 109

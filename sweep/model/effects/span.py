@@ -49,8 +49,8 @@ class Span:
         """Largest magnitude."""
         return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
 
-    def some(self, index: np.ndarray | slice) -> "Span":
-        """The spans of some tiles; one for all stays it."""
+    def some(self, index: np.ndarray | slice | int) -> "Span":
+        """The spans of some tiles, or of one; one for all stays it."""
         ends = (np.asarray(end)[index] if np.ndim(end) else end for end in (self.low, self.high))
         return Span(*ends)
 

@@ -1,10 +1,12 @@
 """What the beams of a block's tiles meet, as spans: a flat plane, or what rays have found."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from sweep.model import reflectance
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -17,9 +19,13 @@ from sweep.model.effects.line_spread import (
 from sweep.model.effects.span import Span, monotone
 from sweep.model.footprint import beamlets
 from sweep.model.ground import Footprints
-from sweep.model.preparation import LASER, RECEIVER, relative_amplitude
+from sweep.model.preparation import LASER, RECEIVER
 
 _ROUNDING = 1e-12
+
+_WHOLE, _GAIN, _RANGES, _OWN_RANGES, _VELOCITIES, _BESIDE, _APART = 0, 1, 2, 5, 8, 11, 12
+_FIELDS = 13
+"""Rows of what is found in footprints; moments have three each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,45 +158,70 @@ def cast(
         The receiver's.
     """
     row, offset, doppler, echo = footprints
-    whole = echo.sum(axis=1)
-    share = echo / np.where(whole > 0, whole, 1.0)[:, None]
-    others = np.zeros(echo.shape, bool) if beside is None else beside
-    own, off = np.where(others, 0.0, share), np.where(others, share, 0.0).sum(axis=1)
-    alone = own / np.maximum(own.sum(axis=1), 1e-300)[:, None]
+    others = np.zeros(echo.shape, np.bool_) if beside is None else beside
+    found = np.empty((_FIELDS, len(echo)))
+    _look(offset, doppler, echo, others, architecture != "direct", found)
+    spans = over(found[:, row], edges)
 
-    def spans(values: np.ndarray) -> Span:
-        return over(values[row], edges)
+    def moments(first: int) -> Moments:
+        return Moments(*np.asarray(spans.high)[first : first + 3])
 
-    def moments(values: np.ndarray, weight: np.ndarray) -> Moments:
-        mean = np.abs((weight * values).sum(axis=1))
-        rms = np.sqrt((weight * values**2).sum(axis=1))
-        extreme = np.where(weight > 0, np.abs(values), 0.0).max(axis=1)
-        return Moments(*(np.asarray(spans(v).high) for v in (mean, rms, extreme)))
-
-    def gain() -> np.ndarray:
-        if architecture == "direct":
-            return np.ones_like(whole)
-        amplitude = relative_amplitude(architecture, share)
-        return np.maximum(amplitude.sum(axis=1), 1.0)
-
-    apart = np.where(others & (echo > 0), np.abs(offset), 0.0).max(axis=1)
     return Geometry(
         grazing_angle=Span(0.0, np.pi / 2),
-        echo=spans(whole),
+        echo=spans.some(_WHOLE),
         echo_ratio=Span.of(1.0),
-        gain=spans(gain()),
-        ranges=moments(offset, share),
-        own_ranges=moments(offset, alone),
-        velocities=moments(doppler * (SPEED_OF_LIGHT / 2), share),
-        beside_share=spans(off),
-        beside_apart=np.asarray(spans(apart).high),
+        gain=spans.some(_GAIN),
+        ranges=moments(_RANGES),
+        own_ranges=moments(_OWN_RANGES),
+        velocities=moments(_VELOCITIES).scaled(SPEED_OF_LIGHT / 2),
+        beside_share=spans.some(_BESIDE),
+        beside_apart=np.asarray(spans.high)[_APART],
     )
 
 
+@njit(cache=True, error_model="numpy")
+def _look(offset, doppler, echo, others, by_roots, out):
+    """Echo, gain, moments (mean, rms, extreme) and what lies beside, (fields, rows)."""
+    out[:] = 0.0
+    for i in range(echo.shape[0]):
+        own = 0.0
+        for b in range(echo.shape[1]):
+            out[_WHOLE, i] += echo[i, b]
+            own += 0.0 if others[i, b] else echo[i, b]
+        whole = out[_WHOLE, i] if out[_WHOLE, i] > 0.0 else 1.0
+        own = own if own > 0.0 else 1.0
+        for b in range(echo.shape[1]):
+            share = echo[i, b] / whole
+            out[_GAIN, i] += math.sqrt(share) if by_roots else 0.0
+            _add_moments(out[_RANGES:, i], offset[i, b], share)
+            _add_moments(out[_VELOCITIES:, i], doppler[i, b], share)
+            if others[i, b]:
+                out[_BESIDE, i] += share
+                far = abs(offset[i, b]) if share > 0.0 else 0.0
+                out[_APART, i] = max(out[_APART, i], far)
+            else:
+                _add_moments(out[_OWN_RANGES:, i], offset[i, b], echo[i, b] / own)
+        out[_GAIN, i] = max(out[_GAIN, i], 1.0)
+        for first in (_RANGES, _OWN_RANGES, _VELOCITIES):
+            out[first, i] = abs(out[first, i])
+            out[first + 1, i] = math.sqrt(out[first + 1, i])
+
+
+@njit(cache=True, error_model="numpy")
+def _add_moments(sums, value, weight):
+    """Adds a value to the sums of values and of squares, and to the largest."""
+    sums[0] += weight * value
+    sums[1] += weight * value * value
+    if weight > 0.0:
+        sums[2] = max(sums[2], abs(value))
+
+
 def over(values: np.ndarray, edges: np.ndarray) -> Span:
-    """Least and largest of (n,) values over each tile, from one edge up to the next."""
+    """Least and largest of (..., n) values over each tile, from one edge up to the next."""
     starts = edges[:-1]
-    return Span(np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts))
+    return Span(
+        np.minimum.reduceat(values, starts, axis=-1), np.maximum.reduceat(values, starts, axis=-1)
+    )
 
 
 def _number(p: Mapping[str, Span | str], path: str) -> Span:
