@@ -45,8 +45,9 @@ def extend(
     """Extend STORE to a larger study, and compute only what is new.
 
     The larger study is the one in the file SPEC, or the one in STORE with fields --set anew: more
-    values on an axis, a new axis, more draws, a tighter tolerance. What STORE has of it is taken
-    from there; what comes out is, byte for byte, the larger study run at once.
+    values on an axis, a new axis, more draws, a tighter tolerance, more scanners of a flight. What
+    STORE has of it is taken from there; what comes out is, byte for byte, the larger study run at
+    once.
 
     The larger store is made beside STORE and takes its place once it is complete. Until then
     nothing in STORE changes; sweep extend, or sweep resume STORE, goes on after an interruption.
@@ -55,6 +56,7 @@ def extend(
       sweep extend results/range_angle.zarr experiments/range_angle.yaml
       sweep extend results/range_angle.zarr --set 'axes.target.reflectance=[0.05, 0.1, 0.2]'
       sweep extend results/speckled_target.zarr --set draws.limit=1e7 --workers 8
+      sweep extend results/gale_crater_descent.zarr --set draws.number=200 --workers 8
       sweep extend s3://bucket/a.zarr larger.yaml --store s3://bucket/b.zarr
     """  # noqa: D301
     from sweep.spec import load

@@ -24,7 +24,7 @@ from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.recipe import EXTENDS, refuse_damaged_recipe, write_recipe
+from sweep.tasks.recipe import EXTENDS, read_recipe, refuse_damaged_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate
@@ -169,7 +169,8 @@ def resume(
         performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec or study.spec)  # fmt: skip
     if path != named:
-        return _grow(named, path, place, chosen(progress), retry_failed=retry_failed)
+        told = chosen(progress)
+        return _grow(named, path, spec or study.spec, place, told, retry_failed=retry_failed)
     return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
 
 
@@ -244,7 +245,7 @@ def extend(
     begun, held = _held(new)
     identity.refuse_other_study(new, begun, held.spec, asked)
     _refuse_unsound(new, begun, held)
-    return _grow(path, new, place, told)
+    return _grow(path, new, asked, place, told)
 
 
 def _declared(cluster: Declaration | None) -> AnyCluster | None:
@@ -287,14 +288,20 @@ def _successor(path: Location, to: str | Location | None) -> Location:
 
 
 def _grow(
-    path: Location, new: Location, place: Place, told: Progress, *, retry_failed: bool = False
+    path: Location,
+    new: Location,
+    asked: Declared,
+    place: Place,
+    told: Progress,
+    *,
+    retry_failed: bool = False,
 ) -> Outcome:
     """Compute what a larger store lacks, and have it succeed the one that it extends."""
     with ExitStack() as stack:
         in_place = isinstance(path, Path) and isinstance(new, Path) and new == beside(path)
         if in_place:
             stack.callback(Lock(path).release)
-        write_recipe(new, **{EXTENDS: str(path)})
+        _note(new, asked, **{EXTENDS: str(path)})
         study = _held(new)[1]
         told.say(what_is_there(new, study))
         outcome = _go_on(new, study, place, told, retry_failed=retry_failed)
@@ -323,6 +330,15 @@ def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told:
         for line in study.reports:
             told.say(line)
     create(path, study)
+    _note(path, study.spec)
+
+
+def _note(path: Location, spec: Declared, **facts: str) -> None:
+    """Put down where the files of a store's study are, and what else is to be known of it."""
+    if (base := getattr(spec, "base", None)) is not None:
+        facts["base"] = str(base.absolute())
+    if facts:
+        write_recipe(path, **read_recipe(path) | facts)
 
 
 def _go_on(
@@ -343,7 +359,7 @@ def _go_on(
             )  # fmt: skip
             if isinstance(study, GridStudy):
                 return session.to_its_end()
-            write_recipe(path, base=str(study.spec.base.absolute()))
+            _note(path, study.spec)
             if _is_done(path, study) and eyepoints_are_sound(study):
                 return session.to_its_end()
             rays, why = cast(

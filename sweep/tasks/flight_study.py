@@ -3,34 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.effects.flags import flag_attributes
-from sweep.model.scene_outputs import (
-    CYCLES,
-    NAVIGATION,
-    POINTS,
-    SHOTS,
-    SIMULATED,
-    STATISTICS,
-    SceneOutput,
-)
+from sweep.model.scene_outputs import POINTS, SHOTS
 from sweep.storage.locations import Location
-from sweep.tasks.calling import EFFECTS, TILE_SHOTS, Called, ShotsPlan, plan_shots
+from sweep.tasks import flight_layout
+from sweep.tasks.calling import TILE_SHOTS, Called, ShotsPlan, plan_shots
+from sweep.tasks.earlier import Earlier
 from sweep.tasks.eyepoint_reader import EyepointReader
-from sweep.tasks.eyepoint_study import (
-    SIZES,
-    EyepointStudy,
-    eyepoints_path,
-    scene_array,
-    world_of,
-)
+from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path, world_of
 from sweep.tasks.grid_study import coordinates
+from sweep.tasks.patches import KnownCloud, Patch, completed
 from sweep.tasks.stretches import Part, Stretches
 from sweep.tasks.study import ArrayLayout, Results
 
@@ -52,14 +40,26 @@ class FlightStudy:
         The study.
     path
         Its store, beside which the eyepoints are.
+    look_up
+        Finds where some of its results are already; asked as the first block is computed.
     """
 
     unit = "shots"
 
-    def __init__(self, spec: SceneSpec, path: Location) -> None:
-        self.spec, self.path = spec, path
+    def __init__(
+        self,
+        spec: SceneSpec,
+        path: Location,
+        look_up: Callable[[FlightStudy], Earlier[KnownCloud] | None] | None = None,
+    ) -> None:
+        self.spec, self.path, self._look_up = spec, path, look_up
         self._stretches = [Stretches(spec, scanner) for scanner in spec.scanners]
         self._readers: dict[str, EyepointReader] = {}
+
+    @cached_property
+    def earlier(self) -> Earlier[KnownCloud] | None:
+        """Where some of its results are already, if anywhere."""
+        return self._look_up(self) if self._look_up else None
 
     @property
     def id(self) -> str:
@@ -83,7 +83,14 @@ class FlightStudy:
         """Number of blocks."""
         return sum(stretches.number for stretches in self._stretches)
 
-    def _part(self, block: int) -> tuple[Stretches, Part]:
+    def part(self, block: int) -> tuple[Stretches, Part]:
+        """What a block is, and the blocks of its scanner.
+
+        Raises
+        ------
+        IndexError
+            Where there is no such block.
+        """
         if block < 0:
             raise IndexError(f"there is no block {block}")
         for stretches in self._stretches:
@@ -92,9 +99,14 @@ class FlightStudy:
             block -= stretches.number
         raise IndexError(f"block is beyond the {self.n_blocks} of the study")
 
+    def block(self, part: Part) -> int:
+        """Number of a block."""
+        before = takewhile(lambda stretches: stretches.scanner != part.scanner, self._stretches)
+        return sum(each.number for each in before) + self.scanners[part.scanner].block(part)
+
     def block_size(self, block: int) -> int:
         """Shots of a block, times draws."""
-        stretches, part = self._part(block)
+        stretches, part = self.part(block)
         return stretches.points(part)
 
     def points_in(self, blocks: np.ndarray) -> int:
@@ -133,78 +145,40 @@ class FlightStudy:
         arrays = list(self._map.arrays())
         for stretches in self._stretches:
             own = coordinates(self.spec.axes)
-            own += [self._array(stretches, name) for name in self._outputs(stretches)]
+            own += flight_layout.arrays(self.spec, stretches)
             arrays += [layout.within(stretches.scanner) for layout in own]
         return arrays
 
-    def _outputs(self, stretches: Stretches) -> dict[str, SceneOutput]:
-        own = SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS
-        return own | (NAVIGATION if stretches.navigates else {})
-
-    def _array(self, stretches: Stretches, name: str) -> ArrayLayout:
-        output = self._outputs(stretches)[name]
-        axes = tuple(axis.name for axis in self.spec.axes) if _is_radiometric(name) else ()
-        sizes = SIZES | {
-            "shot": stretches.total_cycles * stretches.shots_a_cycle,
-            "cycle": stretches.total_cycles,
-            "draw": stretches.draws,
-            "return_number": int(self.spec.draws.returns),
-        }
-        cut = sizes | {
-            "shot": stretches.block_cycles * stretches.shots_a_cycle,
-            "cycle": stretches.block_cycles,
-            "draw": stretches.block_draws,
-        }
-        layout = scene_array(
-            name,
-            output,
-            (*stretches.axes[: len(axes)], *(sizes[dim] for dim in output.dims)),
-            (*(1 for _ in axes), *(cut[dim] for dim in output.dims)),
-            axes=axes,
-        )
-        return replace(layout, attributes=flag_attributes()) if name == EFFECTS else layout
-
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
         """Chunks of a block: what has no draws goes with the first, and so does the geometry."""
-        stretches, part = self._part(block)
-        stretch = {"shot": part.cycles, "cycle": part.cycles, "draw": part.draws}
-        return {
-            f"{part.scanner}/{name}": (
-                *(part.axes if _is_radiometric(name) else ()),
-                *(stretch.get(dim, 0) for dim in output.dims),
-            )
-            for name, output in self._outputs(stretches).items()
-            if _belongs(name, part)
-        }
+        return flight_layout.chunks(*self.part(block))
 
     def owners(self) -> dict[str, np.ndarray]:
         """The blocks along axes, draws and stretches, as far as an array has these dimensions."""
         found, first = {}, 0
         for stretches in self._stretches:
-            blocks = first + np.arange(stretches.number).reshape(stretches.along)
+            found |= flight_layout.owners(stretches, first)
             first += stretches.number
-            for name, output in self._outputs(stretches).items():
-                own = blocks if _is_radiometric(name) else blocks[(0,) * len(stretches.axes)]
-                found[f"{stretches.scanner}/{name}"] = _along(own, output.dims)
         return found
 
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
-        stretches, part = self._part(block)
+        stretches, part = self.part(block)
         first, stop = stretches.shot_range(part)
         reader = self._reader(part.scanner)
         shots, eyepoints = reader.shots(first, stop)
         results = shots | reader.cycles(*stretches.cycle_range(part))
         called = self.called(block)
         results |= {"effects": called.flags, "effects_error": called.error}
-        results |= self.look(part, shots, eyepoints, called, first=first)
+        known = self.earlier.known(block, called) if self.earlier else KnownCloud()
+        results |= self.look(part, shots, eyepoints, called, first=first, known=known)
         depth = len(part.axes)
         return {
             f"{part.scanner}/{name}": values.reshape((1,) * depth + values.shape)
-            if _is_radiometric(name)
+            if flight_layout.is_radiometric(name)
             else values
             for name, values in results.items()
-            if _belongs(name, part)
+            if flight_layout.belongs(name, part)
         }
 
     def compile(self) -> None:
@@ -216,7 +190,7 @@ class FlightStudy:
 
     def called(self, block: int) -> Called:
         """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
-        stretches, part = self._part(block)
+        stretches, part = self.part(block)
         first, stop = stretches.shot_range(part)
         total = stretches.total_cycles * stretches.shots_a_cycle
         begin = first // TILE_SHOTS * TILE_SHOTS
@@ -244,7 +218,14 @@ class FlightStudy:
         )
 
     def look(
-        self, part: Part, shots: Results, eyepoints: Eyepoints, called: Called, *, first: int
+        self,
+        part: Part,
+        shots: Results,
+        eyepoints: Eyepoints,
+        called: Called,
+        *,
+        first: int,
+        known: KnownCloud = KnownCloud(),  # noqa: B008
     ) -> Results:
         """Radiometry, draws and navigation of some shots.
 
@@ -258,48 +239,69 @@ class FlightStudy:
             What is simulated of each.
         first
             Number of the first.
+        known
+            What need not be computed.
         """
-        from sweep.model.cycles import solve
-
         stretches = self.scanners[part.scanner]
-        found = self._cloud(part, eyepoints, called, first)
+        begin, end = stretches.draw_range(part)
+        number, draws = called.flags.size, end - begin
+        clouds = partial(self._clouds, part, eyepoints, called, first)
+        found = completed(known.points, (number, draws), clouds)
         if not stretches.navigates:
             return found
-        navigation = self.spec.navigation
-        return found | solve(
-            shots,
-            found,
-            shots_a_cycle=stretches.shots_a_cycle,
+        solutions = partial(self._solutions, stretches, shots, found)
+        cycles = number // stretches.shots_a_cycle
+        return found | completed(known.navigation, (cycles, draws), solutions)
+
+    def _clouds(
+        self,
+        part: Part,
+        eyepoints: Eyepoints,
+        called: Called,
+        first: int,
+        rows: np.ndarray,
+        draws: slice,
+    ) -> Iterator[Patch]:
+        """Points of some of the shots, those together that call for the same."""
+        from sweep.model.clouds import cloud
+        from sweep.model.philox import point_keys
+
+        begin, _ = self.scanners[part.scanner].draw_range(part)
+        numbers = (first + rows)[:, None].astype(float)
+        keys = point_keys(numbers, domain=DOMAIN, seed=int(self.spec.seed))
+        for index, effects in called.some(rows).groups():
+            results = cloud(
+                eyepoints.some(rows[index]),
+                parameters=self.parameters_at(part),
+                surfaces=self.spec.surfaces(),
+                keys=keys[index],
+                first_draw=begin + draws.start,
+                draws=draws.stop - draws.start,
+                method=self.spec.draws.method,
+                returns=int(self.spec.draws.returns),
+                effects=effects,
+            )
+            yield Patch(rows[index], draws, results)
+
+    def _solutions(
+        self, stretches: Stretches, shots: Results, found: Results, cycles: np.ndarray, draws: slice
+    ) -> Iterator[Patch]:
+        """Navigation from the points of some of the cycles."""
+        from sweep.model.cycles import solve
+
+        navigation, each = self.spec.navigation, stretches.shots_a_cycle
+        rows = (cycles[:, None] * each + np.arange(each)).ravel()
+        some = slice(None) if rows.size == len(found["flags"]) else rows
+        results = solve(
+            {name: values[some] for name, values in shots.items() if name in SHOTS},
+            {name: found[name][some, draws] for name in POINTS},
+            shots_a_cycle=each,
             test_level=navigation.test_level,
             ground_slope=navigation.ground_slope,
             relief=navigation.relief,
             jitter=self.spec.platform.jitter,
         )
-
-    def _cloud(self, part: Part, eyepoints: Eyepoints, called: Called, first: int) -> Results:
-        from sweep.model.clouds import cloud
-        from sweep.model.philox import point_keys
-
-        begin, end = self.scanners[part.scanner].draw_range(part)
-        numbers = first + np.arange(called.flags.size)
-        keys = point_keys(numbers[:, None].astype(float), domain=DOMAIN, seed=int(self.spec.seed))
-        found: Results = {}
-        for index, effects in called.groups():
-            some = cloud(
-                eyepoints.some(index),
-                parameters=self.parameters_at(part),
-                surfaces=self.spec.surfaces(),
-                keys=keys[index],
-                first_draw=begin,
-                draws=end - begin,
-                method=self.spec.draws.method,
-                returns=int(self.spec.draws.returns),
-                effects=effects,
-            )
-            for name, values in some.items():
-                room = (called.flags.size, *values.shape[1:])
-                found.setdefault(name, np.empty(room, values.dtype))[index] = values
-        return found
+        yield Patch(cycles, draws, results)
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
         """SI values of all parameters at a block's place along the axes."""
@@ -331,29 +333,3 @@ class FlightStudy:
         from sweep.tasks.scene_map import SceneMap
 
         return SceneMap.of(self.spec)
-
-
-def _along(blocks: np.ndarray, dims: tuple[str, ...]) -> np.ndarray:
-    """Blocks (..., draws, cycles) along the dimensions of an array; those of the first draws where
-    it has none.
-    """
-    rank = blocks.ndim - 2
-    if "draw" not in dims:
-        blocks = blocks[..., 0, :]
-    elif dims.index("draw") > 0:
-        blocks = np.swapaxes(blocks, -1, -2)
-    cut = [dim in ("shot", "cycle", "draw") for dim in dims]
-    shape = iter(blocks.shape[rank:])
-    return blocks.reshape(*blocks.shape[:rank], *(next(shape) if is_cut else 1 for is_cut in cut))
-
-
-def _is_radiometric(name: str) -> bool:
-    return name not in SHOTS and name not in CYCLES
-
-
-def _belongs(name: str, part: Part) -> bool:
-    """Whether an array has a chunk that is this block's to write."""
-    if name in POINTS or name in NAVIGATION:
-        return True
-    once = name in STATISTICS or name in SIMULATED
-    return part.draws == 0 and (once or not any(part.axes))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from sweep.spec import Axis, Spec
+    from sweep.spec import Axis, SceneSpec, Spec
 
 Value = float | int | str | np.ndarray
 
@@ -112,7 +112,27 @@ def most_points(spec: Spec, points: int) -> int:
     return max(1, min(asked, int(BLOCK_SECONDS / seconds_a_point(spec))))
 
 
-class Grid:
+class Lattice:
+    """Parameters along the axes of a study.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    """
+
+    def __init__(self, spec: Spec | SceneSpec) -> None:
+        self.fixed: dict[str, float | int | str] = dict(spec.parameters())
+        self._axes = tuple(spec.axes)
+        self.shape = tuple(int(axis.size) for axis in self._axes)
+
+    @cached_property
+    def values(self) -> list[dict[str, np.ndarray]]:
+        """Values along each axis by the parameters they set."""
+        return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+
+
+class Grid(Lattice):
     """Points of a study and the blocks they are computed in.
 
     Parameters
@@ -122,11 +142,9 @@ class Grid:
     """
 
     def __init__(self, spec: Spec) -> None:
+        super().__init__(spec)
         self.spec = spec
-        self.fixed: dict[str, float | int | str] = dict(spec.parameters())
-        self._axes = tuple(spec.axes)
         self.dims = tuple(axis.name for axis in self._axes)
-        self.shape = tuple(int(axis.size) for axis in self._axes)
         self.geometric = tuple(is_geometric(axis) for axis in self._axes)
         self.block_shape = block_shape(self.shape, self.geometric, most_points(spec, self.points))
         self.blocks_along = tuple(
@@ -208,11 +226,6 @@ class Grid:
             for path, array in values.items():
                 selected[path] = array[along]
         return selected
-
-    @cached_property
-    def values(self) -> list[dict[str, np.ndarray]]:
-        """Values along each axis by the parameters they set."""
-        return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
 
     def point_rows(self, block: int) -> np.ndarray:
         """Canonical rows of the parameters of a block's points (`canonical_rows`)."""

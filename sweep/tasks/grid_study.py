@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling, layouts
+from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
+from sweep.tasks.earlier import Earlier
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
 from sweep.tasks.study import ArrayLayout, Known, Results
@@ -58,19 +59,6 @@ def further_dims(spec: Spec) -> dict[str, tuple[str, int]]:
     return found | {RUNNING: ("sum", RUNNING_COLUMNS)}
 
 
-class Earlier(Protocol):
-    """Where results of a study may be had without computing them."""
-
-    def known(self, block: int, called: Called) -> Known:
-        """What is there of a block, computed as it would be here."""
-
-    def count(self, block: int) -> int:
-        """Points of a block of which something is there, if nothing is damaged."""
-
-    def remark(self) -> str:
-        """What is not simply taken from there, in words; may be empty."""
-
-
 class GridStudy:
     """A study over a grid of parameters.
 
@@ -85,7 +73,7 @@ class GridStudy:
     unit = "points"
 
     def __init__(
-        self, spec: Spec, look_up: Callable[[GridStudy], Earlier | None] | None = None
+        self, spec: Spec, look_up: Callable[[GridStudy], Earlier[Known] | None] | None = None
     ) -> None:
         self.spec = spec
         self._look_up = look_up
@@ -94,7 +82,7 @@ class GridStudy:
         self._names, self._further = output_names(spec), further_dims(spec)
 
     @cached_property
-    def earlier(self) -> Earlier | None:
+    def earlier(self) -> Earlier[Known] | None:
         """Where some of its results are already, if anywhere."""
         return self._look_up(self) if self._look_up else None
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.tasks.grid import Grid, Value, canonical_rows
+from sweep.tasks.grid import Lattice, Value, canonical_rows
 
 
 class Places(NamedTuple):
@@ -27,31 +27,35 @@ class Places(NamedTuple):
 
 
 class Matching:
-    """Points of one grid by the points of another.
+    """Points along the axes of one study by the points of another.
 
     Parameters
     ----------
     other, grid
-        The grid that is looked in, and the one that is looked from.
+        Those that are looked in, and those that are looked from.
     ignored
         Dotted paths of parameters that may differ.
     """
 
-    def __init__(self, other: Grid, grid: Grid, ignored: Collection[str] = ()) -> None:
-        self._other, self._grid = other, grid
+    def __init__(self, other: Lattice, grid: Lattice, ignored: Collection[str] = ()) -> None:
+        self._other = other
         self.places = [
             _places(grid, axis, {path: v for path, v in values.items() if path not in ignored})
             for axis, values in _parts(other, grid)
         ]
 
-    def of_block(self, block: int) -> np.ndarray:
-        """Numbers, in C order over the other grid, of a block's points; -1 of those it lacks.
+    def of(self, slices: tuple[slice, ...]) -> np.ndarray:
+        """Numbers, in C order over the other grid, of some points; -1 of those it lacks.
+
+        Parameters
+        ----------
+        slices
+            Of the grid that is looked from, one an axis.
 
         Returns
         -------
-        ndarray of int64 (points of the block,)
+        ndarray of int64 (points,)
         """
-        slices = self._grid.block(block)
         numbers = np.zeros((1,) * len(slices), np.int64)
         lacking = np.zeros((1,) * len(slices), bool)
         for places in self.places:
@@ -62,10 +66,10 @@ class Matching:
             if places.axis is not None:
                 numbers = numbers + index * math.prod(self._other.shape[places.axis + 1 :])
         numbers = np.where(lacking, -1, numbers)
-        return np.broadcast_to(numbers, self._grid.extent(block)).ravel()
+        return np.broadcast_to(numbers, [s.stop - s.start for s in slices]).ravel()
 
 
-def _parts(other: Grid, grid: Grid) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
+def _parts(other: Lattice, grid: Lattice) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
     """Parameters that are looked up together: those of each axis, and all that are fixed."""
     yield from enumerate(other.values)
     on_axes = {path for values in other.values for path in values}
@@ -75,7 +79,7 @@ def _parts(other: Grid, grid: Grid) -> Iterator[tuple[int | None, dict[str, np.n
     yield None, fixed
 
 
-def _places(grid: Grid, axis: int | None, values: dict[str, np.ndarray]) -> Places:
+def _places(grid: Lattice, axis: int | None, values: dict[str, np.ndarray]) -> Places:
     """Where values of a grid stand among others of the same parameters, which go together."""
     along = [k for k, own in enumerate(grid.values) if not own.keys().isdisjoint(values)]
     shape = tuple(size if k in along else 1 for k, size in enumerate(grid.shape))

@@ -30,9 +30,14 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
     return records[0] or {} if len(records) == 1 else {}
 
 
-def forget_recipe(store_path: Path) -> None:
-    """Take away what was put down."""
-    (store_path / JOURNAL / RECIPE).unlink(missing_ok=True)
+def forget_older(store_path: Path) -> None:
+    """Take away which store a study's extends."""
+    facts = read_recipe(store_path)
+    facts.pop(EXTENDS, None)
+    if facts:
+        write_recipe(store_path, **facts)
+    else:
+        (store_path / JOURNAL / RECIPE).unlink(missing_ok=True)
 
 
 def refuse_damaged_recipe(store_path: Location) -> None:

@@ -2,14 +2,13 @@
 
 What a point comes to follows from its parameters, its draws and the effects that are simulated,
 and from nothing else. Effects are planned tile by tile, and a larger grid has other tiles: a point
-whose effects are not those of the older store is computed anew. The older store is only read. Each
-of its blocks is held against the digest in its receipt first; one that is damaged counts as absent.
+whose effects are not those of the older store is computed anew.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,24 +16,18 @@ import numpy as np
 from sweep.model.resolution import by_tolerance
 from sweep.spec import Spec
 from sweep.spec.detector_check import is_method
-from sweep.storage.locations import Location, read_array
-from sweep.tasks import identity, store
+from sweep.storage.locations import Location
+from sweep.tasks import identity
 from sweep.tasks.calling import EFFECTS, ERROR, TOLERANCE, Called
 from sweep.tasks.errors import StoreError
 from sweep.tasks.evaluate import no_sums
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.journal import digests
 from sweep.tasks.matching import Matching
+from sweep.tasks.older_blocks import DAMAGED, OlderBlocks
 from sweep.tasks.study import NONE_FOUND, Found, Known, Results
 
 if TYPE_CHECKING:
-    import zarr
-
-#: Blocks of the older store that a process keeps in memory.
-BLOCKS_KEPT = 2
-
-#: What Zarr raises of a chunk that is not there, or not as it was written.
-DAMAGED = (OSError, ValueError, RuntimeError)
+    from sweep.spec import SceneSpec
 
 
 class Share(NamedTuple):
@@ -60,12 +53,10 @@ class OlderStore:
     """
 
     def __init__(self, path: Location, older: GridStudy, study: GridStudy) -> None:
-        self._path, self._older, self._study = path, older, study
-        self._digests = digests(path, older.n_blocks)
+        self._older, self._study = older, study
+        self._blocks = OlderBlocks(path, older)
         self._is_whole = are_alike(older.spec, study.spec)
         self._is_begun = not self._is_whole and goes_on(older.spec, study.spec)
-        self._arrays: dict[str, zarr.Array] = {}
-        self._block = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
 
     @cached_property
     def _matching(self) -> Matching:
@@ -76,7 +67,7 @@ class OlderStore:
         """What is there of a block of the larger study."""
         found: list[Found] = []
         for share in self._shares(block):
-            if (older := self._block(share.block)) is None:
+            if (older := self._read(share.block)) is None:
                 continue
             same = older[EFFECTS][share.place] == called.flags[share.points]
             results = {name: values[share.place[same]] for name, values in older.items()}
@@ -98,7 +89,7 @@ class OlderStore:
         called, number = self._study.calling.of_block(block), 0
         for share in self._shares(block):
             with suppress(*DAMAGED):
-                flags = self._chunk(EFFECTS, share.block)
+                flags = self._blocks.chunk(EFFECTS, share.block).ravel()
                 number += int(np.sum(flags[share.place] == called.flags[share.points]))
         return number
 
@@ -119,7 +110,7 @@ class OlderStore:
         if not (self._is_whole or self._is_begun):
             return []
         grid = self._older.grid
-        numbers = self._matching.of_block(block)
+        numbers = self._matching.of(self._study.grid.block(block))
         points = np.flatnonzero((numbers >= 0) & self._same_resolution(block))
         at = np.unravel_index(numbers[points], grid.shape) if grid.shape else ()
         blocks, place = np.zeros((2, points.size), np.int64)
@@ -131,14 +122,12 @@ class OlderStore:
         return [
             Share(int(b), points[blocks == b], place[blocks == b])
             for b in np.unique(blocks)
-            if self._digests[b]
+            if self._blocks.has(int(b))
         ]
 
-    @property
+    @cached_property
     def _other_tolerance(self) -> bool:
-        """Whether all points have another tolerance; one on an axis tells points apart."""
-        older, ours = _tolerance(self._older.spec), _tolerance(self._study.spec)
-        return older is not None and ours is not None and older != ours
+        return other_tolerance(self._older.spec, self._study.spec)
 
     def _same_resolution(self, block: int) -> np.ndarray | bool:
         """Which points of a block are computed as finely here as there, (points,)."""
@@ -148,21 +137,9 @@ class OlderStore:
 
     def _read(self, block: int) -> Results | None:
         """Results of an older block, (points, ...) each; None where it is damaged or lost."""
-        try:
-            objects = store.block_objects(self._older, block)
-            if store.digest(self._path, objects).encode() != self._digests[block]:
-                return None
-            return {name: self._chunk(name, block) for name in self._older.chunks(block)}
-        except DAMAGED:
-            return None
-
-    def _chunk(self, name: str, block: int) -> np.ndarray:
-        """An array's values at the points of an older block, (points, ...)."""
-        if name not in self._arrays:
-            self._arrays[name] = read_array(self._path / name)
-        part = self._older.grid.block(block)
-        values = np.asarray(self._arrays[name][part or ...])
-        return values.reshape(self._older.block_size(block), *values.shape[len(part) :])
+        size, rank = self._older.block_size(block), len(self._older.grid.shape)
+        found = self._blocks.read(block)
+        return found and {n: v.reshape(size, *v.shape[rank:]) for n, v in found.items()}
 
 
 def older_store(path: Location, study: GridStudy) -> OlderStore | None:
@@ -178,14 +155,21 @@ def older_store(path: Location, study: GridStudy) -> OlderStore | None:
     return OlderStore(path, GridStudy(held), study)
 
 
-def ignored(older: Spec, spec: Spec) -> tuple[str, ...]:
+def ignored(older: Spec | SceneSpec, spec: Spec | SceneSpec) -> tuple[str, ...]:
     """Parameters in which points may differ that are to be taken for the same.
 
     The tolerance, where neither study varies it, and what looks at spectra where none are drawn.
     """
-    ours = [path for path in spec.parameters() if is_method(path) and not spec.draws.whole_spectra]
+    looks = isinstance(spec, Spec) and spec.draws.whole_spectra
+    ours = [path for path in spec.parameters() if is_method(path) and not looks]
     fixed = _tolerance(older) is not None and _tolerance(spec) is not None
     return (*ours, TOLERANCE) if fixed else tuple(ours)
+
+
+def other_tolerance(older: Spec | SceneSpec, spec: Spec | SceneSpec) -> bool:
+    """Whether all points have another tolerance; one on an axis tells points apart."""
+    theirs, ours = _tolerance(older), _tolerance(spec)
+    return theirs is not None and ours is not None and theirs != ours
 
 
 def are_alike(older: Spec, spec: Spec) -> bool:
@@ -213,7 +197,7 @@ def goes_on(older: Spec, spec: Spec) -> bool:
     )
 
 
-def _tolerance(spec: Spec) -> float | None:
+def _tolerance(spec: Spec | SceneSpec) -> float | None:
     """The tolerance of all points; None where an axis varies it."""
     value = spec.parameters_off_axes().get(TOLERANCE)
     return None if value is None else float(value)

@@ -59,6 +59,10 @@ class Stretches:
         *axes, draws, cycles = (int(i) for i in np.unravel_index(number, self.along))
         return Part(self.scanner, tuple(axes), draws, cycles)
 
+    def block(self, part: Part) -> int:
+        """Number of a block of this scanner."""
+        return int(np.ravel_multi_index((*part.axes, part.draws, part.cycles), self.along))
+
     def cycle_range(self, part: Part) -> tuple[int, int]:
         """First cycle of a block, and the one after its last."""
         first = part.cycles * self.block_cycles

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sweep.storage.locations import Location, located
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.flight_reuse import older_flight
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.identity import read_attributes, read_spec
@@ -24,11 +25,23 @@ ACCURACY = "accuracy"
 AnyStudy = GridStudy | EyepointStudy | FlightStudy
 
 
-def study_of(spec: Spec | SceneSpec, path: Location) -> GridStudy | FlightStudy:
-    """The study that a spec declares, to be stored at a path."""
+def study_of(
+    spec: Spec | SceneSpec, path: Location, extends: Location | None = None
+) -> GridStudy | FlightStudy:
+    """The study that a spec declares, to be stored at a path.
+
+    Parameters
+    ----------
+    spec, path
+        The study and its place.
+    extends
+        The store of a smaller one, whose results are taken; by default there is none.
+    """
     from sweep.spec import SceneSpec
 
-    return FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
+    if isinstance(spec, SceneSpec):
+        return FlightStudy(spec, path, partial(older_flight, extends) if extends else None)
+    return GridStudy(spec, partial(older_store, extends) if extends else None)
 
 
 def check(path: Location) -> None:
@@ -70,9 +83,7 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
     if attributes["kind"] == "eyepoints":
         return _eyepoints(path, recipe, base)
     spec = read_spec(path, attributes["spec"], base)
-    if attributes["kind"] == "grid" and EXTENDS in recipe:
-        return GridStudy(spec, partial(older_store, located(recipe[EXTENDS])))  # type: ignore[arg-type]
-    return study_of(spec, path)
+    return study_of(spec, path, located(recipe[EXTENDS]) if EXTENDS in recipe else None)
 
 
 def _eyepoints(path: Location, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:

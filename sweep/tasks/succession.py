@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sweep.storage.locations import Location
 from sweep.tasks.errors import StoreError
-from sweep.tasks.recipe import forget_recipe
+from sweep.tasks.recipe import forget_older
 from sweep.tasks.store import sync
 
 
@@ -54,7 +54,7 @@ def succeed(path: Path, *, durable: bool) -> None:
         Where it can't be renamed. `finish` tries again.
     """
     try:
-        forget_recipe(beside(path))  # from where it stands then it extends nothing
+        forget_older(beside(path))  # from where it stands then it extends nothing
         if durable:
             sync(beside(path))
         os.rename(path, _aside(path))

@@ -17,10 +17,9 @@ from small_flights import small_scene
 
 from sweep.cli import main
 from sweep.model import sampling
-from sweep.tasks import evaluate, store
+from sweep.tasks import evaluate
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
-from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.lock import Lock
 from sweep.tasks.progress import Silent
@@ -370,10 +369,11 @@ def test_what_is_no_larger_study_is_refused_field_by_field(tmp_path, undisturbed
     assert everything(undisturbed) == before
 
 
-def test_flights_are_refused_with_what_to_do(tmp_path):
-    path = store.create(tmp_path / "flight.zarr", FlightStudy(small_scene(), tmp_path / "x"))
-    with pytest.raises(StoreError, match="eyepoints that are there are used"):
-        larger(path, None, changes={"draws.number": 9})
+def test_a_flight_is_no_larger_grid(undisturbed):
+    before = everything(undisturbed)
+    with pytest.raises(StoreError, match="have nothing in common"):
+        larger(undisturbed, small_scene())
+    assert everything(undisturbed) == before
 
 
 def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed):

@@ -1,0 +1,333 @@
+"""Stores of flights extended to larger studies: the bytes of these, and no shot drawn twice."""
+
+import csv
+import json
+import shutil
+
+import pytest
+from click.testing import CliRunner
+from small import everything, quiet, small, tree
+from small_flights import SCENE, small_scene
+from test_extend import Interrupting
+
+from sweep.cli import main
+from sweep.model import clouds, cycles
+from sweep.tasks import flight_study
+from sweep.tasks.driver import extend, resume
+from sweep.tasks.errors import StoreError
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.recipe import read_recipe
+from sweep.tasks.stretches import Part
+from sweep.tasks.succession import beside
+from sweep.tasks.verify import verify
+
+POWER, APERTURE, TNR = (
+    "instrument.laser.power", "instrument.telescope.aperture", "instrument.processing.tnr",
+)  # fmt: skip
+DESCENT = SCENE["platform"]["path"]
+SHORT = {
+    "platform": SCENE["platform"] | {"path": DESCENT | {"to": ["0 m", "0 m", "700 m"]}},
+    "storage": {"block_shots": 30, "block_draws": 2},
+}
+"""Changes of the small scene: a shorter flight in more blocks."""
+
+
+def flight(**changes):
+    """The short flight: two scanners, two powers, five draws."""
+    return small_scene(**SHORT | changes)
+
+
+def shots_of(spec, *names):
+    """Shots of some scanners of a study, by default of all."""
+    return sum(spec.cycles(n) * spec.shots_a_cycle(n) for n in names or spec.scanners)
+
+
+SHOTS, CYCLES = shots_of(flight()), flight().cycles("three")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The store of the short flight, beside it its eyepoints; not to be changed."""
+    return quiet(flight(), tmp_path_factory.mktemp("flown") / "flight.zarr").store
+
+
+@pytest.fixture
+def here(flown, tmp_path):
+    """A copy of the store, beside it its eyepoints."""
+    shutil.copytree(flown.parent, tmp_path, dirs_exist_ok=True)
+    return tmp_path / flown.name
+
+
+class Computed:
+    """Shots that the model draws, times draws, and cycles that it solves."""
+
+    def __init__(self):
+        self.shots = self.cycles = 0
+
+
+@pytest.fixture
+def computed(monkeypatch):
+    """What is computed from here on, but for what compiles the model."""
+    count, cloud, solve = Computed(), clouds.cloud, cycles.solve
+
+    def drawn(eyepoints, *, draws, **rest):
+        count.shots += len(eyepoints.time) * draws
+        return cloud(eyepoints, draws=draws, **rest)
+
+    def solved(shots, points, **rest):
+        found = solve(shots, points, **rest)
+        count.cycles += found["altitude"].size
+        return found
+
+    monkeypatch.setattr(clouds, "cloud", drawn)
+    monkeypatch.setattr(cycles, "solve", solved)
+    monkeypatch.setattr(FlightStudy, "compile", lambda self: None)
+    return count
+
+
+def larger(store, spec, **options):
+    """A store extended as a plain loop, without progress."""
+    return extend(store, spec, progress=False, scheduler="none", **options)
+
+
+def at_once(spec, store):
+    """Files of a study that is run at once, with the eyepoints of another."""
+    return tree(quiet(spec, store.with_name("at_once.zarr")).store)
+
+
+TWO, THREE = ["0.01 W", "1 W"], ["3 W", "0.01 W", "1 W"]
+FIVE, EIGHT = {"number": 5, "returns": 3}, {"number": 8, "returns": 3}
+
+MORE = {
+    "a value": ({"axes": {POWER: [*TWO, "3 W"]}}, 5),
+    "a value in between": ({"axes": {POWER: ["0.01 W", "0.1 W", "1 W"]}}, 5),
+    "values in another order": ({"axes": {POWER: THREE[::-1]}}, 5),
+    "an axis": ({"axes": {POWER: TWO, APERTURE: ["50 mm", "40 mm"]}}, 10),
+    "an axis before": ({"axes": {APERTURE: ["40 mm", "50 mm"], POWER: TWO}}, 10),
+    "an axis zipped to the old one": (
+        {"axes": {"cut": {"zip": {POWER: THREE, TNR: [6, 8, 8]}}}}, 5,
+    ),
+    "draws": ({"draws": EIGHT}, 6),
+    "draws and values": ({"draws": EIGHT, "axes": {POWER: THREE}}, 6 + 8),
+    "blocks of another size": ({"storage": {"block_shots": 33, "block_draws": 5}}, 0),
+    "large blocks": ({"storage": {"block_shots": 4096, "block_draws": 64}, "draws": EIGHT}, 6),
+    "small blocks": (
+        {"storage": {"block_shots": 13, "block_draws": 3}, "draws": EIGHT,
+         "axes": {POWER: THREE}}, 14,
+    ),
+}  # fmt: skip
+"""What is larger, and draws of every shot that are new, over all places along the axes."""
+
+
+@pytest.mark.parametrize("changes, new", MORE.values(), ids=MORE)
+def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
+    spec = flight(**changes)
+    outcome = larger(here, spec)
+    assert outcome.complete and outcome.store == here
+    assert outcome.rays == {"three": 0, "line": 0}
+    assert computed.shots == SHOTS * new and computed.cycles == CYCLES * new
+    assert sorted(file.name for file in here.parent.iterdir()) == ["eyepoints", here.name]
+    assert tree(here) == at_once(spec, here)
+    assert all(report.sound and report.complete for report in verify(here))
+
+
+def test_an_axis_may_come_where_there_was_none(here, computed):
+    one = quiet(flight(axes={}), here.with_name("one.zarr")).store
+    computed.shots = 0
+    assert larger(one, flight()).complete and computed.shots == SHOTS * 5
+    assert tree(one) == tree(here)
+
+
+def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(here, computed):
+    cone = SCENE["scanners"]["three"] | {"beams": 4, "rate": "2 Hz"}
+    spec = flight(scanners={"four": cone, **SCENE["scanners"]})
+    outcome = larger(here, spec)
+    assert outcome.complete and computed.shots == shots_of(spec, "four") * 5 * 2
+    assert outcome.rays["four"] > 0 == outcome.rays["three"] == outcome.rays["line"]
+    assert tree(here) == at_once(spec, here)
+
+
+def test_workers_take_what_is_there_as_a_plain_loop_does(here, computed):
+    spec = flight(draws=EIGHT)
+    assert extend(here, spec, workers=2, processes=False, progress=False).complete
+    assert computed.shots == SHOTS * 6 and tree(here) == at_once(spec, here)
+
+
+def test_in_another_place_not_a_byte_of_the_store_changes(here, computed):
+    before, new = everything(here), here.with_name("larger.zarr")
+    outcome = larger(here, flight(draws=EIGHT), to=new)
+    assert outcome.complete and outcome.store == new and computed.shots == SHOTS * 6
+    assert everything(here) == before
+    assert tree(new) == at_once(flight(draws=EIGHT), here)
+
+
+def test_as_it_is_typed(here, monkeypatch):
+    monkeypatch.chdir(here.parent)
+    change = f"axes.{POWER}=[0.01 W, 1 W, 3 W]"
+    told = CliRunner().invoke(main, ["extend", here.name, "--set", change, "--scheduler", "none"])
+    done, whole = (f"{SHOTS * 5 * places:,}" for places in (2, 3))
+    assert told.exit_code == 0
+    assert f"{done} of {whole} shots are there; {SHOTS * 5:,} to compute\n" in told.stderr
+    assert f"{here.name}: {whole} of {whole} shots" in told.stdout
+    again = CliRunner().invoke(main, ["extend", here.name, "--set", change])
+    assert again.exit_code == 0 and "nothing to extend" in again.stderr
+
+
+#: Errors that are numbers, and do not follow the tolerance.
+CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
+
+
+def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
+    here, computed, monkeypatch, capsys
+):
+    """Tiles of 16 shots, which neither blocks nor cycles fit: some cycles are known in part."""
+    monkeypatch.setattr(flight_study, "TILE_SHOTS", 16)
+    coarse, fine = (flight(accuracy={"tolerance": t, **CLOSE}) for t in (0.2, 0.02))
+    store = quiet(coarse, here.with_name("coarse.zarr")).store
+    whole, solved = computed.shots, computed.cycles
+    computed.shots = computed.cycles = 0
+    assert extend(store, fine, scheduler="none").complete
+    assert 0 < computed.shots < whole and 0 < computed.cycles < solved
+    assert "shots that call for more effects with the tolerance" in capsys.readouterr().err
+    assert tree(store) == at_once(fine, here)
+
+
+def test_where_the_tolerance_says_how_closely_all_is_computed_anew(here, computed, capsys):
+    spec = flight(accuracy={"tolerance": 1e-4})
+    assert extend(here, spec, scheduler="none").complete
+    assert computed.shots == SHOTS * 10
+    told = capsys.readouterr().err
+    assert f"0 of {SHOTS * 10:,} shots are there" in told
+    assert "computed more closely, and anew, but where accuracy.line_error and" in told
+    assert tree(here) == at_once(spec, here)
+
+
+def chunk(store, name, part, scanner="three"):
+    """File of a block's chunk, by its place on the axis, draws and cycles."""
+    block = FlightStudy(flight(), store).block(Part(scanner, (part[0],), *part[1:]))
+    place = FlightStudy(flight(), store).chunks(block)[f"{scanner}/{name}"]
+    return store.joinpath(scanner, name, "c", *map(str, place))
+
+
+@pytest.mark.parametrize("name, draws", [("flags", 2), ("effects", 0), ("pd_shot", 0)])
+def test_a_damaged_block_is_computed_anew(here, computed, name, draws):
+    """In place of its own a block has another's chunk, which any reader takes for sound.
+
+    With the block of a shot's first draws all of its draws are lost: what it was is not known.
+    """
+    chunk(here, name, (0, 1 if draws else 0, 1)).write_bytes(
+        chunk(here, name, (1, 1 if draws else 0, 0)).read_bytes()
+    )
+    spec = flight(draws=EIGHT)
+    assert larger(here, spec).complete
+    assert computed.shots == SHOTS * 6 + 30 * (draws or 5)
+    assert tree(here) == at_once(spec, here)
+
+
+def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed):
+    log = here / ".sweep" / "receipts.jsonl"
+    lines = log.read_text().splitlines(keepends=True)[:11]
+    log.write_text("".join(lines))
+    there = sum(json.loads(line)["points"] for line in lines)
+    spec = flight(axes={POWER: [*TWO, "3 W"]})
+    assert larger(here, spec).complete and computed.shots == SHOTS * 15 - there
+    assert tree(here) == at_once(spec, here)
+
+
+def test_ctrl_c_leaves_the_store_and_both_commands_go_on(here, flown, computed):
+    spec = flight(draws=EIGHT)
+    for _ in range(2):
+        outcome = extend(here, spec, progress=Interrupting(), scheduler="none")
+        assert outcome.stopped == "interrupted" and outcome.store == beside(here)
+        assert tree(here) == tree(flown)
+    assert resume(here, progress=False, scheduler="none").complete
+    assert computed.shots == SHOTS * 6 and tree(here) == at_once(spec, here)
+
+
+def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeypatch, computed):
+    base = tmp_path / "declared"
+    base.mkdir()
+    with (base / "path.csv").open("w") as file:
+        csv.writer(file).writerows(
+            [["time [s]", "x [m]", "y [m]", "z [m]"], [0, 0, 0, 900], [8, 200, 0, 500]]
+        )
+    platform = SCENE["platform"] | {"path": {"kind": "waypoints", "file": "path.csv"}}
+    changes = SCENE | SHORT | {"platform": platform, "draws": {"number": 1}}
+    older, spec = (
+        type(small_scene()).from_mapping(changes | more, base=base)
+        for more in ({}, {"draws": {"number": 2}})
+    )
+    store = quiet(older, tmp_path / "flight.zarr").store
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    computed.shots = 0
+    assert larger(store, None, changes={"draws.number": 2}).complete
+    assert computed.shots == shots_of(spec) * 2
+    assert read_recipe(store) == {"base": str(base)}
+    assert resume(store, progress=False, scheduler="none").complete
+    assert tree(store) == at_once(spec, store)
+
+
+def moved(thing, **changes):
+    """The scene with one of its objects changed."""
+    objects = SCENE["scene"]["objects"]
+    return {"scene": SCENE["scene"] | {"objects": objects | {thing: objects[thing] | changes}}}
+
+
+REFUSED = {
+    "fewer draws": (
+        {"draws": FIVE | {"number": 4}}, ["draws.number: 5 -> 4, and may only grow"],
+    ),
+    "other draws": (
+        {"draws": FIVE | {"method": "noise", "returns": 4}},
+        ["draws.method: probabilities -> noise, and must stay", "draws.returns: 3 -> 4, and must"],
+    ),
+    "a value lost": ({"axes": {POWER: ["1 W", "3 W"]}}, [POWER + ": 0.01 W: lost, and must stay"]),
+    "an axis lost": ({"axes": {}}, [POWER + ": 0.01 W: lost"]),
+    "a looser tolerance": (
+        {"accuracy": {"tolerance": 0.1}}, ["tolerance: 0.001 -> 0.1, and may only become tighter"],
+    ),
+    "another scene": (
+        moved("stone", radius="25 m", reflectance=0.2),
+        ["stone.radius: 20 m -> 25 m, and must stay", "stone.reflectance: 0.3 -> 0.2, and must"],
+    ),
+    "another flight": ({"platform": SCENE["platform"]}, ["path.to: ", ", and must stay"]),
+    "a scanner lost": (
+        {"scanners": {"three": SCENE["scanners"]["three"]}}, ["scanners.line.kind: line -> (none)"],
+    ),
+    "another scanner": (
+        {"scanners": SCENE["scanners"] | {"three": SCENE["scanners"]["three"] | {"beams": 4}}},
+        ["scanners.three.beams: 3 -> 4, and must stay"],
+    ),
+    "another test": (
+        {"navigation": {"test_level": 0.01}}, ["navigation.test_level: 0 -> 0.01, and must stay"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_larger_study_is_refused_field_by_field(flown, changes, told):
+    before = everything(flown)
+    with pytest.raises(
+        StoreError, match=r"new scanners, more draws.* needs a store of its own"
+    ) as error:
+        larger(flown, flight(**changes))
+    assert all(line in str(error.value) for line in told)
+    assert everything(flown) == before and not beside(flown).exists()
+
+
+def test_a_grid_is_no_larger_flight(flown):
+    with pytest.raises(StoreError, match="have nothing in common"):
+        larger(flown, small())
+
+
+def test_another_study_put_in_the_older_ones_place_is_not_taken_for_it(here, computed, monkeypatch):
+    """Between two runs of an extension its store was replaced by that of a darker scene."""
+    spec, new = flight(draws=EIGHT), here.with_name("larger.zarr")
+    extend(here, spec, to=new, progress=Interrupting(), scheduler="none")
+    shutil.rmtree(here)
+    quiet(flight(**moved("ground", reflectance=0.01)), here)
+    monkeypatch.setattr("sweep.tasks.worker._studies", {})
+    assert resume(new, progress=False, scheduler="none").complete
+    assert tree(new) == at_once(spec, here)
