@@ -155,7 +155,8 @@ class FlightStudy:
 
     def owners(self) -> dict[str, np.ndarray]:
         """The blocks along axes, draws and stretches, as far as an array has these dimensions."""
-        found, first = {}, 0
+        found: dict[str, np.ndarray] = {}
+        first = 0
         for stretches in self._stretches:
             found |= flight_layout.owners(stretches, first)
             first += stretches.number
