@@ -182,7 +182,10 @@ def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
 ):
     """Tiles of 16 shots, which neither blocks nor cycles fit: some cycles are known in part."""
     monkeypatch.setattr(flight_study, "TILE_SHOTS", 16)
-    coarse, fine = (flight(accuracy={"tolerance": t, **CLOSE}) for t in (0.2, 0.02))
+    axes = {POWER: ["0.03 W", "0.1 W"]}
+    coarse, fine = (
+        flight(accuracy={"tolerance": tolerance, **CLOSE}, axes=axes) for tolerance in (0.2, 1e-3)
+    )
     store = quiet(coarse, here.with_name("coarse.zarr")).store
     whole, solved = computed.shots, computed.cycles
     computed.shots = computed.cycles = 0
@@ -225,13 +228,19 @@ def test_a_damaged_block_is_computed_anew(here, computed, drawn_more, name, stre
     assert computed.shots == SHOTS * 6 + 48 * lost and tree(here) == drawn_more
 
 
-def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed):
+def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, capsys):
+    """Without the block of the first draws of some shots, that of their last is of no use."""
     log = here / ".sweep" / "receipts.jsonl"
-    lines = log.read_text().splitlines(keepends=True)[:7]
+    lines = log.read_text().splitlines(keepends=True)[1:7]
     log.write_text("".join(lines))
-    there = sum(json.loads(line)["points"] for line in lines)
+    older = FlightStudy(flight(), here)
+    useless = older.block(Part("three", (0,), 1, 0))
+    found = {record["block"]: record["points"] for record in map(json.loads, lines)}
+    there = sum(found.values()) - found[useless]
     spec = flight(axes={POWER: [*TWO, "3 W"]})
-    assert larger(here, spec).complete and computed.shots == SHOTS * 9 - there
+    assert extend(here, spec, scheduler="none").complete
+    assert computed.shots == SHOTS * 9 - there
+    assert f"{there:,} of {SHOTS * 9:,} shots are there" in capsys.readouterr().err
     assert tree(here) == at_once(spec, here)
 
 
