@@ -109,12 +109,13 @@ def at_once(spec, store):
 TWO, THREE = ["0.01 W", "1 W"], ["3 W", "1 W", "0.01 W"]
 DRAWS = SMALLER["draws"]
 MORE_DRAWS = DRAWS | {"number": 6}
+LARGE = {"block_shots": 4096, "block_draws": 64}
 
 MORE = {
     "values in another order": ({"axes": {POWER: ["1 W", "0.1 W", "0.01 W"]}}, 3),
     "an axis before": ({"axes": {APERTURE: ["40 mm", "50 mm"], POWER: TWO}}, 6),
     "draws": ({"draws": MORE_DRAWS}, 6),
-    "large blocks": ({"storage": {"block_shots": 4096, "block_draws": 64}}, 0),
+    "large blocks": ({"storage": LARGE}, 0),
     "draws and values in other blocks": (
         {"storage": {"block_shots": 33, "block_draws": 4}, "draws": MORE_DRAWS,
          "axes": {POWER: THREE}}, 6 + 6,
@@ -237,7 +238,7 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, 
     useless = older.block(Part("three", (0,), 1, 0))
     found = {record["block"]: record["points"] for record in map(json.loads, lines)}
     there = sum(found.values()) - found[useless]
-    spec = flight(axes={POWER: [*TWO, "3 W"]})
+    spec = flight(axes={POWER: [*TWO, "3 W"]}, storage=LARGE)
     assert extend(here, spec, scheduler="none").complete
     assert computed.shots == SHOTS * 9 - there
     assert f"{there:,} of {SHOTS * 9:,} shots are there" in capsys.readouterr().err
