@@ -20,7 +20,7 @@ demo: $(READY)
 # A compiled kernel's cache does not notice a change in a kernel that it calls: begin without it.
 test: $(READY) forget-kernels
 	$(MAKE) --jobs 3 --output-sync lint compile-grids compile-flights
-	$(BIN)/pytest -n auto --dist worksteal
+	$(BIN)/pytest -n auto --dist worksteal --durations 12
 
 test-all: $(READY) forget-kernels
 	$(MAKE) --jobs 2 compile-grids compile-flights
