@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import c as speed_of_light
+from scipy.special import gammaln, jv
 
 from sweep.model.chain import prepare
 from sweep.model.equivalent import (
@@ -13,6 +14,7 @@ from sweep.model.equivalent import (
     MOST_NODES,
     equivalent_lines,
     node_limits,
+    nodes_for,
 )
 from sweep.model.lines import folded_origin, segment_lines
 from sweep.model.runs import reach_of
@@ -204,6 +206,18 @@ def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most(
     assert counts[0] == counts[1] and counts[-1] == counts[-2]
     assert (np.diff(counts[1:-1]) < 0).all()
     assert number(1e-9, counts[3]) == counts[3] and number(1e-9, counts[3] - 1) == 109
+
+
+@given(st.floats(-13, -4), st.floats(0.05, 60.0))
+def test_nodes_are_as_many_as_the_tolerance_takes_and_no_more(exponent, turn):
+    """By the coefficients 2 J_m of what is left out; one node less, and Stirling's bound on the
+    first of them exceeds what half a decade more would allow."""
+    tolerance = 10.0**exponent
+    nodes = nodes_for(turn, tolerance, node_limits(AMPLITUDE_TOLERANCES))
+    left_out = 2 * np.abs(jv(np.arange(nodes, nodes + 200), turn)).sum()
+    assert left_out <= tolerance
+    before = nodes - 1
+    assert 2 * np.exp(before * np.log(turn / 2) - gammaln(nodes)) >= 0.299 * tolerance
 
 
 # Lines
