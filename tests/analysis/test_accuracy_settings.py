@@ -1,5 +1,7 @@
 """Fronts, cheapest settings and who beats whom, on made-up data whose answers are plain."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -160,6 +162,25 @@ def test_marks_stand_at_times_and_errors(dataset):
     assert axes.get_xscale() == axes.get_yscale() == "log"
     words = {t.get_text() for t in axes.texts}
     assert {"1e-1", "19", "2^12"} <= words
+
+
+def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dataset):
+    """As 0.1, 0.01 and 0.001 do here, with 1e-4 as fast as these and less far off."""
+    found = settings.settings_in(dataset)
+    like = next(setting for setting in found if setting.kind == "adaptive")
+    four = [
+        replace(
+            like, name=f"auto at {t:g}", tolerance=t, rounds=1e-6 * np.array([us]),
+            pd_error=np.full(3, error), log10_pfa_error=0.0, magnitude_error=0.0,
+        )
+        for t, us, error in (
+            (0.1, 8.0, 8e-5), (0.01, 8.2, 8e-5), (1e-4, 8.7, 1e-5), (1e-3, 8.8, 8e-5),
+        )
+    ]  # fmt: skip
+    others = [setting for setting in found if setting.kind != "adaptive"]
+    (axes,) = figure.draw(dataset, [*four, *others]).axes
+    words = [t.get_text() for t in axes.texts]
+    assert "1e-1 … 1e-3" in words and "1e-4" in words and "1e-3" not in words
 
 
 def test_a_store_of_another_kind_is_refused(tmp_path):

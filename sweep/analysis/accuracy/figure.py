@@ -100,11 +100,12 @@ def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
 
 
 def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
-    """Settings by time, cut where a mark is far enough from the one before to be named."""
+    """Settings by time, those together whose marks are too close to be named each."""
     clusters: list[list[Setting]] = []
     for setting in sorted(settings, key=lambda each: each.seconds):
-        if clusters and _alike(setting, clusters[-1][-1]):
-            clusters[-1].append(setting)
+        near = (cluster for cluster in clusters if _alike(setting, cluster[-1]))
+        if (cluster := next(near, None)) is not None:
+            cluster.append(setting)
         else:
             clusters.append([setting])
     return clusters
