@@ -5,6 +5,7 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from scipy.stats import ncx2
 from windows import SLOW, marked
 
 from sweep.model import modulation, truth
@@ -18,8 +19,11 @@ from sweep.model.crossings import (
 )
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
+from sweep.model.leakage import _all_beyond
 from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
+from sweep.model.window import samples
+from sweep.model.window import window as shape_of
 
 PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
 
@@ -49,6 +53,29 @@ def held(shots):
     assert error[MAGNITUDE] < 1e-9 and error[PD] < 1e-7
     assert error[FREQUENCY] == 0 and error[EXEMPTED] == 0
     return slow[:, LEAKAGE]
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+@pytest.mark.parametrize("nearest,most", [(0.05, 1.25), (0.7, 3.5)])
+def test_what_a_tone_leaks_far_from_it_is_bounded_and_not_by_much_more(name, nearest, most):
+    """Against each bin of the window's own FFT, from 200 bins on, wherever the tone."""
+    size, first, level = 4096, 200.0, np.sqrt(20.0)
+    shape, n = shape_of(name, size), np.arange(size)
+    kernel = (
+        (size, size),
+        (shape.coefficients, shape.numerator, shape.poles, shape.edge, shape.table),
+        (shape.sum, shape.envelope, shape.reach, shape.beyond),
+    )
+    weight = nearest / shape.envelope[np.searchsorted(shape.reach, first, "right") - 1]
+    alarm, leaked = np.exp(-(level**2) / 2), []
+    for offset in (0.25, 0.5, 0.75):
+        tone = np.exp(2j * np.pi * offset * n / size)
+        magnitude = np.abs(np.fft.fft(samples(name, size) * tone)) / shape.sum
+        away = np.minimum(np.abs(n - offset), np.abs(n - offset - size))
+        a = weight * magnitude[away >= first]
+        leaked.append(((ncx2.sf(level**2, 2, a**2) - alarm) / (1 - alarm)).sum())
+    bound = _all_beyond(weight / shape.sum, first, np.inf, (1.0, level, 0.0), kernel)
+    assert max(leaked) <= bound <= most * max(leaked)
 
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
