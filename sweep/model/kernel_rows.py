@@ -58,8 +58,9 @@ _SCRATCH = threading.local()
 
 LADDER = len(HALVES) + 1
 
-WAYS = 4
-"""Kinds of parts of a segment's lines whose kernels are kept beside each other."""
+WAYS = 8
+"""Kinds of parts of a segment's lines whose kernels are kept beside each other: more than there
+are tolerances to which lines are split, as points of each take turns."""
 
 ROWS = (1 + 3 * WAYS) * LADDER
 """Rows of scratch, for each width and for bundles side by side: of whole lines, and of lines in

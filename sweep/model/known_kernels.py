@@ -89,8 +89,7 @@ def slot_for(segment, own, fold, width, power, parts, kernel):
     level, alone = width
     row = level if alone else LADDER - 1
     if own >= 0:
-        way = int(parts[5][segment, own]) % WAYS
-        row += (1 + segment * WAYS + way) * LADDER
+        row += (1 + segment * WAYS + own % WAYS) * LADDER
     slot = kernel[5][row]
     if slot[HALF] == 0.0:
         slot[REACH] = REACHES[0 if alone else 1]

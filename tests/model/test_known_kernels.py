@@ -9,8 +9,9 @@ from test_bundles import PLACES, WINDOWS
 from test_optional_lines import prepared, scene
 
 from sweep.model import modulation, segments, spectra
+from sweep.model.chain import prepare
 from sweep.model.crossings import crossing_series
-from sweep.model.kernel_rows import HALVES
+from sweep.model.kernel_rows import HALVES, KEY
 from sweep.model.shot import find
 
 ROUNDING = 1e-11
@@ -75,3 +76,17 @@ def test_what_is_known_already_changes_no_bit(table_4_1):
 def test_the_ladder_holds_wide_bundles_with_few_steps():
     assert HALVES[0] >= 0.5  # of a line anywhere about its bin
     assert all(0 < wide / narrow - 1 < 0.5 for narrow, wide in pairwise(HALVES))
+
+
+def test_points_that_take_turns_at_every_tolerance_keep_each_others_kernels(table_4_1):
+    """Lines are split as finely as each point asks for: no point drives out another's tables."""
+    errors = np.tile(np.logspace(-6, 2, 9), 6)
+    parameters = scene(table_4_1, phases="coherent", beamlets=37, range=1000.0)
+    parameters |= {"target.radial_velocity": 300.0, "accuracy.line_error": errors}
+    ((_, shots),) = prepare(parameters, ("doppler", "footprint", "range_walk"))
+    (stretch,) = modulation.stretches(shots)
+    wanted = stretch.scene[1][5]
+    assert wanted.shape[1] == len(modulation.SPLIT_TOLERANCES)
+    find(shots)
+    kept = np.abs(shots.kernel()[5][:, KEY])
+    assert np.isin(wanted[[0, 2]], kept).all()
