@@ -82,11 +82,12 @@ def test_points_that_take_turns_at_every_tolerance_keep_each_others_kernels(tabl
     """Lines are split as finely as each point asks for: no point drives out another's tables."""
     errors = np.tile(np.logspace(-6, 2, 9), 6)
     parameters = scene(table_4_1, phases="coherent", beamlets=37, range=1000.0)
-    parameters |= {"target.radial_velocity": 300.0, "accuracy.line_error": errors}
+    parameters |= {"target.radial_velocity": 3000.0, "accuracy.line_error": errors}
     ((_, shots),) = prepare(parameters, ("doppler", "footprint", "range_walk"))
     (stretch,) = modulation.stretches(shots)
     wanted = stretch.scene[1][5]
     assert wanted.shape[1] == len(modulation.SPLIT_TOLERANCES)
+    assert len(set(wanted[0])) == 4  # two of them ask for the same
     find(shots)
     kept = np.abs(shots.kernel()[5][:, KEY])
     assert np.isin(wanted[[0, 2]], kept).all()
