@@ -6,6 +6,7 @@ Writes docs/promise.md.
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,7 +66,8 @@ One bin more or fewer that a detection occupies, of the 65,536 that could raise 
 6.6e-6 of log10 pfa.
 
 `us` is processor time a point, planning included. `fixed` is that of the cheapest setting with the
-same effects at every point that keeps the tolerance: the front of the ladder of `sweep accuracy`.
+same effects at every point, its lines and leakage to one of three tolerances, that keeps the
+tolerance: the front of the ladder of `sweep accuracy`.
 
 """
 RAYS = f"""
@@ -88,7 +90,8 @@ COSTS = """
 Does cost rise with accuracy no faster than the front of the ladder? From one tolerance to the next,
 `us` a point over that of the cheapest setting with the same effects at every point that is as
 accurate (`fixed`): below 1 asking for a tolerance is the cheaper. The cost has risen no faster than
-the front where no ratio is higher than the first by more than {margin:.0%}.
+the front where no ratio is higher by more than {margin:.0%} than the first, or than 1 where the
+first is lower: to have begun below the front is no debt.
 """
 
 
@@ -152,12 +155,12 @@ def known(spec: Spec | SceneSpec) -> Found:
     whole = whole.with_fixed({t: bench.effects(at[t]) for t in FIXED_AS_AT})
     bench.forget()
     fixed = [rung for rung in whole.rungs if rung.kind in (FIXED, ALL_ON)]
-    rungs = [*at.values(), *fixed, whole.reference]
+    own_rays = {k: v for k, v in whole.reference.overrides.items() if k != BEAMLETS or not flight}
+    own = replace(whole.reference, name="own rays", overrides=own_rays)
+    rungs = [*at.values(), *fixed, own, whole.reference]
     trials = tried(bench, rungs, ROUNDS)
     seen = {rung.name: trial for rung, trial in zip(rungs, trials, strict=True)}
-    every = next(rung for rung in fixed if rung.kind == ALL_ON)
-    finest = seen[whole.reference.name].seen
-    true = seen[every.name].seen if flight else finest
+    finest, true = seen[whole.reference.name].seen, seen[own.name].seen
     worst = {r.name: np.nanmax(np.concatenate(apart(seen[r.name].seen, true))) for r in fixed}
     rows, rays = [], []
     for tolerance, rung in at.items():
@@ -169,7 +172,7 @@ def known(spec: Spec | SceneSpec) -> Found:
     if not flight:
         return Found(rows, [])
     if BEAMLETS not in whole.reference.overrides:
-        return Found(rows, [with_more_rays(bench, whole, seen[every.name], "own, coherent")])
+        return Found(rows, [with_more_rays(bench, whole, seen[own.name], "own, coherent")])
     last = with_more_rays(bench, whole, seen[whole.reference.name], f"{FINEST_RAYS:,} rays")
     return Found(rows, [*rays, last])
 
@@ -230,7 +233,7 @@ def costs_of(name: str, rows: Sequence[Row]) -> str:
     """A row of the table of costs: ratios by tolerance, and whether they rise."""
     ratios = [row.seconds / row.fixed for row in rows]
     there = [ratio for ratio in ratios if np.isfinite(ratio)]
-    rise = max(there) / there[0] if there else np.nan
+    rise = max(there) / max(there[0], 1.0) if there else np.nan
     told = "kept" if rise <= DEARER else f"NOT kept: {rise:.2f} times"
     cells = [f"{ratio:.2f}" if np.isfinite(ratio) else "-" for ratio in ratios]
     return "| " + " | ".join([name, *cells, told if there else "no front"]) + " |"

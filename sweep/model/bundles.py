@@ -17,14 +17,13 @@ import math
 from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.equivalent import chebyshev_moments, nodes_for
-from sweep.model.kernel_rows import FORM_WIDTH, HALVES, MOST_MOMENTS, MOST_PARTS
+from sweep.model.kernel_rows import ASIDE, FORM_WIDTH, HALF, HALVES, MOST_MOMENTS, MOST_PARTS
 from sweep.model.known_kernels import (
     is_real,
     kernels_beside,
     level_for,
     slot_for,
     total_strength,
-    width_of,
 )
 from sweep.model.known_sources import form_of, sources_of, strengths_afar
 from sweep.model.lanes import COLUMNS, combine, dot
@@ -95,9 +94,9 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     if own >= 0 and parts[3][segment, own] > MOST_PARTS:
         return 0, as_lines()
     slot, row = slot_for(segment, own, fold, (level, number == 1), power, parts, kernel)
-    half, each = width_of(slot)
+    half = slot[HALF] + slot[ASIDE]
     band = math.pi * (2.0 if power else 1.0) * HALVES[level]
-    size = nodes_for(band, relative / (each * each if power else each), kernel[3])
+    size = nodes_for(band, relative, kernel[3])
     sources, form = sources_of(power, slot, kernel), power and own >= 0
     room_for_one = max(sources.size, size + 1, FORM_WIDTH if form else 0)
     if size > MOST_MOMENTS or number * room_for_one + COLUMNS > room.shape[1]:
@@ -142,20 +141,30 @@ def side_by_side(lowest, highest, power):
 
 @borrowing()
 def weight(n, power, room):
-    """Bound on the sum of the magnitudes of the weights of n lines: root of n times their squares.
+    """What errors of n lines come to, over that of a line of weight 1.
 
-    Some 1.3 times the sum for a beam's profile, and a product of vectors.
+    Of powers at most the root of n times their squares, some 1.3 times the sum of a beam's profile.
+    Amplitudes add as their phases have it: three times the root of their squares is exceeded by one
+    random sum of 10^4, and lines in phase stay within a tenth of their sum, or three times as much
+    for few.
     """
     re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     squares = dot(re, re, n)
     if not power:
         squares += dot(im, im, n)
+    in_phase = math.sqrt(n)
     if squares > 1e-250:
-        return math.sqrt(n * squares)
+        return math.sqrt(squares) * (in_phase if power else together(in_phase))
     total = 0.0  # too small to be squared
     for b in range(n):
         total += abs(re[b]) + (0.0 if power else abs(im[b]))
     return total
+
+
+@borrowing()
+def together(in_phase):
+    """Root of n, by which n amplitudes in phase exceed the root of their squares, as it counts."""
+    return min(in_phase, max(3.0, 0.1 * in_phase))
 
 
 @borrowing()

@@ -33,7 +33,7 @@ And one more, as in rows of kernels: rows as long as a power of two would share 
 processor's cache.
 """
 
-KEY, HALF, SIZE, NUMBER, ASIDE, EACH, SEEN, PLACES, REACH = range(9)  # of the row's numbers
+KEY, HALF, SIZE, NUMBER, ASIDE, SEEN, PLACES, REACH = range(8)  # of the row's numbers
 NODES = 16
 BOUND = NODES + MOST_MOMENTS
 SUM_RE = BOUND + MOST_MOMENTS

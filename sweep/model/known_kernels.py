@@ -33,7 +33,6 @@ from sweep.model.far_field import kernel_beside
 from sweep.model.kernel_rows import (
     ASIDE,
     BOUND,
-    EACH,
     HALF,
     HALVES,
     KEY,
@@ -133,14 +132,14 @@ def _take_parts(slot, segment, own, fold, parts):
     slot[NUMBER] = number
     slot[BOUND:KNOWN] = 0.0
     place, strength_re, strength_im = parts_of(slot)
-    aside, each = 0.0, 0.0
+    aside = 0.0
     for p in range(number):
         apart, re, im = 0.0, 1.0, 0.0
         if own >= 0:
             apart, re = fold * parts[0][segment, own, p], parts[1][segment, own, p]
             im = fold * parts[2][segment, own, p]
         whole = math.hypot(re, im)
-        aside, each = max(aside, abs(apart)), each + whole
+        aside = max(aside, abs(apart))
         for j in range(size):
             at = slot[NODES + j] + apart
             if at == math.floor(at):  # on a bin: moved off it by the last digit
@@ -150,13 +149,7 @@ def _take_parts(slot, segment, own, fold, parts):
             slot[BOUND + j] += whole * abs(sine)
             slot[SUM_RE + j] += re * sine
             slot[SUM_IM + j] += im * sine
-    slot[ASIDE], slot[EACH] = aside, each
-
-
-@borrowing()
-def width_of(slot):
-    """Half width of lines and their parts [bins]; sum of the parts' magnitudes."""
-    return slot[HALF] + slot[ASIDE], slot[EACH]
+    slot[ASIDE] = aside
 
 
 @borrowing()

@@ -10,6 +10,7 @@ points; shots without them are one stretch, and pay for nothing.
 Shifts are about the middle of the record: there, lines and images keep their phases.
 """
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model import waveform
-from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, weight
+from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, together, weight
 from sweep.model.compiling import borrowing
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_modes import (
@@ -27,7 +28,8 @@ from sweep.model.effects.line_modes import (
     in_modes,
     is_plain,
 )
-from sweep.model.effects.line_splitting import Split, split_lines
+from sweep.model.effects.line_splitting import Split
+from sweep.model.effects.mode_lines import split
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.kernel_rows import digests
 from sweep.model.preparation import LINE_STEPS, Shots
@@ -35,7 +37,7 @@ from sweep.model.preparation import LINE_STEPS, Shots
 POINTS = 256
 """Points of a stretch."""
 
-SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5)
+SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 """To which lines are split, relative to all of them in phase: the last that a point allows."""
 
 
@@ -65,12 +67,14 @@ def stretches(shots: Shots) -> Iterator[Stretch]:
     step = max(shots.size, 1) if plain else POINTS
     table, shared = shots.point_table(), _parts(shots, alike) if plain else None
     for first in range(0, max(shots.size, 1), step):
-        yield _stretch(shots, table, first, min(first + step, shots.size), levels, shared)
+        part = slice(first, min(first + step, shots.size))
+        yield _stretch(shots, table, part, shared or _parts(shots, alike.some(part)))
 
 
 def single(shots: Shots, i: int) -> Stretch:
     """Point ``i`` alone."""
-    return _stretch(shots, shots.point_table(), i, i + 1, _levels(shots))
+    alone = Alike(np.array([i]), np.zeros(1, np.int64), _levels(shots)[i : i + 1])
+    return _stretch(shots, shots.point_table(), slice(i, i + 1), _parts(shots, alone))
 
 
 class Alike(NamedTuple):
@@ -82,6 +86,11 @@ class Alike(NamedTuple):
     """(m,) int64: which of these stands for each point."""
     level: np.ndarray
     """(u,) int64: place in :data:`SPLIT_TOLERANCES`."""
+
+    def some(self, part: slice) -> "Alike":
+        """Those that stand for a run of points."""
+        those, which = np.unique(self.which[part], return_inverse=True)
+        return Alike(self.point[those], which, self.level[those])
 
 
 def _alike(shots: Shots, levels: np.ndarray) -> Alike:
@@ -106,26 +115,17 @@ def _alike(shots: Shots, levels: np.ndarray) -> Alike:
 
 def _levels(shots: Shots) -> np.ndarray:
     """How exactly each point's lines are to be split: a place in :data:`SPLIT_TOLERANCES`, (n,)."""
-    amplitudes = shots.amplitude.sum(axis=1)[shots.row]
-    whole = 0.5 * shots.beat_scale * amplitudes * shots.window.sum
+    squares = (shots.amplitude**2).sum(axis=1)[shots.row]
+    lines = together(math.sqrt(shots.amplitude.shape[1]))
+    whole = 0.5 * shots.beat_scale * np.sqrt(squares) * lines * shots.window.sum
     error = shots.line_tolerance * shots.bin_deviation / LINE_STEPS
     relative = np.where(whole > 0, error / np.where(whole > 0, whole, 1.0), np.inf)
     found = np.searchsorted(SPLIT_TOLERANCES, relative + np.zeros(shots.size), "right") - 1
     return np.asarray(np.maximum(found, 0))
 
 
-def _stretch(
-    shots: Shots,
-    table: np.ndarray,
-    first: int,
-    last: int,
-    levels: np.ndarray,
-    shared: tuple | None = None,
-) -> Stretch:
-    part, index = slice(first, last), np.arange(first, last)
-    parts = shared
-    if parts is None:
-        parts = _parts(shots, Alike(index, np.arange(index.size), levels[part]))
+def _stretch(shots: Shots, table: np.ndarray, part: slice, parts: tuple) -> Stretch:
+    index = np.arange(part.start, part.stop)
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
     times = max(parts[0].shape[2], shifts[0].shape[1])
@@ -164,18 +164,18 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
             left = np.flatnonzero(modes[segment, :, NUMBER] == 0)
         for level in np.unique(alike.level[left]):
             some = left[alike.level[left] == level]
-            split = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
-            splits.append((segment, some, split))
-    most = max((split.offset.shape[1] for _, _, split in splits), default=0)
+            own = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
+            splits.append((segment, some, own))
+    most = max((own.offset.shape[1] for _, _, own in splits), default=0)
     most = max(most, NUMBERS) if modes.size else most
     offset, re, im = np.zeros((3, 3, size, most))
     number = np.zeros((3, size), np.int64)
-    for segment, some, split in splits:
-        lines = split.offset.shape[1]
-        offset[segment, some, :lines] = split.offset
-        re[segment, some, :lines] = split.weight.real
-        im[segment, some, :lines] = split.weight.imag
-        number[segment, some] = split.number
+    for segment, some, own in splits:
+        lines = own.offset.shape[1]
+        offset[segment, some, :lines] = own.offset
+        re[segment, some, :lines] = own.weight.real
+        im[segment, some, :lines] = own.weight.imag
+        number[segment, some] = own.number
     if modes.size:
         re[:, :, :NUMBERS] = np.where((number == 0)[..., None], modes, re[:, :, :NUMBERS])
     known_as = digests(offset, re, im) if shots.alike else np.full(number.shape, np.nan)
@@ -194,7 +194,7 @@ def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> 
     """Lines that each line of some points is split into; what one point has is remembered."""
     errors = _errors(shots, points, segment)
     if points.size > 1:
-        return split_lines(partial(_total_phase, errors), tolerance=tolerance)
+        return split(partial(_total_phase, errors), tolerance=tolerance)
     alone = tuple(
         (phase, sign, tuple((name, float(value[0])) for name, value in values))
         for phase, sign, values in errors
@@ -209,7 +209,7 @@ def _split_alone(errors: tuple, tolerance: float) -> Split:
         (phase, sign, tuple((name, np.array([value])) for name, value in values))
         for phase, sign, values in errors
     )
-    return split_lines(partial(_total_phase, arrays), tolerance=tolerance)
+    return split(partial(_total_phase, arrays), tolerance=tolerance)
 
 
 def _total_phase(errors: tuple, x: np.ndarray) -> np.ndarray:

@@ -37,16 +37,20 @@ CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
-LEAKAGE_SHARE = 0.1
+LEAKAGE_SHARE = 0.5
 """Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
 
 AUTOMATIC = -1.0
 """Stands for an error that follows from the tolerance."""
 
-LINE_SHARE = 0.1
-"""The same, for errors of bins over sigma: pd changes by half as much in each segment."""
+LINE_SHARE = 1.0
+"""The same, for errors of bins over sigma: pd changes by less than half as much in each segment.
 
-LINE_STEPS = 5
+All of it, as bounds on these errors have all lines and bins at their worst: what comes of them is a
+hundredth of the tolerance or less.
+"""
+
+LINE_STEPS = 3
 """Steps that take few lines for many, at the most: each may err by as much of the whole."""
 
 
@@ -222,11 +226,16 @@ class Shots:
         The last is the thread's own: kernels that are worked out when they are met.
         """
         w = self.window
+        limits = (
+            node_limits(w.power_band_weights, POWER_TOLERANCES)
+            if self.incoherent
+            else node_limits(w.band_weights, AMPLITUDE_TOLERANCES)
+        )
         return (
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach, w.beyond),
-            node_limits(POWER_TOLERANCES if self.incoherent else AMPLITUDE_TOLERANCES),
+            limits,
             tangents(self.fft_size),
             with_modes(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),
         )

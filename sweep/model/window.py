@@ -37,6 +37,7 @@ OVERSAMPLING = 16
 """Samples a bin in the tabulated kernel."""
 
 _SHORTEST_CLOSED_FORM = 64
+_STAND_IN = 256
 _TABLE_PAD = 8
 
 
@@ -80,6 +81,28 @@ class Window:
         steps = np.append(np.diff(self.reach), 0.0) * self.envelope**2
         return np.cumsum(steps[::-1])[::-1].copy()
 
+    @cached_property
+    def band_weights(self) -> tuple[float, ...]:
+        """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
+
+        All at the end for a window whose kernel is tabulated: an upper bound.
+        """
+        if self.table.size:
+            return 0.0, 1.0
+        w = np.abs(samples(self.name, min(self.length, _STAND_IN) // 2 * 2))
+        half = w.size // 2
+        return _shares(np.append(w[half:], 0.0) + np.append(0.0, w[half - 1 :: -1]))
+
+    @cached_property
+    def power_band_weights(self) -> tuple[float, ...]:
+        """The same of |w|'s autocorrelation, whose transform |W|^2 is: t is the lag over L."""
+        if self.table.size:
+            return 0.0, 1.0
+        w = np.abs(samples(self.name, min(self.length, _STAND_IN)))
+        correlation = np.correlate(w, w, "full")[w.size - 1 :]
+        correlation[1:] *= 2  # either sign
+        return _shares(np.append(correlation, 0.0))
+
     @property
     def equivalent_noise_bandwidth(self) -> float:
         """Equivalent noise bandwidth [bins of fs/L]."""
@@ -89,6 +112,10 @@ class Window:
     def scalloping_loss(self) -> float:
         """Power lost by a tone half-way between two bins [dB, positive]."""
         return float(-20 * np.log10(abs(transform(self, np.array([0.5]))[0]) / self.sum))
+
+
+def _shares(weights: np.ndarray) -> tuple[float, ...]:
+    return tuple(map(float, weights / weights.sum()))
 
 
 def canonical_name(name: str) -> str:

@@ -50,6 +50,11 @@ def test_bins_are_those_of_the_lines_one_by_one(phases, place, table_4_1):
                 _, expected = spectra.segment_spectrum(exact, 0, 0)
                 missed = abs(found - expected[low : low + found.size])
                 allowed = tolerance * exact.bin_deviation[0] + ROUNDING * peak
+                if (
+                    phases == "incoherent"
+                ):  # of powers, where they are those of half a sigma or more
+                    away = 0.5 * exact.bin_deviation[0] / expected[low : low + found.size]
+                    allowed *= np.maximum(away, 1.0)
                 assert (missed <= allowed).all()
                 levels.add(level)
     # at DC all lines lie so close together that few of them do
@@ -80,14 +85,14 @@ def test_the_ladder_holds_wide_bundles_with_few_steps():
 
 def test_points_that_take_turns_at_every_tolerance_keep_each_others_kernels(table_4_1):
     """Lines are split as finely as each point asks for: no point drives out another's tables."""
-    errors = np.tile(np.logspace(-6, 2, 9), 6)
+    errors = np.tile(np.logspace(-6, 3, 10), 6)
     parameters = scene(table_4_1, phases="coherent", beamlets=37, range=1000.0)
     parameters |= {"target.radial_velocity": 3000.0, "accuracy.line_error": errors}
     ((_, shots),) = prepare(parameters, ("doppler", "footprint", "range_walk"))
     (stretch,) = modulation.stretches(shots)
     wanted = stretch.scene[1][5]
     assert wanted.shape[1] == len(modulation.SPLIT_TOLERANCES)
-    assert len(set(wanted[0])) == 4  # two of them ask for the same
+    assert len(set(wanted[0])) == wanted.shape[1]  # each asks for other lines
     find(shots)
     kept = np.abs(shots.kernel()[5][:, KEY])
     assert np.isin(wanted[[0, 2]], kept).all()

@@ -3,15 +3,16 @@
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import c as speed_of_light
-from scipy.special import gammaln, jv
+from scipy.special import jv
 
 from sweep.model.chain import prepare
 from sweep.model.equivalent import (
     AMPLITUDE_TOLERANCES,
     MOST_NODES,
+    POWER_TOLERANCES,
     equivalent_lines,
     node_limits,
     nodes_for,
@@ -21,6 +22,9 @@ from sweep.model.runs import reach_of
 from sweep.model.spectra import segment_spectrum
 from sweep.model.spectrum import bin_magnitudes, tangents
 from sweep.model.window import COSINE_SUMS, samples, window
+
+AT_THE_ENDS = 0.0, 1.0
+"""Weights of a band that may be all at its ends: of windows of which nothing is known."""
 
 TABULATED = ("kaiser(8.6)", "chebwin(100)", "dpss(3)", "tukey(0.3)", "gaussian(300)")
 
@@ -145,7 +149,7 @@ def test_far_sidelobes_of_a_line_keep_their_digits(name):
 def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, tolerance):
     """Sum of C e^{i u delta} for |u| <= pi, to what is allowed of the summed amplitudes."""
     rng = np.random.default_rng(43)
-    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
+    limits, work = node_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.empty((5, 128))
     u = np.linspace(-np.pi, np.pi, 41)[:, None]
     allowed = max(tolerance, 1e-13) + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
     for spread in 10 ** np.linspace(-16, 2, 500):
@@ -163,7 +167,7 @@ def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre
 
 
 def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
-    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
+    limits, work = node_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.empty((5, 128))
     few, re, im = np.empty(128), np.empty(128), np.empty(128)
     counts = []
     for spread in (0.0, 0.1, 1.0, 5.0, 200.0):
@@ -193,7 +197,7 @@ def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
 
 
 def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most():
-    limits, work = node_limits(AMPLITUDE_TOLERANCES), np.empty((5, 128))
+    limits, work = node_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.empty((5, 128))
     few, re, im = np.empty(128), np.empty(128), np.empty(128)
 
     def number(tolerance, most):
@@ -202,22 +206,86 @@ def test_fewer_lines_serve_a_looser_tolerance_and_none_are_taken_above_the_most(
             *line, 109, False, np.pi, tolerance, most, limits, few, re, im, work
         )
 
-    counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-4, 1.0)]
+    counts = [number(t, 108) for t in (1e-14, 1e-13, 1e-11, 1e-9, 1e-7, 1e-2, 1.0)]
     assert counts[0] == counts[1] and counts[-1] == counts[-2]
     assert (np.diff(counts[1:-1]) < 0).all()
     assert number(1e-9, counts[3]) == counts[3] and number(1e-9, counts[3] - 1) == 109
 
 
-@given(st.floats(-13, -4), st.floats(0.05, 60.0))
-def test_nodes_are_as_many_as_the_tolerance_takes_and_no_more(exponent, turn):
-    """By the coefficients 2 J_m of what is left out; one node less, and Stirling's bound on the
-    first of them exceeds what half a decade more would allow."""
+WEIGHED = [
+    (name, power)
+    for name in ("rectangular", "hann", "hamming", "flattop")
+    for power in (False, True)
+]
+
+
+def weights_of(name, power, length=512):
+    w = window(name, length)
+    if power:
+        return w.power_band_weights, POWER_TOLERANCES
+    return w.band_weights, AMPLITUDE_TOLERANCES
+
+
+def left_out(nodes, turn, weights):
+    """2 sum |J_m(turn t)| over what a series of so many terms leaves out, the mean over t."""
+    t = np.linspace(0, 1, len(weights))
+    series = np.abs(jv(np.arange(nodes, nodes + 150)[:, None], turn * t))
+    return float(2 * series.sum(axis=0) @ np.array(weights))
+
+
+@pytest.mark.parametrize(("name", "power"), WEIGHED)
+@given(st.floats(-13, -2), st.floats(0.05, 40.0))
+@settings(max_examples=30)
+def test_nodes_are_as_many_as_a_tolerance_takes_and_few_more(name, power, exponent, turn):
+    """By the Bessel functions that are left out, weighed by the window."""
+    weights, tolerances = weights_of(name, power)
     tolerance = 10.0**exponent
-    nodes = nodes_for(turn, tolerance, node_limits(AMPLITUDE_TOLERANCES))
-    left_out = 2 * np.abs(jv(np.arange(nodes, nodes + 200), turn)).sum()
-    assert left_out <= tolerance
-    before = nodes - 1
-    assert 2 * np.exp(before * np.log(turn / 2) - gammaln(nodes)) >= 0.299 * tolerance
+    nodes = nodes_for(turn, tolerance, node_limits(weights, tolerances))
+    least = max(t for t in tolerances if t <= tolerance)
+    assert left_out(nodes, turn, weights) <= least
+    assert nodes <= 2 or left_out(nodes - 2 - nodes // 12, turn, weights) > least
+
+
+@pytest.mark.parametrize(("name", "power"), WEIGHED)
+def test_band_weights_are_those_of_the_record(name, power):
+    """Even moments of the record's places, and of the differences of two, from all its samples."""
+    w = np.abs(samples(name, 512))
+    t = np.arange(512) / 256 - 1
+    weights, _ = weights_of(name, power)
+    places = np.linspace(0, 1, len(weights))
+    for order in (2, 8, 20):
+        found = float(places**order @ np.array(weights))
+        if power:
+            apart = (t[:, None] - t) / 2
+            expected = float((apart**order * np.outer(w, w)).sum() / w.sum() ** 2)
+        else:
+            expected = float((t**order * w).sum() / w.sum())
+        assert abs(found - expected) < 0.03 * expected
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "flattop"])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-10])
+def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolerance):
+    """Lines in phase at the ends of their bundle, the worst there are: by direct sums."""
+    weights, tolerances = weights_of(name, False, 256)
+    limits, work = node_limits(weights, tolerances), np.empty((5, 128))
+    record = samples(name, 256) * np.exp(
+        2j * np.pi * np.outer(np.arange(-20, 21), np.arange(256)) / 256
+    )
+    t = np.arange(256) / 128 - 1
+    for half in (0.3, 1.0, 3.0, 8.0):
+        delta = np.repeat([-half, 0.9 * half, half], 36)
+        few, re, im = np.empty(128), np.empty(128), np.empty(128)
+        n = equivalent_lines(
+            delta, np.ones(108), np.zeros(108), 108, False, np.pi, tolerance, 107, limits, few, re,
+            im, work,
+        )  # fmt: skip
+        assert n < 108
+        many = record @ np.exp(1j * np.pi * np.outer(t, delta)).sum(axis=1)
+        found = record @ (np.exp(1j * np.pi * np.outer(t, few[:n])) @ (re[:n] + 1j * im[:n]))
+        # What nodes alias onto the terms that are there is as much again.
+        whole = 108 * np.abs(samples(name, 256)).sum()
+        assert np.abs(many - found).max() <= 2 * tolerance * whole + 1e-12 * whole
 
 
 # Lines

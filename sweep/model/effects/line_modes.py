@@ -64,7 +64,12 @@ class Modes(NamedTuple):
 @lru_cache(maxsize=1)
 def modes() -> Modes:
     """The modes, worked out when they are first needed."""
-    offset, weight, error = fitted(_polynomials, np.array(ORDER), LINES, SPACING)
+    return mode_weights(LINES, SPACING)
+
+
+def mode_weights(lines: int, spacing: float) -> Modes:
+    """The modes as sums of so many lines, as well as these can be."""
+    offset, weight, error = fitted(_polynomials, np.array(ORDER), lines, spacing)
     strength = np.where(np.arange(MODES)[:, None] < EVENS, weight.real, weight.imag)
     return Modes(offset, np.ascontiguousarray(strength), error)
 

@@ -37,7 +37,7 @@ FINEST_RAYS = 1009
 """Beamlets of a flight's reference, where each is a ray."""
 
 FINEST_TOLERANCE = 1e-9
-"""Tolerance of the reference where the number of beamlets follows from it: over a plane."""
+"""Tolerance of the reference: of lines, of leakage and, over a plane, of the number of beamlets."""
 
 DRAW_NUMBERS = (10, 100, 1000)
 
@@ -53,6 +53,7 @@ MEAN, COUNTS = "mean", "counts"
 _TOLERANCE = "accuracy.tolerance"
 _BEAMLETS, _PATTERN = "footprint.beamlets", "footprint.pattern"
 _LINE = "line"
+_EXACTLY = dict.fromkeys(("accuracy.line_error", "accuracy.leakage_error"), FINEST_TOLERANCE)
 
 DRAWN = "draws.number"
 """Field that holds the number of draws."""
@@ -131,6 +132,8 @@ class Ladder:
     def with_fixed(self, sets: Mapping[float, frozenset[str]]) -> Ladder:
         """The ladder with rungs that simulate the same effects at every point.
 
+        Each of them to all of the tolerances, which say how exactly lines and leakage are computed.
+
         Parameters
         ----------
         sets
@@ -138,16 +141,18 @@ class Ladder:
         """
         from sweep.model.effects.catalogue import EFFECTS
 
-        further, seen = [], set()
+        as_at: dict[frozenset[str], float] = {}
         for tolerance, names in sets.items():
-            if names not in seen:
-                seen.add(names)
-                modes = {
-                    f"effects.{effect.name}": "on" if effect.name in names else "off"
-                    for effect in EFFECTS
-                }
-                name = f"{len(names)} effects, as at {tolerance:g}"
-                overrides = modes | dict(self.fixed)
+            as_at.setdefault(names, tolerance)
+        further = []
+        for names, first in as_at.items():
+            modes = {
+                f"effects.{effect.name}": "on" if effect.name in names else "off"
+                for effect in EFFECTS
+            }
+            for tolerance in sets:
+                name = f"{len(names)} effects as at {first:g}, to {tolerance:g}"
+                overrides = modes | dict(self.fixed) | {_TOLERANCE: tolerance}
                 further.append(Rung(name=name, kind=FIXED, overrides=overrides, plans=False))
         place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
         return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
@@ -170,14 +175,14 @@ def ladder(spec: Declared) -> Ladder:
         ]
     every = _every_effect(spec)
     rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every, plans=False))
-    finest, about = every, "all effects on"
+    finest, about = every | _EXACTLY, "all effects on"
     if why:
         notes.append(f"the number of beamlets is left alone: {why}")
     elif follow:
-        finest = every | follow | {_TOLERANCE: FINEST_TOLERANCE}
+        finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
     else:
-        finest = every | {_BEAMLETS: FINEST_RAYS}
+        finest |= {_BEAMLETS: FINEST_RAYS}
         about += f", {FINEST_RAYS} beamlets"
     rungs += _numbers(spec) if not why else ()
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
