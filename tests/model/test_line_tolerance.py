@@ -77,5 +77,5 @@ def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
     ((_, by_hand),) = prepare(parameters | given | {"accuracy.tolerance": 0.1})
     assert (by_hand.line_tolerance, by_hand.leakage_tolerance) == (1e-4, 2e-5)
     ((_, auto),) = prepare(parameters | {"accuracy.tolerance": 0.1})
-    assert auto.line_tolerance == pytest.approx(0.01)
-    assert auto.leakage_tolerance == pytest.approx(0.01)
+    assert auto.line_tolerance == pytest.approx(0.1)
+    assert auto.leakage_tolerance == pytest.approx(0.05)
