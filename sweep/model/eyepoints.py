@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sweep.model import reflectance
 from sweep.model.chain import prepare_cast
@@ -70,7 +71,10 @@ class Eyepoints(NamedTuple):
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
     def some(self, shots: slice | np.ndarray) -> "Eyepoints":
-        """Some of the shots, by a slice, their places or a mask."""
+        """Some of the shots, by a slice, their places or a mask; of all nothing is copied."""
+        whole = np.arange(len(self.time))
+        if np.array_equal(whole[shots], whole):
+            return self
         return Eyepoints._make([*(values[shots] for values in self[:-1]), self.weight])
 
 
@@ -197,13 +201,8 @@ def seen_ground(
         raise ValueError("a shot that sees nothing has no radiometry: leave it out")
     if eyepoints.surface.max(initial=-1) >= len(surfaces):
         raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
-    hit = eyepoints.surface >= 0
-    relative = np.where(hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
-    doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
-    lit, back = _scattered(eyepoints, surfaces)
-    footprints = Footprints(np.arange(len(hit)), relative, doppler, back / (1 + relative) ** 2)
-    axis = eyepoints.surface[np.arange(len(hit)), eyepoints.reference]
-    ground = Cast(footprints, hit & (eyepoints.surface != axis[:, None]))
+    lit, relative, doppler, echo, beside = _footprints(eyepoints, surfaces)
+    ground = Cast(Footprints(np.arange(len(echo)), relative, doppler, echo), beside)
     shots = dict(parameters) | {
         "target.range": eyepoints.range,
         "target.radial_velocity": eyepoints.radial_velocity,
@@ -221,15 +220,61 @@ def _height_of_target(eyepoints: Eyepoints) -> np.ndarray:
     return eyepoints.position[:, 2] + eyepoints.range * eyepoints.direction[:, 2]
 
 
-def _scattered(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """Power fraction x reflectance of the footprint (n,); that x backscatter by beamlet (n, b)."""
-    # the entry past the last surface is that of a miss, -1
-    bright = np.array([*(surface.reflectance for surface in surfaces), 0.0])
-    sent = eyepoints.weight * bright[eyepoints.surface]
-    cosine = np.where(eyepoints.surface >= 0, eyepoints.cos_incidence, 0.0)
-    laws = [surface.law for surface in surfaces]
-    back = np.zeros_like(sent)
-    for law in dict.fromkeys(laws):
-        follows = np.array([*(other == law for other in laws), False])[eyepoints.surface]
-        back = np.where(follows, sent * reflectance.backscatter(law, cosine), back)
-    return sent.sum(axis=1), back
+def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, ...]:
+    """What footprints send back, and from where; 0 for a beamlet that misses.
+
+    Returns
+    -------
+    (n,) ndarray
+        Power fraction x reflectance.
+    (n, beamlets) ndarray, (n, beamlets) ndarray, (n, beamlets) ndarray
+        Offset, Doppler and echo as of :class:`sweep.model.ground.Footprints`.
+    (n, beamlets) bool ndarray
+        Whether a beamlet meets another surface than the reference beamlet.
+    """
+    bright = np.array([surface.reflectance for surface in surfaces])
+    laws = np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
+    shape = eyepoints.offset.shape
+    sent, relative, doppler, echo = np.empty((4, *shape))
+    beside = np.empty(shape, np.bool_)
+    seen = (
+        eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
+        eyepoints.surface,
+    )  # fmt: skip
+    _look(
+        tuple(map(np.ascontiguousarray, seen)),
+        (eyepoints.weight, bright, laws),
+        (sent, relative, doppler, echo, beside),
+    )
+    return sent.sum(axis=1), relative, doppler, echo, beside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(seen, materials, found):
+    """Fill in what :func:`_footprints` says."""
+    ranges, offset, velocity, cosine, surface = seen
+    weight, bright, laws = materials
+    sent, relative, doppler, echo, beside = found
+    beamlets = surface.shape[1]
+    for i in range(surface.shape[0]):
+        axis = _first_seen(surface, i)
+        for b in range(beamlets):
+            s = surface[i, b]
+            hit = s >= 0
+            beside[i, b] = hit and s != axis
+            relative[i, b] = offset[i, b] / ranges[i] if hit else 0.0
+            doppler[i, b] = 2 * velocity[i, b] / SPEED_OF_LIGHT if hit else 0.0
+            sent[i, b] = weight[b] * bright[s] if hit else 0.0
+            back = reflectance.backscatter_of(laws[s], cosine[i, b]) if hit else 0.0
+            echo[i, b] = sent[i, b] * back
+        for b in range(beamlets):  # by itself, as the machine's vectors take it
+            echo[i, b] /= (1 + relative[i, b]) * (1 + relative[i, b])
+
+
+@njit(cache=True, nogil=True)
+def _first_seen(surface, i):
+    """Surface that the first beamlet meets that meets any; -1 for none."""
+    for b in range(surface.shape[1]):
+        if surface[i, b] >= 0:
+            return surface[i, b]
+    return -1

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
 from itertools import takewhile
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from sweep.tasks.study import ArrayLayout, Results
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
+    from sweep.model.geometry.surfaces import Surface
     from sweep.spec import SceneSpec
 
 #: Domain of the keys of draws; a shot's key is its number, so that the draws of a flight are the
@@ -55,6 +57,7 @@ class FlightStudy:
         self.spec, self.path, self._look_up = spec, path, look_up
         self._stretches = [Stretches(spec, scanner) for scanner in spec.scanners]
         self._readers: dict[str, EyepointReader] = {}
+        self._parameters: dict[tuple[int, ...], Mapping[str, Any]] = {}
 
     @cached_property
     def earlier(self) -> Earlier[KnownCloud] | None:
@@ -122,7 +125,7 @@ class FlightStudy:
             "title": self.spec.title,
             "question": self.spec.question,
             "spec": self.spec.to_json(),
-            "surfaces": [surface.name for surface in self.spec.surfaces()],
+            "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
             "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
             "origin": self._map.origin.tolist(),
@@ -212,10 +215,10 @@ class FlightStudy:
         return plan_shots(
             eyepoints,
             self.parameters_at(part),
-            self.spec.surfaces(),
-            modes=self.spec.modes(),
+            self.surfaces,
+            modes=self._modes,
             tiles=tiles,
-            rotating=self.spec.rotating,
+            rotating=self._rotating,
         )
 
     def look(
@@ -274,7 +277,7 @@ class FlightStudy:
             results = cloud(
                 eyepoints.some(rows[index]),
                 parameters=self.parameters_at(part),
-                surfaces=self.spec.surfaces(),
+                surfaces=self.surfaces,
                 keys=keys[index],
                 first_draw=begin + draws.start,
                 draws=draws.stop - draws.start,
@@ -305,13 +308,29 @@ class FlightStudy:
         yield Patch(cycles, draws, results)
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
-        """SI values of all parameters at a block's place along the axes."""
-        parameters = dict(self.spec.parameters())
-        for axis, index in zip(self.spec.axes, part.axes, strict=True):
-            for member in axis.members:
-                value = member.values[index]
-                parameters[member.path] = value.item() if isinstance(value, np.generic) else value
-        return parameters
+        """SI values of all parameters at a block's place along the axes, which is asked often."""
+        if part.axes not in self._parameters:
+            parameters: dict[str, Any] = dict(self.spec.parameters())
+            for axis, index in zip(self.spec.axes, part.axes, strict=True):
+                for member in axis.members:
+                    value = member.values[index]
+                    scalar = value.item() if isinstance(value, np.generic) else value
+                    parameters[member.path] = scalar
+            self._parameters[part.axes] = MappingProxyType(parameters)
+        return self._parameters[part.axes]
+
+    @cached_property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """What surface numbers mean."""
+        return self.spec.surfaces()
+
+    @cached_property
+    def _modes(self) -> Mapping[str, str]:
+        return self.spec.modes()
+
+    @cached_property
+    def _rotating(self) -> bool:
+        return self.spec.rotating
 
     def _reader(self, scanner: str) -> EyepointReader:
         if scanner not in self._readers:

@@ -276,7 +276,7 @@ def _found(
     from sweep.model.eyepoints import prepare_eyepoints
     from sweep.model.shot import statistics
 
-    parameters, surfaces = study.parameters_at(tiles.part), study.spec.surfaces()
+    parameters, surfaces = study.parameters_at(tiles.part), study.surfaces
     shots = prepare_eyepoints(eyepoints, parameters, surfaces, names)
     return seen_in(statistics(shots, look(shots)), MEAN, 0)
 
