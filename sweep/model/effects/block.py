@@ -16,7 +16,7 @@ from sweep.model import ground, resolution
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.line_spread import NOT_AWAY, Line, Moments
-from sweep.model.effects.span import Span, monotone
+from sweep.model.effects.span import Span, any_holds, monotone
 from sweep.model.effects.tile_geometry import Geometry
 from sweep.model.effects.tile_link import Parameters, TileLink
 from sweep.model.ground import Footprints
@@ -119,7 +119,7 @@ class Block(TileLink):
             return self.resting_lines
         slow = np.any(self.doppler_shift <= NOT_AWAY, axis=0) & (self.beta.magnitude > 0)
         beta = self.beta
-        if np.any(slow):
+        if any_holds(slow):
             either = Span.hull(beta, 0.0)
             beta = Span(
                 np.where(slow, either.low, beta.low), np.where(slow, either.high, beta.high)

@@ -13,6 +13,7 @@ from sweep.model.effects import footprint_phase
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.line_spread import spread_change
+from sweep.model.effects.span import any_holds
 from sweep.model.preparation import Shots
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def bound(block: "Block") -> Change | None:
     of amplitudes that add, lines in phase change by their own moves.
     """
     velocities = block.velocity_spread
-    if not np.any(np.asarray(velocities.extreme) > 0):
+    if not any_holds(np.greater(velocities.extreme, 0)):
         return None
     change = Change()
     if block.architecture != "direct":

@@ -19,11 +19,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.lobes import Lobe, lobe
+from sweep.model.effects.lobes import Lobe, lobe, lobe_least, lobe_most
 from sweep.model.effects.span import Span
 from sweep.model.footprint import beamlets
 from sweep.model.window import Window
@@ -223,29 +224,42 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
 
     ``spread`` is that of the lines in it; images are in it.
     """
-    mean, rms, extreme = (np.asarray(value, float) for value in spread)
-    f = line.lobe
-    double = image_factor(line, extreme)
-    on_axis, one_place = f.least(line.bin_offset) ** 2, line.bin_offset == line.bin_offset_least
-    with np.errstate(invalid="ignore", over="ignore"):
-        second = 0.5 * f.curvature * rms**2
-        slant = np.minimum(f.slope, f.curvature * line.bin_offset)
-        least = on_axis - slant * mean - second - line.tilt * rms
-        uphill = np.exp(np.minimum(line.tilt * extreme, 50.0))
-        most = f.most(line.bin_offset_least) ** 2
-        most = np.where(one_place & (rms == 0), on_axis, most)
-        most = most + f.slope * mean + second
-        most = (
-            double
-            * np.fmin(most, f.most(np.asarray(0.0)) ** 2)
-            * (1 + uphill * np.fmin(line.tilt * rms, 50.0))
-        )
-    least = np.fmax(least, np.exp(-line.tilt * extreme) * f.least(np.asarray(0.5)) ** 2 / beamlets)
-    for t in _CHEBYSHEV if np.any(rms > 0) else ():
-        wide = t * rms
-        mean_bin = (1 - 1 / t**2) * f.energy / (2 * wide + 2 * f.margin + 1)
-        least = np.fmax(least, mean_bin * np.exp(-line.tilt * wide))
-    return np.asarray(np.minimum(least, most)), np.asarray(most)
+    f, double = line.lobe, image_factor(line, spread.extreme)
+    values = (line.bin_offset, line.bin_offset_least, line.tilt, double, *spread)
+    columns = np.empty((len(values), *np.broadcast(*values).shape))
+    for column, value in zip(columns, values, strict=True):
+        column[...] = value
+    found = np.empty((2, *columns.shape[1:]))
+    _power_ranges(
+        columns.reshape(len(values), -1), beamlets, (f.highest, f.lowest),
+        (f.slope, f.curvature, f.margin, f.energy), found.reshape(2, -1),
+    )  # fmt: skip
+    return found[0], found[1]
+
+
+@njit(cache=True, error_model="numpy")
+def _power_ranges(columns, beamlets, tables, sizes, out):
+    """Least and largest powers (2, n), from one column of values each."""
+    (highest, lowest), (slope, curvature, margin, energy) = tables, sizes
+    worst, top = lobe_least(lowest, 0.5) ** 2 / beamlets, lobe_most(highest, 0.0) ** 2
+    for i in range(columns.shape[1]):
+        offset, offset_least, tilt, double, mean, rms, extreme = columns[:, i]
+        on_axis = lobe_least(lowest, offset) ** 2
+        second = 0.5 * curvature * rms**2
+        slant = min(slope, curvature * offset)
+        least = on_axis - slant * mean - second - tilt * rms
+        uphill = np.exp(np.minimum(tilt * extreme, 50.0))
+        one_place = offset == offset_least and rms == 0
+        most = on_axis if one_place else lobe_most(highest, offset_least) ** 2
+        most = np.fmin(most + slope * mean + second, top)
+        most = double * most * (1 + uphill * np.fmin(tilt * rms, 50.0))
+        least = np.fmax(least, np.exp(-tilt * extreme) * worst)
+        if rms > 0:
+            for t in _CHEBYSHEV:
+                wide = t * rms
+                mean_bin = (1 - 1 / t**2) * energy / (2 * wide + 2 * margin + 1)
+                least = np.fmax(least, mean_bin * np.exp(-tilt * wide))
+        out[0, i], out[1, i] = np.minimum(least, most), most
 
 
 def image_factor(line: Line, extreme: ArrayLike) -> np.ndarray:

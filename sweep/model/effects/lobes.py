@@ -19,6 +19,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sweep.model.window import Window, samples, window
 
@@ -51,7 +52,7 @@ class Lobe(NamedTuple):
     def tail(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
         away = np.asarray(distance, float)
-        place = np.searchsorted(self.reach, np.maximum(np.nan_to_num(away), 0.0), "right") - 1
+        place = np.searchsorted(self.reach, np.fmax(away, 0.0), "right") - 1
         return np.asarray(self.envelope[place])
 
     def within(self, magnitude: np.ndarray) -> np.ndarray:
@@ -61,16 +62,44 @@ class Lobe(NamedTuple):
 
     def most(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line, 0..1/2."""
-        return self._read(self.highest, distance) * (1 + _ROUNDING)
+        return _read(self.highest, distance) * (1 + _ROUNDING)
 
     def least(self, distance: np.ndarray) -> np.ndarray:
         """Least magnitude of a bin at most ``distance`` [bins] from a line, 0..1/2."""
-        return self._read(self.lowest, distance) * (1 - _ROUNDING)
+        return _read(self.lowest, distance) * (1 - _ROUNDING)
 
-    def _read(self, table: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        x = np.clip(np.asarray(distance, float), 0.0, 0.5) * (2 * (table.size - 1))
-        low = np.minimum(x.astype(np.int64), table.size - 2)
-        return np.asarray(table[low] + (x - low) * (table[low + 1] - table[low]))
+
+def _read(table: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Main lobe's table at distances, of their shape."""
+    away = np.asarray(distance, float)
+    found = np.empty(away.shape)
+    _read_each(table, away.ravel(), found.reshape(-1))
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _read_each(table, distance, found):
+    for i in range(distance.size):
+        found[i] = _at(table, distance[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _at(table, distance):
+    x = np.minimum(np.maximum(distance, 0.0), 0.5) * (2 * (table.size - 1))
+    low = max(min(int(x), table.size - 2), 0)
+    return table[low] + (x - low) * (table[low + 1] - table[low])
+
+
+@njit(cache=True, error_model="numpy")
+def lobe_most(highest, distance):
+    """:meth:`Lobe.most` of one distance, compiled."""
+    return _at(highest, distance) * (1 + _ROUNDING)
+
+
+@njit(cache=True, error_model="numpy")
+def lobe_least(lowest, distance):
+    """:meth:`Lobe.least` of one distance, compiled."""
+    return _at(lowest, distance) * (1 - _ROUNDING)
 
 
 @lru_cache(maxsize=32)

@@ -17,6 +17,7 @@ from sweep.model.effects.line_spread import (
     image_factor,
     power_range,
 )
+from sweep.model.effects.span import any_holds
 from sweep.model.preparation import Shots
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def bound(block: "Block") -> Change | None:
     largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that
     add nothing is known but that no bin holds more than all in phase.
     """
-    if not np.any(block.beside_share.high > 0):
+    if not any_holds(np.greater(block.beside_share.high, 0)):
         return None
     f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
     apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme

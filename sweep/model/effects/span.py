@@ -42,7 +42,10 @@ class Span:
     def is_one(self) -> bool:
         """Whether all tiles have one and the same value."""
         low, high = np.asarray(self.low), np.asarray(self.high)
-        return bool(low.size and (low == low.flat[0]).all() and (high == low.flat[0]).all())
+        if not low.size:
+            return False
+        first = low.flat[0]
+        return all_hold(low == first) and all_hold(high == first)
 
     @property
     def magnitude(self) -> np.ndarray:
@@ -154,16 +157,29 @@ def monotone(
     """
     spans = {name: Span.of(value) for name, value in values.items()}
     low = {name: s.high if name in falling else s.low for name, s in spans.items()}
+    if all(s.low is s.high for s in spans.values()):
+        one = function(**low)
+        return Span(one, one)
     high = {name: s.low if name in falling else s.high for name, s in spans.items()}
     return Span(function(**low), function(**high))
 
 
 def _never_negative(value: np.ndarray | float) -> bool:
-    return value >= 0 if isinstance(value, float) else bool(np.asarray(value >= 0).all())
+    return value >= 0 if isinstance(value, float) else all_hold(value >= 0)
 
 
 def _positive(value: np.ndarray | float) -> bool:
-    return value > 0 if isinstance(value, float) else bool(np.asarray(value > 0).all())
+    return value > 0 if isinstance(value, float) else all_hold(value > 0)
+
+
+def all_hold(conditions: np.ndarray | bool) -> bool:
+    """Whether all of some conditions hold; of few, ten times as fast as ``np.all``."""
+    return bool(np.count_nonzero(conditions) == np.size(conditions))
+
+
+def any_holds(conditions: np.ndarray | bool) -> bool:
+    """Whether any of some conditions holds; of few, ten times as fast as ``np.any``."""
+    return bool(np.count_nonzero(conditions))
 
 
 def _extremes(*values: np.ndarray | float) -> Span:

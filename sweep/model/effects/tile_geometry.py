@@ -27,6 +27,8 @@ _WHOLE, _GAIN, _RANGES, _OWN_RANGES, _VELOCITIES, _BESIDE, _APART = 0, 1, 2, 5, 
 _FIELDS = 13
 """Rows of what is found in footprints; moments have three each."""
 
+_NO_SUMS = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
@@ -182,38 +184,52 @@ def cast(
 @njit(cache=True, error_model="numpy")
 def _look(offset, doppler, echo, others, by_roots, out):
     """Echo, gain, moments (mean, rms, extreme) and what lies beside, (fields, rows)."""
-    out[:] = 0.0
+    beamlets = echo.shape[1]
+    share, own_share, root = np.empty(beamlets), np.empty(beamlets), np.empty(beamlets)
     for i in range(echo.shape[0]):
-        own = 0.0
-        for b in range(echo.shape[1]):
-            out[_WHOLE, i] += echo[i, b]
-            own += 0.0 if others[i, b] else echo[i, b]
-        whole = out[_WHOLE, i] if out[_WHOLE, i] > 0.0 else 1.0
-        own = own if own > 0.0 else 1.0
-        for b in range(echo.shape[1]):
-            share = echo[i, b] / whole
-            out[_GAIN, i] += math.sqrt(share) if by_roots else 0.0
-            _add_moments(out[_RANGES:, i], offset[i, b], share)
-            _add_moments(out[_VELOCITIES:, i], doppler[i, b], share)
+        out[_WHOLE, i] = _set_shares(echo, others, i, share, own_share)
+        for b in range(beamlets):  # apart from sums, whose order holds up the machine's vectors
+            root[b] = math.sqrt(share[b]) if by_roots else 0.0
+        gain, beside, apart = 0.0, 0.0, 0.0
+        ranges, own_ranges, velocities = _NO_SUMS, _NO_SUMS, _NO_SUMS
+        for b in range(beamlets):
+            gain += root[b]
+            ranges = _with(ranges, offset[i, b], share[b])
+            own_ranges = _with(own_ranges, offset[i, b], own_share[b])
+            velocities = _with(velocities, doppler[i, b], share[b])
             if others[i, b]:
-                out[_BESIDE, i] += share
-                far = abs(offset[i, b]) if share > 0.0 else 0.0
-                out[_APART, i] = max(out[_APART, i], far)
-            else:
-                _add_moments(out[_OWN_RANGES:, i], offset[i, b], echo[i, b] / own)
-        out[_GAIN, i] = max(out[_GAIN, i], 1.0)
-        for first in (_RANGES, _OWN_RANGES, _VELOCITIES):
-            out[first, i] = abs(out[first, i])
-            out[first + 1, i] = math.sqrt(out[first + 1, i])
+                beside += share[b]
+                apart = max(apart, abs(offset[i, b]) if share[b] > 0.0 else 0.0)
+        out[_GAIN, i], out[_BESIDE, i], out[_APART, i] = max(gain, 1.0), beside, apart
+        _put_moments(out, _RANGES, i, ranges)
+        _put_moments(out, _OWN_RANGES, i, own_ranges)
+        _put_moments(out, _VELOCITIES, i, velocities)
 
 
 @njit(cache=True, error_model="numpy")
-def _add_moments(sums, value, weight):
-    """Adds a value to the sums of values and of squares, and to the largest."""
-    sums[0] += weight * value
-    sums[1] += weight * value * value
-    if weight > 0.0:
-        sums[2] = max(sums[2], abs(value))
+def _set_shares(echo, others, i, share, own_share):
+    """Shares of all of a row's echo, and of that from the axis's surface; the whole echo."""
+    beamlets, whole, own = echo.shape[1], 0.0, 0.0
+    for b in range(beamlets):
+        whole += echo[i, b]
+        own += 0.0 if others[i, b] else echo[i, b]
+    divisor, own = whole if whole > 0.0 else 1.0, own if own > 0.0 else 1.0
+    for b in range(beamlets):
+        share[b], own_share[b] = echo[i, b] / divisor, 0.0 if others[i, b] else echo[i, b] / own
+    return whole
+
+
+@njit(cache=True, error_model="numpy")
+def _with(sums, value, weight):
+    """Sums of values and of squares, and the largest, with one more."""
+    largest = max(sums[2], abs(value)) if weight > 0.0 else sums[2]
+    return sums[0] + weight * value, sums[1] + weight * value * value, largest
+
+
+@njit(cache=True, error_model="numpy")
+def _put_moments(out, first, i, sums):
+    mean, square, largest = sums
+    out[first, i], out[first + 1, i], out[first + 2, i] = abs(mean), math.sqrt(square), largest
 
 
 def over(values: np.ndarray, edges: np.ndarray) -> Span:

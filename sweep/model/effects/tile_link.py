@@ -7,7 +7,7 @@ import numpy as np
 
 from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.span import Span, monotone
+from sweep.model.effects.span import Span, any_holds, monotone
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, TELESCOPE
 from sweep.model.window import Window, canonical_name, window
 
@@ -57,7 +57,7 @@ class TileLink:
 
     def has(self, *paths: str) -> bool:
         """Whether any of some parameters that are numbers is other than 0 in any tile."""
-        return any(np.any(self[path].magnitude > 0) for path in paths)
+        return any(any_holds(self[path].magnitude > 0) for path in paths)
 
     @cached_property
     def window(self) -> Window:
