@@ -145,7 +145,8 @@ def _radial_velocity(
     A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
     turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
     """
-    closing = np.einsum("nbi,ni->nb", rays, state.velocity)
+    closing = np.empty(rays.shape[:2])
+    _project(rays, state.velocity, bundle.surface, closing)
     for body, motion in enumerate(moving):
         if motion is None:
             continue
@@ -156,7 +157,18 @@ def _radial_velocity(
             surface = surface + np.cross(motion.rate[:, None], arm)
         receding = (rays * surface).sum(axis=-1)
         closing = np.where(bundle.body == body, closing - receding, closing)
-    return np.where(bundle.valid, closing, np.nan)
+    return closing
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(rays, velocity, surface, closing):
+    """Products of rays with the instrument's velocity, (n, b); nan for a miss."""
+    for i in range(rays.shape[0]):
+        x, y, z = velocity[i, 0], velocity[i, 1], velocity[i, 2]
+        for b in range(rays.shape[1]):
+            # x and z first: the order that results have had, bit for bit
+            along = rays[i, b, 0] * x + rays[i, b, 2] * z + rays[i, b, 1] * y
+            closing[i, b] = along if surface[i, b] >= 0 else np.nan
 
 
 def prepare_eyepoints(

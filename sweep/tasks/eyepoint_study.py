@@ -115,7 +115,7 @@ class EyepointStudy:
         weights = scene_array("weight", WEIGHT, shape, shape, values=self.weight)
         return [weights, *(self._array(name) for name in self._outputs)]
 
-    @property
+    @cached_property
     def weight(self) -> np.ndarray:
         """Power fractions of the beamlets, (beamlets,)."""
         from sweep.model.footprint import beamlets
@@ -169,7 +169,9 @@ class EyepointStudy:
             to_arrays(self._observe(index[start : start + step]))
             for start in range(0, len(index), step)
         ]
-        shots = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        shots = parts[0]
+        if len(parts) > 1:
+            shots = {name: np.concatenate([part[name] for part in parts]) for name in shots}
         return shots | self._cycles(shots)
 
     def spread(self, cycles: int) -> np.ndarray:
@@ -182,19 +184,8 @@ class EyepointStudy:
     def _observe(self, index: np.ndarray) -> Eyepoints:
         from sweep.model.eyepoints import observe
 
-        parameters = self.spec.parameters()
-        return observe(
-            index,
-            flight=self._flight,
-            scanner=self._scanner,
-            caster=self.world.caster,
-            bodies=self.world.bodies,
-            beam_divergence=float(parameters["instrument.laser.beam_divergence"]),
-            number=self.beamlets,
-            pattern=self.spec.pattern,
-            jitter=self.spec.pointing_jitter(),
-            rotation=self.spec.modes()["rotation"] != "off",
-        )
+        world = self.world
+        return observe(index, caster=world.caster, bodies=world.bodies, **self._optics)
 
     def _cycles(self, shots: Results) -> Results:
         first = slice(None, None, self.shots_a_cycle)
@@ -212,12 +203,17 @@ class EyepointStudy:
         return world_of(self.spec)
 
     @cached_property
-    def _flight(self) -> Any:
-        return self.spec.flight()
-
-    @cached_property
-    def _scanner(self) -> Any:
-        return self.spec.scan(self.scanner)
+    def _optics(self) -> dict[str, Any]:
+        """What looks at the scene, as :func:`sweep.model.eyepoints.observe` takes it."""
+        return {
+            "flight": self.spec.flight(),
+            "scanner": self.spec.scan(self.scanner),
+            "beam_divergence": float(self.spec.instrument.laser.beam_divergence),
+            "number": self.beamlets,
+            "pattern": self.spec.pattern,
+            "jitter": self.spec.pointing_jitter(),
+            "rotation": self.spec.modes()["rotation"] != "off",
+        }
 
 
 @lru_cache(maxsize=1)

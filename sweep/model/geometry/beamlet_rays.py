@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.geometry.jitter import transverse
-from sweep.model.geometry.quaternion import rotate
+from sweep.model.geometry.jitter import transverse_of
+from sweep.model.geometry.quaternion import rotated
 
 
 def beamlet_rays(
@@ -26,20 +26,26 @@ def beamlet_rays(
     sigma : float
         Standard deviation of the beam on each axis [rad].
     """
-    frame = np.stack([*transverse(axis), np.asarray(axis, float)], axis=1)
-    turned = rotate(np.asarray(attitude, float)[:, None], frame)
-    rays = np.empty((len(turned), across.size, 3))
-    _spread(turned, across * sigma, along * sigma, rays)
+    attitude, axis = np.ascontiguousarray(attitude, float), np.ascontiguousarray(axis, float)
+    rays = np.empty((len(attitude), across.size, 3))
+    _spread(attitude, axis, across * sigma, along * sigma, rays)
     return rays
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _spread(frame, across, along, rays):
+def _spread(attitude, axes, across, along, rays):
     """Vectors axis + across first + along second, scaled to length 1."""
-    for i in range(frame.shape[0]):
+    x, y, z = np.empty(across.size), np.empty(across.size), np.empty(across.size)
+    for i in range(rays.shape[0]):
+        turn = attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3]
+        axis = axes[i, 0], axes[i, 1], axes[i, 2]
+        first, second = transverse_of(axis)
+        first, second, axis = rotated(turn, first), rotated(turn, second), rotated(turn, axis)
         for b in range(across.size):
-            x = frame[i, 2, 0] + (across[b] * frame[i, 0, 0] + along[b] * frame[i, 1, 0])
-            y = frame[i, 2, 1] + (across[b] * frame[i, 0, 1] + along[b] * frame[i, 1, 1])
-            z = frame[i, 2, 2] + (across[b] * frame[i, 0, 2] + along[b] * frame[i, 1, 2])
-            length = math.sqrt(x * x + y * y + z * z)
-            rays[i, b, 0], rays[i, b, 1], rays[i, b, 2] = x / length, y / length, z / length
+            vx = axis[0] + (across[b] * first[0] + along[b] * second[0])
+            vy = axis[1] + (across[b] * first[1] + along[b] * second[1])
+            vz = axis[2] + (across[b] * first[2] + along[b] * second[2])
+            length = math.sqrt(vx * vx + vy * vy + vz * vz)
+            x[b], y[b], z[b] = vx / length, vy / length, vz / length
+        for b in range(across.size):  # by itself, as the machine's vectors divide
+            rays[i, b, 0], rays[i, b, 1], rays[i, b, 2] = x[b], y[b], z[b]

@@ -94,23 +94,22 @@ def _workspace():
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_planes(planes, low, high):
-    """Constants of the box test for directions between `low` and `high` (3,).
+def _set_plane(planes, k, low, high):
+    """Constants of the box test for directions between `low` and `high` along axis `k`.
 
     The rays o + t d with low <= d <= high can reach between the box's lower and upper plane
     across an axis only if  t high >= lower - o  and  t low <= upper - o: each bounds t from
     below or from above, by the sign of its factor. Rows of `planes` (3, 6): the reciprocal, and
     what is added to make the bound idle from below or from above.
     """
-    for k in range(3):
-        least = -_TINY if abs(low[k]) < _TINY else low[k]
-        most = _TINY if abs(high[k]) < _TINY else high[k]
-        planes[0, k] = 1.0 / most
-        planes[0, k + 3] = 1.0 / least
-        planes[1, k] = 0.0 if most > 0.0 else -np.inf
-        planes[1, k + 3] = 0.0 if least < 0.0 else -np.inf
-        planes[2, k] = 0.0 if most < 0.0 else np.inf
-        planes[2, k + 3] = 0.0 if least > 0.0 else np.inf
+    least = -_TINY if abs(low) < _TINY else low
+    most = _TINY if abs(high) < _TINY else high
+    planes[0, k] = 1.0 / most
+    planes[0, k + 3] = 1.0 / least
+    planes[1, k] = 0.0 if most > 0.0 else -np.inf
+    planes[1, k + 3] = 0.0 if least < 0.0 else -np.inf
+    planes[2, k] = 0.0 if most < 0.0 else np.inf
+    planes[2, k + 3] = 0.0 if least > 0.0 else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -158,7 +157,8 @@ def _walk_ray(tree, ray, distance, face, planes, stack, entry, entered):
     """(distance, face) of the nearest triangle; what was known where none is nearer."""
     bounds, children, number, faces, order, vertices = tree
     o, d = ray[0], ray[1]
-    _set_planes(planes, d, d)
+    for k in range(3):
+        _set_plane(planes, k, d[k], d[k])
     kx, ky, kz = axes(d)
     inverse = 1.0 / d[kz]
     sx, sy = d[kx] * inverse, d[ky] * inverse
@@ -205,7 +205,7 @@ def _walk_bundle(
     bounds, children, number, faces, order, vertices = tree
     o = origins[i]
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
-    _set_rays(directions[i], kx, ky, axis, shears, planes)
+    _set_rays(directions, i, kx, ky, axis, shears, planes)
     budget = _LARGEST_FRONT
     farthest = distance.max() * _TIE_SLACK
     stack[0], entry[0] = 0, 0.0
@@ -235,20 +235,19 @@ def _walk_bundle(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_rays(d, kx, ky, kz, shears, planes):
-    """Shears of the rays of a bundle, and the box test's constants for all of them."""
-    low, high = np.empty(3), np.empty(3)
-    for k in range(3):
-        low[k], high[k] = d[0, k], d[0, k]
-    for b in range(d.shape[0]):
-        inverse = 1.0 / d[b, kz]
-        shears[0, b] = d[b, kx] * inverse
-        shears[1, b] = d[b, ky] * inverse
+def _set_rays(directions, i, kx, ky, kz, shears, planes):
+    """Shears of the rays of bundle `i`, and the box test's constants for all of them."""
+    for b in range(directions.shape[1]):
+        inverse = 1.0 / directions[i, b, kz]
+        shears[0, b] = directions[i, b, kx] * inverse
+        shears[1, b] = directions[i, b, ky] * inverse
         shears[2, b] = inverse
-        for k in range(3):
-            low[k] = min(low[k], d[b, k])
-            high[k] = max(high[k], d[b, k])
-    _set_planes(planes, low, high)
+    for k in range(3):
+        low = high = directions[i, 0, k]
+        for b in range(1, directions.shape[1]):
+            low = smaller(low, directions[i, b, k])
+            high = larger(high, directions[i, b, k])
+        _set_plane(planes, k, low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from sweep.model.geometry.quaternion import from_rotation_vector, multiply
+from sweep.model.geometry.quaternion import cross, from_rotation_vector, multiply
 from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair, point_keys
 
 DOMAIN = "sweep.jitter"
@@ -92,11 +93,35 @@ def transverse(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     directions : (..., 3) ndarray
         Unit vectors.
     """
-    u = np.asarray(directions, float)
-    second = np.cross(u, [1.0, 0.0, 0.0])
-    length = np.linalg.norm(second, axis=-1, keepdims=True)
-    along_x = length < 1e-6
-    second = np.where(along_x, [0.0, 1.0, 0.0], second / np.where(along_x, 1.0, length))
-    first = np.cross(second, u)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return first, np.asarray(np.cross(u, first))
+    u = np.ascontiguousarray(directions, float)
+    first, second = np.empty((2, *u.shape))
+    _transverse_rows(u.reshape(-1, 3), first.reshape(-1, 3), second.reshape(-1, 3))
+    return first, second
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _transverse_rows(u, first, second):
+    for i in range(u.shape[0]):
+        one, other = transverse_of((u[i, 0], u[i, 1], u[i, 2]))
+        first[i, 0], first[i, 1], first[i, 2] = one
+        second[i, 0], second[i, 1], second[i, 2] = other
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def transverse_of(u):
+    """:func:`transverse` of one direction, compiled."""
+    second = cross(u, (1.0, 0.0, 0.0))
+    second = (0.0, 1.0, 0.0) if _length(second) < 1e-6 else _unit(second)
+    first = _unit(cross(second, u))
+    return first, cross(u, first)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _length(v):
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _unit(v):
+    length = _length(v)
+    return v[0] / length, v[1] / length, v[2] / length

@@ -92,14 +92,20 @@ def facet_normal(vertices, faces, face):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_distance(vertices, faces, face, normal, o, d):
+def plane_height(vertices, faces, face, normal, o):
+    """Product (high, low) of a facet's normal with a corner less the origin `o`."""
+    return _dot(normal, _less(_vertex(vertices, faces[face, 0]), o))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def plane_distance(vertices, faces, face, normal, height, o, d):
     """Distance (high, low) of a facet's plane along a ray of pairs, in lengths of `d`.
 
+    `height` is :func:`plane_height`, which all rays from one origin share.
     A plane seen so flatly that it runs through the facet within rounding is met somewhere
     on the facet: the distance stays between those of its corners.
     """
-    a = _less(_vertex(vertices, faces[face, 0]), o)
-    nh, nl = _dot(normal, a)
+    nh, nl = height
     dh, dl = _dot(normal, d)
     high = nh / dh
     p, e = _product(high, 0.0, dh, dl)

@@ -4,7 +4,13 @@ import math
 
 from numba import njit
 
-from sweep.model.geometry.ray_plane import body_origin, facet_normal, plane_distance, turned_back
+from sweep.model.geometry.ray_plane import (
+    body_origin,
+    facet_normal,
+    plane_distance,
+    plane_height,
+    turned_back,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -83,7 +89,8 @@ def finish_rays(mesh, frame, rays, beamlet, origins, directions, face, result):
         o = body_origin(origins, i, shift, rotation, position, p, anchor, fixed)
         d = _body_direction(directions, i, b, rotation, p, fixed)
         n = facet_normal(vertices, faces, face[i])
-        high[i], low[i] = plane_distance(vertices, faces, face[i], n, o, d)
+        away = plane_height(vertices, faces, face[i], n, o)
+        high[i], low[i] = plane_distance(vertices, faces, face[i], n, away, o, d)
         x, y, z = _world_normal(n, rotation, p, fixed)
         along = x * directions[i, b, 0] + y * directions[i, b, 1] + z * directions[i, b, 2]
         sign = -1.0 if along > 0.0 else 1.0
@@ -117,7 +124,7 @@ def finish_bundles(mesh, frame, number, origins, directions, hit, centre, result
     offset, cosine = result
     step = 0 if rotation.shape[0] == 1 else 1
     for i in range(face.shape[0]):
-        p, r = i * step, reference[i]
+        p, r, known = i * step, reference[i], -1
         for b in range(face.shape[1]):
             if body[i, b] != number:
                 continue
@@ -125,12 +132,15 @@ def finish_bundles(mesh, frame, number, origins, directions, hit, centre, result
                 along, across = _slopes(directions, i, r, b, normal)
                 offset[i, b], cosine[i, b] = -high[i] * across / along, abs(along)
                 continue
-            o = body_origin(origins, i, shift, rotation, position, p, anchor, fixed)
+            if face[i, b] != known:  # the beamlet before may have met the same facet
+                known = face[i, b]
+                o = body_origin(origins, i, shift, rotation, position, p, anchor, fixed)
+                n = facet_normal(vertices, faces, known)
+                away = plane_height(vertices, faces, known, n, o)
+                x, y, z = _world_normal(n, rotation, p, fixed)
             d = _body_direction(directions, i, b, rotation, p, fixed)
-            n = facet_normal(vertices, faces, face[i, b])
-            t_high, t_low = plane_distance(vertices, faces, face[i, b], n, o, d)
+            t_high, t_low = plane_distance(vertices, faces, known, n, away, o, d)
             offset[i, b] = (t_high - high[i]) + (t_low - low[i])
-            x, y, z = _world_normal(n, rotation, p, fixed)
             cosine[i, b] = abs(
                 x * directions[i, b, 0] + y * directions[i, b, 1] + z * directions[i, b, 2]
             )

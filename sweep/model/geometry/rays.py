@@ -21,6 +21,7 @@ from sweep.model.geometry.bvh import build
 from sweep.model.geometry.bvh_traversal import nearest_of_bundles, nearest_of_rays
 from sweep.model.geometry.mesh import Mesh
 from sweep.model.geometry.ray_embree import Guesser
+from sweep.model.geometry.ray_hits import are_units, first_hits, put_surfaces, take_nearer
 from sweep.model.geometry.ray_ranges import finish_bundles, finish_rays, to_body, turn_to_body
 from sweep.model.geometry.ray_triangle import check_guesses
 
@@ -137,7 +138,7 @@ class Caster:
             o, d = _in_frame(frame, start, along[:, None])
             found = np.full(n, -1)
             self._nearest(number, o, d[:, 0], distance, found)
-            face[found >= 0], body[found >= 0] = found[found >= 0], number
+            take_nearer(found, number, face, body)
         result = np.full(n, np.inf), np.zeros(n), np.full(n, np.nan), np.full((n, 3), np.nan)
         self._finish(frames, start, along[:, None], np.zeros_like(face), face, body, result)
         return Hits(face, result[0], result[2], result[3], self._surface(face, body), body)
@@ -173,7 +174,7 @@ class Caster:
             o, d = _in_frame(frame, start, along)
             found = np.full(face.shape, -1)
             nearest_of_bundles(self._trees[number], o, d, distance, found)
-            face[found >= 0], body[found >= 0] = found[found >= 0], number
+            take_nearer(found.reshape(-1), number, face.reshape(-1), body.reshape(-1))
         return self._relative(frames, start, along, face, body)
 
     def _frames(self, offset, poses, n):
@@ -214,8 +215,8 @@ class Caster:
     def _relative(self, frames, origins, directions, face, body):
         """Bundle of known hits: the reference beamlets first, then all relative to them."""
         n, rows = len(origins), np.arange(len(origins))
-        valid = face >= 0
-        reference = np.where(valid.any(axis=1), valid.argmax(axis=1), -1)
+        reference = np.empty(n, np.int64)
+        first_hits(face, reference)
         high, low, cosine = np.full(n, np.inf), np.zeros(n), np.full(n, np.nan)
         normal = np.full((n, 3), np.nan)
         at = face[rows, reference], body[rows, reference]
@@ -227,16 +228,15 @@ class Caster:
                 (face, body), (reference, high, low, normal), result,
             )  # fmt: skip
         surface = self._surface(face, body)
-        return Bundle(high, reference, normal, result[0], valid, result[1], surface, face, body)
+        return Bundle(high, reference, normal, result[0], face >= 0, result[1], surface, face, body)
 
     def _surface(self, face, body):
         """Surface of each triangle hit, -1 for a miss."""
-        if len(self.meshes) == 1:
-            return np.where(face >= 0, self.meshes[0].surface[face], np.int16(-1))
         surface = np.full(face.shape, -1, dtype=np.int16)
         for number, mesh in enumerate(self.meshes):
-            here = body == number
-            surface[here] = mesh.surface[face[here]]
+            put_surfaces(
+                mesh.surface, number, face.reshape(-1), body.reshape(-1), surface.reshape(-1)
+            )
         return surface
 
 
@@ -253,8 +253,7 @@ def _rays(origins, directions, dimensions):
         raise ValueError("a ray has an origin of three coordinates; a bundle, at least one beamlet")
     if not np.isfinite(origins).all():
         raise ValueError("a ray's origin is finite")
-    lengths = np.einsum("...i,...i->...", directions, directions)
-    if not (np.abs(lengths - 1.0) < 2.0 * _UNIT_TOLERANCE).all():
+    if not are_units(directions.reshape(-1, 3), _UNIT_TOLERANCE):
         raise ValueError("a ray's direction is a vector of length 1")
     return origins, directions
 
