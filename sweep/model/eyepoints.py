@@ -71,10 +71,10 @@ class Eyepoints(NamedTuple):
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
     def some(self, shots: slice | np.ndarray) -> "Eyepoints":
-        """Some of the shots, by a slice, their places or a mask; of all nothing is copied."""
-        whole = np.arange(len(self.time))
-        if np.array_equal(whole[shots], whole):
-            return self
+        """Some of the shots, by a slice, their places or a mask; neighbours are not copied."""
+        places = np.arange(len(self.time))[shots]
+        if places.size and (np.diff(places) == 1).all():
+            shots = slice(places[0], places[-1] + 1)
         return Eyepoints._make([*(values[shots] for values in self[:-1]), self.weight])
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.readings import best_reading
 from sweep.model.segments import SIGNS
 from sweep.model.waveform import FOLD_PENALTY
 
@@ -37,7 +38,6 @@ threshold as much again. A peak anywhere confirms one of the 16 readings by chan
 _UNPAIRED = 1e9
 """Cost of an up peak without a down peak: more than any sum of mismatches."""
 
-READINGS = 16
 ASSUMED = 0
 """Reading without folds in which the half sum is the Doppler frequency."""
 
@@ -58,62 +58,6 @@ are signal, of no common beamlet; misread: a common beamlet, but the wrong one o
 sidelobe: one of its peaks holds no beamlet's line. Unconfirmed, which the instrument knows: no
 Doppler peak within the tolerance.
 """
-
-
-@njit(cache=True, error_model="numpy")
-def _read(code, up, down, sample_rate):
-    """(f_d, f_r): signed Doppler and range beat by one of the readings, in the unit given.
-
-    The bits of ``code`` are, from the highest, folds of up, Doppler and down peak, and whether
-    half sum and half difference are exchanged: the order of :func:`sweep.model.waveform.resolve`.
-    """
-    u = sample_rate - up if code & 8 else up
-    d = sample_rate - down if code & 2 else down
-    half_sum, half_difference = (u + d) / 2.0, abs(d - u) / 2.0
-    shift, beat = (half_difference, half_sum) if code & 1 else (half_sum, half_difference)
-    return (shift if d >= u else -shift), beat
-
-
-@njit(cache=True, error_model="numpy")
-def best_reading(up, doppler, down, at_start, sample_rate, penalty, tolerance):
-    """Reading that predicts the Doppler peak best among those that do within a tolerance.
-
-    ``at_start`` is the Doppler segment's carrier over that at mid-chirp, which the chirps see.
-
-    Returns
-    -------
-    code : int
-        Reading; -1 where none comes within the tolerance.
-    cost : float
-        Its mismatch and penalties, in the unit of the frequencies; inf for none.
-    """
-    best, least = -1, np.inf
-    for code in range(READINGS):
-        shift, _ = _read(code, up, down, sample_rate)
-        p = sample_rate - doppler if code & 4 else doppler
-        mismatch = abs(abs(shift) * at_start - p)
-        cost = mismatch + ((code >> 3 & 1) + (code >> 2 & 1) + (code >> 1 & 1)) * penalty
-        if cost < least and mismatch <= tolerance:
-            best, least = code, cost
-    return best, least
-
-
-@njit(cache=True, error_model="numpy")
-def resolve_reading(code, up, down, carrier, bandwidth, duration, sample_rate):
-    """(range [m], radial velocity [m/s]) of an up and a down peak [Hz] by a given reading."""
-    f_d, f_r = _read(code, up, down, sample_rate)
-    beta = f_d / (carrier + bandwidth / 2.0)
-    delay = (f_r - bandwidth * beta / 2.0) / (bandwidth / duration * (1.0 + beta))
-    return SPEED_OF_LIGHT * delay / 2.0, SPEED_OF_LIGHT * beta / 2.0
-
-
-@njit(cache=True, error_model="numpy")
-def resolve_peaks(up, doppler, down, carrier, bandwidth, duration, sample_rate, bin_width):
-    """(range, radial velocity) of three peaks: compiled :func:`sweep.model.waveform.resolve`."""
-    at_start = carrier / (carrier + bandwidth / 2.0)
-    penalty = FOLD_PENALTY * bin_width
-    code, _ = best_reading(up, doppler, down, at_start, sample_rate, penalty, np.inf)
-    return resolve_reading(code, up, down, carrier, bandwidth, duration, sample_rate)
 
 
 @njit(cache=True, error_model="numpy")

@@ -46,7 +46,6 @@ from sweep.model.pairing import (
     beamlet_lines,
     common_beamlet,
     pair_peaks,
-    resolve_reading,
 )
 from sweep.model.pairing import workspace as pairing_workspace
 from sweep.model.peaks import (
@@ -62,6 +61,7 @@ from sweep.model.peaks import (
     draw_in_noise,
 )
 from sweep.model.preparation import Shots
+from sweep.model.readings import resolve_reading
 from sweep.model.segments import inspect_bins, workspace
 
 __all__ = ["Groups", "Returns", "draw_returns", "groups"]

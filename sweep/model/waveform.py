@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.readings import resolve_each
 
 SEGMENTS = ("up", "doppler", "down")
 SIGNS = (1, 0, -1)
@@ -101,21 +102,10 @@ def resolve(
     PHYSICS section 2 gives the unfolded readings. That half sum and half difference belong to
     the carrier and to the range at mid-chirp is put right here.
     """
-    penalty = FOLD_PENALTY * bin_width
-    at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
-    least = np.full(np.shape(up), np.inf)
-    f_d, f_r = np.zeros(np.shape(up)), np.zeros(np.shape(up))
-    for folds in np.ndindex(2, 2, 2):
-        u, p, d = (
-            sample_rate - x if f else x for x, f in zip((up, doppler, down), folds, strict=True)
-        )
-        half_sum, half_difference = (u + d) / 2, np.abs(d - u) / 2
-        for shift, beat in ((half_sum, half_difference), (half_difference, half_sum)):
-            cost = np.abs(shift * at_start - p) + sum(folds) * penalty
-            better = cost < least
-            least = np.where(better, cost, least)
-            f_d = np.where(better, np.where(d >= u, shift, -shift), f_d)
-            f_r = np.where(better, beat, f_r)
-    beta = f_d / (carrier + bandwidth / 2)
-    delay = (f_r - bandwidth * beta / 2) / (bandwidth / duration * (1 + beta))
-    return Resolution(SPEED_OF_LIGHT * delay / 2, SPEED_OF_LIGHT * beta / 2)
+    values = (
+        up, doppler, down, carrier, bandwidth, duration, sample_rate, FOLD_PENALTY * bin_width,
+    )  # fmt: skip
+    columns = np.array(np.broadcast_arrays(*values), float)
+    found = np.empty((2, *columns.shape[1:]))
+    resolve_each(columns.reshape(len(values), -1), found.reshape(2, -1))
+    return Resolution(*found)

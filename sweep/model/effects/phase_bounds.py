@@ -374,9 +374,10 @@ def over_record(terms: Mapping[int, Span], *, start: Span, duration: Span) -> Er
 
 def by_segment(block: "Block", *errors: Error | None) -> Error:
     """Errors of up, Doppler and down segment as one, (3, tiles) each."""
-    each = [(*e.powers, e.rest, e.constant) for e in (v or NO_ERROR for v in errors)]
-    values = [
-        np.stack([np.broadcast_to(v, block.size) for v in column])
-        for column in zip(*each, strict=True)
-    ]
-    return Error(tuple(values[:4]), *values[4:])
+    values = np.zeros((6, 3, block.size))
+    for segment, error in enumerate(errors):
+        if error is not None:
+            parts = (*error.powers, error.rest, error.constant)
+            for row, value in zip(values, parts, strict=True):
+                row[segment] = value
+    return Error(tuple(values[:4]), values[4], values[5])
