@@ -70,8 +70,8 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
         As the first three of :func:`sweep.model.known_kernels.slot_for`.
     parts : tuple
         Of :class:`sweep.model.modulation.Stretch`.
-    allowed : float
-        Error of a bin, or of its power.
+    allowed
+        As of :func:`relative_error`.
     kernel, room
         As of :func:`sweep.model.segments.segment_spectrum`.
 
@@ -88,7 +88,7 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     segment, own, fold = whose
     lowest, highest = extent(room[DELTA], n)
     level, number, first, spacing = side_by_side(lowest, highest, power)
-    relative = allowed / max(kernel[2][0] ** (2 if power else 1) * weight(n, power, room), 1e-300)
+    relative = relative_error(n, power, allowed, kernel, room)
     if own < 0 and _better_alone(n, highest - lowest, level, number, power, relative, kernel):
         return n, as_lines()
     if own >= 0 and parts[3][segment, own] > MOST_PARTS:
@@ -159,6 +159,24 @@ def weight(n, power, room):
     for b in range(n):
         total += abs(re[b]) + (0.0 if power else abs(im[b]))
     return total
+
+
+@borrowing()
+def relative_error(n, power, allowed, kernel, room):
+    """Error that few lines for n may make, over what :func:`weight` says of all on the peak.
+
+    Parameters
+    ----------
+    allowed : (float, float)
+        Error of a bin; threshold. Powers of bins at the threshold, or of half the largest there
+        can be where that is less, are as far off as makes this much of the bin: those of larger
+        bins may be further off, and in smaller ones nothing is decided.
+    """
+    error, level = allowed
+    if not power:
+        return error / max(kernel[2][0] * weight(n, power, room), 1e-300)
+    whole = max(kernel[2][0] * kernel[2][0] * weight(n, power, room), 1e-300)
+    return error * min(level, 0.5 * math.sqrt(whole)) / whole
 
 
 @borrowing()

@@ -15,9 +15,9 @@ from sweep.model.bundles import (
     as_lines,
     extent,
     moments_of,
+    relative_error,
     side_by_side,
     take_moments,
-    weight,
 )
 from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import CENTRE, EVENS, IM, MODES, NUMBER, RE
@@ -55,8 +55,8 @@ def take_modes(n, whose, modes, allowed, kernel, room):
         Segment; place in ``modes``; -1 where the lines are seen as their images, else 1.
     modes : (3, u, >= NUMBERS) float64
         Of :func:`sweep.model.effects.line_modes.in_modes`.
-    allowed : float
-        Error of a bin's power.
+    allowed
+        As of :func:`sweep.model.bundles.relative_error`.
     kernel, room
         As of :func:`sweep.model.segments.segment_spectrum`.
 
@@ -71,7 +71,7 @@ def take_modes(n, whose, modes, allowed, kernel, room):
         room[DELTA, b] += fold * numbers[CENTRE]
     lowest, highest = extent(room[DELTA], n)
     level, number, first, spacing = side_by_side(lowest, highest, True)
-    relative = allowed / max(kernel[2][0] * kernel[2][0] * weight(n, True, room), 1e-300)
+    relative = relative_error(n, True, allowed, kernel, room)
     row = modes_row(level, number == 1, relative, kernel)
     slot = slot_of(row, kernel)
     size, places = int(slot[SIZE]), int(slot[PLACES])

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model import waveform
-from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, together, weight
+from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, relative_error, together
 from sweep.model.compiling import borrowing
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_modes import (
@@ -238,8 +238,8 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
         0 up, 1 Doppler, 2 down; place of the point in its stretch; number of lines.
     fold : float
         -1 where the lines are seen as their images, which conjugates their weights.
-    allowed : float
-        As of :func:`reduce_lines`.
+    allowed
+        As of :func:`sweep.model.bundles.relative_error`.
     scene, power, kernel, room
         As of :class:`Stretch` and :func:`sweep.model.segments.segment_spectrum`.
 
@@ -295,15 +295,12 @@ def is_whole(segment, i, scene):
 def reduce_lines(n, power, allowed, most, kernel, room):
     """Few lines that are equivalent to those in rows DELTA .., into rows 4 to 6; how many.
 
-    ``allowed`` is the error of a bin, of its power for ``power``; above ``most`` lines nothing is
+    ``allowed`` is as of :func:`sweep.model.bundles.relative_error`; above ``most`` lines nothing is
     gained, and they stay as they are.
     """
     fft_size, length = kernel[0]
     band = np.pi * length / fft_size * (2.0 if power else 1.0)
-    tolerance = 0.0
-    if allowed > 0.0:
-        peak = kernel[2][0] * kernel[2][0] if power else kernel[2][0]
-        tolerance = allowed / max(peak * weight(n, power, room), 1e-300)
+    tolerance = relative_error(n, power, allowed, kernel, room)
     return equivalent_lines(
         room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM], n, power, band, tolerance, most,
         kernel[3], room[4], room[5], room[6], room[7:12],

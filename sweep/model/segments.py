@@ -64,7 +64,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     """
     power, image = choices[0], choices[1]
     origin, n, fold = _lines_of(segment, p, scene, at, power, True, kernel, room)
-    few = reduce_lines(n, power, allowed(p, power), n - 1, kernel, room)
+    few = reduce_lines(n, power, allowed(p), n - 1, kernel, room)
     split, further = parts_at(segment, at[1], fold, scene, kernel)
     reach = extent_of(at[1], few, split, further, scene[2], power, kernel, room)
     low, high = bins_above(level, reach, origin, kernel)
@@ -82,13 +82,9 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
 
 
 @borrowing()
-def allowed(p, power):
-    """Error of a bin, or of its power, that one step of taking few lines for many may make.
-
-    Powers are those of bins of half a sigma or more.
-    """
-    error = p[15] * p[10] / LINE_STEPS
-    return error * p[10] if power else error
+def allowed(p):
+    """Error of a bin that one step of taking few lines for many may make, and the threshold."""
+    return p[15] * p[10] / LINE_STEPS, p[11]
 
 
 @borrowing()
@@ -113,7 +109,7 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
         fold = folding(which, chirp, record)
         if power or split:
             n = modulate(
-                segment, at[1], n, fold, scene, power, allowed(p, power), kernel, room
+                segment, at[1], n, fold, scene, power, allowed(p), kernel, room
             )  # fmt: skip
     return origin, n, fold
 
@@ -181,19 +177,19 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
         if parts[3][segment, own] > 0:
             return origin, 0, as_lines()
         n, kind = take_modes(
-            n, (segment, own, fold), parts[1], allowed(p, power), kernel, room
+            n, (segment, own, fold), parts[1], allowed(p), kernel, room
         )  # fmt: skip
         return origin, n, kind
     own = -1 if alone else own
     if own >= 0 or p[15] > 0.0:
         n, kind = take_bundles(
-            n, power, (segment, own, fold), parts, allowed(p, power), kernel, room
+            n, power, (segment, own, fold), parts, allowed(p), kernel, room
         )  # fmt: skip
         if own >= 0 or kind[0] >= 0:
             return origin, n, kind
     several = alone or (power and scene[2][0].size > 0)
     most = n - 1 if several else (n // 2 if p[15] > 0.0 else 0)
-    n = take_few(n, power, allowed(p, power), most, kernel, room)
+    n = take_few(n, power, allowed(p), most, kernel, room)
     return origin, n, as_lines()
 
 

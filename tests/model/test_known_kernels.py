@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from test_bundles import PLACES, WINDOWS
+from test_bundles import allowed as powers_allowed
 from test_optional_lines import prepared, scene
 
 from sweep.model import modulation, segments, spectra
@@ -50,11 +51,9 @@ def test_bins_are_those_of_the_lines_one_by_one(phases, place, table_4_1):
                 _, expected = spectra.segment_spectrum(exact, 0, 0)
                 missed = abs(found - expected[low : low + found.size])
                 allowed = tolerance * exact.bin_deviation[0] + ROUNDING * peak
-                if (
-                    phases == "incoherent"
-                ):  # of powers, where they are those of half a sigma or more
-                    away = 0.5 * exact.bin_deviation[0] / expected[low : low + found.size]
-                    allowed *= np.maximum(away, 1.0)
+                if phases == "incoherent":
+                    some = expected[low : low + found.size]
+                    allowed = powers_allowed(loose, some) + ROUNDING * peak
                 assert (missed <= allowed).all()
                 levels.add(level)
     # at DC all lines lie so close together that few of them do

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_bundles import AGREEMENT, PLACES, WINDOWS, apart, both, drifting
+from test_bundles import AGREEMENT, PLACES, WINDOWS, allowed, apart, both, drifting
 from test_optional_lines import prepared, scene
 from windows import marked
 
@@ -58,10 +58,8 @@ def test_bins_are_within_what_is_allowed_all_over_the_reach(table_4_1):
             tolerance = 10 ** rng.uniform(-5, -1)
             loose = own(replace(drifting(shots, drift), line_tolerance=np.asarray(tolerance)))
             found, true, peak, _ = both(loose, 0)
-            sigma, missed = shots.bin_deviation[0], abs(found - true)
-            # of powers, where they are those of half a sigma or more
-            assert (missed * np.minimum(1.0, 2 * true / sigma) <= tolerance * sigma
-                    + 1e-11 * peak).all()  # fmt: skip
+            missed = abs(found - true)
+            assert (missed <= allowed(loose, true) + 1e-11 * peak).all()
             changed += missed.max() > AGREEMENT * peak
     assert changed > 3
 
