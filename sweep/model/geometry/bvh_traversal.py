@@ -46,15 +46,13 @@ def nearest_of_rays(tree, origins, directions, distance, face):
     face : (n,) int64
         Triangle's index in the mesh where `distance` was replaced, else left as it is.
     """
-    planes, stack, entry, entered = _workspace()
+    stack, entry, entered = _workspace()
     ray = np.empty((2, 3))
     for i in range(origins.shape[0]):
         for k in range(3):
             ray[0, k] = origins[i, k]
             ray[1, k] = directions[i, k]
-        distance[i], face[i] = _walk_ray(
-            tree, ray, distance[i], face[i], planes, stack, entry, entered
-        )
+        distance[i], face[i] = _walk_ray(tree, ray, distance[i], face[i], stack, entry, entered)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -69,59 +67,58 @@ def nearest_of_bundles(tree, origins, directions, distance, face):
     distance, face : (n, b)
         As in `nearest_of_rays`.
     """
-    planes, stack, entry, entered = _workspace()
+    stack, entry, entered = _workspace()
     shears = np.empty((3, directions.shape[1]))
     ray = np.empty((2, 3))
     for i in range(origins.shape[0]):
         axis = _common_axis(directions, i)
         if axis < 0 or not _walk_bundle(
             tree, origins, directions, i, axis, distance[i], face[i],
-            shears, planes, stack, entry, entered,
+            shears, stack, entry, entered,
         ):  # fmt: skip
             for b in range(directions.shape[1]):
                 for k in range(3):
                     ray[0, k] = origins[i, k]
                     ray[1, k] = directions[i, b, k]
                 distance[i, b], face[i, b] = _walk_ray(
-                    tree, ray, distance[i, b], face[i, b], planes, stack, entry, entered
+                    tree, ray, distance[i, b], face[i, b], stack, entry, entered
                 )
 
 
 @njit(cache=True, nogil=True)
 def _workspace():
-    """Constants of the box test; the stack's nodes and entries; a node's children's entries."""
-    return np.empty((3, 6)), np.empty(_STACK, dtype=np.int64), np.empty(_STACK), np.empty(WIDTH)
+    """The stack's nodes and entries; a node's children's entries."""
+    return np.empty(_STACK, dtype=np.int64), np.empty(_STACK), np.empty(WIDTH)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_plane(planes, k, low, high):
-    """Constants of the box test for directions between `low` and `high` along axis `k`.
+def _planes(low, high):
+    """Constants of the box test across one axis for directions between `low` and `high` along it.
 
     The rays o + t d with low <= d <= high can reach between the box's lower and upper plane
-    across an axis only if  t high >= lower - o  and  t low <= upper - o: each bounds t from
-    below or from above, by the sign of its factor. Rows of `planes` (3, 6): the reciprocal, and
-    what is added to make the bound idle from below or from above.
+    only if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
+    by the sign of its factor. The factors' reciprocals, and what is added to make the two bounds
+    idle from below, and from above.
     """
     least = -_TINY if abs(low) < _TINY else low
     most = _TINY if abs(high) < _TINY else high
-    planes[0, k] = 1.0 / most
-    planes[0, k + 3] = 1.0 / least
-    planes[1, k] = 0.0 if most > 0.0 else -np.inf
-    planes[1, k + 3] = 0.0 if least < 0.0 else -np.inf
-    planes[2, k] = 0.0 if most < 0.0 else np.inf
-    planes[2, k + 3] = 0.0 if least > 0.0 else np.inf
+    return (
+        1.0 / most,
+        1.0 / least,
+        0.0 if most > 0.0 else -np.inf,
+        0.0 if least < 0.0 else -np.inf,
+        0.0 if most < 0.0 else np.inf,
+        0.0 if least > 0.0 else np.inf,
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _enter(bounds, node, ox, oy, oz, planes, limit, entry):
     """Least distance at which the rays may enter each child's box; inf where they cannot."""
-    # Read before the loop: the compiler cannot know that `entry` is no part of `planes`.
-    rx, ry, rz = planes[0, 0], planes[0, 1], planes[0, 2]
-    sx, sy, sz = planes[0, 3], planes[0, 4], planes[0, 5]
-    bx, by, bz = planes[1, 0], planes[1, 1], planes[1, 2]
-    cx, cy, cz = planes[1, 3], planes[1, 4], planes[1, 5]
-    fx, fy, fz = planes[2, 0], planes[2, 1], planes[2, 2]
-    gx, gy, gz = planes[2, 3], planes[2, 4], planes[2, 5]
+    # Numbers, not an array: the compiler could not know that `entry` is no part of it.
+    rx, sx, bx, cx, fx, gx = planes[0]
+    ry, sy, by, cy, fy, gy = planes[1]
+    rz, sz, bz, cz, fz, gz = planes[2]
     for c in range(entry.size):  # a number known when compiling would not be vectorised
         x0, x1 = (bounds[node, 0, c] - ox) * rx, (bounds[node, 3, c] - ox) * sx
         y0, y1 = (bounds[node, 1, c] - oy) * ry, (bounds[node, 4, c] - oy) * sy
@@ -153,12 +150,11 @@ def _push(children, node, number, entered, stack, entry, top):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk_ray(tree, ray, distance, face, planes, stack, entry, entered):
+def _walk_ray(tree, ray, distance, face, stack, entry, entered):
     """(distance, face) of the nearest triangle; what was known where none is nearer."""
     bounds, children, number, faces, order, vertices = tree
     o, d = ray[0], ray[1]
-    for k in range(3):
-        _set_plane(planes, k, d[k], d[k])
+    planes = _planes(d[0], d[0]), _planes(d[1], d[1]), _planes(d[2], d[2])
     kx, ky, kz = axes(d)
     inverse = 1.0 / d[kz]
     sx, sy = d[kx] * inverse, d[ky] * inverse
@@ -195,9 +191,7 @@ def _common_axis(directions, i):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk_bundle(
-    tree, origins, directions, i, axis, distance, face, shears, planes, stack, entry, entered
-):
+def _walk_bundle(tree, origins, directions, i, axis, distance, face, shears, stack, entry, entered):
     """Nearest triangles of all rays of bundle `i` in one walk; False where it was given up.
 
     Given up with all triangles tested so far accounted for, so that single walks may go on.
@@ -205,7 +199,12 @@ def _walk_bundle(
     bounds, children, number, faces, order, vertices = tree
     o = origins[i]
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
-    _set_rays(directions, i, kx, ky, axis, shears, planes)
+    _set_shears(directions, i, kx, ky, axis, shears)
+    planes = (
+        _common_planes(directions, i, 0),
+        _common_planes(directions, i, 1),
+        _common_planes(directions, i, 2),
+    )
     budget = _LARGEST_FRONT
     farthest = distance.max() * _TIE_SLACK
     stack[0], entry[0] = 0, 0.0
@@ -235,19 +234,23 @@ def _walk_bundle(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_rays(directions, i, kx, ky, kz, shears, planes):
-    """Shears of the rays of bundle `i`, and the box test's constants for all of them."""
+def _set_shears(directions, i, kx, ky, kz, shears):
+    """Shears of the rays of bundle `i`."""
     for b in range(directions.shape[1]):
         inverse = 1.0 / directions[i, b, kz]
         shears[0, b] = directions[i, b, kx] * inverse
         shears[1, b] = directions[i, b, ky] * inverse
         shears[2, b] = inverse
-    for k in range(3):
-        low = high = directions[i, 0, k]
-        for b in range(1, directions.shape[1]):
-            low = smaller(low, directions[i, b, k])
-            high = larger(high, directions[i, b, k])
-        _set_plane(planes, k, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _common_planes(directions, i, k):
+    """Constants of the box test across axis `k` for all rays of bundle `i`."""
+    low = high = directions[i, 0, k]
+    for b in range(1, directions.shape[1]):
+        low = smaller(low, directions[i, b, k])
+        high = larger(high, directions[i, b, k])
+    return _planes(low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
