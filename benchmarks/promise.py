@@ -6,7 +6,6 @@ Writes docs/promise.md.
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ import promise_drawn
 from rich.console import Console
 from rich.progress import Progress
 
+from sweep.model.resolution import RAYS as NUMBERS
 from sweep.spec import SceneSpec, Spec, SpecError, load
 from sweep.tasks.accuracy.bench import Bench, Seen, Trial
 from sweep.tasks.accuracy.flight_bench import FlightBench
@@ -40,9 +40,13 @@ STRETCH = 4096
 """Points that are timed together: what one costs depends on those beside it in its block."""
 KEPT = 0.999
 """Share of the points that shall keep a tolerance."""
+LONG = 0.5
+"""Seconds that a trial may take to be repeated: longer ones are timed well enough as it is."""
 TOLERANCE, BEAMLETS = "accuracy.tolerance", "footprint.beamlets"
-MORE_RAYS = 4003
+MORE_RAYS = 16_021
 """What the reference of flights is held against."""
+MOST = NUMBERS[-1]
+"""Rays of a flight at the most."""
 DEARER = 1.1
 """What timings may be off."""
 WHAT = ("pd", "log10 pfa", "magnitude")
@@ -55,12 +59,13 @@ VARIANTS = {
 HEAD = """# Is the tolerance kept?
 
 Written by `make promise`. Of each experiment 1,000 points, drawn by chance (of flights, some tiles
-of shots), are computed as the study computes them at each `accuracy.tolerance`, and once more with
-all effects on and, where their number follows from the tolerance, as many beamlets as at 1e-9. How
-far off is pd (the largest of segments and shot), how far log10 of the probability of a false alarm,
-and how far |X| of the largest bins, relative to itself or to sigma if that is larger? A cell has
-the error of the worst point; before it, where not all points are within the tolerance, the share
-of those that are: 99.9 % is what is asked for. Points that are drawn have a table of their own.
+of shots), are computed at each `accuracy.tolerance`, with `footprint.beamlets: auto` where their
+number is accuracy's to choose, and once more with all effects on and as many beamlets as at 1e-9,
+or of flights more rays than any tolerance calls for. How far off is pd (the largest of segments and
+shot), how far log10 of the probability of a false alarm, and how far |X| of the largest bins,
+relative to itself or to sigma if that is larger? A cell has the error of the worst point; before
+it, where not all points are within the tolerance, the share of those that are: 99.9 % is what is
+asked for. Points that are drawn have a table of their own.
 
 One bin more or fewer that a detection occupies, of the 65,536 that could raise a false alarm, is
 6.6e-6 of log10 pfa.
@@ -73,16 +78,16 @@ tolerance: the front of the ladder of `sweep accuracy`.
 RAYS = f"""
 ## Flights against many more rays
 
-A flight has as many beamlets as it says, or 109, whatever the tolerance: each is a ray. Above, they
-are held against all effects on with the same rays, here against all effects on with as many as
-{FINEST_RAYS:,}. That these are enough is seen from the last row of each flight: {FINEST_RAYS:,}
-rays against {MORE_RAYS:,}, at one stretch of it. A cell has the share of shots within the
-tolerance, the error that 90 % of the shots keep, and the worst. `us` is processor time a shot, rays
-included.
+Each beamlet of a flight is a ray. Where powers add, `footprint.beamlets: auto` takes their number
+from the tolerance, 19 to {MOST:,}, alike for all shots; the rows show it, and what is left against
+all effects on with {FINEST_RAYS:,} rays. A number that an experiment gives by hand has a row too,
+with all effects on. That {FINEST_RAYS:,} are enough is seen from the last row of each flight: they
+against {MORE_RAYS:,}, at one stretch of it. A cell has the share of shots within the tolerance, the
+error that 90 % of the shots keep, and the worst. `us` is processor time a shot, rays included.
 
 Where phases are coherent the number of beamlets is part of the scene, as the thesis has it, and no
 number is enough: a smooth slope sends next to nothing back, and what is left of the sum of so many
-beamlets is their own. Of these flights there is one row, their own number against {MORE_RAYS:,}.
+beamlets is their own. Of these flights there is one row, their own number against {MOST:,}.
 """
 COSTS = """
 ## Cost and tolerance
@@ -118,7 +123,7 @@ def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
         best: dict[int, Trial] = {}
         for turn in range(rounds):  # in turn, so that whatever slows the machine slows all
             for k, rung in enumerate(rungs):
-                if rung.kind == REFERENCE and turn > 0:
+                if turn > 0 and (rung.kind == REFERENCE or best[k].seconds * len(part) > LONG):
                     continue
                 stretch = 1 if rung.kind == REFERENCE else min(STRETCH, bench.most_times)
                 trial = bench.try_on(rung, part, stretch)
@@ -155,35 +160,39 @@ def known(spec: Spec | SceneSpec) -> Found:
     whole = whole.with_fixed({t: bench.effects(at[t]) for t in FIXED_AS_AT})
     bench.forget()
     fixed = [rung for rung in whole.rungs if rung.kind in (FIXED, ALL_ON)]
-    own_rays = {k: v for k, v in whole.reference.overrides.items() if k != BEAMLETS or not flight}
-    own = replace(whole.reference, name="own rays", overrides=own_rays)
-    rungs = [*at.values(), *fixed, own, whole.reference]
+    rungs = [*at.values(), *fixed, whole.reference]
     trials = tried(bench, rungs, ROUNDS)
     seen = {rung.name: trial for rung, trial in zip(rungs, trials, strict=True)}
-    finest, true = seen[whole.reference.name].seen, seen[own.name].seen
-    worst = {r.name: np.nanmax(np.concatenate(apart(seen[r.name].seen, true))) for r in fixed}
+    every = next(rung for rung in fixed if rung.kind == ALL_ON)
+    finest = seen[whole.reference.name].seen
+    worst = {r.name: np.nanmax(np.concatenate(apart(seen[r.name].seen, finest))) for r in fixed}
     rows, rays = [], []
     for tolerance, rung in at.items():
         as_good = [seen[name].seconds for name, error in worst.items() if error <= tolerance]
         trial = seen[rung.name]
         best = min(as_good, default=np.nan)
-        rows.append(Row(tolerance, apart(trial.seen, true), trial.seconds, best))
-        rays.append(Row(tolerance, apart(trial.seen, finest), trial.seconds))
+        rows.append(Row(tolerance, apart(trial.seen, finest), trial.seconds, best))
+        label = f"{tolerance:g}: {rung.of(spec).parameters()[BEAMLETS]:,} rays" if flight else ""
+        rays.append(rows[-1]._replace(label=label))
     if not flight:
         return Found(rows, [])
     if BEAMLETS not in whole.reference.overrides:
-        return Found(rows, [with_more_rays(bench, whole, seen[own.name], "own, coherent")])
-    last = with_more_rays(bench, whole, seen[whole.reference.name], f"{FINEST_RAYS:,} rays")
+        return Found(rows, [with_more_rays(bench, whole, seen[every.name], "own, coherent", MOST)])
+    if spec.footprint.beamlets:
+        own, label = seen[every.name], f"{spec.footprint.beamlets:,} by hand"
+        rays.append(Row(np.inf, apart(own.seen, finest), own.seconds, label=label))
+    trial, label = seen[whole.reference.name], f"{FINEST_RAYS:,} rays"
+    last = with_more_rays(bench, whole, trial, label, MORE_RAYS)
     return Found(rows, [*rays, last])
 
 
-def with_more_rays(bench: Bench, whole: Ladder, own: Trial, label: str) -> Row:
+def with_more_rays(bench: Bench, whole: Ladder, own: Trial, label: str, more: int) -> Row:
     """The reference's number of rays against more of them, at a part of the sample."""
     put = dict(whole.reference.overrides)
     part = bench.parts(POINTS)[0]
     seen, other = (
         bench.try_on(Rung(name=f"{i} rays", kind=REFERENCE, overrides=each, plans=False), part, 1)
-        for i, each in enumerate((put, put | {BEAMLETS: MORE_RAYS}))
+        for i, each in enumerate((put, put | {BEAMLETS: more}))
     )
     bench.forget()
     return Row(np.inf, apart(seen.seen, other.seen), own.seconds, label=label)

@@ -12,7 +12,7 @@ from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.accuracy_table import AccuracyRow
+    from sweep.tasks.accuracy_table import AccuracyRow, RaysRow
     from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.session import Outcome
 
@@ -91,8 +91,8 @@ def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
 
 
 def tell_accuracy(store: Location) -> None:
-    """Print how well what is drawn is known, where anything is."""
-    from sweep.tasks.accuracy_table import accuracy_table
+    """Print how well what is drawn is known, where anything is, and what rays leave of flights."""
+    from sweep.tasks.accuracy_table import accuracy_table, rays_table
 
     if rows := accuracy_table(store):
         print_table(
@@ -101,6 +101,24 @@ def tell_accuracy(store: Location) -> None:
             [_accuracy_cells(row) for row in rows],
             "at",
         )
+    if rays := rays_table(store):
+        print_table(
+            "What more rays may change of pd",
+            ["", "rays a shot", "met", "worst", "missed by", "at"],
+            [_rays_cells(row) for row in rays],
+            "at",
+        )
+
+
+def _rays_cells(row: RaysRow) -> list[str]:
+    return [
+        row.scanner,
+        f"{row.rays:,}{', the most' if row.most else ''}",
+        f"{row.met:,} of {row.shots:,}",
+        f"{row.error:.3g}",
+        f"{row.missed:.2g}",
+        row.where,
+    ]
 
 
 def _accuracy_cells(row: AccuracyRow) -> list[str]:
@@ -174,12 +192,17 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
 
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a scene will take."""
+    from sweep.model.resolution import BEAMLETS, RAYS
     from sweep.tasks.progress import duration
     from sweep.tasks.scene_plan import scene_plan as planned
 
     p = planned(study, store=store, workers=workers)
     for report in p.reports:
         yield "scene", report
+    if study.rays_by_tolerance:
+        rays = int(study.parameters()[BEAMLETS])
+        most = ", the most that any gets" if rays == RAYS[-1] else ""
+        yield "beamlets", f"{rays:,} a shot, by accuracy.tolerance{most}"
     for s in p.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast

@@ -16,11 +16,14 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from sweep.model import chances
+from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE
-from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
+from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.surfaces import Surface
+from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.ray_error import ray_error
 from sweep.model.returns import Returns, draw_returns
 from sweep.model.scene_outputs import POINTS, STATISTICS, SceneOutput
 
@@ -42,6 +45,7 @@ def cloud(
     method: str = "probabilities",
     returns: int = 4,
     effects: Collection[str] = CORE,
+    estimates_rays: bool = False,
 ) -> dict[str, np.ndarray]:
     """Statistics and points of n shots.
 
@@ -64,6 +68,8 @@ def cloud(
         shot and draw; at least 1.
     effects : collection of str
         Names of the effects that are simulated.
+    estimates_rays : bool
+        Whether ``beamlets_error`` is estimated, for which powers have to add (0 where not).
 
     Returns
     -------
@@ -86,13 +92,14 @@ def cloud(
     for first in range(0, n, step):
         part = slice(first, first + step)
         seen = eyepoints.some(part)
-        shots, found = _groups(seen, parameters, surfaces, returns, effects)
+        shots, rays, found = _groups(seen, parameters, surfaces, returns, effects)
         drawn = draw_returns(
             shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
         )
-        for name, values in (
-            _statistics(seen, shots, found) | _points(seen, drawn, shots.offset.shape[1])
-        ).items():
+        left = ray_error(shots, rays, found) if estimates_rays else np.zeros(shots.size)
+        computed = _statistics(shots, found) | _points(seen, drawn, shots.offset.shape[1])
+        computed["beamlets_error"] = np.where(seen.seen, left, np.nan)
+        for name, values in computed.items():
             results[name][part] = values
     return results
 
@@ -107,14 +114,15 @@ def _groups(
     surfaces: Sequence[Surface],
     most: int,
     effects: Collection[str],
-) -> tuple[Shots, Groups]:
-    """Prepared shots and the groups in their spectra; none where nothing is seen."""
+) -> tuple[Shots, Footprints, Groups]:
+    """Prepared shots, what their rays hit, and groups in their spectra; none for no target."""
     seen = eyepoints.seen
     somewhere = eyepoints._replace(
         range=np.where(seen, eyepoints.range, _NOWHERE),
         radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
     )
-    shots = prepare_eyepoints(somewhere, parameters, surfaces, effects)
+    given, ground = seen_ground(somewhere, parameters, surfaces)
+    shots = prepare_cast(given, ground, effects)
     found = groups(shots, most=most)
     if not seen.all():
         blind = ~seen
@@ -122,10 +130,10 @@ def _groups(
             bins[blind] = -1
         found.neighbours[blind] = found.pd[blind] = np.nan
         found.exempted[blind] = found.leakage[blind] = 0.0
-    return shots, found
+    return shots, ground.beamlets, found
 
 
-def _statistics(eyepoints: Eyepoints, shots: Shots, found: Groups) -> dict[str, np.ndarray]:
+def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     """Probabilities before any draw, (n,) each."""
     up, doppler, down = found.pd[:, :, 0].T
     one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]

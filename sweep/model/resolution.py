@@ -9,6 +9,10 @@ tolerance: with b the threshold over sigma,
 in each of three segments. Most of the rest is the effects' (:mod:`.effects.planning`).
 Where amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
 what [T] takes, 109, is then taken.
+
+In a flight each beamlet is a ray, and nothing is known of the ground before they are cast: their
+number follows from the tolerance alone (:func:`rays_needed`), and what it leaves is estimated from
+what they hit (:mod:`.ray_error`).
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -51,6 +55,34 @@ EFFECTS_SHARE = 0.8
 
 FINEST = int(quadrature.COUNTS[-1])
 
+RAYS = (19, 37, 61, 109, 223, 439, 1015, 2029, 4009)
+"""Rays that a flight may cast for a shot: whole shells of the lattice, as only these are alike on
+opposite sides, which makes smooth ground a hundred times more exact. The fewest are those whose
+error can be told from themselves.
+
+The last is the limit, as each costs 0.2 us and 26 bytes: a tolerance below 2.5e-5 gets no more, and
+what is then left is stored, and told after a run."""
+
+RAYS_ERROR = 0.1
+"""Rays times tolerance: over open ground the error of one shot in a thousand is 0.03 to 0.14 over
+the number of rays.
+
+The share of shots [%] with pd, log10 pfa and magnitudes within the tolerance, all effects on, held
+against 8,017 rays:
+
+| flight, powers adding   | 19: 1e-1 | 19: 1e-2 | 109: 1e-3 | 1,015: 1e-4 | 4,009: 1e-5 |
+| scan pattern comparison |   100    |   100    |   100     |   99.98     |   99.86     |
+| gale crater descent     |   100    |   100    |   100     |   100       |   100       |
+| oblique descent         |   100    |   100    |   100     |   100       |   100       |
+| expanded pattern        |   100    |   100    |   99.95   |   99.86     |   99.62     |
+| square high descent     |   100    |   100    |   100     |   100       |   99.94     |
+| square low descent      |   100    |   100    |   99.95   |   99.91     |   99.81     |
+| forest scan             |   99.93  |   98.96  |   98.63   |   98.50     |   98.11     |
+
+In the forest a beam in forty is cut by the rim of a tree, and the error of one in a thousand is 2.5
+over the number of rays: as many as that calls for nobody would cast.
+"""
+
 _SEGMENTS = 3
 _SQUARE_SIDE = 64
 """Beamlets on a side of a square at the most."""
@@ -74,7 +106,7 @@ def resolved_categories(
             continue
         number, pattern, error = np.asarray(1), np.asarray("line"), np.asarray(0.0)
         if "footprint" in effects:
-            if _is_open(p):
+            if is_open(p):
                 number, pattern, error = beamlets_needed(p, index.size)
             else:
                 number, pattern = map(np.asarray, finest(p))
@@ -85,12 +117,27 @@ def resolved_categories(
 
 def finest(words: Mapping[str, Any]) -> tuple[int, str]:
     """Most beamlets that points with these words may be given, and their pattern."""
-    return (FINEST, "line") if _is_open(words) else (THESIS, ground.pattern(words))
+    return (FINEST, "line") if is_open(words) else (THESIS, ground.pattern(words))
+
+
+def rays_needed(words: Mapping[str, Any], tolerance: float) -> int:
+    """Rays of each shot of a flight that leaves their number to the tolerance.
+
+    Parameters
+    ----------
+    words : mapping
+        Phases and pattern of the footprint, architecture of the receiver.
+    tolerance : float
+        Of the study.
+    """
+    if not is_open(words):
+        return THESIS
+    return next((number for number in RAYS if number * tolerance >= RAYS_ERROR), RAYS[-1])
 
 
 def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:
     """What is left of a tolerance for the effects that are left out."""
-    return tolerance * (EFFECTS_SHARE - (SHARE if number == 0 and _is_open(words) else 0.0))
+    return tolerance * (EFFECTS_SHARE - (SHARE if number == 0 and is_open(words) else 0.0))
 
 
 def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
@@ -101,7 +148,7 @@ def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
     return ~given
 
 
-def _is_open(words: Mapping[str, Any]) -> bool:
+def is_open(words: Mapping[str, Any]) -> bool:
     """Whether there is a number of beamlets that is enough."""
     return ground.powers_add(words) and str(words[PATTERN]) not in ("hexagonal", "sunflower")
 

@@ -151,6 +151,9 @@ def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
             "What was left out changes a probability by "
             f"{float(dataset['effects_error'].max()):.2g} at the most, at any point."
         )
+    left = float(dataset["beamlets_error"].max()) if "beamlets_error" in dataset else 0.0
+    if left > 0:
+        told.append(f"More beamlets would change one by {left:.2g} at the most.")
     if "n_draws" in dataset:
         missed = dataset["accuracy_missed"]
         known = int(missed.notnull().sum())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import Field, PrivateAttr
 
 from sweep.model import VERSION
-from sweep.model.resolution import BEAMLETS, PATTERN, THESIS
+from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
 from sweep.spec.detector_check import is_method, not_on_flights
@@ -138,10 +138,16 @@ class SceneSpec(Study):
             for path, value in values_of(getattr(self, section), section).items()
             if not is_method(path)
         }
+        rays = rays_needed(parameters, self.accuracy.tolerance)
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,
-            BEAMLETS: self.footprint.beamlets or THESIS,
+            BEAMLETS: self.footprint.beamlets or rays,
         }
+
+    @property
+    def rays_by_tolerance(self) -> bool:
+        """Whether the tolerance says how many rays there are of each shot."""
+        return self.footprint.beamlets == 0 and is_open(self.parameters())
 
     def surfaces(self) -> tuple[Surface, ...]:
         """What surface numbers mean; no file is looked at."""
@@ -234,12 +240,13 @@ class SceneSpec(Study):
 
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides, nor where files are: they count by content. The order of axes and of objects
-        is: it lays out the arrays and numbers the surfaces.
+        is: it lays out the arrays and numbers the surfaces. A number of rays that follows from the
+        tolerance counts by that, as 0.
         """
-        digests = self._digests
+        digests, counted = self._digests, {BEAMLETS: 0} if self.rays_by_tolerance else {}
         return {
             "model": VERSION,
-            "parameters": self.parameters_off_axes(),
+            "parameters": self.parameters_off_axes() | counted,
             "axes": [axis_identity(axis) for axis in self.axes],
             "objects": list(self.scene.objects),
             "scene": leaf_values(self.scene, digests),

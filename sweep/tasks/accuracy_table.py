@@ -1,4 +1,7 @@
-"""The table of what was promised of what is drawn: where it is met, and by how much it is not."""
+"""The tables of what was promised: where it is met, and by how much it is not.
+
+Of a grid, what is drawn; of a flight, what rays leave where the tolerance says how many they are.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import Location, located, read_array
 from sweep.tasks import studies
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.journal import receipted
 from sweep.tasks.pieces import done_blocks, pieces
 
 if TYPE_CHECKING:
@@ -73,6 +78,66 @@ def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
                 draws=worst.draws,
                 needed=_needed(worst.draws, worst.half_width, worst.tolerance),
             )
+
+
+@dataclass(frozen=True)
+class RaysRow:
+    """How well a scanner's probabilities of detection are known, for what its rays leave."""
+
+    scanner: str
+    shots: int  # that are computed and see something, times places along the axes
+    met: int  # of these, within the tolerance
+    error: float  # of the worst
+    tolerance: float
+    where: str
+    rays: int  # of each shot
+    most: bool  # whether no tolerance calls for more
+
+    @property
+    def missed(self) -> float:
+        """By how much the tolerance is missed by the worst shot; 0 where it is met."""
+        return max(0.0, self.error - self.tolerance)
+
+
+def rays_table(store: str | Location) -> list[RaysRow]:
+    """A row for each scanner; none where the tolerance does not say how many rays there are.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store of sweep's.
+    """
+    path = located(store)
+    _, study = studies.read(path)
+    if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
+        return []
+    return [row for scanner in study.scanners if (row := _of_rays(path, study, scanner)).shots]
+
+
+def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
+    from sweep.model.resolution import BEAMLETS, RAYS
+
+    stretches, worst = study.scanners[scanner], _Worst()
+    errors, times = (read_array(path / scanner / name) for name in ("beamlets_error", "time"))
+    tolerance = float(study.spec.accuracy.tolerance)
+    for block in np.flatnonzero(receipted(path, study)).tolist():
+        own, part = study.part(block)
+        if own is stretches and part.draws == 0:
+            first, stop = stretches.shot_range(part)
+            there = *(slice(i, i + 1) for i in part.axes), slice(first, stop)
+            error = np.asarray(errors[there])
+            start, undrawn = (*part.axes, first), np.zeros(error.shape, np.int64)
+            worst.add(error, np.full(error.shape, tolerance), undrawn, start)
+    where = ""
+    if worst.points:
+        *axes, shot = worst.index
+        where = f"{_place(study.spec.axes, tuple(axes))}, " if axes else ""
+        where += f"time {float(np.asarray(times[shot])):.4g} s"
+    rays = int(study.spec.parameters()[BEAMLETS])
+    return RaysRow(
+        scanner, worst.points, worst.met, worst.half_width, tolerance, where, rays,
+        rays == RAYS[-1],
+    )  # fmt: skip
 
 
 @dataclass

@@ -130,6 +130,7 @@ def plan_shots(
     modes: Mapping[str, str],
     tiles: np.ndarray,
     rotating: bool,
+    rays_by_tolerance: bool = False,
 ) -> ShotsPlan | None:
     """Plans of shots of a flight; None where none of them sees anything.
 
@@ -143,6 +144,8 @@ def plan_shots(
         Number of the tile of each shot, rising.
     rotating
         Whether any body turns.
+    rays_by_tolerance
+        Whether the tolerance is for the number of rays too.
     """
     from sweep.model.effects.block import Block
     from sweep.model.effects.catalogue import DEFAULTS
@@ -162,7 +165,8 @@ def plan_shots(
         np.append(starts, seen.size),
         rotating,
     )
-    tolerance = effects_tolerance({}, ground.beamlets.offset.shape[1], parameters[TOLERANCE])
+    number = 0 if rays_by_tolerance else ground.beamlets.offset.shape[1]
+    tolerance = effects_tolerance(parameters, number, parameters[TOLERANCE])
     planned = plan(block, modes=modes, tolerance=tolerance)
     tile = np.searchsorted(starts, np.arange(seen.size), "right") - 1
     return ShotsPlan(seen, tile, planned)

@@ -123,9 +123,10 @@ class OlderFlight:
             return ""
         if self._is_as_fine:
             return "shots that call for more effects with the tolerance are computed anew"
+        rays = "footprint.beamlets, " if self._study.spec.rays_by_tolerance else ""
         return (
             "with the tolerance all is computed more closely, and anew, but where "
-            "accuracy.line_error and accuracy.leakage_error are numbers"
+            f"{rays}accuracy.line_error and accuracy.leakage_error are numbers"
         )
 
     def _shares(self, block: int) -> Iterator[Share]:
@@ -162,7 +163,9 @@ class OlderFlight:
     @cached_property
     def _is_as_fine(self) -> bool:
         """Whether shots are computed as finely there as here, effects apart."""
-        return not (self._other_tolerance and bool(by_tolerance(self._study.spec.parameters())))
+        spec = self._study.spec
+        follows = spec.rays_by_tolerance or bool(by_tolerance(spec.parameters()))
+        return not (self._other_tolerance and follows)
 
     def _read(self, block: int) -> Results | None:
         """Results of an older block by name, (shots or cycles, ...) each; None where damaged."""

@@ -218,7 +218,12 @@ class FlightStudy:
             self.surfaces,
             modes=self._modes,
             tiles=tiles,
+<<<<<<< HEAD
             rotating=self._rotating,
+=======
+            rotating=self.spec.rotating,
+            rays_by_tolerance=self.spec.rays_by_tolerance,
+>>>>>>> 5b78581 (The tolerance says how many rays a shot of a flight has, and each shot tells what they leave)
         )
 
     def look(
@@ -284,6 +289,7 @@ class FlightStudy:
                 method=self.spec.draws.method,
                 returns=int(self.spec.draws.returns),
                 effects=effects,
+                estimates_rays=self.spec.rays_by_tolerance,
             )
             yield Patch(rows[index], draws, results)
 

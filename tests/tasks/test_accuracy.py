@@ -9,6 +9,7 @@ import xarray as xr
 from small import STUDY, small
 from small_flights import SCENE, small_scene
 
+from sweep.model import resolution
 from sweep.model.effects.catalogue import NAMES
 from sweep.tasks import progress
 from sweep.tasks.accuracy import measure, rungs
@@ -264,8 +265,8 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "FINEST_RAYS", 61)
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
     store = tmp_path / "flight.zarr"
-    # Each beamlet is a ray: their number is fixed in adaptive settings too.
-    assert "footprint.beamlets" not in rungs.ladder(small_scene()).rungs[1].overrides
+    monkeypatch.setattr(resolution, "RAYS", (7, 19))
+    assert rungs.ladder(small_scene()).rungs[1].overrides["footprint.beamlets"] == "auto"
     short = {"path": SCENE["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
     spec = small_scene(platform=SCENE["platform"] | short)
     measured(spec, store_path=store, points=30, progress=False)

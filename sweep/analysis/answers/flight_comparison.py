@@ -25,7 +25,12 @@ SAME_DIRECTION = 1e-9
 DETECTED = "detected"
 """Share of the draws in which a shot has a true point."""
 
-COMPARED = tuple(name for name, output in STATISTICS.items() if output.dtype == "float64")
+ERRORS = ("effects_error", "beamlets_error")
+"""What is known of how far a shot's probabilities may be off."""
+
+COMPARED = tuple(
+    name for name, output in STATISTICS.items() if output.dtype == "float64" and name not in ERRORS
+)
 
 
 def compare(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
@@ -122,7 +127,8 @@ def _complete(tree: xr.DataTree) -> bool:
 
 def _quantities(group: xr.Dataset, tree: xr.DataTree, *, drawn: bool) -> xr.Dataset:
     """What is compared of a group's shots, over its axes and shots."""
-    found = group[[*COMPARED, "effects_error"]].assign_attrs(tree.attrs)
+    there = [name for name in (*COMPARED, *ERRORS) if name in group]
+    found = group[there].assign_attrs(tree.attrs)
     if not drawn:
         return found
     confidence, draws = study_of(found).accuracy.confidence, group.sizes["draw"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,8 +22,8 @@ MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
-NUMBERS = (1, 7, 19, 37, 61, 109, 217, 1009, 4003)
-"""Beamlets that a study might fix: full shells of a hexagonal lattice, as far as they are."""
+NUMBERS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
+"""Beamlets that a study might fix: full shells of a hexagonal lattice."""
 
 NODES = (3, 9, 33, 163, 1234)
 """Beamlets in a line along the slope that a study over a plane might fix."""
@@ -33,8 +34,11 @@ FIXED_NODES = 163
 OF_THESIS = 109
 """Beamlets of [T 3.3.1]."""
 
-FINEST_RAYS = 1009
-"""Beamlets of a flight's reference, where each is a ray."""
+FINEST_RAYS = 8017
+"""Beamlets of a flight's reference, where each is a ray: more than any tolerance calls for."""
+
+MOST_RAYS = 223
+"""Rays that are tried as a fixed number, at the most: more cost as much as all else together."""
 
 FINEST_TOLERANCE = 1e-9
 """Tolerance of the reference: of lines, of leakage and, over a plane, of the number of beamlets."""
@@ -121,8 +125,8 @@ class Ladder:
     about: str
     """What the reference is."""
     notes: tuple[str, ...] = ()
-    fixed: Mapping[str, Any] = field(default_factory=dict)
-    """What else is fixed where effects are."""
+    fixed: Callable[[float], dict[str, Any]] = lambda tolerance: {}
+    """What else is fixed where effects are, to a tolerance."""
 
     @property
     def reference(self) -> Rung:
@@ -152,7 +156,7 @@ class Ladder:
             }
             for tolerance in sets:
                 name = f"{len(names)} effects as at {first:g}, to {tolerance:g}"
-                overrides = modes | dict(self.fixed) | {_TOLERANCE: tolerance}
+                overrides = modes | self.fixed(tolerance) | {_TOLERANCE: tolerance}
                 further.append(Rung(name=name, kind=FIXED, overrides=overrides, plans=False))
         place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
         return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
@@ -165,7 +169,7 @@ def ladder(spec: Declared) -> Ladder:
     notes: list[str] = []
     rungs = [Rung(name="as written", kind=WRITTEN)]
     why = _beamlets_fixed(spec)
-    follow: dict[str, Any] = {} if why or _is_flight(spec) else {_BEAMLETS: "auto"}
+    follow: dict[str, Any] = {} if why else {_BEAMLETS: "auto"}
     if _on_axis(spec, _TOLERANCE):
         notes.append("accuracy.tolerance is on an axis: left as it is")
     else:
@@ -178,24 +182,35 @@ def ladder(spec: Declared) -> Ladder:
     finest, about = every | _EXACTLY, "all effects on"
     if why:
         notes.append(f"the number of beamlets is left alone: {why}")
-    elif follow:
-        finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
-        about += f", beamlets as at {FINEST_TOLERANCE:g}"
-    else:
+    elif _is_flight(spec):
         finest |= {_BEAMLETS: FINEST_RAYS}
         about += f", {FINEST_RAYS} beamlets"
+    else:
+        finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
+        about += f", beamlets as at {FINEST_TOLERANCE:g}"
     rungs += _numbers(spec) if not why else ()
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
     reference = Rung(name="reference", kind=REFERENCE, overrides=finest, plans=False)
-    fixed = {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE} if follow else {}
+    fixed = partial(_fixed_beamlets, spec, bool(why))
     return Ladder((*rungs, reference), about, tuple(notes), fixed)
+
+
+def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, Any]:
+    """Beamlets that a study whose effects are fixed might have, if their number is not given."""
+    if given:
+        return {}
+    if not _is_flight(spec):
+        return {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE}
+    from sweep.model.resolution import rays_needed
+
+    return {_BEAMLETS: min(rays_needed(spec.parameters(), tolerance), MOST_RAYS)}
 
 
 def _numbers(spec: Declared) -> Iterator[Rung]:
     """Fixed numbers of beamlets: in a lattice, and in a line where the ground is a plane."""
     flight = _is_flight(spec)
     for n in NUMBERS:
-        if not flight or n < FINEST_RAYS:
+        if not flight or n <= MOST_RAYS:
             yield Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
     for n in () if flight else NODES:
         put = {_BEAMLETS: n, _PATTERN: _LINE}

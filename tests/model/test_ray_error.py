@@ -1,0 +1,206 @@
+"""Rays of a flight: how many the tolerance calls for, and what they leave against what they do."""
+
+import numpy as np
+import pytest
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model import philox, window
+from sweep.model.clouds import cloud
+from sweep.model.eyepoints import prepare_eyepoints, seen_ground
+from sweep.model.footprint import beamlets
+from sweep.model.geometry.mesh import clean
+from sweep.model.geometry.surfaces import Surface
+from sweep.model.groups import groups
+from sweep.model.ray_error import folded, ray_error
+from sweep.model.resolution import RAYS, RAYS_ERROR, THESIS, rays_needed
+
+INCOHERENT = {
+    "footprint.phases": "incoherent",
+    "footprint.pattern": "auto",
+    "instrument.receiver.architecture": "homodyne",
+}
+SURFACES = [Surface("ground", 0.1), Surface("table", 0.2)]
+SHOTS, HEIGHT, MANY = 400, 1000.0, 4009
+DETECTED = "pd_up", "pd_doppler", "pd_down"
+
+
+def _rough(spacing=0.03, size=161, relief=0.02, seed=1):
+    """Facets smaller than the footprint at random heights, in a square about the origin."""
+    rng = np.random.default_rng(seed)
+    x = spacing * (np.arange(size) - size // 2)
+    height = relief * rng.standard_normal((size, size))
+    corners = np.stack([*np.meshgrid(x, x, indexing="ij"), height], axis=-1).reshape(-1, 3)
+    first = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
+    faces = np.concatenate([
+        np.stack([first, first + size, first + size + 1], axis=1),
+        np.stack([first, first + size + 1, first + 1], axis=1),
+    ])  # fmt: skip
+    return clean(corners, faces, 0)[0]
+
+
+SCENES = {
+    "rough ground": ([_rough()], 0.004),
+    "the edge of a table": ([plate(), plate(x=(0.0, 1e3), surface=1, height=7.0)], 0.00025),
+}
+"""Meshes, and the way from shot to shot [m]."""
+
+
+def _seen(scene, number):
+    bodies, step = SCENES[scene]
+    path = flight(
+        position=(-step * SHOTS / 2, 0.0, HEIGHT), velocity=(step, 0.0, 0.0), duration=1e4
+    )
+    return observed(path, bodies=bodies, number=number, index=np.arange(SHOTS))
+
+
+def _parameters(table_4_1, power=0.006):
+    return instrument(table_4_1, power=power, fft_size=2**16)
+
+
+def _cloud(seen, parameters, **keywords):
+    keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="rays", seed=1)
+    return cloud(
+        seen, parameters=parameters, surfaces=SURFACES, keys=keys, **{"returns": 1} | keywords
+    )
+
+
+# How many
+
+
+def test_the_number_follows_from_the_tolerance_alone():
+    tolerances = np.geomspace(1, 1e-8, 200)
+    numbers = [rays_needed(INCOHERENT, t) for t in tolerances]
+    assert numbers == sorted(numbers) and set(numbers) == set(RAYS)
+    enough = [n * t >= RAYS_ERROR for n, t in zip(numbers, tolerances, strict=True)]
+    assert all(e or n == RAYS[-1] for e, n in zip(enough, numbers, strict=True))
+    assert [rays_needed(INCOHERENT, t) for t in (1e-2, 1e-3, 1e-4, 1e-5, 0.0)] == [
+        19, 109, 1015, 4009, 4009,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"footprint.phases": "coherent"},
+        {"footprint.pattern": "sunflower"},
+        {"instrument.receiver.architecture": "direct"},
+    ],
+)
+def test_where_no_number_is_enough_it_is_the_thesis_s(change):
+    assert {rays_needed(INCOHERENT | change, t) for t in (1.0, 1e-3, 0.0)} == {THESIS}
+
+
+@pytest.mark.parametrize("number", RAYS)
+def test_numbers_are_whole_shells(number):
+    """Each beamlet has one opposite, and the fold tells them all."""
+    rule = folded(number)
+    offsets, weight = beamlets(number)
+    np.testing.assert_allclose(offsets[:, rule.second], -offsets[:, rule.first], atol=1e-12)
+    assert sorted({*rule.first, *rule.second}) == list(range(number))
+    assert rule.first.size == (number + 1) // 2
+    np.testing.assert_allclose(weight[rule.second], weight[rule.first], rtol=1e-12)
+    identity = rule.weighted @ rule.smooth.T
+    np.testing.assert_allclose(identity, np.eye(len(identity)), atol=1e-12)
+
+
+# What they leave
+
+
+def _by_hand(seen, parameters, number):
+    """The formula of the module in numpy: windows by their samples, pairs by their distances."""
+    _, ground = seen_ground(seen, parameters, SURFACES)
+    shots = prepare_eyepoints(seen, parameters, SURFACES, ["footprint"])
+    found = groups(shots)
+    (x, y), weight = beamlets(number)
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    near = np.argwhere(np.triu(apart < 1.3 * apart[0, 1:].min(), 1))
+    fit = np.stack([x ** (d - i) * y**i for d in ((0, 2) if number < 37 else (0, 2, 4))
+                    for i in range(d + 1)], axis=1)  # fmt: skip
+    taken = (number + 1) / (number + 1 - 2 * fit.shape[1])
+    opposite = np.hypot(x[:, None] + x, y[:, None] + y).argmin(axis=1)
+    rate, fs, window_length = shots.chirp_rate, float(shots.sample_rate[0]), shots.window.length
+    errors = np.zeros(seen.time.size)
+    for i in range(errors.size):
+        for s in (0, 2):
+            metres = seen.range[i] * ground.beamlets.offset[i]
+            beat = 2 / 299792458.0 * rate * (seen.range[i] + metres)
+            where = (beat - found.bin[i, s, 0] * fs / shots.fft_size) * window_length / fs
+            lobe = np.abs(window.transform(shots.window, where)) ** 2
+            g = ground.beamlets.echo[i] * lobe
+            g = (g + g[opposite]) / (2 * weight * g.sum())
+            root = np.sqrt(weight)
+            g = g - fit @ np.linalg.lstsq(fit * root[:, None], g * root, rcond=None)[0]
+            a, b = found.magnitude[i, s, 0], shots.threshold[i]
+            a, b = a / shots.line_deviation[i], b / shots.line_deviation[i]
+            apart = g[near[:, 0]] - g[near[:, 1]]
+            relative = np.sqrt((np.prod(weight[near], axis=1) * apart**2).sum() * taken)
+            away = max(abs(a - b) - relative * a / 2, 0.0)
+            errors[i] += relative / 2 * np.sqrt(a * b / (2 * np.pi)) * np.exp(-(away**2) / 2)
+    return errors
+
+
+@pytest.mark.parametrize("number", [19, 109])
+def test_it_is_what_the_formula_gives(table_4_1, number):
+    """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0."""
+    parameters = _parameters(table_4_1)
+    seen = _seen("rough ground", number).some(np.arange(0, SHOTS, 40))
+    _, ground = seen_ground(seen, parameters, SURFACES)
+    shots = prepare_eyepoints(seen, parameters, SURFACES, ["footprint"])
+    found = groups(shots)
+    found.bin[:, 1] = -1  # no Doppler segment
+    got = ray_error(shots, ground.beamlets, found)
+    expected = _by_hand(seen, parameters, number)
+    assert expected.max() > 1e-4
+    np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("number", [19, 109, 439])
+@pytest.mark.parametrize("scene, surfaces", [("rough ground", 1), ("the edge of a table", 2)])
+def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, surfaces, number):
+    """Of 99 in 100 shots at least half of it, of four in ten no more than ten times as much.
+
+    But of those in which no ray has hit what others would.
+    """
+    parameters, seen = _parameters(table_4_1), _seen(scene, number)
+    many = _cloud(_seen(scene, MANY), parameters)
+    few = _cloud(seen, parameters, estimates_rays=True)
+    real = sum(abs(few[name] - many[name]) for name in DETECTED)
+    off = (real > 1e-6) & (np.ptp(seen.surface, axis=1) == surfaces - 1)
+    ratio = few["beamlets_error"][off] / real[off]
+    assert off.sum() > SHOTS / 4 and real[off].max() > 0.03
+    assert (ratio >= 0.5).mean() >= 0.99
+    assert (ratio <= 10).mean() >= 0.4
+    assert few["beamlets_error"].max() <= 1
+
+
+def test_of_even_ground_there_is_next_to_nothing_to_tell(table_4_1):
+    parameters = _parameters(table_4_1)
+    found = [
+        _cloud(_seen("the edge of a table", number), parameters, estimates_rays=True)
+        for number in (19, 109)
+    ]
+    far = np.arange(SHOTS) < 50  # 38 mm and more, three deviations, from the edge
+    assert [each["beamlets_error"][far].max() < 1e-8 for each in found] == [True, True]
+
+
+def test_it_is_told_only_where_it_is_asked_for(table_4_1):
+    """All else is the same bit for bit; shots that see nothing have none."""
+    seen = _seen("the edge of a table", 19)
+    seen.surface[3] = -1
+    seen.range[3], seen.radial_velocity[3] = np.inf, np.nan
+    for values in (seen.offset, seen.velocity_offset, seen.cos_incidence):
+        values[3] = np.nan
+    parameters = _parameters(table_4_1)
+    asked, not_asked = (_cloud(seen, parameters, estimates_rays=each) for each in (True, False))
+    for name in asked.keys() - {"beamlets_error"}:
+        np.testing.assert_array_equal(asked[name], not_asked[name])
+    assert np.isnan([each["beamlets_error"][3] for each in (asked, not_asked)]).all()
+    others = np.arange(SHOTS) != 3
+    assert (not_asked["beamlets_error"][others] == 0).all()
+    assert (asked["beamlets_error"][others] > 0).any()
+    part = np.arange(100, 130)
+    alone = cloud(
+        seen.some(part), parameters=parameters, surfaces=SURFACES, returns=1, estimates_rays=True,
+        keys=np.zeros((part.size, 2), np.uint64),
+    )  # fmt: skip
+    np.testing.assert_array_equal(alone["beamlets_error"], asked["beamlets_error"][part])
