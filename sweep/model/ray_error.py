@@ -106,7 +106,7 @@ def folded(number: int) -> Rule:
     share = np.where(opposite[first] == first, 1.0, 2.0) * weight[first]
     near = np.unique(tree.query_pairs(reach, output_type="ndarray"), axis=0)
     pairs, which = np.unique(np.sort(place[near], axis=1), axis=0, return_inverse=True)
-    product = np.bincount(which.ravel(), weight[near[:, 0]] * weight[near[:, 1]])
+    product: np.ndarray = np.bincount(which.ravel(), weight[near[:, 0]] * weight[near[:, 1]])
     smooth = _smooth(offsets[:, first], share, 4 if number >= _QUARTIC else 2)
     product = product * (first.size / (first.size - len(smooth)))
     return Rule(first, opposite[first], 1 / share, smooth, share * smooth, pairs, product)

@@ -13,6 +13,7 @@ from sweep.analysis.answers.flight_comparison import compare
 from sweep.analysis.scenes.opening import open_scene
 from sweep.cli import main
 from sweep.model import resolution
+from sweep.report.asked import accuracy
 from sweep.spec import SceneSpec
 from sweep.tasks.accuracy_table import rays_table
 from sweep.tasks.driver import extend
@@ -160,3 +161,10 @@ def test_it_is_the_same_however_it_is_cut(flown, tmp_path):
     cut = facets(1e-2, storage={"block_shots": 7, "block_draws": 1})
     found = shots(quiet(cut, tmp_path / "cut.zarr").store)
     np.testing.assert_array_equal(found.beamlets_error, shots(flown["coarse"]).beamlets_error)
+
+
+def test_a_report_says_so_too(flown):
+    told = " ".join(accuracy(shots(flown["coarse"]), facets(1e-2)))
+    worst = float(shots(flown["coarse"]).beamlets_error.max())
+    assert f"More beamlets would change one by {worst:.2g} at the most." in told
+    assert "beamlets" not in " ".join(accuracy(shots(flown["by hand"]), facets(1e-4, 4009)))
