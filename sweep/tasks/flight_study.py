@@ -218,12 +218,8 @@ class FlightStudy:
             self.surfaces,
             modes=self._modes,
             tiles=tiles,
-<<<<<<< HEAD
             rotating=self._rotating,
-=======
-            rotating=self.spec.rotating,
             rays_by_tolerance=self.spec.rays_by_tolerance,
->>>>>>> 5b78581 (The tolerance says how many rays a shot of a flight has, and each shot tells what they leave)
         )
 
     def look(
