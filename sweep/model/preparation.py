@@ -17,7 +17,6 @@ import numpy as np
 
 from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 from sweep.model.ground import Ground
 from sweep.model.mode_kernels import with_modes
 from sweep.model.spectrum import tangents
@@ -44,11 +43,7 @@ AUTOMATIC = -1.0
 """Stands for an error that follows from the tolerance."""
 
 LINE_SHARE = 1.0
-"""The same, for errors of bins over sigma: pd changes by less than half as much in each segment.
-
-All of it, as bounds on these errors have all lines and bins at their worst: what comes of them is a
-hundredth of the tolerance or less.
-"""
+"""The same, for errors of bins over sigma: all, as bounds have lines and bins at their worst."""
 
 LINE_STEPS = 3
 """Steps that take few lines for many, at the most: each may err by as much of the whole."""
@@ -226,16 +221,11 @@ class Shots:
         The last is the thread's own: kernels that are worked out when they are met.
         """
         w = self.window
-        limits = (
-            node_limits(w.power_band_weights, POWER_TOLERANCES)
-            if self.incoherent
-            else node_limits(w.band_weights, AMPLITUDE_TOLERANCES)
-        )
         return (
             (self.fft_size, w.length),
             (w.coefficients, w.numerator, w.poles, w.edge, w.table),
             (w.sum, w.envelope, w.reach, w.beyond),
-            limits,
+            w.node_limits(self.incoherent),
             tangents(self.fft_size),
             with_modes(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),
         )

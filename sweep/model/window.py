@@ -20,6 +20,8 @@ from functools import cached_property, lru_cache
 import mpmath
 import numpy as np
 
+from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
+
 COSINE_SUMS: dict[str, tuple[str, ...]] = {
     "rectangular": ("1", "0"),
     "hann": ("0.5", "0.5"),
@@ -102,6 +104,12 @@ class Window:
         correlation = np.correlate(w, w, "full")[w.size - 1 :]
         correlation[1:] *= 2  # either sign
         return _shares(np.append(correlation, 0.0))
+
+    def node_limits(self, power: bool) -> np.ndarray:
+        """How few lines stand for many under this window (:mod:`sweep.model.equivalent`)."""
+        if power:
+            return node_limits(self.power_band_weights, POWER_TOLERANCES)
+        return node_limits(self.band_weights, AMPLITUDE_TOLERANCES)
 
     @property
     def equivalent_noise_bandwidth(self) -> float:

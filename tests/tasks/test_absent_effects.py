@@ -40,7 +40,7 @@ def calls(monkeypatch):
     watch(footprint, "plane_footprint", "plane_footprint")
     watch(atmosphere, "optical_depth", "optical_depth")
     watch(turbulence, "rytov_variance", "rytov_variance")
-    watch(modulation, "split_lines", "split_lines")
+    watch(modulation, "split", "split")
     yield counted
     for effect, plain in acts:
         object.__setattr__(effect, "act", plain)
@@ -70,7 +70,7 @@ def test_a_hovering_lidar_sees_no_doppler_shift(calls):
     still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
     called = evaluated(small(axes=MOON, target=still))
     assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
-    assert calls["doppler"] == calls["range_walk"] == calls["split_lines"] == 0
+    assert calls["doppler"] == calls["range_walk"] == calls["split"] == 0
 
 
 def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):

@@ -232,7 +232,7 @@ def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
-    spec = small(footprint={"beamlets": 7})
+    spec = small(footprint={"beamlets": 7}, accuracy={"line_error": 1e-9})
     measured(spec, store_path=tmp_path / "a.zarr", points=6, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load()
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
