@@ -115,14 +115,17 @@ def _fit_rows(phase, tolerance, errors, to_degrees, found):
             out[NUMBER], out[RE] = 1.0, 1.0
             continue
         combine(own, flat, COLUMNS, 0, COLUMNS, slope)
+        middle, rise = slope[0], slope[1]
+        for i in range(COLUMNS):  # a loop of its own, so that the next one vectorises
+            size[i] = own[i] - middle - rise * PLACES[i]
         for i in range(COLUMNS):
-            im[i], re[i] = sincos_cycles(own[i] - slope[0] - slope[1] * PLACES[i])
+            im[i], re[i] = sincos_cycles(size[i])
         combine(re, flat, COLUMNS, 0, COLUMNS, one)
         combine(im, flat, COLUMNS, 0, COLUMNS, other)
         for k in range(COLUMNS):
             size[k] = math.sqrt(one[k] * one[k] + other[k] * other[k])
         if _keep(one, other, size, tolerance[row], errors, out):
-            out[CENTRE] = 2.0 * slope[1]
+            out[CENTRE] = 2.0 * rise
 
 
 @njit(cache=True, error_model="numpy")

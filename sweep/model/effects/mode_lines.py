@@ -6,6 +6,7 @@ lines each of these is made up, to what error, is worked out once. The lines are
 squares are linear, and the fewest that a tolerance takes; finding them costs a twentieth.
 """
 
+import math
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -52,18 +53,16 @@ def split(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
     As :func:`sweep.model.effects.line_splitting.split_lines`, which is asked for what wanders too
     far for modes; parameters, result and errors are its own.
     """
-    at = np.ascontiguousarray(phase(PLACES))
-    size, most = at.shape[0], STEPS[-1][0]
-    found = in_modes(at, np.full(size, 2 * LEFT_OUT * tolerance))
-    whole = Split(
-        np.zeros((size, most)), np.zeros((size, most), complex), np.zeros(size, np.int64),
-        np.zeros(size),
-    )  # fmt: skip
-    _put_together(found, at, tolerance, *_made(), *whole)
-    rest = np.flatnonzero(whole.number == 0)
+    at, made = np.ascontiguousarray(phase(PLACES)), _made()
+    found = in_modes(at, np.full(at.shape[0], 2 * LEFT_OUT * tolerance))
+    step, error = _steps_needed(found, tolerance, made.error)
+    number = np.append(made.number, 0)[step]
+    room = at.shape[0], int(number.max(initial=1))
+    whole = Split(np.zeros(room), np.zeros(room, complex), number, error)
+    _put_together(found, at, step, number, made.offset, made.strength, whole.offset, whole.weight)
+    rest = np.flatnonzero(number == 0)
     if rest.size == 0:
-        most = int(whole.number.max(initial=1))
-        return Split(whole.offset[:, :most], whole.weight[:, :most], whole.number, whole.error)
+        return whole
     return _with(whole, rest, split_lines(partial(_some, phase, rest), tolerance=tolerance))
 
 
@@ -101,31 +100,43 @@ def _made() -> _Made:
 
 
 @njit(cache=True, error_model="numpy")
-def _put_together(
-    found, phase, tolerance, numbers, offsets, strengths, errors, offset, weight, number, error
-):
-    """Lines of rows in modes, of the first step that serves; none of rows without."""
+def _steps_needed(found, tolerance, errors):
+    """First step that serves each row in modes, -1 where none does or it has none; its error."""
+    step, error = np.full(found.shape[0], -1), np.zeros(found.shape[0])
+    size = np.empty(MODES)
+    for row in range(found.shape[0]):
+        own = found[row]
+        if own[NUMBER] == 0.0 and own[NUMBER + 1] == 0.0:
+            continue
+        for k in range(MODES):
+            size[k] = math.sqrt(own[RE + k] * own[RE + k] + own[IM + k] * own[IM + k])
+        for tried in range(errors.shape[0]):
+            off = LEFT_OUT * tolerance
+            for k in range(MODES):
+                off += size[k] * errors[tried, k]
+            if off <= tolerance:
+                step[row], error[row] = tried, off
+                break
+    return step, error
+
+
+@njit(cache=True, error_model="numpy")
+def _put_together(found, phase, step, number, offsets, strengths, offset, weight):
+    """Lines of rows in modes, of the step of each; none of rows without."""
     for row in range(found.shape[0]):
         own = found[row]
         evens, odds = int(own[NUMBER]), int(own[NUMBER + 1])
-        if evens == 0 and odds == 0:
-            continue
-        for step in range(numbers.size):
-            off = 0.0
-            for k in range(MODES):
-                off += np.hypot(own[RE + k], own[IM + k]) * errors[step, k]
-            if off <= (1.0 - LEFT_OUT) * tolerance:
-                break
-        else:
-            continue
-        sine, cosine = sincos_cycles(phase[row].mean())
-        turn = complex(cosine, sine)
-        number[row], error[row] = numbers[step], LEFT_OUT * tolerance + off
-        for p in range(numbers[step]):
-            offset[row, p] = own[CENTRE] + offsets[step, p]
-            even, odd = 0j, 0j
+        middle = 0.0
+        for i in range(phase.shape[1]):
+            middle += phase[row, i] / phase.shape[1]
+        sine, cosine = sincos_cycles(middle)
+        for p in range(number[row]):
+            re, im = 0.0, 0.0
             for k in range(evens):
-                even += complex(own[RE + k], own[IM + k]) * strengths[step, k, p]
-            for k in range(EVENS, EVENS + odds):
-                odd += complex(own[RE + k], own[IM + k]) * strengths[step, k, p]
-            weight[row, p] = turn * (even + 1j * odd)
+                re += own[RE + k] * strengths[step[row], k, p]
+                im += own[IM + k] * strengths[step[row], k, p]
+            for k in range(EVENS, EVENS + odds):  # times i
+                re -= own[IM + k] * strengths[step[row], k, p]
+                im += own[RE + k] * strengths[step[row], k, p]
+            offset[row, p] = own[CENTRE] + offsets[step[row], p]
+            weight[row, p] = complex(cosine * re - sine * im, cosine * im + sine * re)
