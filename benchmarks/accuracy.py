@@ -78,8 +78,9 @@ on it is written by hand.
 A ladder of settings is put onto the spec. Each is computed by the machinery that computes the
 study, in one process, on one core: the spec as it is written; effects on demand (`auto`) at
 tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a
-tolerance calls for anywhere; fixed numbers of beamlets, where they add as powers; numbers of
-draws, where the study draws; and the way that the thesis describes. All take turns on parts of
+tolerance calls for anywhere, with lines and leakage to three tolerances; fixed numbers of beamlets,
+where they add as powers; numbers of draws, where the study draws; and the way that the thesis
+describes. All take turns on parts of
 the sample, round after round, so that whatever slows the machine slows them alike. What a point
 costs depends on those that are computed beside it, as they share what is worked out for them: so
 times are taken on stretches of the blocks that the study computes, some thousands of points each,
@@ -90,7 +91,8 @@ plans; storing is not counted.
 The **error** of a setting is what a tolerance promises to bound: the largest, over the points,
 of the differences from the reference in a probability of detection, of the segments and the
 shot, in log10 of a probability of false alarm, and in the magnitude of a peak's bin over itself
-or sigma. The reference has all effects on and the finest footprint of all. The figures show as
+or sigma. The reference has all effects on, lines and leakage to 1e-9 and the finest footprint of
+all. The figures show as
 well what 90 % and half of the points stay below in pd. Where draws make errors random, the error
 is that of pd at 95 % of the points. The reference itself is held against the time domain, sample
 by sample, at some of the same points.

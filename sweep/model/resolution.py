@@ -51,7 +51,7 @@ SHARE = 0.25
 """Of the tolerance on pd, for the number of beamlets."""
 
 EFFECTS_SHARE = 0.8
-"""For effects that are left out, if beamlets are given; the rest is that of lines and leakage."""
+"""For effects that are left out, if beamlets are given; the rest is that of lines."""
 
 FINEST = int(quadrature.COUNTS[-1])
 
