@@ -25,7 +25,7 @@ MOST_ROUNDS = 9
 PARTS = 2
 """Parts of a sample, at the least: whole ones are kept where it is broken off."""
 
-LONG_ENOUGH = 0.01
+LONG_ENOUGH = 0.003
 """Share of the time limit that a trial takes: its calls then cost little beside its points."""
 
 TOO_LONG = 2
