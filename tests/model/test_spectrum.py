@@ -240,7 +240,7 @@ def test_nodes_are_as_many_as_a_tolerance_takes_and_few_more(name, power, expone
     """By the Bessel functions that are left out, weighed by the window."""
     weights, tolerances = weights_of(name, power)
     tolerance = 10.0**exponent
-    nodes = nodes_for(turn, tolerance, node_limits(weights, tolerances))
+    nodes = nodes_for(turn, tolerance, window(name, 512).node_limits(power))
     least = max(t for t in tolerances if t <= tolerance)
     assert left_out(nodes, turn, weights) <= least
     assert nodes <= 2 or left_out(nodes - 2 - nodes // 12, turn, weights) > least
