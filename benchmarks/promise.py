@@ -118,6 +118,7 @@ def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
     parts = bench.parts(bench.size)
     for rung in rungs:  # compiles what there is to compile
         bench.try_on(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
+    bench.forget()
     found: list[list[Trial]] = [[] for _ in rungs]
     for part in parts:
         best: dict[int, Trial] = {}
@@ -172,7 +173,7 @@ def known(spec: Spec | SceneSpec) -> Found:
         trial = seen[rung.name]
         best = min(as_good, default=np.nan)
         rows.append(Row(tolerance, apart(trial.seen, finest), trial.seconds, best))
-        label = f"{tolerance:g}: {rung.of(spec).parameters()[BEAMLETS]:,} rays" if flight else ""
+        label = f"{tolerance:g}: {of_rays(trial.seen.beamlets)}" if flight else ""
         rays.append(rows[-1]._replace(label=label))
     if not flight:
         return Found(rows, [])
@@ -184,6 +185,13 @@ def known(spec: Spec | SceneSpec) -> Found:
     trial, label = seen[whole.reference.name], f"{FINEST_RAYS:,} rays"
     last = with_more_rays(bench, whole, trial, label, MORE_RAYS)
     return Found(rows, [*rays, last])
+
+
+def of_rays(number: np.ndarray) -> str:
+    """How many rays shots have, where they have any: the mean, and the most."""
+    if not np.isfinite(number).any():
+        return "nothing seen"
+    return f"{np.nanmean(number):,.0f} rays, at most {np.nanmax(number):,.0f}"
 
 
 def with_more_rays(bench: Bench, whole: Ladder, own: Trial, label: str, more: int) -> Row:

@@ -103,7 +103,7 @@ def tell_accuracy(store: Location) -> None:
         )
     if rays := rays_table(store):
         print_table(
-            "What more rays may change of pd",
+            "What more rays may change",
             ["", "rays a shot", "met", "worst", "missed by", "at"],
             [_rays_cells(row) for row in rays],
             "at",
@@ -113,7 +113,7 @@ def tell_accuracy(store: Location) -> None:
 def _rays_cells(row: RaysRow) -> list[str]:
     return [
         row.scanner,
-        f"{row.rays:,}{', the most' if row.most else ''}",
+        f"{row.rays:,.0f}, at most {row.most:,}",
         f"{row.met:,} of {row.shots:,}",
         f"{row.error:.3g}",
         f"{row.missed:.2g}",
@@ -201,8 +201,7 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
         yield "scene", report
     if study.rays_by_tolerance:
         rays = int(study.parameters()[BEAMLETS])
-        most = ", the most that any gets" if rays == RAYS[-1] else ""
-        yield "beamlets", f"{rays:,} a shot, by accuracy.tolerance{most}"
+        yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {RAYS[-1]:,}"
     for s in p.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast

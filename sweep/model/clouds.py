@@ -96,9 +96,12 @@ def cloud(
         drawn = draw_returns(
             shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
         )
-        left = ray_error(shots, rays, found) if estimates_rays else np.zeros(shots.size)
+        left = np.zeros(shots.size)
+        if estimates_rays:
+            left = ray_error(shots, rays, found.bin[:, :, 0], found.magnitude[:, :, 0])
         computed = _statistics(shots, found) | _points(seen, drawn, shots.offset.shape[1])
         computed["beamlets_error"] = np.where(seen.seen, left, np.nan)
+        computed["beamlets"] = np.full(shots.size, seen.weight.size)
         for name, values in computed.items():
             results[name][part] = values
     return results

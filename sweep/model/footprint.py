@@ -28,7 +28,7 @@ _TILT = 0.191
 """Rotation [rad] of the lattice against the slope, so that no two rows project onto each other."""
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=32)
 def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.ndarray]:
     """Directions and weights of a Gaussian beam's beamlets.
 

@@ -10,9 +10,9 @@ in each of three segments. Most of the rest is the effects' (:mod:`.effects.plan
 Where amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
 what [T] takes, 109, is then taken.
 
-In a flight each beamlet is a ray, and nothing is known of the ground before they are cast: their
-number follows from the tolerance alone (:func:`rays_needed`), and what it leaves is estimated from
-what they hit (:mod:`.ray_error`).
+In a flight each beamlet is a ray, and nothing is known of the ground before they are cast: few are
+(:func:`rays_needed`), what these leave is estimated from what they hit (:mod:`.ray_error`), and
+shots of which that is too much are cast again with more (:func:`more_rays`).
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -55,33 +55,19 @@ EFFECTS_SHARE = 0.8
 
 FINEST = int(quadrature.COUNTS[-1])
 
-RAYS = (19, 37, 61, 109, 223, 439, 1015, 2029, 4009)
-"""Rays that a flight may cast for a shot: whole shells of the lattice, as only these are alike on
-opposite sides, which makes smooth ground a hundred times more exact. The fewest are those whose
-error can be told from themselves.
+RAYS = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
+"""Rays that may be cast for a shot of a flight: whole shells of the lattice, as only these are
+alike on opposite sides, which makes smooth ground a hundred times more exact. The fewest are those
+whose error can be told from themselves; each costs some 80 ns."""
 
-The last is the limit, as each costs 0.2 us and 26 bytes: a tolerance below 2.5e-5 gets no more, and
-what is then left is stored, and told after a run."""
+LEAST_RAYS_TOLERANCE = 1e-6
+"""Tighter tolerances call for no more rays than this one."""
 
-RAYS_ERROR = 0.1
-"""Rays times tolerance: over open ground the error of one shot in a thousand is 0.03 to 0.14 over
-the number of rays.
+_FEWEST = ((1e-2, 19), (1e-5, 37), (0.0, 109))
+"""Rays that every shot has from a tolerance on: what none of them hits no estimate knows of."""
 
-The share of shots [%] with pd, log10 pfa and magnitudes within the tolerance, all effects on, held
-against 8,017 rays:
-
-| flight, powers adding   | 19: 1e-1 | 19: 1e-2 | 109: 1e-3 | 1,015: 1e-4 | 4,009: 1e-5 |
-| scan pattern comparison |   100    |   100    |   100     |   99.98     |   99.86     |
-| gale crater descent     |   100    |   100    |   100     |   100       |   100       |
-| oblique descent         |   100    |   100    |   100     |   100       |   100       |
-| expanded pattern        |   100    |   100    |   99.95   |   99.86     |   99.62     |
-| square high descent     |   100    |   100    |   100     |   100       |   99.94     |
-| square low descent      |   100    |   100    |   99.95   |   99.91     |   99.81     |
-| forest scan             |   99.93  |   98.96  |   98.63   |   98.50     |   98.11     |
-
-In the forest a beam in forty is cut by the rim of a tree, and the error of one in a thousand is 2.5
-over the number of rays: as many as that calls for nobody would cast.
-"""
+_LEAST_STEP, _MOST_STEP = 2, 10
+"""Times as many rays at the least, and at the most, as have told that they are too few."""
 
 _SEGMENTS = 3
 _SQUARE_SIDE = 64
@@ -121,7 +107,7 @@ def finest(words: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def rays_needed(words: Mapping[str, Any], tolerance: float) -> int:
-    """Rays of each shot of a flight that leaves their number to the tolerance.
+    """Rays that every shot of a flight has that leaves their number to the tolerance.
 
     Parameters
     ----------
@@ -132,7 +118,30 @@ def rays_needed(words: Mapping[str, Any], tolerance: float) -> int:
     """
     if not is_open(words):
         return THESIS
-    return next((number for number in RAYS if number * tolerance >= RAYS_ERROR), RAYS[-1])
+    return next(number for least, number in _FEWEST if tolerance >= least)
+
+
+def more_rays(rays: int, error: np.ndarray, tolerance: float) -> np.ndarray:
+    """Rays that shots are to be cast with again, (n,) int64; 0 where they have enough.
+
+    Parameters
+    ----------
+    rays : int
+        One of :data:`RAYS`, which shots have had.
+    error : (n,) ndarray
+        What these leave (:func:`sweep.model.ray_error.ray_error`), which falls about as one over
+        their number; nan where nothing is seen.
+    tolerance : float
+        Of the study, above 0.
+    """
+    further = np.array([n for n in RAYS if n > _LEAST_STEP * rays], np.int64)
+    over = np.asarray(error, float) / tolerance
+    if not further.size:
+        return np.zeros(over.shape, np.int64)
+    # The fewest take smooth ground for far rougher than it is: what they tell is no measure.
+    wanted = rays * np.minimum(over, _MOST_STEP if rays > RAYS[0] else 1)
+    place = np.minimum(np.searchsorted(further, wanted), further.size - 1)
+    return np.where(over > 1, further[place], 0)
 
 
 def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:

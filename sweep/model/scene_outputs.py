@@ -88,10 +88,12 @@ STATISTICS: dict[str, SceneOutput] = {
     "pfa_down": _shot("1", "probability of a false alarm, down-chirp, noise and leakage"),
     "snr_up": _shot("1", "signal-to-noise ratio, up-chirp, strongest bin"),
     "surfaces_seen": _shot("1", "groups of bins above the threshold, up-chirp", dtype="int16"),
+    "beamlets": _shot("1", "beamlets, each a ray that was cast", dtype="int32"),
     "beamlets_error": _shot(
-        "1", "largest change of a probability of detection by more beamlets",
-        comment="estimated from the shot's own rays, where accuracy.tolerance says how many they "
-        "are; else 0",
+        "1", "largest change by more beamlets",
+        comment="of pd in all three segments, or of a relative magnitude, whichever is more; "
+        "estimated from the shot's own rays, where accuracy.tolerance says how many they are; "
+        "else 0",
     ),
 }  # fmt: skip
 """Probabilities of each shot, before any draw.

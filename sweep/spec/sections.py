@@ -76,8 +76,7 @@ class Footprint(Part):
         int,
         Numeric(
             about="Number of beamlets; auto: as many as accuracy.tolerance needs where powers add "
-            "(each point of a plane as many as it needs; all shots of a flight alike, 19 to 4009), "
-            "else 109",
+            "(each point of a plane and each shot of a flight as many as it needs), else 109",
             example="109",
             at_least="1",
             at_most="100000",

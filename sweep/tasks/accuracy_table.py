@@ -82,7 +82,7 @@ def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
 
 @dataclass(frozen=True)
 class RaysRow:
-    """How well a scanner's probabilities of detection are known, for what its rays leave."""
+    """How well a scanner's probabilities and magnitudes are known, for what its rays leave."""
 
     scanner: str
     shots: int  # that are computed and see something, times places along the axes
@@ -90,8 +90,8 @@ class RaysRow:
     error: float  # of the worst
     tolerance: float
     where: str
-    rays: int  # of each shot
-    most: bool  # whether no tolerance calls for more
+    rays: float  # of a shot, in the mean
+    most: int  # of any shot
 
     @property
     def missed(self) -> float:
@@ -115,17 +115,18 @@ def rays_table(store: str | Location) -> list[RaysRow]:
 
 
 def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
-    from sweep.model.resolution import BEAMLETS, RAYS
-
+    names = "beamlets_error", "beamlets", "time"
+    errors, numbers, times = (read_array(path / scanner / name) for name in names)
     stretches, worst = study.scanners[scanner], _Worst()
-    errors, times = (read_array(path / scanner / name) for name in ("beamlets_error", "time"))
-    tolerance = float(study.spec.accuracy.tolerance)
+    tolerance, rays, most = float(study.spec.accuracy.tolerance), 0, 0
     for block in np.flatnonzero(receipted(path, study)).tolist():
         own, part = study.part(block)
         if own is stretches and part.draws == 0:
             first, stop = stretches.shot_range(part)
             there = *(slice(i, i + 1) for i in part.axes), slice(first, stop)
             error = np.asarray(errors[there])
+            number = np.where(np.isfinite(error), np.asarray(numbers[there]), 0)
+            rays, most = rays + int(number.sum()), max(most, int(number.max(initial=0)))
             start, undrawn = (*part.axes, first), np.zeros(error.shape, np.int64)
             worst.add(error, np.full(error.shape, tolerance), undrawn, start)
     where = ""
@@ -133,10 +134,9 @@ def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
         *axes, shot = worst.index
         where = f"{_place(study.spec.axes, tuple(axes))}, " if axes else ""
         where += f"time {float(np.asarray(times[shot])):.4g} s"
-    rays = int(study.spec.parameters()[BEAMLETS])
+    mean = rays / max(worst.points, 1)
     return RaysRow(
-        scanner, worst.points, worst.met, worst.half_width, tolerance, where, rays,
-        rays == RAYS[-1],
+        scanner, worst.points, worst.met, worst.half_width, tolerance, where, mean, most
     )  # fmt: skip
 
 

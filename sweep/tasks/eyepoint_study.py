@@ -50,15 +50,17 @@ class EyepointStudy:
         A study of the scene.
     scanner
         Name of the scanner.
+    beamlets
+        Rays of each shot; those of the spec by default.
     """
 
     unit = "shots"
 
-    def __init__(self, spec: SceneSpec, scanner: str) -> None:
+    def __init__(self, spec: SceneSpec, scanner: str, beamlets: int | None = None) -> None:
         self.spec, self.scanner = spec, scanner
         self.cycles = spec.cycles(scanner)
         self.shots_a_cycle = spec.shots_a_cycle(scanner)
-        self.beamlets = int(spec.parameters()["footprint.beamlets"])
+        self.beamlets = beamlets or int(spec.parameters()["footprint.beamlets"])
         most = max(1, min(BLOCK_SHOTS, BLOCK_BEAMLETS // self.beamlets))
         self.block_cycles = min(self.cycles, max(1, most // self.shots_a_cycle))
 
@@ -166,7 +168,7 @@ class EyepointStudy:
 
         step = max(1, CAST_BEAMLETS // self.beamlets)
         parts = [
-            to_arrays(self._observe(index[start : start + step]))
+            to_arrays(self.observe(index[start : start + step]))
             for start in range(0, len(index), step)
         ]
         shots = parts[0]
@@ -181,7 +183,8 @@ class EyepointStudy:
             (first[:, None] * self.shots_a_cycle + np.arange(self.shots_a_cycle)).ravel()
         )
 
-    def _observe(self, index: np.ndarray) -> Eyepoints:
+    def observe(self, index: np.ndarray) -> Eyepoints:
+        """Eyepoints of any shots, by number (n,): all their rays are cast at once."""
         from sweep.model.eyepoints import observe
 
         world = self.world

@@ -18,6 +18,7 @@ from sweep.tasks.calling import TILE_SHOTS, Called, ShotsPlan, plan_shots
 from sweep.tasks.earlier import Earlier
 from sweep.tasks.eyepoint_reader import EyepointReader
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path, world_of
+from sweep.tasks.finer_rays import FinerRays, refine
 from sweep.tasks.grid_study import coordinates
 from sweep.tasks.patches import KnownCloud, Patch, completed
 from sweep.tasks.stretches import Part, Stretches
@@ -175,7 +176,8 @@ class FlightStudy:
         called = self.called(block)
         results |= {"effects": called.flags, "effects_error": called.error}
         known = self.earlier.known(block, called) if self.earlier else KnownCloud()
-        results |= self.look(part, shots, eyepoints, called, first=first, known=known)
+        numbers = np.arange(first, stop)
+        results |= self.look(part, shots, eyepoints, called, numbers, known)
         depth = len(part.axes)
         return {
             f"{part.scanner}/{name}": values.reshape((1,) * depth + values.shape)
@@ -190,7 +192,8 @@ class FlightStudy:
         for stretches in self._stretches:
             part = stretches.part(0)
             shots, eyepoints = self._reader(part.scanner).shots(0, stretches.shots_a_cycle)
-            self.look(part, shots, eyepoints, self.call(part, eyepoints), first=0)
+            called = self.call(part, eyepoints)
+            self.look(part, shots, eyepoints, called, np.arange(stretches.shots_a_cycle))
 
     def called(self, block: int) -> Called:
         """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
@@ -228,8 +231,7 @@ class FlightStudy:
         shots: Results,
         eyepoints: Eyepoints,
         called: Called,
-        *,
-        first: int,
+        numbers: np.ndarray,
         known: KnownCloud = KnownCloud(),  # noqa: B008
     ) -> Results:
         """Radiometry, draws and navigation of some shots.
@@ -242,15 +244,15 @@ class FlightStudy:
             Whole cycles of them.
         called
             What is simulated of each.
-        first
-            Number of the first.
+        numbers
+            Of the shots, counted from the flight's first.
         known
             What need not be computed.
         """
         stretches = self.scanners[part.scanner]
         begin, end = stretches.draw_range(part)
         number, draws = called.flags.size, end - begin
-        clouds = partial(self._clouds, part, eyepoints, called, first)
+        clouds = partial(self._clouds, part, eyepoints, called, numbers)
         found = completed(known.points, (number, draws), clouds)
         if not stretches.navigates:
             return found
@@ -263,31 +265,59 @@ class FlightStudy:
         part: Part,
         eyepoints: Eyepoints,
         called: Called,
-        first: int,
+        numbers: np.ndarray,
         rows: np.ndarray,
         draws: slice,
     ) -> Iterator[Patch]:
         """Points of some of the shots, those together that call for the same."""
+        for index, effects in called.some(rows).groups():
+            some = rows[index]
+            cloud = self._cloud(part, draws, effects)
+            results = cloud(eyepoints.some(some), numbers[some])
+            if self.spec.rays_by_tolerance:
+                self._refine(part.scanner, numbers[some], results, cloud)
+            yield Patch(some, draws, results)
+
+    def _cloud(
+        self, part: Part, draws: slice, effects: tuple[str, ...]
+    ) -> Callable[[Eyepoints, np.ndarray], Results]:
+        """What makes points of eyepoints and the shots' numbers."""
         from sweep.model.clouds import cloud
         from sweep.model.philox import point_keys
 
         begin, _ = self.scanners[part.scanner].draw_range(part)
-        numbers = (first + rows)[:, None].astype(float)
-        keys = point_keys(numbers, domain=DOMAIN, seed=int(self.spec.seed))
-        for index, effects in called.some(rows).groups():
-            results = cloud(
-                eyepoints.some(rows[index]),
-                parameters=self.parameters_at(part),
-                surfaces=self.surfaces,
-                keys=keys[index],
-                first_draw=begin + draws.start,
-                draws=draws.stop - draws.start,
-                method=self.spec.draws.method,
-                returns=int(self.spec.draws.returns),
-                effects=effects,
-                estimates_rays=self.spec.rays_by_tolerance,
-            )
-            yield Patch(rows[index], draws, results)
+        make = partial(
+            cloud,
+            parameters=self.parameters_at(part),
+            surfaces=self.surfaces,
+            first_draw=begin + draws.start,
+            draws=draws.stop - draws.start,
+            method=self.spec.draws.method,
+            returns=int(self.spec.draws.returns),
+            effects=effects,
+            estimates_rays=self.spec.rays_by_tolerance,
+        )
+        keys = partial(point_keys, domain=DOMAIN, seed=int(self.spec.seed))
+        return lambda seen, numbers: make(seen, keys=keys(numbers[:, None].astype(float)))
+
+    def _refine(
+        self,
+        scanner: str,
+        numbers: np.ndarray,
+        results: Results,
+        cloud: Callable[[Eyepoints, np.ndarray], Results],
+    ) -> None:
+        """Put points of shots that need more rays in the place of their results."""
+
+        def again(places: np.ndarray, rays: int) -> np.ndarray:
+            some = numbers[places]
+            finer = cloud(self._finer_rays.see(scanner, some, rays), some)
+            for name, values in finer.items():
+                results[name][places] = values
+            return finer["beamlets_error"]
+
+        rays = int(self.spec.parameters()["footprint.beamlets"])
+        refine(rays, results["beamlets_error"], self.spec.rays_tolerance, again)
 
     def _solutions(
         self, stretches: Stretches, shots: Results, found: Results, cycles: np.ndarray, draws: slice
@@ -333,6 +363,10 @@ class FlightStudy:
     @cached_property
     def _rotating(self) -> bool:
         return self.spec.rotating
+
+    @cached_property
+    def _finer_rays(self) -> FinerRays:
+        return FinerRays(self.spec)
 
     def _reader(self, scanner: str) -> EyepointReader:
         if scanner not in self._readers:

@@ -103,10 +103,11 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
 
     def timed(cycles: int) -> tuple[float, float]:
         begun = time.perf_counter()
-        seen = eyepoints.see(eyepoints.spread(cycles))
+        numbers = eyepoints.spread(cycles)
+        seen = eyepoints.see(numbers)
         cast = time.perf_counter()
         shots = from_arrays(seen, weight)
-        study.look(part, seen, shots, study.call(part, shots), first=0)
+        study.look(part, seen, shots, study.call(part, shots), numbers)
         return cast - begun, time.perf_counter() - cast
 
     timed(1)  # compiles what there is to compile

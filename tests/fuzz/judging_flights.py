@@ -50,7 +50,8 @@ def judge_flight(file: Path) -> Verdict:
 
 def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
     """All shots of a scanner: what they see, and every place along axes and draws."""
-    seen = eyepoints.see(np.arange(eyepoints.points))
+    numbers = np.arange(eyepoints.points)
+    seen = eyepoints.see(numbers)
     look_at_shots(seen)
     shots = from_arrays(seen, eyepoints.weight)
     stretches = study.scanners[eyepoints.scanner]
@@ -58,7 +59,7 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
         part = Part(eyepoints.scanner, tuple(axes), draws, 0)
         called = study.call(part, shots)
         assert np.isfinite(called.error).all() and (called.error >= 0).all(), "effects_error"
-        found = study.look(part, seen, shots, called, first=0)
+        found = study.look(part, seen, shots, called, numbers)
         architecture = study.parameters_at(part)["instrument.receiver.architecture"]
         look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
 

@@ -194,9 +194,10 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     spec = SceneSpec.from_mapping(flight_in(instrument, turn, shift))
     study = FlightStudy(spec, Path("nowhere.zarr"))
     (eyepoints,) = study.eyepoint_studies()
-    seen = eyepoints.see(np.arange(eyepoints.points))
+    numbers = np.arange(eyepoints.points)
+    seen = eyepoints.see(numbers)
     shots, part = from_arrays(seen, eyepoints.weight), Part("cone", (), 0, 0)
-    return seen, study.look(part, seen, shots, study.call(part, shots), first=0)
+    return seen, study.look(part, seen, shots, study.call(part, shots), numbers)
 
 
 @settings(SOME, max_examples=6)

@@ -9,7 +9,6 @@ import xarray as xr
 from small import STUDY, small
 from small_flights import SCENE, small_scene
 
-from sweep.model import resolution
 from sweep.model.effects.catalogue import NAMES
 from sweep.tasks import progress
 from sweep.tasks.accuracy import measure, rungs
@@ -265,7 +264,6 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "FINEST_RAYS", 61)
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
     store = tmp_path / "flight.zarr"
-    monkeypatch.setattr(resolution, "RAYS", (7, 19))
     assert rungs.ladder(small_scene()).rungs[1].overrides["footprint.beamlets"] == "auto"
     short = {"path": SCENE["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
     spec = small_scene(platform=SCENE["platform"] | short)
@@ -298,7 +296,7 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives():
     eyepoints = from_arrays(shots, caster.weight)
     called = study.call(tiles.part, eyepoints)
     assert len(tiles.index) <= TILE_SHOTS
-    found = study.look(tiles.part, shots, eyepoints, called, first=0)
+    found = study.look(tiles.part, shots, eyepoints, called, tiles.index)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
     assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
 
@@ -307,7 +305,12 @@ def seen(pd, magnitude=1.0):
     """A point of given probabilities and magnitude, sigma 0.5."""
     alarms = np.array([[-np.inf, -3.0]])
     return Seen(
-        np.array([pd]), alarms, np.array([[magnitude]]), np.array([np.nan]), np.array([0.5])
+        np.array([pd]),
+        alarms,
+        np.array([[magnitude]]),
+        np.array([np.nan]),
+        np.array([0.5]),
+        np.array([1.0]),
     )
 
 

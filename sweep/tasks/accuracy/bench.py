@@ -39,6 +39,8 @@ class Seen(NamedTuple):
     """(n,): of the worst of pd, where it is a mean over draws."""
     sigma: np.ndarray
     """(n,): noise of a bin, per quadrature, in the magnitudes' unit."""
+    beamlets: np.ndarray
+    """(n,): of each point; of a flight all rays that are cast, whatever is made of them."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         pd = np.stack(counts, axis=1) / draws
         nothing = np.full((len(pd), 3), np.nan)
         error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / draws)
-        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1), nothing[:, 0])
+        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1), *nothing[:, :2].T)
     pd = np.stack([outputs[name] for name in names], axis=1)
     alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
     magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]
@@ -125,4 +127,5 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         np.stack(magnitude, axis=1),
         np.fmax.reduce(errors) if errors else np.full(len(pd), np.nan),
         np.sqrt(outputs["noise_variance"] / 2),
+        outputs["beamlets"],
     )

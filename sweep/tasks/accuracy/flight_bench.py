@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import thread_time
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,6 +25,7 @@ from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
 from sweep.tasks.accuracy.sample import spread
 from sweep.tasks.calling import TILE_SHOTS, Called
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
+from sweep.tasks.finer_rays import FinerRays, refine
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.stretches import Part, Stretches
 
@@ -63,8 +66,10 @@ class Cast(NamedTuple):
 class _Caster(EyepointStudy):
     """Eyepoints of a geometry in a world that others share, as building one can take seconds."""
 
-    def __init__(self, spec: SceneSpec, scanner: str, world: World) -> None:
-        super().__init__(spec, scanner)
+    def __init__(
+        self, spec: SceneSpec, scanner: str, world: World, beamlets: int | None = None
+    ) -> None:
+        super().__init__(spec, scanner, beamlets)
         self._world = world
 
     @property
@@ -96,6 +101,7 @@ class FlightBench:
         self._cast: dict[tuple[str, int], Cast] = {}
         self._geometry: dict[tuple[int, str], str] = {}
         self._casters: dict[str, _Caster] = {}
+        self._finer: dict[int, FinerRays] = {}
         self._names: dict[str, frozenset[str]] = {}
         self._tiles = self._sample(points)
 
@@ -130,7 +136,7 @@ class FlightBench:
         cast = self._seen(study, tiles)
         called, planning = self._planned(rung, study, tiles, cast)
         begun = thread_time()
-        seen = _looked(rung, study, tiles, cast.eyepoints, called)
+        seen = self._looked(rung, study, tiles, cast.eyepoints, called)
         spent = thread_time() - begun + cast.seconds + planning
         return Trial(seen, spent / len(part), planning / len(part))
 
@@ -151,7 +157,8 @@ class FlightBench:
             return _nothing(1), _nothing(1)
         names = [n for n in names_of(int(called.flags[one[0]])) if n not in NOT_IN_TRUTH]
         in_time, ordinary = (
-            _found(study, tiles, eyepoints, names, look) for look in (truth.find, shot.find)
+            _look(study, tiles, names, look, False, eyepoints)[0]
+            for look in (truth.find, shot.find)
         )
         return in_time, ordinary
 
@@ -226,6 +233,47 @@ class FlightBench:
         called = _called(study, tiles, cast.eyepoints)
         return called, thread_time() - begun if rung.plans else 0.0
 
+    def _looked(
+        self, rung: Rung, study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, called: Called
+    ) -> Seen:
+        """Statistics of shots, of those that see anything; more rays are cast where they must."""
+        whole = _nothing(len(called.flags))
+        tolerance = rung.rays_error
+        if not tolerance and study.spec.rays_by_tolerance:
+            tolerance = study.spec.rays_tolerance
+        for flag in np.unique(called.flags):
+            index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
+            if index.size:
+                names = list(names_of(int(flag)))
+                look = partial(_look, study, tiles, names, look_of(rung), bool(tolerance))
+                error = _put(whole, index, look(eyepoints.some(index)))
+                if tolerance:
+                    self._refine(study, tiles, (whole, index, error), tolerance, look)
+        return whole
+
+    def _refine(
+        self,
+        study: FlightStudy,
+        tiles: Tiles,
+        found: tuple[Seen, np.ndarray, np.ndarray],
+        tolerance: float,
+        look: Callable[[Eyepoints], tuple[Seen, np.ndarray]],
+    ) -> None:
+        """As the study does where the tolerance says how many rays there are."""
+        whole, index, error = found
+        if id(study) not in self._finer:
+            make = partial(_Caster, world=world_of(self.spec))
+            self._finer[id(study)] = FinerRays(study.spec, make)
+
+        def again(places: np.ndarray, rays: int) -> np.ndarray:
+            some = index[places]
+            seen = self._finer[id(study)].see(tiles.part.scanner, tiles.index[some], rays)
+            there, error = np.flatnonzero(seen.seen), np.zeros(len(some))
+            error[there] = _put(whole, some[there], look(seen.some(there)))
+            return error
+
+        refine(int(study.spec.parameters()["footprint.beamlets"]), error, tolerance, again)
+
 
 def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
     """Numbers of the shots, in whole cycles, of some tiles of a scanner."""
@@ -245,21 +293,6 @@ def _called(study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints) -> Called:
     return nothing if planned is None else planned.called(number)
 
 
-def _looked(
-    rung: Rung, study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, called: Called
-) -> Seen:
-    """Statistics of shots, of those that see anything."""
-    whole = _nothing(len(called.flags))
-    for flag in np.unique(called.flags):
-        index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
-        if index.size:
-            names = list(names_of(int(flag)))
-            seen = _found(study, tiles, eyepoints.some(index), names, look_of(rung))
-            for values, some in zip(whole, seen, strict=True):
-                values[index] = some
-    return whole
-
-
 def _everywhere(names: frozenset[str], eyepoints: Eyepoints) -> Called:
     """The same effects of every shot that sees anything."""
     from sweep.model.effects.catalogue import NAMES
@@ -269,18 +302,44 @@ def _everywhere(names: frozenset[str], eyepoints: Eyepoints) -> Called:
     return Called(np.where(seen, flag, 0).astype(np.uint32), np.zeros(len(seen)))
 
 
-def _found(
-    study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, names: list[str], look: Look
-) -> Seen:
-    """Statistics of shots that see something, from a way to look at their spectra."""
-    from sweep.model.eyepoints import prepare_eyepoints
+def _put(whole: Seen, index: np.ndarray, found: tuple[Seen, np.ndarray]) -> np.ndarray:
+    """Put statistics of some shots into those of all; what their rays leave."""
+    seen, error = found
+    for values, some in zip(whole, seen, strict=True):
+        values[index] = some
+    return error
+
+
+def _look(
+    study: FlightStudy,
+    tiles: Tiles,
+    names: list[str],
+    look: Look,
+    estimates: bool,
+    eyepoints: Eyepoints,
+) -> tuple[Seen, np.ndarray]:
+    """Statistics of shots that see something, from a way to look at their spectra.
+
+    And what their rays leave, (n,), if that is asked for.
+    """
+    from sweep.model.chain import prepare_cast
+    from sweep.model.eyepoints import seen_ground
+    from sweep.model.ray_error import ray_error
     from sweep.model.shot import statistics
 
-    parameters, surfaces = study.parameters_at(tiles.part), study.surfaces
-    shots = prepare_eyepoints(eyepoints, parameters, surfaces, names)
-    return seen_in(statistics(shots, look(shots)), MEAN, 0)
+    given, ground = seen_ground(eyepoints, study.parameters_at(tiles.part), study.surfaces)
+    shots = prepare_cast(given, ground, names)
+    found = look(shots)
+    rays = np.full(shots.size, float(eyepoints.weight.size))
+    seen = seen_in(statistics(shots, found), MEAN, 0)._replace(beamlets=rays)
+    error = np.zeros(shots.size)
+    if estimates:
+        frequency = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+        bins = np.where(np.isfinite(frequency), np.rint(frequency), -1).astype(np.int64)
+        error = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
+    return seen, error
 
 
 def _nothing(shots: int) -> Seen:
-    sizes = ((shots, 4), (shots, 2), (shots, 3), shots, shots)
+    sizes = ((shots, 4), (shots, 2), (shots, 3), shots, shots, shots)
     return Seen(*(np.full(size, np.nan) for size in sizes))

@@ -34,11 +34,15 @@ FIXED_NODES = 163
 OF_THESIS = 109
 """Beamlets of [T 3.3.1]."""
 
-FINEST_RAYS = 8017
-"""Beamlets of a flight's reference, where each is a ray: more than any tolerance calls for."""
+FINEST_RAYS, FINEST_RAYS_TOLERANCE = 8017, 1e-7
+"""Rays of each shot of a flight's reference, and what they may leave: else shots have more."""
 
 MOST_RAYS = 223
 """Rays that are tried as a fixed number, at the most: more cost as much as all else together."""
+
+FEWEST_RAYS, RAYS_ERROR = 19, 0.1
+"""Where effects are fixed too: rays at the least, and rays times tolerance, which leaves one shot
+in a thousand over open ground that is off by more."""
 
 FINEST_TOLERANCE = 1e-9
 """Tolerance of the reference: of lines, of leakage and, over a plane, of the number of beamlets."""
@@ -85,6 +89,9 @@ class Rung:
         whether it goes back to the bins alone (:mod:`sweep.model.oversampled`); else 0.
     estimate
         What is read off draws.
+    rays_error
+        What the rays of a flight's shots may leave before they are cast with more; 0 where the
+        spec says that.
     """
 
     name: str
@@ -96,6 +103,7 @@ class Rung:
     degree: int = 0
     folded: bool = False
     estimate: str = MEAN
+    rays_error: float = 0.0
 
     def of(self, spec: Declared) -> Declared:
         """The spec with the overrides put onto it.
@@ -179,18 +187,20 @@ def ladder(spec: Declared) -> Ladder:
         ]
     every = _every_effect(spec)
     rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every, plans=False))
-    finest, about = every | _EXACTLY, "all effects on"
+    finest, about, rays_error = every | _EXACTLY, "all effects on", 0.0
     if why:
         notes.append(f"the number of beamlets is left alone: {why}")
     elif _is_flight(spec):
-        finest |= {_BEAMLETS: FINEST_RAYS}
-        about += f", {FINEST_RAYS} beamlets"
+        finest, rays_error = finest | {_BEAMLETS: FINEST_RAYS}, FINEST_RAYS_TOLERANCE
+        about += f", {FINEST_RAYS} beamlets or more"
     else:
         finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
     rungs += _numbers(spec) if not why else ()
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
-    reference = Rung(name="reference", kind=REFERENCE, overrides=finest, plans=False)
+    reference = Rung(
+        name="reference", kind=REFERENCE, overrides=finest, plans=False, rays_error=rays_error
+    )
     fixed = partial(_fixed_beamlets, spec, bool(why))
     return Ladder((*rungs, reference), about, tuple(notes), fixed)
 
@@ -201,9 +211,8 @@ def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, 
         return {}
     if not _is_flight(spec):
         return {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE}
-    from sweep.model.resolution import rays_needed
-
-    return {_BEAMLETS: min(rays_needed(spec.parameters(), tolerance), MOST_RAYS)}
+    least = max(FEWEST_RAYS, RAYS_ERROR / tolerance)
+    return {_BEAMLETS: min(next((n for n in NUMBERS if n >= least), MOST_RAYS), MOST_RAYS)}
 
 
 def _numbers(spec: Declared) -> Iterator[Rung]:
