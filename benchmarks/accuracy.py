@@ -98,13 +98,14 @@ is that of pd at 95 % of the points. The reference itself is held against the ti
 by sample, at some of the same points.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
-cells a bin, convolves it with the window's transform by an FFT of 2^11 or 2^12, and samples that at
-the bins. Two things would improve it, and stand beside it: a way back to the bins alone, by an FFT
-of a sixteenth of the size (`folded`), and lines shared out among ten cells, by which they are where
-they belong (`degree 9`). All are compiled, transform many spectra at once and real numbers where
-powers add (`sweep/model/oversampled.py`), have no leakage and no range walk to compute, and share
-preparation and detection with the rest. The same beamlets with the same effects in closed form
-stand beside them too.
+cells a bin, convolves it with the window's transform by a complex FFT of 2^11 or 2^12, and samples
+that at the bins. Three things would improve it, and stand beside it: half the transform where
+powers add, which are real (`real`; [T] adds amplitudes, which are not), a way back to the bins
+alone, by an FFT of a sixteenth of the size (`folded`, which is `real` too), and lines shared out
+among ten cells, by which they are where they belong (`degree 9`). All are compiled and transform
+many spectra at once (`sweep/model/oversampled.py`), have no leakage and no range walk to compute,
+and share preparation and detection with the rest. The same beamlets with the same effects in closed
+form stand beside them too.
 
 Two things are asked of the adaptive settings, and the answers below are computed: at equal error
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5

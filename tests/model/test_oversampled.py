@@ -97,9 +97,12 @@ def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1)
     shots = drawn(table_4_1, 12, phases=phases)
     for i, segment in itertools.product(range(shots.size), range(3)):
         _, whole = oversampled.spectrum(shots, i, segment)
+        _, real = oversampled.spectrum(shots, i, segment, real=True)
         _, folded = oversampled.spectrum(shots, i, segment, folded=True)
+        _, both = oversampled.spectrum(shots, i, segment, real=True, folded=True)
         order = 2 if shots.incoherent else 1  # a root of rounding is much
-        assert np.abs(whole**order - folded**order).max() < 1e-14 * whole.max() ** order
+        for other in (real, folded, both):
+            assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
 
 
 def test_the_same_detections_come_of_it(table_4_1):

@@ -98,7 +98,9 @@ def look_of(rung: Rung) -> Look:
 
     if not rung.cells:
         return shot.find
-    return partial(oversampled.find, degree=rung.degree, size=rung.cells, folded=rung.folded)
+    return partial(
+        oversampled.find, degree=rung.degree, size=rung.cells, real=rung.real, folded=rung.folded
+    )
 
 
 def of_lines(names: frozenset[str]) -> tuple[str, ...]:

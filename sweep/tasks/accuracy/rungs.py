@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -84,9 +84,10 @@ class Rung:
     of_lines
         Whether only what the thesis's way can have is simulated: no effects within a record, no
         leakage.
-    cells, degree, folded
+    cells, degree, real, folded
         Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit,
-        whether it goes back to the bins alone (:mod:`sweep.model.oversampled`); else 0.
+        whether powers are transformed as real numbers, and whether it goes back to the bins alone
+        (:mod:`sweep.model.oversampled`); else 0.
     estimate
         What is read off draws.
     rays_error
@@ -101,6 +102,7 @@ class Rung:
     of_lines: bool = False
     cells: int = 0
     degree: int = 0
+    real: bool = False
     folded: bool = False
     estimate: str = MEAN
     rays_error: float = 0.0
@@ -141,15 +143,19 @@ class Ladder:
         """The rung that the errors of all others are taken against."""
         return self.rungs[-1]
 
-    def with_fixed(self, sets: Mapping[float, frozenset[str]]) -> Ladder:
+    def with_fixed(
+        self, sets: Mapping[float, frozenset[str]], tolerances: Iterable[float] = ()
+    ) -> Ladder:
         """The ladder with rungs that simulate the same effects at every point.
 
-        Each of them to all of the tolerances, which say how exactly lines and leakage are computed.
+        Each of them to several tolerances, which say how exactly lines and leakage are computed.
 
         Parameters
         ----------
         sets
             Effects that a tolerance calls for anywhere.
+        tolerances
+            For lines and leakage; those of the effects by default.
         """
         from sweep.model.effects.catalogue import EFFECTS
 
@@ -162,7 +168,7 @@ class Ladder:
                 f"effects.{effect.name}": "on" if effect.name in names else "off"
                 for effect in EFFECTS
             }
-            for tolerance in sets:
+            for tolerance in tolerances or sets:
                 name = f"{len(names)} effects as at {first:g}, to {tolerance:g}"
                 overrides = modes | self.fixed(tolerance) | {_TOLERANCE: tolerance}
                 further.append(Rung(name=name, kind=FIXED, overrides=overrides, plans=False))
@@ -172,6 +178,8 @@ class Ladder:
 
 def ladder(spec: Declared) -> Ladder:
     """The rungs of a study, without those whose effects are fixed."""
+    from sweep.model.ground import powers_add
+
     if _draws(spec):
         return _drawn_ladder(spec)
     notes: list[str] = []
@@ -197,7 +205,7 @@ def ladder(spec: Declared) -> Ladder:
         finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
     rungs += _numbers(spec) if not why else ()
-    rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
+    rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS}, powers_add(spec.parameters()))
     reference = Rung(
         name="reference", kind=REFERENCE, overrides=finest, plans=False, rays_error=rays_error
     )
@@ -226,20 +234,24 @@ def _numbers(spec: Declared) -> Iterator[Rung]:
         yield Rung(name=f"{n} in a line", kind=IN_A_LINE, overrides=put)
 
 
-def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
+def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
     """The thesis's way: in the nearest of 2^11 or 2^12 cells; and with what would improve it.
 
-    Before them the same beamlets with the same effects in closed form, like for like.
+    Before them the same beamlets with the same effects in closed form, like for like. ``powers``:
+    whether beamlets add as such, which then are transformed as real numbers.
     """
     like: dict[str, Any] = {"overrides": overrides, "plans": False, "of_lines": True}
     yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, **like)
     for power in (11, 12):
         yield Rung(name=f"thesis 2^{power}", kind=THESIS, cells=1 << power, **like)
+    improved = like | {"kind": IMPROVED, "real": powers}
+    for power in (11, 12) if powers else ():
+        yield Rung(name=f"thesis 2^{power}, real", cells=1 << power, **improved)
     for power, degree in ((11, 0), (12, 0), (12, 9)):
         how = f"folded, degree {degree}" if degree else "folded"
         yield Rung(
-            name=f"thesis 2^{power}, {how}", kind=IMPROVED, cells=1 << power, degree=degree,
-            folded=True, **like,
+            name=f"thesis 2^{power}, {how}", cells=1 << power, degree=degree, folded=True,
+            **improved,
         )  # fmt: skip
 
 
