@@ -4,7 +4,7 @@ Where powers add, the power of the bin that is detected is a mean over the beam,
 with g_b what it would be if all light went where beamlet b goes. By its weights and places a
 hexagonal lattice of whole shells is right for all that is odd about the beam's axis, for what goes
 with the square of the places, and all but right for smooth ground. So g is made even, its best
-polynomial is taken off, of the second degree for few rays and the fourth for more, and what is left
+polynomial is taken off, of no, the second or the fourth degree as rays are more, and what is left
 tells how rough the ground is between the beamlets: the share of the beam about each is taken to be
 off by as much as its beamlet differs from its neighbours, each for itself,
 
@@ -41,8 +41,8 @@ _REACH, _STEPS, _SAMPLES = 4, 1024, 1024
 _NEIGHBOURS = 1.3
 """How far neighbours may be from each other, over the nearest; the next but one are 1.7 away."""
 
-_QUARTIC = 37
-"""Rays from which on the polynomials are of the fourth degree, and leave enough to tell from."""
+_DEGREES = ((37, 4), (19, 2), (1, 0))
+"""Rays from which on the polynomials are of a degree, and leave enough to tell from."""
 
 _NOTHING = 1e-9
 """Change of a probability that is not looked for."""
@@ -116,7 +116,8 @@ def folded(number: int) -> Rule:
     key, which = np.unique(both[:, 0] * number + both[:, 1], return_inverse=True)
     pairs = np.stack([key // number, key % number], axis=1)
     product: np.ndarray = np.bincount(which.ravel(), weight[near[:, 0]] * weight[near[:, 1]])
-    smooth = _smooth(offsets[:, first], share, 4 if number >= _QUARTIC else 2)
+    degree = next(degree for least, degree in _DEGREES if number >= least)
+    smooth = _smooth(offsets[:, first], share, degree)
     product = product * (first.size / (first.size - len(smooth)))
     return Rule(first, opposite[first], 1 / share, smooth, share * smooth, pairs, product)
 

@@ -55,7 +55,7 @@ EFFECTS_SHARE = 0.8
 
 FINEST = int(quadrature.COUNTS[-1])
 
-RAYS = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
+RAYS = (7, 19, 37, 109, 439, 2029, 8017, 31987, 127999)
 """Rays that may be cast for a shot of a flight: whole shells of the lattice, as only these are
 alike on opposite sides, which makes smooth ground a hundred times more exact. The fewest are those
 whose error can be told from themselves; each costs some 80 ns."""
@@ -63,11 +63,14 @@ whose error can be told from themselves; each costs some 80 ns."""
 LEAST_RAYS_TOLERANCE = 1e-6
 """Tighter tolerances call for no more rays than this one."""
 
-_FEWEST = ((1e-2, 19), (1e-5, 37), (0.0, 109))
+_FEWEST = ((0.05, 7), (1e-2, 19), (1e-5, 37), (0.0, 109))
 """Rays that every shot has from a tolerance on: what none of them hits no estimate knows of."""
 
 _LEAST_STEP, _MOST_STEP = 2, 10
 """Times as many rays at the least, and at the most, as have told that they are too few."""
+
+_UNSURE = 19
+"""Rays up to which smooth ground is taken for far rougher than it is: how much is no measure."""
 
 _SEGMENTS = 3
 _SQUARE_SIDE = 64
@@ -138,8 +141,7 @@ def more_rays(rays: int, error: np.ndarray, tolerance: float) -> np.ndarray:
     over = np.asarray(error, float) / tolerance
     if not further.size:
         return np.zeros(over.shape, np.int64)
-    # The fewest take smooth ground for far rougher than it is: what they tell is no measure.
-    wanted = rays * np.minimum(over, _MOST_STEP if rays > RAYS[0] else 1)
+    wanted = rays * np.minimum(over, _MOST_STEP if rays > _UNSURE else 1)
     place = np.minimum(np.searchsorted(further, wanted), further.size - 1)
     return np.where(over > 1, further[place], 0)
 

@@ -43,6 +43,9 @@ LEAST_IN_TRUTH = 3
 TRUTH_BEAMLETS = 109
 """Beamlets in the time domain where accuracy decides on their number: each is a record."""
 
+LONG = 1.0
+"""Seconds from which on a trial is made once: it is timed well enough by that."""
+
 FIXED_AS_AT = (1e-1, 1e-3, 1e-6)
 """Tolerances whose effects are tried at every point alike."""
 
@@ -96,6 +99,7 @@ class Measurement:
         self._ladder = self._completed(ladder(bench.spec))
         self._rungs = self._ladder.rungs
         self._times = np.ones(len(self._rungs), np.int64)
+        self._once = np.zeros(len(self._rungs), bool)
 
     def run(self) -> Measured:
         """All rounds that the time allows, the first of them at least in part.
@@ -127,7 +131,7 @@ class Measurement:
             measured.stopped = "interrupted" if self._interrupts.stopping else "time limit"
         self._add_truth(measured)
         for _ in range(rounds - 1):
-            again = self._round(kept, until=1.0)
+            again = self._round(kept, until=1.0, first=first)
             if len(again) < len(kept):
                 break
             timed = self._gathered(kept, again)
@@ -179,9 +183,11 @@ class Measurement:
         fitting = TOO_LONG * enough * shorter / took
         cut = np.exp2(np.floor(np.log2(fitting))).clip(1, times)
         self._times[:] = cut
-        spent = float((took * cut / shorter).sum())
-        left = self._limit - (time.monotonic() - self._begun)
-        return max(1, min(MOST_ROUNDS, int(0.75 * left / (spent * len(parts)))))
+        spent = took * cut / shorter
+        self._once = spent > LONG
+        left = 0.75 * (self._limit - (time.monotonic() - self._begun)) / len(parts)
+        further = (left - float(spent.sum())) / max(float(spent[~self._once].sum()), 1e-9)
+        return 1 + max(0, min(MOST_ROUNDS - 1, int(further)))
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
         begun = time.monotonic()
@@ -194,8 +200,17 @@ class Measurement:
     def _try(self, rung: int, part: np.ndarray) -> Trial:
         return self._bench.try_on(self._rungs[rung], part, int(self._times[rung]))
 
-    def _round(self, parts: list[np.ndarray], *, until: float) -> list[list[Trial]]:
-        """Every rung on every part that there is time for; the first at least, if uninterrupted."""
+    def _round(
+        self,
+        parts: list[np.ndarray],
+        *,
+        until: float,
+        first: list[list[Trial]] | None = None,
+    ) -> list[list[Trial]]:
+        """Every rung on every part that there is time for; the first at least, if uninterrupted.
+
+        Those that take long are what they were in the first round.
+        """
         done: list[list[Trial]] = []
         for part in parts:
             if done and time.monotonic() - self._begun > until * self._limit:
@@ -204,7 +219,10 @@ class Measurement:
             for rung in range(len(self._rungs)):
                 if self._interrupts.stopping:
                     return done
-                trials.append(self._try(rung, part))
+                if first is not None and self._once[rung]:
+                    trials.append(first[len(done)][rung])
+                else:
+                    trials.append(self._try(rung, part))
                 self._told.advance(points=1, failed=0)
             self._bench.forget()
             done.append(trials)

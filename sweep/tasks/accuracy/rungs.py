@@ -34,7 +34,7 @@ FIXED_NODES = 163
 OF_THESIS = 109
 """Beamlets of [T 3.3.1]."""
 
-FINEST_RAYS, FINEST_RAYS_TOLERANCE = 8017, 1e-7
+FINEST_RAYS, FINEST_RAYS_TOLERANCE = 8017, 3e-7
 """Rays of each shot of a flight's reference, and what they may leave: else shots have more."""
 
 MOST_RAYS = 223
