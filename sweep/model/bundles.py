@@ -17,7 +17,15 @@ import math
 from sweep.model.compiling import borrowing
 from sweep.model.elementary import fma
 from sweep.model.equivalent import chebyshev_moments, nodes_for
-from sweep.model.kernel_rows import ASIDE, FORM_WIDTH, HALF, HALVES, MOST_MOMENTS, MOST_PARTS
+from sweep.model.kernel_rows import (
+    ASIDE,
+    FORM_WIDTH,
+    HALF,
+    HALVES,
+    MOST_MOMENTS,
+    MOST_PARTS,
+    PLACES,
+)
 from sweep.model.known_kernels import (
     is_real,
     kernels_beside,
@@ -106,9 +114,7 @@ def take_bundles(n, power, whose, parts, allowed, kernel, room):
     for k in range(number):
         one, other = moments_of(k, size, room)
         total += total_strength(one, other, size, power, slot, room[4:6])
-        if form:
-            form_of(one, size, sources.size, slot, room[FORM, k * FORM_WIDTH :])
-        else:
+        if not form:
             _strengths(one, other, size, power, slot, k * sources.size, room)
         for i in range(sources.size):
             room[DELTA, k * sources.size + i] = first + k * spacing + sources[i]
@@ -303,14 +309,18 @@ def add(out, values, mirrored, sign):
 
 
 @borrowing()
-def constant_of(n, kind, room):
-    """What the window's first sample adds to every bin, of forms of n sources in all."""
-    number = kind[1]
-    each = n // number
-    last = each * (each + 1) // 2 + each
-    total = 0.0
+def forms_afar(kind, sources, kernel, room):
+    """Forms of bundles into row FORM, or without ``sources`` their constants alone.
+
+    Returns the sum of the constants: what the window's first sample adds to every bin.
+    """
+    row, number, _, _, size, _, _ = kind
+    slot, total = kernel[5][row], 0.0
+    each = int(slot[PLACES])
     for k in range(number):
-        total += room[FORM, k * FORM_WIDTH + last]
+        one, out = moments_of(k, size, room)[0], room[FORM, k * FORM_WIDTH :]
+        last = form_of(one, size, each, sources, slot, out)
+        total += out[last]
     return total
 
 
@@ -323,6 +333,8 @@ def add_forms_afar(t, tangents, n, kind, numerator, poles, side, room, out):
     number = kind[1]
     each = n // number
     rows, inner, sums = room[FORM + 1], room[5], room[6]
+    if each == 0:
+        return
     for k in range(number):
         form = room[FORM, k * FORM_WIDTH : (k + 1) * FORM_WIDTH]
         for start in range(0, t.size, COLUMNS):

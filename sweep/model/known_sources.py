@@ -136,8 +136,12 @@ def strengths_afar(power, slot):
 
 
 @borrowing()
-def form_of(moments, size, number, slot, out):
-    """The form of moments; into ``out``, up to FORM_WIDTH numbers, the constant last."""
-    width = number * (number + 1) // 2 + number + 1
-    for first in range(0, width, COLUMNS):
+def form_of(moments, size, number, whole, slot, out):
+    """The form of moments; into ``out``, up to FORM_WIDTH numbers; the place of the last of them.
+
+    That is the constant, which is all that is sure to be there if not the ``whole`` is asked for.
+    """
+    last = number * (number + 1) // 2 + number
+    for first in range(0 if whole else last // COLUMNS * COLUMNS, last + 1, COLUMNS):
         combine(moments, slot, size, FAR + first, FORM_WIDTH, out[first:])
+    return last

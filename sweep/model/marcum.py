@@ -28,6 +28,9 @@ _NODES = tuple((_STEP * (k + 0.5)) ** 2 for k in range(13))
 _WEIGHTS = tuple(_STEP / math.pi * math.exp(-0.5 * v) for v in _NODES)
 _POLE_REACH = 2.0 * math.pi / _STEP
 
+_NOTHING_LEFT = 1500.0
+"""(a - b)^2 from which on the smaller tail, exp of minus half of it, is 0 to float64."""
+
 # Excess crossings, K terms: 1/(m+1) and 1/m^2 for m = K .. 1, so that no step divides.
 _LONGEST_EXCESS = 24
 _HARMONIC = tuple(1.0 / (m + 1) for m in range(_LONGEST_EXCESS + 1))
@@ -118,6 +121,8 @@ def marcum_q1_pair(a, b):
         return 1.0, 0.0
     if math.isinf(b):
         return 0.0, 1.0
+    if (a - b) * (a - b) > _NOTHING_LEFT:
+        return (1.0, 0.0) if b < a else (0.0, 1.0)
     high, low, lead, scale, pole, is_p = _smaller_tail(a, b)
     tail = lead * (lead * scale * _exp_minus(high, low)) + pole
     if is_p:

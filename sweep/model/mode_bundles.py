@@ -79,7 +79,7 @@ def take_modes(n, whose, modes, allowed, kernel, room):
         return 0, as_lines()
     take_moments(n, True, HALVES[level], number, first, spacing, size, room)
     _take_shares(numbers, fold, size, slot, room)
-    whole, (factor, summand) = _see_from_afar(size, places, slot, room), _bounds(slot, room)
+    factor, summand = _bounds(slot, room)
     total = 0.0
     for k in range(number):
         strong = room[STRENGTH_RE, k * MOST_MOMENTS : (k + 1) * MOST_MOMENTS]
@@ -87,7 +87,6 @@ def take_modes(n, whose, modes, allowed, kernel, room):
         for j in range(0, size, COLUMNS):
             combine(moments, slot, size, TO_NODES + j, MOST_MOMENTS, strong[j:])
         total += factor * max(dot(strong, slot[SQUARES:], size), 0.0) + summand * moments[0]
-        _form(strong, size, places, whole, kernel[1][3], room, room[FORM, k * FORM_WIDTH :])
         for i in range(places):
             room[DELTA, k * places + i] = first + k * spacing + slot[SOURCES + i]
     half = HALVES[level] + ASIDE
@@ -125,6 +124,36 @@ def _mix(own, slot, at, stride, re, im, work):
             im[i] += work[i]
 
 
+@borrowing()
+def modes_afar(kind, sources, kernel, room):
+    """Forms of bundles in modes, or without ``sources`` their constants alone.
+
+    Returns the sum of the constants, as of :func:`sweep.model.bundles.forms_afar`.
+    """
+    row, number, _, _, size, _, _ = kind
+    slot, total, edge = slot_of(row - ROWS, kernel), 0.0, kernel[1][3]
+    places, whole = int(slot[PLACES]), 0
+    if sources:
+        whole = _see_from_afar(size, places, slot, room)
+    for k in range(number):
+        strong = room[STRENGTH_RE, k * MOST_MOMENTS : (k + 1) * MOST_MOMENTS]
+        if sources:
+            _form(strong, size, places, whole, edge, room, room[FORM, k * FORM_WIDTH :])
+        total += edge * edge * _constant(strong, size, room)
+    return total
+
+
+@borrowing()
+def _constant(strong, size, room):
+    """Sum over nodes of |S|^2."""
+    sum_re, sum_im = room[SHARE], room[SHARE, MOST_MOMENTS:]
+    total = 0.0
+    for j in range(size):
+        a, b = sum_re[j], sum_im[j]
+        total += strong[j] * (a * a + b * b)
+    return total
+
+
 @owning()
 def _see_from_afar(size, places, slot, room):
     """Amplitudes of the sources that each node is seen as, into the row of kernels.
@@ -160,14 +189,15 @@ def _bounds(slot, room):
 
 @borrowing()
 def _form(strong, size, places, whole, edge, room, out):
-    """The form of one bundle's sources, as :func:`sweep.model.bundles.add_forms_afar` has it."""
+    """The form of one bundle's sources, as :func:`sweep.model.bundles.add_forms_afar` has it.
+
+    But for its constant.
+    """
     rows, scaled, turned = room[FORM + 1], room[5], room[6]
     sum_re, sum_im = room[SHARE], room[SHARE, MOST_MOMENTS:]
-    constant = 0.0
     for j in range(size):
         a, b = sum_re[j], sum_im[j]
         turned[j], turned[whole + j] = -2.0 * edge * strong[j] * b, 2.0 * edge * strong[j] * a
-        constant += strong[j] * (a * a + b * b)
     for j in range(size, whole):
         turned[j], turned[whole + j] = 0.0, 0.0
     linear, k = places * (places + 1) // 2, 0
@@ -182,7 +212,6 @@ def _form(strong, size, places, whole, edge, room, out):
         out[k] = 0.5 * dot(scaled, row, 2 * whole)
         k += 1
         out[linear + i] = dot(turned, row, 2 * whole)
-    out[linear + places] = edge * edge * constant
 
 
 @borrowing()

@@ -17,13 +17,13 @@ from sweep.model.bundles import (
     STRENGTH_RE,
     add_forms_afar,
     add_near,
-    constant_of,
+    forms_afar,
 )
 from sweep.model.compiling import borrowing, inlined
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE, LARGEST_ANGLE, add_far_field, add_near_field
 from sweep.model.kernel_rows import REACHES, ROWS
-from sweep.model.mode_bundles import add_modes_near
+from sweep.model.mode_bundles import add_modes_near, modes_afar
 from sweep.model.spectrum import set_tangents
 
 SOURCES, IMAGES = 13, 16
@@ -198,11 +198,16 @@ def prepare_field(origin, n, kind, spread, sources, choices, kernel, room):
     centre = seen_from(origin, spread, fft_size)
     lines, images = 0, 0
     if kind[5]:
-        far_field.seen_at(
-            delta, n, centre, centre - origin, fft_size, kernel[4], room[SOURCES], room[IMAGES]
-        )  # fmt: skip
-        constant = constant_of(n, kind, room) * (2.0 if image else 1.0)
-        return centre, n, n if image else 0, constant, 0.0, kind
+        if kind[0] >= ROWS:
+            constant = modes_afar(kind, sources, kernel, room)
+        else:
+            constant = forms_afar(kind, sources, kernel, room)
+        if sources:
+            lines, images = n, n if image else 0
+            far_field.seen_at(
+                delta, n, centre, centre - origin, fft_size, kernel[4], room[SOURCES], room[IMAGES]
+            )  # fmt: skip
+        return centre, lines, images, constant * (2.0 if image else 1.0), 0.0, kind
     if sources:
         lines, images = far_field.far_sources(
             delta, re, im, n, spread, centre, centre - origin, fft_size, poles, power, kernel[4],
@@ -223,15 +228,16 @@ def magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room
     re, im, t = room[0, :count], room[1, :count], room[2, :count]
     re[:] = edge_re
     im[:] = edge_im
-    set_tangents(low - centre, count, fft_size, kernel[4], t)
     first, last = near[0] - low, near[1] - low + 1
+    if field[1]:
+        set_tangents(low - centre, count, fft_size, kernel[4], t)
     for start, end in ((0, first), (last, count)):
         if start < end:
             at, part_re, part_im = t[start:end], re[start:end], im[start:end]
             add_afar(at, False, field, power, kernel, room, part_re, part_im)
             if mirrored:
                 add_afar(at, True, field, power, kernel, room, part_re, part_im)
-    if not mirrored:
+    if not mirrored and field[2]:
         add_afar(t, True, field, power, kernel, room, re, im)
     near_re, near_im = re[first:last], im[first:last]
     _add_beside(near[0] - origin, DELTA, n, False, field, power, kernel, room, near_re, near_im)

@@ -181,7 +181,7 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
         )  # fmt: skip
         return origin, n, kind
     own = -1 if alone else own
-    if own >= 0 or p[15] > 0.0:
+    if own >= 0 or (n > 1 and p[15] > 0.0):
         n, kind = take_bundles(
             n, power, (segment, own, fold), parts, allowed(p), kernel, room
         )  # fmt: skip
@@ -272,11 +272,13 @@ def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
     fft_size = kernel[0][0]
     scene, kernel, (room, exempt, series) = lent(scene, kernel, work)
     p = np.empty(points.shape[0])
+    before = -1.0
     for i in range(points.shape[1]):
         p[:] = points[:, i]
         sigma, level = p[10], p[11]
-        if choices[2]:
-            crossing_series(level / sigma, series)
+        if choices[2] and level / sigma != before:
+            before = level / sigma
+            crossing_series(before, series)
         for s in range(3):
             if not segments[s]:
                 continue
