@@ -12,6 +12,7 @@ from numba import njit
 
 from sweep.model.crossings import crossing_series
 from sweep.model.elementary import borrowed
+from sweep.model.lending import lend
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.modulation import Stretch, choices, stretches
 from sweep.model.preparation import Shots
@@ -78,7 +79,8 @@ def _find_groups(
 ):
     """Groups of every point and segment, into arrays of the shapes of :class:`Groups`."""
     half = kernel[0][0] // 2
-    scene, kernel, (room, exempt, series) = lent(scene, kernel, work)
+    seen, known, (room, exempt, series) = lent(scene, kernel, work)
+    scene, kernel = lend(seen), lend(known)
     bins = borrowed(bins)
     p = np.empty(points.shape[0])
     for i in range(points.shape[1]):

@@ -248,7 +248,7 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     int
         Number of lines.
     """
-    _, parts, shifts = scene
+    parts, shifts = scene[1], scene[2]
     count = shifts[0].shape[1] if power else parts[0].shape[2]
     if count == 0 or (not power and is_whole(segment, i, scene)):
         return n

@@ -20,6 +20,7 @@ from sweep.model.elementary import borrowed
 from sweep.model.equivalent import MOST_NODES
 from sweep.model.far_field import MOST_POINTS
 from sweep.model.leakage import inspect
+from sweep.model.lending import lend
 from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.mode_bundles import take_modes
@@ -94,7 +95,7 @@ def _lines_of(segment, p, scene, at, power, split, kernel, room):
     Those that add as amplitudes are replaced by their parts, if asked for. Returns their origin,
     their number, and -1 where they are seen as their images, else 1.
     """
-    footprint, parts, shifts = scene
+    footprint, parts, shifts = scene[0], scene[1], scene[2]
     row, sizes = at[0], kernel[0]
     offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
     phase = footprint[3][segment, row]  # without phases a row of none
@@ -270,7 +271,8 @@ def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
         Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
     """
     fft_size = kernel[0][0]
-    scene, kernel, (room, exempt, series) = lent(scene, kernel, work)
+    seen, known, (room, exempt, series) = lent(scene, kernel, work)
+    scene, kernel = lend(seen), lend(known)
     p = np.empty(points.shape[0])
     before = -1.0
     for i in range(points.shape[1]):

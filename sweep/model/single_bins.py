@@ -53,7 +53,7 @@ def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel,
 
     ``split``: the lines' parts (:func:`parts_at`) where powers add; else they are lines already.
     """
-    sizes, shape, _, _, tangent, _ = kernel
+    sizes, shape, tangent = kernel[0], kernel[1], kernel[4]
     power, image = choices[0], choices[1]
     delta, re, im = room[4], room[5], room[6]
     if power and split[0].size:
@@ -73,7 +73,7 @@ def magnitudes_of(low, high, origin, n, i, fold, split, shifts, choices, kernel,
 @borrowing()
 def _average(low, high, origin, n, i, fold, shifts, image, kernel, room):
     """Root of the mean |X|^2 over shifts of n lines that add as amplitudes, into row 0."""
-    sizes, shape, _, _, tangent, _ = kernel
+    sizes, shape, tangent = kernel[0], kernel[1], kernel[4]
     total, moved = room[0, : high - low + 1], room[10]
     total[:] = 0.0
     for m in range(shifts[0].shape[1]):
