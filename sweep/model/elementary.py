@@ -10,6 +10,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 
 _TAU = 2.0 * math.pi
 # Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2; |r| <= 1/8 leaves 5e-17.
@@ -51,6 +52,21 @@ def borrowed(typingctx, array):  # type: ignore[no-untyped-def]  # a numba intri
         return view._getvalue()
 
     return array(array), codegen
+
+
+@intrinsic
+def flat(typingctx, array):  # type: ignore[no-untyped-def]  # a numba intrinsic
+    """All elements of a contiguous array in one row, their use uncounted as of `borrowed`."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        whole = context.make_array(sig.args[0])(context, builder, args[0])
+        row = context.make_array(sig.return_type)(context, builder)
+        populate_array(
+            row, whole.data, [whole.nitems], [whole.itemsize], whole.itemsize, meminfo=None
+        )
+        return row._getvalue()
+
+    return types.Array(array.dtype, 1, "C")(array), codegen
 
 
 @njit(inline="always")

@@ -73,6 +73,42 @@ def combine(typingctx, factors, rows, number, at, stride, out):  # type: ignore[
     return types.void(factors, rows, types.intp, types.intp, types.intp, out), codegen
 
 
+@intrinsic
+def combine_both(typingctx, factors, rows, number, at, stride, out):  # type: ignore[no-untyped-def]
+    """As :func:`combine` with two factors for each row; ``factors`` and ``out`` are pairs."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        factors_of, into = (
+            [
+                context.make_array(kind)(context, builder, builder.extract_value(args[k], i)).data
+                for i, kind in enumerate(sig.args[k])
+            ]
+            for k in (0, 5)
+        )
+        row_of = context.make_array(sig.args[1])(context, builder, args[1]).data
+        sums = [[cgutils.alloca_once_value(builder, _ZEROS) for _ in range(SUMS)] for _ in into]
+        for place in (*sums[0], *sums[1]):
+            builder.store(_ZEROS, place)
+        with cgutils.for_range(builder, args[2]) as loop:
+            start = builder.add(args[3], builder.mul(loop.index, args[4]))
+            row = [
+                _load(builder, row_of, builder.add(start, _long(k * LANES))) for k in range(SUMS)
+            ]
+            for array, places in zip(factors_of, sums, strict=True):
+                factor = _in_all_lanes(builder, builder.load(builder.gep(array, [loop.index])))
+                for vector, place in zip(row, places, strict=True):
+                    builder.store(_fma(builder, factor, vector, builder.load(place)), place)
+        for array, places in zip(into, sums, strict=True):
+            for k, place in enumerate(places):
+                stored = builder.store(
+                    builder.load(place), _place(builder, array, _long(k * LANES))
+                )
+                stored.align = 8
+        return context.get_dummy_value()
+
+    return types.void(factors, rows, types.intp, types.intp, types.intp, out), codegen
+
+
 def _long(value):  # type: ignore[no-untyped-def]
     return ir.Constant(_LONG, value)
 

@@ -22,7 +22,7 @@ from sweep.model.bundles import (
 from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import CENTRE, EVENS, IM, MODES, NUMBER, RE
 from sweep.model.kernel_rows import FORM_WIDTH, HALVES, MOST_MOMENTS, ROWS
-from sweep.model.lanes import COLUMNS, LANES, combine, dot
+from sweep.model.lanes import COLUMNS, LANES, combine, combine_both, dot
 from sweep.model.mode_kernels import (
     ASIDE,
     BOUND,
@@ -112,16 +112,16 @@ def _take_shares(numbers, fold, size, slot, room):
 def _mix(own, slot, at, stride, re, im, work):
     """Sum over modes of a_k times rows of a slot, COLUMNS numbers."""
     evens, odds = int(own[0]), int(own[1])
-    combine(own[COLUMNS:], slot, evens, at, stride, re)
-    combine(own[2 * COLUMNS :], slot, evens, at, stride, im)
+    one, other = own[COLUMNS:], own[2 * COLUMNS :]
+    combine_both((one, other), slot, evens, at, stride, (re, im))
     if odds:
-        odd = at + EVENS * stride
-        combine(own[COLUMNS + EVENS :], slot, odds, odd, stride, work)
+        more, further = work, work[COLUMNS:]
+        combine_both(
+            (one[EVENS:], other[EVENS:]), slot, odds, at + EVENS * stride, stride, (more, further)
+        )
         for i in range(COLUMNS):
-            re[i] += work[i]
-        combine(own[2 * COLUMNS + EVENS :], slot, odds, odd, stride, work)
-        for i in range(COLUMNS):
-            im[i] += work[i]
+            re[i] += more[i]
+            im[i] += further[i]
 
 
 @borrowing()

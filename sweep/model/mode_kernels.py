@@ -20,7 +20,7 @@ import numpy as np
 
 from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_modes import IM, LINES, MODES, RE, modes
-from sweep.model.elementary import fma, sincos_cycles
+from sweep.model.elementary import flat, fma, sincos_cycles
 from sweep.model.equivalent import CHEBYSHEV, POWER_TOLERANCES, nodes_for
 from sweep.model.far_field import kernel_beside, sources_needed
 from sweep.model.kernel_rows import (
@@ -73,10 +73,9 @@ def with_modes(*key: Hashable) -> np.ndarray:
 @owning()
 def modes_in(kernel):
     """Offsets and strengths of :func:`sweep.model.effects.line_modes.modes`."""
-    flat = kernel[5].reshape(-1)
-    start = ROWS * WIDTH
-    strength = flat[start + LINES : start + LINES + MODES * LINES]
-    return flat[start : start + LINES], strength.reshape((MODES, LINES))
+    numbers, start = flat(kernel[5]), ROWS * WIDTH
+    strength = numbers[start + LINES : start + LINES + MODES * LINES]
+    return numbers[start : start + LINES], strength.reshape((MODES, LINES))
 
 
 @borrowing()
@@ -101,12 +100,12 @@ def modes_row(level, alone, relative, kernel):
 @owning()
 def slot_of(row, kernel):
     """A row of scratch."""
-    flat = kernel[5].reshape(-1)
+    numbers = flat(kernel[5])
     if row < _ROWS:
         start = _FIRST + row * _WIDTHS[0]
-        return flat[start : start + _WIDTHS[0]]
+        return numbers[start : start + _WIDTHS[0]]
     start = _FIRST + _ROWS * _WIDTHS[0] + (row - _ROWS) * _WIDTHS[1]
-    return flat[start : start + _WIDTHS[1]]
+    return numbers[start : start + _WIDTHS[1]]
 
 
 @borrowing()

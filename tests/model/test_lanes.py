@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.lanes import COLUMNS, combine, dot
+from sweep.model.lanes import COLUMNS, combine, combine_both, dot
 
 
 @njit
@@ -16,6 +16,11 @@ def products(a, b, n):
 @njit
 def combined(factors, rows, number, at, stride, out):
     combine(factors, rows, number, at, stride, out)
+
+
+@njit
+def combined_both(factors, rows, number, at, stride, out):
+    combine_both((factors[0], factors[1]), rows, number, at, stride, (out[0], out[1]))
 
 
 def test_sums_of_products_are_right_to_rounding_for_any_length():
@@ -47,3 +52,14 @@ def test_combinations_of_rows_are_products_with_a_matrix():
         expected = factors[:number] @ np.array(matrix).reshape(number, COLUMNS)
         np.testing.assert_allclose(out[:COLUMNS], expected, rtol=1e-13, atol=1e-13)
         assert (out[COLUMNS:] == 7.0).all()
+
+
+def test_two_combinations_at_once_are_each_of_them_to_the_bit():
+    rng = np.random.default_rng(74)
+    rows, factors = rng.normal(size=3000), rng.normal(size=(2, 40))
+    for number, at, stride in ((0, 0, 1), (1, 5, 32), (33, 7, 41), (40, 0, 64)):
+        out, alone = np.full((2, 2, COLUMNS + 3), 7.0)
+        combined_both(factors, rows, number, at, stride, out)
+        for k in range(2):
+            combined(factors[k], rows, number, at, stride, alone[k])
+        assert (out == alone).all()
