@@ -310,8 +310,6 @@ def reduce_lines(n, power, allowed, most, kernel, room):
 @borrowing()
 def take_few(n, power, allowed, most, kernel, room):
     """Puts equivalent lines in the place of n lines; how many there are then."""
-    if most < 1:
-        return n
     few = reduce_lines(n, power, allowed, most, kernel, room)
     for j in range(few):
         room[DELTA, j], room[STRENGTH_RE, j] = room[4, j], room[5, j]

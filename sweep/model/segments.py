@@ -31,6 +31,9 @@ from sweep.model.single_bins import bins_above, extent_of, magnitudes_of, parts_
 
 SIGNS = (1.0, 0.0, -1.0)
 
+LEAKING = (True, False, True)
+"""Segments whose leakage is looked at: no output tells that of the Doppler segment, 0 here."""
+
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Rows of the result: what is found in each segment's spectrum."""
 
@@ -190,7 +193,8 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
             return origin, n, kind
     several = alone or (power and scene[2][0].size > 0)
     most = n - 1 if several else (n // 2 if p[15] > 0.0 else 0)
-    n = take_few(n, power, allowed(p), most, kernel, room)
+    if most > 0:
+        n = take_few(n, power, allowed(p), most, kernel, room)
     return origin, n, as_lines()
 
 
@@ -273,19 +277,21 @@ def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
     fft_size = kernel[0][0]
     seen, known, (room, exempt, series) = lent(scene, kernel, work)
     scene, kernel = lend(seen), lend(known)
+    power, image, leakage_too, every_bin = choices
     p = np.empty(points.shape[0])
     before = -1.0
     for i in range(points.shape[1]):
         p[:] = points[:, i]
         sigma, level = p[10], p[11]
-        if choices[2] and level / sigma != before:
+        if leakage_too and level / sigma != before:
             before = level / sigma
             crossing_series(before, series)
         for s in range(3):
             if not segments[s]:
                 continue
+            own = power, image, leakage_too and LEAKING[s], every_bin
             low, _, peak, exempted, leakage = inspect_segment(
-                s, p, scene, (row[i], i), choices, kernel, room, exempt, series
+                s, p, scene, (row[i], i), own, kernel, room, exempt, series
             )
             found, missed = marcum_q1_pair(room[0, peak] / p[13], level / p[13])
             out[s, 0, i] = found
