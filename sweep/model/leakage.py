@@ -4,7 +4,7 @@ Bins within a run around the lines are evaluated one by one: all that may cross 
 as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
 chances that leaked signal adds are summed as an integral (:mod:`sweep.model.far_field`), to better
 than 1e-6 of the leakage; or left out, where the window's envelope says that they come to no more
-than the accuracy asked for.
+than the accuracy asked for. What this leaves of that may do for the bins within the run as well.
 """
 
 import math
@@ -23,6 +23,7 @@ from sweep.model.crossings import (
 )
 from sweep.model.detection import mark
 from sweep.model.far_field import CLEARANCE
+from sweep.model.lanes import dot
 from sweep.model.runs import (
     add_afar,
     bundle,
@@ -89,7 +90,8 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
     mirror = min(centre, half_size - centre) - 0.5 * (highest - lowest) - 1.0
     mirror = mirror if image else math.inf
-    alone = _all_beyond(total, float(clearance + reach), mirror, noise, kernel) <= noise[2]
+    left = noise[2] - _all_beyond(total, float(clearance + reach), mirror, noise, kernel)
+    alone = left >= 0.0
     if alone and reach > 0:
         served = min(reach, served_beside(kind, kernel))
         wider = near_bins(origin, lowest, highest, clearance + served, image, kernel)
@@ -103,6 +105,8 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
         count = high - low + 1
         magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
         peak, exempted = mark(room[0], count, noise[1], exempt)
+        if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
+            return low, count, peak, exempted, 0.0
         _chances(count, noise, kernel, room, exempt, series)
         return low, count, peak, exempted, any_crossing(room[4], 0, count)
     reach = _least_reach(total, highest - lowest, noise, crossing, kernel)
@@ -157,6 +161,30 @@ def _envelope_beyond(first, kernel):
     _, envelope, reach, beyond = kernel[2]
     place = max(np.searchsorted(reach, max(first - 1.5, 0.0), "right") - 1, 0)
     return envelope[place], envelope[place] * envelope[place] + beyond[place]
+
+
+@borrowing()
+def _at_most(count, noise, exempt, room):
+    """Bound on the chance that any bin of a run adds to leakage; infinite where it is large.
+
+    With x and y as of :func:`_all_beyond`, Q_1 is convex in x up to y - 2, as I_2(z) / I_1(z) is at
+    least z / (2 + sqrt(z^2 + 4)); there each bin adds no more than in proportion to the largest of
+    them, and that at most e^{-(b - a)^2 / 2}, of the e^-2 and more below 1 that noise alone leaves.
+    """
+    sigma, level, _ = noise
+    magnitude, loud = room[0], room[3]
+    for i in range(count):
+        loud[i] = magnitude[i]
+    for i in range(count):
+        loud[i] = 0.0 if exempt[i] else loud[i]
+    most = largest(loud[:count])
+    if not most > 0.0:
+        return 0.0
+    a, b = most / sigma, level / sigma
+    if a * a > b * b - 4.0:
+        return np.inf
+    share = dot(loud, loud, count) / (most * most)
+    return 1.2 * share * math.exp(-0.5 * (b - a) * (b - a))
 
 
 @borrowing()

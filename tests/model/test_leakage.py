@@ -19,7 +19,7 @@ from sweep.model.crossings import (
 )
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
-from sweep.model.leakage import _all_beyond
+from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 from sweep.model.window import samples
@@ -43,7 +43,12 @@ def compare(shots):
     # A tone on a bin leaks nothing but rounding, which bin by bin is left out under 1e-12 sigma.
     scale[:, LEAKAGE] = np.maximum(scale[:, LEAKAGE], 1e-20)
     scale = np.maximum(scale, 1e-290)
-    return np.nanmax(np.abs(fast - slow) / scale, axis=(0, 2)), slow
+    error = np.nanmax(np.abs(fast - slow) / scale, axis=(0, 2))
+    # Of the Doppler segment only draws need to know what leaks.
+    listed, every = (groups(shots, most=1, every_bin=k).leakage[:, 1] for k in (False, True))
+    apart = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
+    error[LEAKAGE] = max(error[LEAKAGE], apart)
+    return error, slow
 
 
 def held(shots):
@@ -102,6 +107,26 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
     np.testing.assert_allclose(some[:, others], whole[:, others], rtol=1e-9, atol=1e-300)
     assert (missed > 0).any()
+
+
+@pytest.mark.parametrize("beta", [2.1, 4.0, 6.55, 12.0, 25.0])
+def test_what_bins_of_a_run_add_at_most_is_more_than_they_add(beta):
+    generator = np.random.default_rng(14)
+    series, chance = np.empty(MOST_TERMS), np.empty(64)
+    crossing_series(beta, series)
+    room, some = np.zeros((4, 64)), 0
+    for _ in range(500):
+        count = int(generator.integers(1, 40))
+        a = beta * generator.uniform(0.0, 1.0) * generator.uniform(0.0, 1.0, count) ** 3
+        exempt = generator.uniform(size=count) < 0.2
+        room[0, :count] = 0.3 * a
+        most = _at_most(count, (0.3, 0.3 * beta, 0.0), exempt, room)
+        x = np.zeros(64)
+        x[:count] = np.where(exempt, 0.0, 0.5 * a**2)
+        added_crossings(x, count, beta, series, chance)
+        assert chance[:count].sum() <= most
+        some += most < np.inf
+    assert some > 100
 
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
