@@ -13,9 +13,11 @@ from numba import njit
 
 from sweep.model import reflectance
 from sweep.model.chain import prepare_cast
+from sweep.model.compiling import borrowing, inlined
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.atmosphere import PATH_ELEVATION
 from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.footprint_fields import together
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.beamlet_rays import beamlet_rays
 from sweep.model.geometry.jitter import PointingJitter
@@ -27,7 +29,9 @@ from sweep.model.geometry.surfaces import Surface
 from sweep.model.ground import Cast, Footprints
 from sweep.model.preparation import Parameters, Shots
 
-_HEIGHT = "atmosphere.target_height"
+HEIGHT = "atmosphere.target_height"
+SUNLIGHT = "target.solar_irradiance"
+_LAMBERT = reflectance.LAWS.index("lambert")
 
 
 class Eyepoints(NamedTuple):
@@ -209,25 +213,29 @@ def seen_ground(
     ValueError
         Where a shot sees nothing, or a surface that is not given.
     """
-    if not eyepoints.seen.all():
-        raise ValueError("a shot that sees nothing has no radiometry: leave it out")
-    if eyepoints.surface.max(initial=-1) >= len(surfaces):
-        raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
     lit, relative, doppler, echo, beside = _footprints(eyepoints, surfaces)
     ground = Cast(Footprints(np.arange(len(echo)), relative, doppler, echo), beside)
-    shots = dict(parameters) | {
-        "target.range": eyepoints.range,
-        "target.radial_velocity": eyepoints.radial_velocity,
+    shots = {
+        **parameters,
+        **axis_parameters(eyepoints),
         "target.reflectance": 1.0,
-        PATH_ELEVATION: -np.arcsin(eyepoints.direction[:, 2]),
-        _HEIGHT: parameters.get(_HEIGHT, 0.0) + _height_of_target(eyepoints),
+        HEIGHT: parameters.get(HEIGHT, 0.0) + height_of_target(eyepoints),
+        # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
+        SUNLIGHT: np.asarray(parameters[SUNLIGHT]) * lit,
     }
-    # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
-    shots["target.solar_irradiance"] = np.asarray(parameters["target.solar_irradiance"]) * lit
     return shots, ground
 
 
-def _height_of_target(eyepoints: Eyepoints) -> np.ndarray:
+def axis_parameters(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
+    """What is seen along the beams' axes, by path, (n,) each."""
+    return {
+        "target.range": eyepoints.range,
+        "target.radial_velocity": eyepoints.radial_velocity,
+        PATH_ELEVATION: -np.arcsin(eyepoints.direction[:, 2]),
+    }
+
+
+def height_of_target(eyepoints: Eyepoints) -> np.ndarray:
     """Height in the world where the beam's axis ends [m], (n,)."""
     return eyepoints.position[:, 2] + eyepoints.range * eyepoints.direction[:, 2]
 
@@ -244,49 +252,140 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
     (n, beamlets) bool ndarray
         Whether a beamlet meets another surface than the reference beamlet.
     """
-    bright = np.array([surface.reflectance for surface in surfaces])
-    laws = np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
+    rays, materials = to_look_at(eyepoints, surfaces)
     shape = eyepoints.offset.shape
     sent, relative, doppler, echo = np.empty((4, *shape))
     beside = np.empty(shape, np.bool_)
-    seen = (
-        eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
-        eyepoints.surface,
-    )  # fmt: skip
-    _look(
-        tuple(map(np.ascontiguousarray, seen)),
-        (eyepoints.weight, bright, laws),
-        (sent, relative, doppler, echo, beside),
-    )
+    flat = tuple(values.reshape(-1) for values in (sent, relative, doppler, echo, beside))
+    _look(rays, materials, np.empty(materials[0].size), flat)
     return sent.sum(axis=1), relative, doppler, echo, beside
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _look(seen, materials, found):
-    """Fill in what :func:`_footprints` says."""
-    ranges, offset, velocity, cosine, surface = seen
+def to_look_at(
+    eyepoints: Eyepoints, surfaces: Sequence[Surface]
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """What :func:`look_at` needs of shots, one after the other, and of surfaces.
+
+    Returns
+    -------
+    tuple of ndarray
+        Ranges (n,); offsets, velocities, cosines and surface numbers of rays, (n beamlets,) each.
+    tuple of ndarray
+        Weights of the beamlets of as many shots as are looked at together; reflectance and law of
+        each surface.
+
+    Raises
+    ------
+    ValueError
+        As of :func:`seen_ground`.
+    """
+    if not eyepoints.seen.all():
+        raise ValueError("a shot that sees nothing has no radiometry: leave it out")
+    if eyepoints.surface.max(initial=-1) >= len(surfaces):
+        raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
+    bright = np.array([surface.reflectance for surface in surfaces])
+    laws = np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
+    rays = (
+        eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
+        eyepoints.surface,
+    )  # fmt: skip
+    weight = np.tile(eyepoints.weight, together(len(eyepoints.weight)))
+    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
+
+
+@borrowing(nogil=True)
+def _look(rays, materials, room, found):
+    """Fill in what :func:`_footprints` says, of rays one after the other."""
+    ranges, offset = rays[0], rays[1]
+    beamlets = offset.size // max(ranges.size, 1)
+    group = room.size // beamlets
+    sent, relative, doppler, echo, beside = found
+    for first in range(0, ranges.size, group):
+        stop = min(first + group, ranges.size)
+        some = slice(first * beamlets, stop * beamlets)
+        here = sent[some], relative[some], doppler[some], echo[some], beside[some]
+        look_at(first, stop, rays, materials, room, here)
+
+
+@inlined(nogil=True)
+def look_at(first, stop, rays, materials, room, found):
+    """What some footprints send back, and from where, ray by ray; whether any may lie beside.
+
+    All rays of shots are taken at once, however few each has, as the machine's vectors like it.
+    """
+    ranges, offset, velocity, cosine, surface = rays
+    weight, bright, laws = materials
+    sent, relative, _, echo, _ = found
+    beamlets = sent.size // (stop - first)
+    some = slice(first * beamlets, stop * beamlets)
+    offset, velocity, cosine, surface = offset[some], velocity[some], cosine[some], surface[some]
+    for i in range(first, stop):
+        for j in range((i - first) * beamlets, (i - first + 1) * beamlets):
+            room[j] = ranges[i]
+    axis, several = surface[0], not _is_one(surface)
+    if several:
+        _look_each(beamlets, (room, offset, velocity, cosine, surface), materials, found)
+    else:
+        _look_alike((room, offset, velocity, cosine), weight, bright[axis], laws[axis], found)
+    for j in range(sent.size):  # by itself, as the machine's vectors take it
+        echo[j] /= (1 + relative[j]) * (1 + relative[j])
+    return several
+
+
+@inlined(nogil=True)
+def _look_alike(rays, weight, reflected, law, found):
+    """The same of footprints that lie on one surface, in loops short enough for vectors."""
+    ranges, offset, velocity, cosine = rays
+    sent, relative, doppler, echo, beside = found
+    for j in range(sent.size):
+        beside[j] = False
+    for j in range(sent.size):
+        relative[j] = offset[j] / ranges[j]
+    for j in range(sent.size):
+        doppler[j] = 2 * velocity[j] / SPEED_OF_LIGHT
+    for j in range(sent.size):
+        sent[j] = weight[j] * reflected
+    if law == _LAMBERT:
+        for j in range(sent.size):
+            echo[j] = sent[j] * reflectance.backscatter_of(_LAMBERT, cosine[j])
+    else:
+        even = reflectance.backscatter_of(law, 1.0)
+        for j in range(sent.size):
+            echo[j] = sent[j] * even
+
+
+@borrowing(nogil=True)
+def _look_each(beamlets, rays, materials, found):
+    """The same of footprints on several surfaces, or with beamlets that miss, ray by ray."""
+    ranges, offset, velocity, cosine, surface = rays
     weight, bright, laws = materials
     sent, relative, doppler, echo, beside = found
-    beamlets = surface.shape[1]
-    for i in range(surface.shape[0]):
-        axis = _first_seen(surface, i)
-        for b in range(beamlets):
-            s = surface[i, b]
+    for start in range(0, surface.size, beamlets):
+        axis = _first_seen(surface[start : start + beamlets])
+        for j in range(start, start + beamlets):
+            s = surface[j]
             hit = s >= 0
-            beside[i, b] = hit and s != axis
-            relative[i, b] = offset[i, b] / ranges[i] if hit else 0.0
-            doppler[i, b] = 2 * velocity[i, b] / SPEED_OF_LIGHT if hit else 0.0
-            sent[i, b] = weight[b] * bright[s] if hit else 0.0
-            back = reflectance.backscatter_of(laws[s], cosine[i, b]) if hit else 0.0
-            echo[i, b] = sent[i, b] * back
-        for b in range(beamlets):  # by itself, as the machine's vectors take it
-            echo[i, b] /= (1 + relative[i, b]) * (1 + relative[i, b])
+            beside[j] = hit and s != axis
+            relative[j] = offset[j] / ranges[j] if hit else 0.0
+            doppler[j] = 2 * velocity[j] / SPEED_OF_LIGHT if hit else 0.0
+            sent[j] = weight[j] * bright[s] if hit else 0.0
+            back = reflectance.backscatter_of(laws[s], cosine[j]) if hit else 0.0
+            echo[j] = sent[j] * back
 
 
-@njit(cache=True, nogil=True)
-def _first_seen(surface, i):
+@inlined(nogil=True)
+def _is_one(surface):
+    """Whether all beamlets meet one and the same surface."""
+    different = 0
+    for b in range(surface.size):
+        different |= surface[b] ^ surface[0]
+    return different == 0 and surface[0] >= 0
+
+
+@inlined(nogil=True)
+def _first_seen(surface):
     """Surface that the first beamlet meets that meets any; -1 for none."""
-    for b in range(surface.shape[1]):
-        if surface[i, b] >= 0:
-            return surface[i, b]
+    for b in range(surface.size):
+        if surface[b] >= 0:
+            return surface[b]
     return -1

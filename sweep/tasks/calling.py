@@ -122,54 +122,64 @@ class ShotsPlan(NamedTuple):
         return called
 
 
-def plan_shots(
-    eyepoints: Eyepoints,
-    parameters: Mapping[str, Any],
-    surfaces: Sequence[Surface],
-    *,
-    modes: Mapping[str, str],
-    tiles: np.ndarray,
-    rotating: bool,
-    rays_by_tolerance: bool = False,
-) -> ShotsPlan | None:
-    """Plans of shots of a flight; None where none of them sees anything.
+class ShotsCalling:
+    """Plans of a flight's shots, at one place along its axes.
 
     Parameters
     ----------
-    eyepoints, parameters, surfaces
-        As of :func:`sweep.model.eyepoints.seen_ground`, but that shots may see nothing.
+    parameters, surfaces
+        As of :func:`sweep.model.eyepoints.seen_ground`.
     modes
         Mode of each effect.
-    tiles
-        Number of the tile of each shot, rising.
     rotating
         Whether any body turns.
     rays_by_tolerance
         Whether the tolerance is for the number of rays too.
     """
-    from sweep.model.effects.block import Block
-    from sweep.model.effects.catalogue import DEFAULTS
-    from sweep.model.effects.planning import plan
-    from sweep.model.eyepoints import seen_ground
-    from sweep.model.resolution import effects_tolerance
 
-    seen = np.flatnonzero(eyepoints.seen)
-    if not seen.size:
-        return None
-    starts = np.flatnonzero(np.diff(tiles[seen], prepend=-1))
-    shots, ground = seen_ground(eyepoints.some(seen), parameters, surfaces)
-    block = Block.of_cast(
-        DEFAULTS | dict(shots),
-        ground.beamlets,
-        ground.beside,
-        np.append(starts, seen.size),
-        rotating,
-    )
-    number = 0 if rays_by_tolerance else ground.beamlets.offset.shape[1]
-    tolerance = effects_tolerance(parameters, number, parameters[TOLERANCE])
-    planned = plan(block, modes=modes, tolerance=tolerance)
-    tile = np.searchsorted(starts, np.arange(seen.size), "right") - 1
-    return ShotsPlan(seen, tile, planned)
+    def __init__(
+        self,
+        parameters: Mapping[str, Any],
+        surfaces: Sequence[Surface],
+        *,
+        modes: Mapping[str, str],
+        rotating: bool,
+        rays_by_tolerance: bool = False,
+    ) -> None:
+        from sweep.model.effects.catalogue import DEFAULTS
+        from sweep.model.effects.span import Span
+        from sweep.model.effects.tile_link import TileLink
+
+        self._parameters, self._surfaces, self._modes = parameters, surfaces, modes
+        self._rotating, self._rays_by_tolerance = rotating, rays_by_tolerance
+        self._instrument = TileLink(
+            {
+                path: value if isinstance(value, str) else Span.of(np.asarray(value)[()])
+                for path, value in (DEFAULTS | dict(parameters)).items()
+            }
+        )
+
+    def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
+        """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""
+        from sweep.model.effects.planning import plan
+        from sweep.model.seen_tiles import block_of
+
+        seen = np.flatnonzero(eyepoints.seen)
+        if not seen.size:
+            return None
+        some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
+        starts = np.flatnonzero(np.diff(tiles[seen], prepend=-1))
+        edges = np.append(starts, seen.size)
+        block = block_of(some, self._instrument, self._surfaces, edges, self._rotating)
+        planned = plan(block, modes=self._modes, tolerance=self._tolerance(some))
+        return ShotsPlan(seen, np.repeat(np.arange(starts.size), np.diff(edges)), planned)
+
+    def _tolerance(self, eyepoints: Eyepoints) -> float:
+        """What of the tolerance is for effects."""
+        from sweep.model.resolution import effects_tolerance
+
+        number = 0 if self._rays_by_tolerance else eyepoints.offset.shape[1]
+        return effects_tolerance(self._parameters, number, self._parameters[TOLERANCE])
 
 
 def layouts(

@@ -14,7 +14,7 @@ import numpy as np
 from sweep.model.scene_outputs import POINTS, SHOTS
 from sweep.storage.locations import Location
 from sweep.tasks import flight_layout
-from sweep.tasks.calling import TILE_SHOTS, Called, ShotsPlan, plan_shots
+from sweep.tasks.calling import TILE_SHOTS, Called, ShotsCalling, ShotsPlan
 from sweep.tasks.earlier import Earlier
 from sweep.tasks.eyepoint_reader import EyepointReader
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path, world_of
@@ -59,6 +59,7 @@ class FlightStudy:
         self._stretches = [Stretches(spec, scanner) for scanner in spec.scanners]
         self._readers: dict[str, EyepointReader] = {}
         self._parameters: dict[tuple[int, ...], Mapping[str, Any]] = {}
+        self._calling: dict[tuple[int, ...], ShotsCalling] = {}
 
     @cached_property
     def earlier(self) -> Earlier[KnownCloud] | None:
@@ -215,15 +216,15 @@ class FlightStudy:
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
-        return plan_shots(
-            eyepoints,
-            self.parameters_at(part),
-            self.surfaces,
-            modes=self._modes,
-            tiles=tiles,
-            rotating=self._rotating,
-            rays_by_tolerance=self.spec.rays_by_tolerance,
-        )
+        if part.axes not in self._calling:
+            self._calling[part.axes] = ShotsCalling(
+                self.parameters_at(part),
+                self.surfaces,
+                modes=self._modes,
+                rotating=self._rotating,
+                rays_by_tolerance=self.spec.rays_by_tolerance,
+            )
+        return self._calling[part.axes].plans(eyepoints, tiles)
 
     def look(
         self,

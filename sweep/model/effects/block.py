@@ -7,7 +7,6 @@ same formulas at the ends. Nothing is computed before it is asked for.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -30,9 +29,15 @@ class Block(TileLink):
     """
 
     def __init__(
-        self, parameters: Parameters, size: int, geometry: Geometry, *, at_rest: bool = False
+        self,
+        parameters: Parameters,
+        size: int,
+        geometry: Geometry,
+        *,
+        at_rest: bool = False,
+        instrument: TileLink | None = None,
     ) -> None:
-        super().__init__(parameters)
+        super().__init__(parameters, instrument)
         self.size, self.geometry = size, geometry
         self._at_rest = at_rest
         self.number, self.pattern = _beamlets(self)
@@ -97,8 +102,8 @@ class Block(TileLink):
             else:
                 spans[path] = tile_geometry.over(array, edges) if array.ndim else Span.of(array[()])
         amplitudes = str(spans[RECEIVER + "architecture"])
-        geometry = tile_geometry.cast(footprints, beside, edges, amplitudes)
-        return cls(spans, edges.size - 1, replace(geometry, rotating=rotating))
+        geometry = tile_geometry.cast(footprints, beside, edges, amplitudes, rotating)
+        return cls(spans, edges.size - 1, geometry)
 
     @property
     def reach(self) -> float:
@@ -107,7 +112,7 @@ class Block(TileLink):
 
     def at_rest(self) -> "Block":
         """The same tiles without the Doppler effect."""
-        return Block(self._parameters, self.size, self.geometry, at_rest=True)
+        return Block(self.parameters, self.size, self.geometry, at_rest=True, instrument=self)
 
     @cached_property
     def lines(self) -> Line:

@@ -41,6 +41,8 @@ class Span:
     @property
     def is_one(self) -> bool:
         """Whether all tiles have one and the same value."""
+        if isinstance(self.low, float) and isinstance(self.high, float):
+            return bool(self.low == self.high)
         low, high = np.asarray(self.low), np.asarray(self.high)
         if not low.size:
             return False
@@ -50,6 +52,8 @@ class Span:
     @property
     def magnitude(self) -> np.ndarray:
         """Largest magnitude."""
+        if self.low is self.high:
+            return np.asarray(np.abs(self.low))
         return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
 
     def some(self, index: np.ndarray | slice | int) -> "Span":
@@ -81,6 +85,9 @@ class Span:
         return Span(o.low - self.high, o.high - self.low)
 
     def __mul__(self, other: Operand) -> "Span":
+        if isinstance(other, float | int):  # checked once, and not over all tiles
+            low, high = self.low * other, self.high * other
+            return Span(low, high) if other >= 0 else Span(high, low)
         o = Span.of(other)
         if _never_negative(self.low) and _never_negative(o.low):
             return Span(self.low * o.low, self.high * o.high)
@@ -90,6 +97,8 @@ class Span:
 
     def __truediv__(self, other: Operand) -> "Span":
         """Infinite to both sides where the divisor's span holds 0 and is not 0 itself."""
+        if isinstance(other, float | int) and other > 0:
+            return Span(self.low / other, self.high / other)
         o = Span.of(other)
         if _positive(o.low):
             if _never_negative(self.low):
@@ -122,6 +131,13 @@ class Span:
         ends = _extremes(np.abs(self.low), np.abs(self.high))
         through = np.less_equal(self.low, 0) & np.greater_equal(self.high, 0)
         return Span(np.where(through, 0.0, ends.low), ends.high)
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether it is 0 in all tiles."""
+        if isinstance(self.low, float) and isinstance(self.high, float):
+            return bool(self.low == 0 and self.high == 0)
+        return not (any_holds(self.low != 0) or any_holds(self.high != 0))
 
     def sqrt(self) -> "Span":
         """Square root of what is not negative."""

@@ -1,15 +1,23 @@
 """What the beams of a block's tiles meet, as spans: a flat plane, or what rays have found."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sweep.model import reflectance
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.footprint_fields import (
+    APART,
+    BESIDE,
+    GAIN,
+    OWN_RANGES,
+    RANGES,
+    VELOCITIES,
+    WHOLE,
+    fields_of,
+)
 from sweep.model.effects.line_spread import (
     Moments,
     plane_range_moments,
@@ -22,12 +30,6 @@ from sweep.model.ground import Footprints
 from sweep.model.preparation import LASER, RECEIVER
 
 _ROUNDING = 1e-12
-
-_WHOLE, _GAIN, _RANGES, _OWN_RANGES, _VELOCITIES, _BESIDE, _APART = 0, 1, 2, 5, 8, 11, 12
-_FIELDS = 13
-"""Rows of what is found in footprints; moments have three each."""
-
-_NO_SUMS = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,88 +150,45 @@ def _plane_gain(architecture: str, number: int, pattern: str, each: Span, whole:
 
 
 def cast(
-    footprints: Footprints, beside: np.ndarray | None, edges: np.ndarray, architecture: str
+    footprints: Footprints,
+    beside: np.ndarray | None,
+    edges: np.ndarray,
+    architecture: str,
+    rotating: bool,
 ) -> Geometry:
     """Tiles of shots whose footprints rays have found.
 
     Parameters
     ----------
-    footprints, beside, edges
+    footprints, beside, edges, rotating
         As of :meth:`sweep.model.effects.block.Block.of_cast`.
     architecture : str
         The receiver's.
     """
     row, offset, doppler, echo = footprints
     others = np.zeros(echo.shape, np.bool_) if beside is None else beside
-    found = np.empty((_FIELDS, len(echo)))
-    _look(offset, doppler, echo, others, architecture != "direct", found)
-    spans = over(found[:, row], edges)
+    found = fields_of(offset, doppler, echo, others, architecture != "direct")
+    return of_fields(over(found[:, row], edges), rotating)
 
-    def moments(first: int) -> Moments:
-        return Moments(*np.asarray(spans.high)[first : first + 3])
 
+def of_fields(fields: Span, rotating: bool = False) -> Geometry:
+    """Tiles by what is found in the footprints of their shots, (fields, tiles)."""
+    low, high = np.asarray(fields.low), np.asarray(fields.high)
+    ranges, own, velocities = (
+        Moments(*high[first : first + 3]) for first in (RANGES, OWN_RANGES, VELOCITIES)
+    )
     return Geometry(
         grazing_angle=Span(0.0, np.pi / 2),
-        echo=spans.some(_WHOLE),
+        echo=Span(low[WHOLE], high[WHOLE]),
         echo_ratio=Span.of(1.0),
-        gain=spans.some(_GAIN),
-        ranges=moments(_RANGES),
-        own_ranges=moments(_OWN_RANGES),
-        velocities=moments(_VELOCITIES).scaled(SPEED_OF_LIGHT / 2),
-        beside_share=spans.some(_BESIDE),
-        beside_apart=np.asarray(spans.high)[_APART],
+        gain=Span(low[GAIN], high[GAIN]),
+        ranges=ranges,
+        own_ranges=own,
+        velocities=velocities.scaled(SPEED_OF_LIGHT / 2),
+        beside_share=Span(low[BESIDE], high[BESIDE]),
+        beside_apart=high[APART],
+        rotating=rotating,
     )
-
-
-@njit(cache=True, error_model="numpy")
-def _look(offset, doppler, echo, others, by_roots, out):
-    """Echo, gain, moments (mean, rms, extreme) and what lies beside, (fields, rows)."""
-    beamlets = echo.shape[1]
-    share, own_share, root = np.empty(beamlets), np.empty(beamlets), np.empty(beamlets)
-    for i in range(echo.shape[0]):
-        out[_WHOLE, i] = _set_shares(echo, others, i, share, own_share)
-        for b in range(beamlets):  # apart from sums, whose order holds up the machine's vectors
-            root[b] = math.sqrt(share[b]) if by_roots else 0.0
-        gain, beside, apart = 0.0, 0.0, 0.0
-        ranges, own_ranges, velocities = _NO_SUMS, _NO_SUMS, _NO_SUMS
-        for b in range(beamlets):
-            gain += root[b]
-            ranges = _with(ranges, offset[i, b], share[b])
-            own_ranges = _with(own_ranges, offset[i, b], own_share[b])
-            velocities = _with(velocities, doppler[i, b], share[b])
-            if others[i, b]:
-                beside += share[b]
-                apart = max(apart, abs(offset[i, b]) if share[b] > 0.0 else 0.0)
-        out[_GAIN, i], out[_BESIDE, i], out[_APART, i] = max(gain, 1.0), beside, apart
-        _put_moments(out, _RANGES, i, ranges)
-        _put_moments(out, _OWN_RANGES, i, own_ranges)
-        _put_moments(out, _VELOCITIES, i, velocities)
-
-
-@njit(cache=True, error_model="numpy")
-def _set_shares(echo, others, i, share, own_share):
-    """Shares of all of a row's echo, and of that from the axis's surface; the whole echo."""
-    beamlets, whole, own = echo.shape[1], 0.0, 0.0
-    for b in range(beamlets):
-        whole += echo[i, b]
-        own += 0.0 if others[i, b] else echo[i, b]
-    divisor, own = whole if whole > 0.0 else 1.0, own if own > 0.0 else 1.0
-    for b in range(beamlets):
-        share[b], own_share[b] = echo[i, b] / divisor, 0.0 if others[i, b] else echo[i, b] / own
-    return whole
-
-
-@njit(cache=True, error_model="numpy")
-def _with(sums, value, weight):
-    """Sums of values and of squares, and the largest, with one more."""
-    largest = max(sums[2], abs(value)) if weight > 0.0 else sums[2]
-    return sums[0] + weight * value, sums[1] + weight * value * value, largest
-
-
-@njit(cache=True, error_model="numpy")
-def _put_moments(out, first, i, sums):
-    mean, square, largest = sums
-    out[first, i], out[first + 1, i], out[first + 2, i] = abs(mean), math.sqrt(square), largest
 
 
 def over(values: np.ndarray, edges: np.ndarray) -> Span:

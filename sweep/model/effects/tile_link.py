@@ -7,11 +7,18 @@ import numpy as np
 
 from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.span import Span, any_holds, monotone
+from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, TELESCOPE
 from sweep.model.window import Window, canonical_name, window
 
 Parameters = Mapping[str, Span | str]
+
+_INSTRUMENT = (
+    "architecture", "fft_size", "window", "carriers", "chirp_rate", "bin_width", "record_duration",
+    "electrical_bandwidth", "noise_scale", "shot_noise_scale", "noise_variance", "deviation",
+    "threshold",
+)  # fmt: skip
+"""What the instrument alone makes, whatever the beams meet."""
 
 
 class TileLink:
@@ -22,10 +29,15 @@ class TileLink:
     parameters : mapping
         Dotted path to a span over each tile, or to the word that all share: every parameter,
         those that effects bring among them.
+    instrument : TileLink, optional
+        Another whose instrument is the same: what follows from it alone is taken from there.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, instrument: "TileLink | None" = None) -> None:
         self._parameters = parameters
+        if instrument is not None:
+            self.__dict__.update((name, getattr(instrument, name)) for name in _INSTRUMENT)
+            return
         self.architecture = self.word(RECEIVER + "architecture")
         self.fft_size = self.whole(PROCESSING + "fft_size")
 
@@ -39,6 +51,11 @@ class TileLink:
     def word(self, path: str) -> str:
         """A parameter that is a word."""
         return str(self._parameters[path])
+
+    @property
+    def parameters(self) -> Parameters:
+        """All parameters."""
+        return self._parameters
 
     @property
     def words(self) -> dict[str, str]:
@@ -57,7 +74,7 @@ class TileLink:
 
     def has(self, *paths: str) -> bool:
         """Whether any of some parameters that are numbers is other than 0 in any tile."""
-        return any(any_holds(self[path].magnitude > 0) for path in paths)
+        return not all(self[path].is_zero for path in paths)
 
     @cached_property
     def window(self) -> Window:

@@ -1,0 +1,168 @@
+"""What a tile needs of each of its shots' footprints, in numbers that do not count beamlets.
+
+Shots are looked at some at a time: as they lie behind one another in memory, all that is done ray
+by ray is done to the rays of them all at once, however few each has, which the machine's vectors
+take; and sums, whose order holds these up, are taken of four shots beside each other.
+"""
+
+import math
+
+import numpy as np
+
+from sweep.model.compiling import borrowing, inlined
+
+WHOLE, GAIN, RANGES, OWN_RANGES, VELOCITIES, BESIDE, APART = 0, 1, 2, 5, 8, 11, 12
+FIELDS = 13
+"""Rows of what is found in footprints; moments have three each."""
+
+ROOM = 4
+"""Rows of as many numbers as shots that are looked at together have rays, to work in."""
+
+_RAYS = 512
+
+
+def together(beamlets: int) -> int:
+    """Shots that are looked at together: so many that what is made of them stays at hand."""
+    return max(_RAYS // beamlets, 1)
+
+
+def fields_of(
+    offset: np.ndarray, doppler: np.ndarray, echo: np.ndarray, others: np.ndarray, by_roots: bool
+) -> np.ndarray:
+    """Fields of footprints, (fields, n): echo, gain, moments and what lies beside.
+
+    Parameters
+    ----------
+    offset, doppler, echo, others : (n, beamlets) ndarray
+        Of :class:`sweep.model.ground.Footprints`; whether beamlets lie on others surfaces.
+    by_roots : bool
+        Whether amplitudes are the roots of echoes.
+    """
+    found = np.empty((FIELDS, len(echo)))
+    beamlets = echo.shape[1]
+    group = together(beamlets)
+    room = np.empty((ROOM, group * beamlets))
+    seen = tuple(np.ascontiguousarray(values).ravel() for values in (offset, doppler, echo, others))
+    _each(seen, beamlets, group, by_roots, room, found)
+    return found
+
+
+@borrowing(nogil=True)
+def _each(seen, beamlets, group, by_roots, room, out):
+    """Fill in the fields of all footprints."""
+    offset, doppler, echo, others = seen
+    for first in range(0, out.shape[1], group):
+        stop = min(first + group, out.shape[1])
+        rays = slice(first * beamlets, stop * beamlets)
+        some = offset[rays], doppler[rays], echo[rays], others[rays]
+        set_fields(some, stop - first, True, by_roots, room, out[:, first:stop])
+
+
+@inlined(nogil=True)
+def set_fields(seen, number, several, by_roots, room, out):
+    """Fields of a number of footprints, of which some may lie on several surfaces."""
+    offset, doppler, echo, others = seen
+    rays = echo.size
+    share, one, two, whole = room[0, :rays], room[1, :rays], room[2, :rays], room[3, :rays]
+    _put_sums(echo, number, out[WHOLE])
+    _divide(echo, number, out[WHOLE], whole, share)
+    for k in range(number):
+        out[GAIN, k], out[BESIDE, k], out[APART, k] = 1.0, 0.0, 0.0
+    if by_roots:
+        for j in range(rays):
+            one[j] = math.sqrt(share[j])
+        _put_sums(one, number, out[GAIN])
+        for k in range(number):
+            out[GAIN, k] = max(out[GAIN, k], 1.0)
+    _put_moments(offset, share, number, one, two, out[RANGES:])
+    _put_moments(doppler, share, number, one, two, out[VELOCITIES:])
+    if not several:
+        for k in range(number):
+            for m in range(3):
+                out[OWN_RANGES + m, k] = out[RANGES + m, k]
+        return
+    for j in range(rays):
+        one[j] = share[j] if others[j] else 0.0
+        two[j] = abs(offset[j]) if one[j] > 0.0 else 0.0
+    _put_sums(one, number, out[BESIDE])
+    _put_largest(two, number, out[APART])
+    for j in range(rays):
+        one[j] = 0.0 if others[j] else echo[j]
+    _put_sums(one, number, out[OWN_RANGES])
+    _divide(one, number, out[OWN_RANGES], whole, share)
+    _put_moments(offset, share, number, one, two, out[OWN_RANGES:])
+
+
+@inlined(nogil=True)
+def _divide(echo, number, sums, whole, share):
+    """Shares of their sums; of nothing they are 0."""
+    beamlets = echo.size // number
+    for k in range(number):
+        divisor = sums[k] if sums[k] > 0.0 else 1.0
+        for b in range(beamlets):
+            whole[k * beamlets + b] = divisor
+    for j in range(echo.size):
+        share[j] = echo[j] / whole[j]
+
+
+@inlined(nogil=True)
+def _put_moments(values, weight, number, one, two, out):
+    """Magnitudes of means, rms, and largest magnitudes of what has any weight."""
+    for j in range(values.size):
+        one[j] = weight[j] * values[j]
+        two[j] = one[j] * values[j]
+    _put_sums(one, number, out[0])
+    _put_sums(two, number, out[1])
+    for j in range(values.size):
+        one[j] = abs(values[j]) if weight[j] > 0.0 else 0.0
+    _put_largest(one, number, out[2])
+    for k in range(number):
+        out[0, k], out[1, k] = abs(out[0, k]), math.sqrt(out[1, k])
+
+
+@inlined(nogil=True)
+def _put_sums(values, number, out):
+    """Sums over each shot's rays, in order."""
+    beamlets = values.size // number
+    k = 0
+    while k + 4 <= number:
+        at, a, b, c, d = k * beamlets, 0.0, 0.0, 0.0, 0.0
+        for j in range(at, at + beamlets):
+            a += values[j]
+            b += values[j + beamlets]
+            c += values[j + 2 * beamlets]
+            d += values[j + 3 * beamlets]
+        out[k], out[k + 1], out[k + 2], out[k + 3] = a, b, c, d
+        k += 4
+    while k < number:
+        a = 0.0
+        for j in range(k * beamlets, (k + 1) * beamlets):
+            a += values[j]
+        out[k] = a
+        k += 1
+
+
+@inlined(nogil=True)
+def _put_largest(values, number, out):
+    """Largest of each shot's rays, of numbers that are not negative."""
+    beamlets = values.size // number
+    k = 0
+    while k + 4 <= number:
+        at, a, b, c, d = k * beamlets, 0.0, 0.0, 0.0, 0.0
+        for j in range(at, at + beamlets):
+            a, b = _larger(a, values[j]), _larger(b, values[j + beamlets])
+            c = _larger(c, values[j + 2 * beamlets])
+            d = _larger(d, values[j + 3 * beamlets])
+        out[k], out[k + 1], out[k + 2], out[k + 3] = a, b, c, d
+        k += 4
+    while k < number:
+        a = 0.0
+        for j in range(k * beamlets, (k + 1) * beamlets):
+            a = _larger(a, values[j])
+        out[k] = a
+        k += 1
+
+
+@inlined(nogil=True)
+def _larger(one, other):
+    return other if other > one else one
