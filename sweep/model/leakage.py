@@ -105,10 +105,8 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
         count = high - low + 1
         magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
         peak, exempted = mark(room[0], count, noise[1], exempt)
-        if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
-            return low, count, peak, exempted, 0.0
-        _chances(count, noise, kernel, room, exempt, series)
-        return low, count, peak, exempted, any_crossing(room[4], 0, count)
+        chance = _of_run(count, left, noise, kernel, room, exempt, series)
+        return low, count, peak, exempted, chance
     reach = _least_reach(total, highest - lowest, noise, crossing, kernel)
     while True:
         low, high = near[0] - reach, near[1] + reach
@@ -185,6 +183,15 @@ def _at_most(count, noise, exempt, room):
         return np.inf
     share = dot(loud, loud, count) / (most * most)
     return 1.2 * share * math.exp(-0.5 * (b - a) * (b - a))
+
+
+@borrowing()
+def _of_run(count, left, noise, kernel, room, exempt, series):
+    """Leakage of a run of bins; 0 where that is sure to be no more than is ``left`` to leave out."""
+    if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
+        return 0.0
+    _chances(count, noise, kernel, room, exempt, series)
+    return any_crossing(room[4], 0, count)
 
 
 @borrowing()
