@@ -73,9 +73,9 @@ def log_at_least_one(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
 
 def _broadcast(chance: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, ...]:
     """Both as float64 of one shape; refuses an impossible number of tries."""
-    arrays = np.broadcast_arrays(
-        np.asarray(chance, dtype=np.float64), np.asarray(n, dtype=np.float64)
-    )
+    arrays: tuple[np.ndarray, ...] = (np.asarray(chance, np.float64), np.asarray(n, np.float64))
+    if arrays[0].shape != arrays[1].shape:
+        arrays = np.broadcast_arrays(*arrays)
     if not np.all((arrays[1] >= 0.0) & np.isfinite(arrays[1])):
         raise ValueError("the number of tries is finite and not negative")
     return arrays

@@ -25,8 +25,8 @@ from sweep.model.effects.line_modes import (
     NUMBER,
     NUMBERS,
     PLACES,
-    in_modes,
     is_plain,
+    segments_in_modes,
 )
 from sweep.model.effects.line_splitting import Split
 from sweep.model.effects.mode_lines import split
@@ -39,6 +39,8 @@ POINTS = 256
 
 SPLIT_TOLERANCES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 """To which lines are split, relative to all of them in phase: the last that a point allows."""
+
+_TOLERANCES = np.array(SPLIT_TOLERANCES)
 
 
 class Stretch(NamedTuple):
@@ -89,7 +91,10 @@ class Alike(NamedTuple):
 
     def some(self, part: slice) -> "Alike":
         """Those that stand for a run of points."""
-        those, which = np.unique(self.which[part], return_inverse=True)
+        those = self.which[part]
+        if self.point.size == self.which.size:  # each stands for one
+            return Alike(self.point[those], np.arange(those.size), self.level[those])
+        those, which = np.unique(those, return_inverse=True)
         return Alike(self.point[those], which, self.level[those])
 
 
@@ -115,6 +120,8 @@ def _alike(shots: Shots, levels: np.ndarray) -> Alike:
 
 def _levels(shots: Shots) -> np.ndarray:
     """How exactly each point's lines are to be split: a place in :data:`SPLIT_TOLERANCES`, (n,)."""
+    if not shots.phase_errors:
+        return np.zeros(shots.size, np.int64)
     squares = (shots.amplitude**2).sum(axis=1)[shots.row]
     lines = together(math.sqrt(shots.amplitude.shape[1]))
     whole = 0.5 * shots.beat_scale * np.sqrt(squares) * lines * shots.window.sum
@@ -155,21 +162,22 @@ def _by_modes(shots: Shots) -> bool:
 def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     """Places and weights of the lines that each line is split into, by segment and point."""
     size = alike.point.size if shots.phase_errors else 0
-    modes, splits = np.zeros((3, size if _by_modes(shots) else 0, NUMBERS)), []
+    modes = _in_modes(shots, alike) if size and _by_modes(shots) else np.empty((3, 0, NUMBERS))
+    splits = []
     for segment in map(int, np.flatnonzero(shots.segments)) if size else ():
         left = np.arange(size)
         if modes.size:
-            phase = _total_phase(_errors(shots, alike.point, segment), PLACES)
-            modes[segment] = in_modes(phase, np.array(SPLIT_TOLERANCES)[alike.level])
             left = np.flatnonzero(modes[segment, :, NUMBER] == 0)
-        for level in np.unique(alike.level[left]):
+        for level in np.unique(alike.level[left]) if left.size else ():
             some = left[alike.level[left] == level]
             own = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
             splits.append((segment, some, own))
+    number, unknown = np.zeros((3, size), np.int64), np.full((3, size), np.nan)
+    if modes.size and not splits:  # of whose parts nobody looks at any but the real weights
+        return modes, modes, modes, number, alike.which, unknown
     most = max((own.offset.shape[1] for _, _, own in splits), default=0)
     most = max(most, NUMBERS) if modes.size else most
     offset, re, im = np.zeros((3, 3, size, most))
-    number = np.zeros((3, size), np.int64)
     for segment, some, own in splits:
         lines = own.offset.shape[1]
         offset[segment, some, :lines] = own.offset
@@ -178,14 +186,29 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
         number[segment, some] = own.number
     if modes.size:
         re[:, :, :NUMBERS] = np.where((number == 0)[..., None], modes, re[:, :, :NUMBERS])
-    known_as = digests(offset, re, im) if shots.alike else np.full(number.shape, np.nan)
+    known_as = digests(offset, re, im) if shots.alike else unknown
     return offset, re, im, number, alike.which, known_as
 
 
-def _errors(shots: Shots, points: np.ndarray, segment: int) -> tuple:
-    """Phase errors of some points in a segment, as :func:`_total_phase` takes them."""
+def _in_modes(shots: Shots, alike: Alike) -> np.ndarray:
+    """Lines in modes by segment and point, (3, u, NUMBERS)."""
+    phase = np.zeros((3, alike.point.size, PLACES.size))
+    for segment in map(int, np.flatnonzero(shots.segments)):
+        phase[segment] = _total_phase(_errors(shots, alike.point, segment, once=True), PLACES)
+    return segments_in_modes(phase, _TOLERANCES[alike.level])
+
+
+def _errors(shots: Shots, points: np.ndarray, segment: int, *, once: bool = False) -> tuple:
+    """Phase errors of some points in a segment, as :func:`_total_phase` takes them.
+
+    ``once``: what all points share is given once.
+    """
     return tuple(
-        (error.phase, waveform.SIGNS[segment], tuple(error.chosen(segment, points).items()))
+        (
+            error.phase,
+            waveform.SIGNS[segment],
+            tuple(error.chosen(segment, points, once=once).items()),
+        )
         for error in shots.phase_errors
     )
 

@@ -8,17 +8,18 @@ footprint's geometry is worked out once and serves every point that has it, what
 radiometry.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, link, noise, receiver, waveform
+from sweep.model import detection, link, noise, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.ground import Ground
 from sweep.model.mode_kernels import with_modes
+from sweep.model.receiver_noise import NOISY, receiver_noise
 from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
@@ -57,12 +58,16 @@ class PhaseError(NamedTuple):
     values: dict[str, Any]
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
-    def chosen(self, segment: int, index: np.ndarray) -> dict[str, np.ndarray]:
-        """Arguments of some points in a segment, as many each."""
-        found = {}
+    def chosen(
+        self, segment: int, index: np.ndarray, *, once: bool = False
+    ) -> dict[str, np.ndarray]:
+        """Arguments of some points in a segment, as many each; or one where all have it."""
+        found, size = {}, 1 if once else index.size
         for name, value in self.values.items():
             value = value[segment] if isinstance(value, tuple) else value
-            found[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
+            found[name] = value[index] if np.ndim(value) else np.full(size, float(value))
+            if once and (found[name] == found[name][:1]).all():
+                found[name] = found[name][:1]
         return found
 
 
@@ -213,7 +218,7 @@ class Shots:
             self.carriers[2], self.bin_deviation, self.threshold, self.leakage_floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
-        return np.array(np.broadcast_arrays(*columns), dtype=float)
+        return in_rows(columns, (self.size,))
 
     def kernel(self) -> tuple:
         """What the spectrum needs to know of window and FFT, as the compiled code takes it.
@@ -266,6 +271,14 @@ def categories(
         yield index, chosen | {path: chosen[path][0] for path in varying}
 
 
+def in_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.ndarray:
+    """Values that broadcast to a shape, as rows."""
+    rows = np.empty((len(values), *shape))
+    for row, value in zip(rows, values, strict=True):
+        row[...] = value
+    return rows
+
+
 def as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
     """Parameters as arrays, with the length of the record among them."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
@@ -292,7 +305,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = _link_scales(architecture, p)
-    per_ampere, per_watt, sources = _noise(architecture, p)
+    per_ampere, per_watt, sources = receiver_noise(architecture, _receiver(p, *NOISY))
     row, offset, doppler, echo = ground.axis(size)
     everywhere = np.zeros(size)
     return Shots(
@@ -368,31 +381,3 @@ def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.nda
 
 def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
     return {name: p[RECEIVER + name] for name in names}
-
-
-def _noise(
-    architecture: str, p: Mapping[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Variance at the ADC [V^2] of 1 A^2, of the shot noise of 1 W, and of the receiver's own."""
-    bandwidth = receiver.electrical_bandwidth(
-        **_receiver(p, "detector_bandwidth", "amplifier_bandwidth")
-    )
-    scale = (
-        noise.current_scale(architecture, noise_figure=p[RECEIVER + "noise_figure"])
-        * p[RECEIVER + "transimpedance"] ** 2
-    )
-    per_watt = noise.shot_noise(
-        power=1.0,
-        electrical_bandwidth=bandwidth,
-        **_receiver(p, "apd_gain", "excess_noise_factor", "responsivity"),
-    )
-    currents = noise.receiver_currents(
-        architecture,
-        electrical_bandwidth=bandwidth,
-        **_receiver(
-            p, "local_oscillator_power", "apd_gain", "excess_noise_factor", "responsivity",
-            "noise_equivalent_power", "amplifier_noise_current", "load_resistance", "temperature",
-        ),
-    )  # fmt: skip
-    sources = {source: np.asarray(value * scale) for source, value in currents.items()}
-    return np.asarray(scale), np.asarray(per_watt * scale), sources

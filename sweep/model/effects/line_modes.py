@@ -20,7 +20,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model.compiling import borrowing, owning
 from sweep.model.effects.line_splitting import fitted
@@ -99,36 +98,79 @@ def in_modes(phase: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
     A drift of two bins within the record (psi = x^2 / 4) is within the reach at 1e-9, one of four
     bins at 1e-5.
     """
-    found = np.zeros((phase.shape[0], NUMBERS))
-    _fit_rows(np.ascontiguousarray(phase), tolerance + 0.0, modes().error, _TO_DEGREES, found)
+    return segments_in_modes(phase[None], tolerance)[0]
+
+
+def segments_in_modes(phase: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
+    """The same of some segments, (segments, n, COLUMNS): (segments, n, NUMBERS).
+
+    Where the last drifts just as the first does, but the other way, as a target's motion has it in
+    the two chirps, its modes are those of the first, conjugated.
+    """
+    found = np.zeros((*phase.shape[:2], NUMBERS))
+    phase, room = np.ascontiguousarray(phase), np.empty((6, COLUMNS))
+    _fit_all(phase, tolerance + 0.0, modes().error, _TO_DEGREES, room, found)
     return found
 
 
-@njit(cache=True, error_model="numpy")
-def _fit_rows(phase, tolerance, errors, to_degrees, found):
-    room = np.empty((6, COLUMNS))
-    slope, re, im, one, other, size = room[0], room[1], room[2], room[3], room[4], room[5]
+@borrowing()
+def _fit_all(phase, tolerance, errors, to_degrees, room, found):
+    """Fit the modes of every row of every segment."""
     flat = to_degrees.reshape(-1)
-    for row in range(phase.shape[0]):
-        own, out = phase[row], found[row]
-        if not own.any():
-            out[NUMBER], out[RE] = 1.0, 1.0
-            continue
-        combine(own, flat, COLUMNS, 0, COLUMNS, slope)
-        middle, rise = slope[0], slope[1]
-        for i in range(COLUMNS):  # a loop of its own, so that the next one vectorises
-            size[i] = own[i] - middle - rise * PLACES[i]
-        for i in range(COLUMNS):
-            im[i], re[i] = sincos_cycles(size[i])
-        combine(re, flat, COLUMNS, 0, COLUMNS, one)
-        combine(im, flat, COLUMNS, 0, COLUMNS, other)
-        for k in range(COLUMNS):
-            size[k] = math.sqrt(one[k] * one[k] + other[k] * other[k])
-        if _keep(one, other, size, tolerance[row], errors, out):
-            out[CENTRE] = 2.0 * rise
+    last = phase.shape[0] - 1
+    for segment in range(phase.shape[0]):
+        for row in range(phase.shape[1]):
+            own, out = phase[segment, row], found[segment, row]
+            if segment == last and segment > 0 and _are_opposite(own, phase[0, row]):
+                _conjugate(found[0, row], out)
+            else:
+                _fit_row(own, tolerance[row], errors, flat, room, out)
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing()
+def _are_opposite(one, other):
+    """Whether phases are each other's opposite, at all places."""
+    apart = 0
+    for i in range(COLUMNS):
+        apart += one[i] != -other[i]
+    return apart == 0
+
+
+@borrowing()
+def _conjugate(numbers, out):
+    """Modes of the opposite phases."""
+    for i in range(NUMBERS):
+        out[i] = numbers[i]
+    out[CENTRE] = -numbers[CENTRE]
+    for i in range(IM, NUMBERS):
+        out[i] = -numbers[i]
+
+
+@borrowing()
+def _fit_row(own, tolerance, errors, flat, room, out):
+    """Fit the modes of one row."""
+    slope, re, im, one, other, size = room[0], room[1], room[2], room[3], room[4], room[5]
+    wanders = False
+    for i in range(COLUMNS):
+        wanders |= own[i] != 0.0
+    if not wanders:
+        out[NUMBER], out[RE] = 1.0, 1.0
+        return
+    combine(own, flat, COLUMNS, 0, COLUMNS, slope)
+    middle, rise = slope[0], slope[1]
+    for i in range(COLUMNS):  # a loop of its own, so that the next one vectorises
+        size[i] = own[i] - middle - rise * PLACES[i]
+    for i in range(COLUMNS):
+        im[i], re[i] = sincos_cycles(size[i])
+    combine(re, flat, COLUMNS, 0, COLUMNS, one)
+    combine(im, flat, COLUMNS, 0, COLUMNS, other)
+    for k in range(COLUMNS):
+        size[k] = math.sqrt(one[k] * one[k] + other[k] * other[k])
+    if _keep(one, other, size, tolerance, errors, out):
+        out[CENTRE] = 2.0 * rise
+
+
+@borrowing()
 def _keep(re, im, size, tolerance, errors, out):
     """Takes the modes that count, so that what is left out comes to less than the tolerance."""
     count_even, count_odd, left_out, error = 0, 0, 0.0, 0.0
