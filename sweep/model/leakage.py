@@ -187,7 +187,7 @@ def _at_most(count, noise, exempt, room):
 
 @borrowing()
 def _of_run(count, left, noise, kernel, room, exempt, series):
-    """Leakage of a run of bins; 0 where that is sure to be no more than is ``left`` to leave out."""
+    """Leakage of a run of bins; 0 where it is sure to be no more than is ``left`` to leave out."""
     if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
         return 0.0
     _chances(count, noise, kernel, room, exempt, series)
