@@ -6,6 +6,7 @@ radiometric studies [T 3.2].
 """
 
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -283,14 +284,20 @@ def to_look_at(
         raise ValueError("a shot that sees nothing has no radiometry: leave it out")
     if eyepoints.surface.max(initial=-1) >= len(surfaces):
         raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
-    bright = np.array([surface.reflectance for surface in surfaces])
-    laws = np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
     rays = (
         eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
         eyepoints.surface,
     )  # fmt: skip
     weight = np.tile(eyepoints.weight, together(len(eyepoints.weight)))
+    bright, laws = _materials(tuple(surfaces))
     return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
+
+
+@lru_cache(maxsize=16)
+def _materials(surfaces: tuple[Surface, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance and number of the law of surfaces."""
+    bright = np.array([surface.reflectance for surface in surfaces])
+    return bright, np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
 
 
 @borrowing(nogil=True)

@@ -168,11 +168,11 @@ class ShotsCalling:
         if not seen.size:
             return None
         some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
-        starts = np.flatnonzero(np.diff(tiles[seen], prepend=-1))
-        edges = np.append(starts, seen.size)
+        theirs = tiles[seen]
+        edges = np.flatnonzero(np.r_[True, theirs[1:] != theirs[:-1], True])
         block = block_of(some, self._instrument, self._surfaces, edges, self._rotating)
         planned = plan(block, modes=self._modes, tolerance=self._tolerance(some))
-        return ShotsPlan(seen, np.repeat(np.arange(starts.size), np.diff(edges)), planned)
+        return ShotsPlan(seen, np.repeat(np.arange(edges.size - 1), np.diff(edges)), planned)
 
     def _tolerance(self, eyepoints: Eyepoints) -> float:
         """What of the tolerance is for effects."""

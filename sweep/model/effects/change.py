@@ -58,7 +58,7 @@ def within_changes(
     lower, upper = np.asarray(threshold.low), np.asarray(threshold.high)
     added: np.ndarray = np.zeros(1)
     for change in changes:
-        quiet, loud = (1 / np.sqrt(np.asarray(v)) for v in change.noise)
+        quiet, loud = (1.0, 1.0) if change.noise is NONE else (1 / np.sqrt(v) for v in change.noise)
         weak, strong = (np.asarray(v, float) for v in change.signal)
         low = low * np.minimum(weak * loud, 1.0)
         high = high * np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)

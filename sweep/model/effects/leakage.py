@@ -29,6 +29,7 @@ from numba import njit
 from sweep.model.effects.change import Mean
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.footprint_sum import footprint_sum
+from sweep.model.effects.lobes import lobe
 from sweep.model.effects.sidelobes import CELLS, LEVELS, STEEPEST, sidelobes
 from sweep.model.effects.span import Span
 from sweep.model.marcum import excess_crossing
@@ -81,17 +82,18 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     image, sloping = lines.lobe.tail(edge), STEEPEST * lines.lobe.tail(edge - 1 / ratio)
     steepest = table.steepest[LEVELS, 0]
     askew = np.minimum(lean * sloping * ratio, most * image)
-    columns = np.broadcast_arrays(
+    values = (
         most, together, np.asarray(amplitude.low), np.asarray(threshold.low),
         np.asarray(threshold.high), extreme, lines.bin_offset_least, lines.bin_offset, image,
         np.minimum(together * image + askew, most * image),
         askew + np.minimum(lean * ratio * steepest, 2 * most), lean * ratio,
     )  # fmt: skip
-    steps = _steps(table.lowest.size / CELLS / ratio, block.fft_size)
+    columns = np.empty((len(values), *np.shape(most)))
+    for column, value in zip(columns, values, strict=True):
+        column[...] = value
     found = _union(
-        np.stack([c.ravel() for c in columns]), (table.highest, table.lowest, table.steepest),
-        (np.diff(steps), lines.lobe.tail(steps[:-1]),
-         STEEPEST * lines.lobe.tail(steps[:-1] - 1 / ratio)),
+        columns.reshape(len(values), -1), (table.highest, table.lowest, table.steepest),
+        _far(shape.name, shape.length, block.fft_size),
         (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
         not block.adds_amplitudes,
     ).reshape(columns[0].shape)  # fmt: skip
@@ -106,9 +108,19 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
 
 
 @lru_cache(maxsize=32)
-def _steps(first: float, fft_size: int) -> np.ndarray:
-    """Distances [bins] from the table's end on, between which sidelobes are taken to be even."""
-    return np.geomspace(first, max(fft_size / 2, first) + 1, _STEPS)
+def _far(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances [bins] from the table's end on, between which sidelobes are taken to be even.
+
+    Returns
+    -------
+    (m,) ndarray, (m,) ndarray, (m,) ndarray
+        Bins from each to the next; largest magnitude and slope from each on.
+    """
+    ratio, form = length / fft_size, lobe(name, length, fft_size)
+    first = sidelobes(name, length).lowest.size / CELLS / ratio
+    steps = np.geomspace(first, max(fft_size / 2, first) + 1, _STEPS)
+    begin = steps[:-1]
+    return np.diff(steps), form.tail(begin), STEEPEST * form.tail(begin - 1 / ratio)
 
 
 @njit(cache=True, error_model="numpy")

@@ -15,6 +15,7 @@ bins around, of which the largest holds the mean at least; and no footprint's la
 less than its strongest beamlet's line. No bin holds more than all power on the lobe's peak.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -92,51 +93,82 @@ def axis_lines(
     amplifier_bandwidth: Span,
 ) -> Line:
     """The axis's line in up, Doppler and down segment, (3, tiles), as :mod:`sweep.model.lines`."""
-    beat = chirp_rate * (2 / SPEED_OF_LIGHT) * (1 + beta) * range
-    shift, later = carriers[0] * beta, carriers[2] * beta
-    segments = (shift - beat, carriers[1] * beta, later + beat)
-    ends = np.broadcast_arrays([0.0], *(end for f in segments for end in (f.low, f.high)))[1:]
-    frequency = Span(np.stack(ends[::2]), np.stack(ends[1::2]))
-    width = sample_rate / fft_size
-    position = frequency / width
-    signed = abs(frequency)
-    transfers = [
-        1 / (np.hypot(1, f / one) * np.hypot(1, f / two))
-        for f, one, two in zip(
-            (signed.high, signed.low),
-            (detector_bandwidth.low, detector_bandwidth.high),
-            (amplifier_bandwidth.low, amplifier_bandwidth.high),
-            strict=True,
-        )
-    ]
-    least, largest = _from_whole(position)
-    tilt = (1 / detector_bandwidth.low + 1 / amplifier_bandwidth.low) * width.high
-    return Line(
-        bin_offset=largest,
-        bin_offset_least=least,
-        edge=_from_edge(position, fft_size),
-        transfer=np.asarray(transfers[1]),
-        transfer_least=np.asarray(transfers[0]),
-        tilt=np.broadcast_to(tilt, least.shape),
-        lobe=lobe(window.name, window.length, fft_size),
-    )
+    spans = (
+        *carriers, beta, chirp_rate * (2 / SPEED_OF_LIGHT), range, sample_rate / fft_size,
+        detector_bandwidth, amplifier_bandwidth,
+    )  # fmt: skip
+    ends = [end for span in spans for end in (span.low, span.high)]
+    tiles = max(np.size(end) for end in ends)
+    given, found = np.empty((len(ends), tiles)), np.empty((6, 3, tiles))
+    for row, end in zip(given, ends, strict=True):
+        row[:] = end
+    _put_lines(given.reshape(-1, 2, tiles), fft_size / 2, found)
+    offset, least, edge, transfer, transfer_least, tilt = found
+    form = lobe(window.name, window.length, fft_size)
+    return Line(offset, least, edge, transfer, transfer_least, tilt, form)
 
 
-def _from_whole(position: Span) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest distance from a whole number."""
-    low, high = np.asarray(position.low), np.asarray(position.high)
-    one, two = (np.abs(x - np.rint(x)) for x in (low, high))
-    least = np.where(np.floor(high) > np.floor(low), 0.0, np.minimum(one, two))
-    halves = np.floor(high + 0.5) > np.floor(low + 0.5)
-    return least, np.where(halves, 0.5, np.maximum(one, two))
+@njit(cache=True, error_model="numpy")
+def _put_lines(given, half, out):
+    """Fields of :class:`Line`, (6, 3, tiles), from the ends of nine spans, (9, 2, tiles)."""
+    for t in range(given.shape[2]):
+        ends = given[:, :, t]
+        beta, width = (ends[3, 0], ends[3, 1]), (ends[6, 0], ends[6, 1])
+        stretched = _product((ends[4, 0], ends[4, 1]), (1.0 + beta[0], 1.0 + beta[1]))
+        beat = _product(stretched, (ends[5, 0], ends[5, 1]))
+        tilt = (1.0 / ends[7, 0] + 1.0 / ends[8, 0]) * width[1]
+        for s in range(3):
+            low, high = _product((ends[s, 0], ends[s, 1]), beta)
+            if s == 0:
+                low, high = low - beat[1], high - beat[0]
+            elif s == 2:
+                low, high = low + beat[0], high + beat[1]
+            one, other = abs(low), abs(high)
+            furthest = max(one, other)
+            nearest = 0.0 if low <= 0.0 and high >= 0.0 else min(one, other)
+            position = _quotient((low, high), width)
+            out[0, s, t], out[1, s, t] = _from_whole(position)
+            out[2, s, t] = _from_edge(position, half)
+            out[3, s, t] = 1.0 / (
+                math.hypot(1.0, nearest / ends[7, 1]) * math.hypot(1.0, nearest / ends[8, 1])
+            )
+            out[4, s, t] = 1.0 / (
+                math.hypot(1.0, furthest / ends[7, 0]) * math.hypot(1.0, furthest / ends[8, 0])
+            )
+            out[5, s, t] = tilt
 
 
-def _from_edge(position: Span, fft_size: int) -> np.ndarray:
+@njit(cache=True, error_model="numpy")
+def _product(one, other):
+    """Product of two spans."""
+    a, b, c, d = one[0] * other[0], one[0] * other[1], one[1] * other[0], one[1] * other[1]
+    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+
+
+@njit(cache=True, error_model="numpy")
+def _quotient(one, other):
+    """Quotient of two spans, of which the other is positive."""
+    a, b, c, d = one[0] / other[0], one[0] / other[1], one[1] / other[0], one[1] / other[1]
+    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+
+
+@njit(cache=True, error_model="numpy")
+def _from_whole(position):
+    """Largest and least distance from a whole number."""
+    low, high = position
+    one, other = abs(low - np.rint(low)), abs(high - np.rint(high))
+    least = 0.0 if math.floor(high) > math.floor(low) else min(one, other)
+    most = 0.5 if math.floor(high + 0.5) > math.floor(low + 0.5) else max(one, other)
+    return most, least
+
+
+@njit(cache=True, error_model="numpy")
+def _from_edge(position, half):
     """Least distance of the folded line from DC and Nyquist."""
-    half = fft_size / 2
-    turns = [np.asarray(x) / half for x in (position.low, position.high)]
-    distance = np.minimum(*(np.abs(x - np.rint(x)) for x in turns)) * half
-    return np.where(np.floor(turns[1]) > np.floor(turns[0]), 0.0, distance)
+    low, high = position[0] / half, position[1] / half
+    if math.floor(high) > math.floor(low):
+        return 0.0
+    return min(abs(low - np.rint(low)), abs(high - np.rint(high))) * half
 
 
 def plane_range_moments(

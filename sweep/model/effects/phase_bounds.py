@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
 from sweep.model.effects.line_spread import Moments, image_factor, power_range
-from sweep.model.effects.span import Span
+from sweep.model.effects.span import Span, any_holds
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
@@ -120,6 +120,8 @@ class Error(NamedTuple):
 
     def __add__(self, other: "Error") -> "Error":  # type: ignore[override]
         """The sum of two errors."""
+        if other is NO_ERROR:
+            return self
         return Error(
             tuple(np.add(a, b) for a, b in zip(self.powers, other.powers, strict=True)),
             np.add(self.rest, other.rest),
@@ -208,8 +210,10 @@ def phase_change(
         Phase errors that may be there besides: they lower the bin, and turn what changes.
     """
     form, peak = shape(window), peak or one_line(window)
-    own, besides = missed(error, window), missed(others, window)
-    turned = own * np.minimum(_largest(others), 2.0)
+    besides, turned = np.zeros(()), np.zeros(())
+    if others is not NO_ERROR:
+        besides = missed(others, window)
+        turned = missed(error, window) * np.minimum(_largest(others), 2.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         c = np.asarray(peak.least) - besides
         if peak.single:
@@ -304,7 +308,9 @@ def error_change(block: "Block", own: Own) -> Change | None:
     low, high = (np.where(cancelling, 1.0, end) for end in change.signal)
     return Change(
         signal=(low, high),
-        added=np.where(cancelling, added(block, error, images), 0.0),
+        added=np.where(cancelling, added(block, error, images), 0.0)
+        if any_holds(cancelling)
+        else 0.0,
         shift=2 * moved * block.fft_size / window.length,
     )
 

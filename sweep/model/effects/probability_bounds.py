@@ -65,6 +65,7 @@ def probability_changes(
     table = np.empty((len(factors), _FIELDS, 3, tiles))
     for entry, change in zip(table, factors, strict=True):
         _fill(entry, change)
+    _finish(table.reshape(len(factors), _FIELDS, 3 * tiles))
     ends = np.empty((2, 2, 3, tiles))
     ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
         amplitude.low, amplitude.high, threshold.low, threshold.high,
@@ -99,20 +100,31 @@ def pd_change_within(
     ends = np.array(np.broadcast_arrays(*amplitude, *threshold), dtype=float)
     entry = np.empty((_FIELDS, *ends.shape[1:]))
     _fill(entry, change)
+    _finish(entry.reshape(1, _FIELDS, -1))
     flat = _each_within(entry.reshape(_FIELDS, -1), ends.reshape(4, -1))
     return np.asarray(flat.reshape(ends.shape[1:]))
 
 
 def _fill(entry: np.ndarray, change: Change) -> None:
+    """Ends of signal and noise, what is added, and whether the threshold follows."""
+    entry[_WEAK], entry[_STRONG] = change.signal
+    entry[_DOWN], entry[_UP] = change.noise
+    entry[_ADDED], entry[_SHARE] = change.added, change.threshold_follows
+
+
+@njit(cache=True, error_model="numpy")
+def _finish(table):
     """Factors on amplitude and threshold over sigma; what is added; change of |X| by its factor."""
-    weak, strong = change.signal
-    quiet, loud = (1 / np.sqrt(value) for value in change.noise)
-    entry[_WEAK], entry[_STRONG] = np.multiply(weak, loud), np.multiply(strong, quiet)
-    entry[_DOWN] = 1.0 if change.threshold_follows else loud
-    entry[_UP] = 1.0 if change.threshold_follows else quiet
-    entry[_ADDED] = change.added
-    entry[_SHARE] = np.maximum(np.subtract(strong, 1), np.subtract(1, weak))
-    np.minimum(entry, _HUGE, out=entry)
+    for i in range(table.shape[0]):
+        for t in range(table.shape[2]):
+            own = table[i, :, t]
+            weak, strong, follows = own[_WEAK], own[_STRONG], own[_SHARE] != 0.0
+            quiet, loud = 1.0 / math.sqrt(own[_DOWN]), 1.0 / math.sqrt(own[_UP])
+            own[_WEAK], own[_STRONG] = min(weak * loud, _HUGE), min(strong * quiet, _HUGE)
+            own[_DOWN] = 1.0 if follows else min(loud, _HUGE)
+            own[_UP] = 1.0 if follows else min(quiet, _HUGE)
+            own[_ADDED] = min(own[_ADDED], _HUGE)
+            own[_SHARE] = min(max(strong - 1.0, 1.0 - weak), _HUGE)
 
 
 @njit(cache=True, error_model="numpy")
