@@ -4,7 +4,7 @@ Where powers add, the power of the bin that is detected is a mean over the beam,
 with g_b what it would be if all light went where beamlet b goes. By its weights and places a
 hexagonal lattice of whole shells is right for all that is odd about the beam's axis, for what goes
 with the square of the places, and all but right for smooth ground. So g is made even, its best
-polynomial is taken off, of no, the second or the fourth degree as rays are more, and what is left
+polynomial is taken off, of the second degree for few rays and the fourth for more, and what is left
 tells how rough the ground is between the beamlets: the share of the beam about each is taken to be
 off by as much as its beamlet differs from its neighbours, each for itself,
 
@@ -41,8 +41,14 @@ _REACH, _STEPS, _SAMPLES = 4, 1024, 1024
 _NEIGHBOURS = 1.3
 """How far neighbours may be from each other, over the nearest; the next but one are 1.7 away."""
 
-_DEGREES = ((37, 4), (19, 2), (1, 0))
-"""Rays from which on the polynomials are of a degree, and leave enough to tell from."""
+_QUARTIC = 37
+"""Rays from which on the polynomials are of the fourth degree, and leave enough to tell from."""
+
+_FEW = 20
+"""Places up to which the roughness is a product with one matrix."""
+
+_FAR = 15.0
+"""Standard deviations from the threshold at which nothing changes: e^-112."""
 
 _NOTHING = 1e-9
 """Change of a probability that is not looked for."""
@@ -66,6 +72,8 @@ class Rule(NamedTuple):
     pair_weight: np.ndarray
     """(m,): sum of the products of their beamlets' power fractions, made larger for what the
     polynomials have taken of the roughness too: k of h."""
+    at_once: np.ndarray
+    """(h, m): all of that for few places as one matrix, from them to what pairs add; or empty."""
 
 
 def ray_error(
@@ -89,7 +97,7 @@ def ray_error(
     out = np.empty(shots.size)
     _errors(
         shots.point_table(), (shots.fft_size, shots.window.length), shots.segments,
-        footprints.row, (footprints.offset, footprints.doppler, np.sqrt(footprints.echo)),
+        footprints.row, (footprints.offset, footprints.doppler, footprints.echo),
         (bins, magnitude), _lobe(shots.window.name),
         folded(footprints.echo.shape[1]), out,
     )  # fmt: skip
@@ -116,10 +124,21 @@ def folded(number: int) -> Rule:
     key, which = np.unique(both[:, 0] * number + both[:, 1], return_inverse=True)
     pairs = np.stack([key // number, key % number], axis=1)
     product: np.ndarray = np.bincount(which.ravel(), weight[near[:, 0]] * weight[near[:, 1]])
-    degree = next(degree for least, degree in _DEGREES if number >= least)
-    smooth = _smooth(offsets[:, first], share, degree)
+    smooth = _smooth(offsets[:, first], share, 4 if number >= _QUARTIC else 2)
     product = product * (first.size / (first.size - len(smooth)))
-    return Rule(first, opposite[first], 1 / share, smooth, share * smooth, pairs, product)
+    rule = Rule(
+        first, opposite[first], 1 / share, smooth, share * smooth, pairs, product, np.empty((0, 0))
+    )
+    return rule._replace(at_once=_at_once(rule)) if first.size <= _FEW else rule
+
+
+def _at_once(rule: Rule) -> np.ndarray:
+    """The steps of :func:`_roughness` on each place alone, (h, m)."""
+    rest = np.eye(rule.first.size)
+    for smooth, weighted in zip(rule.smooth, rule.weighted, strict=True):
+        rest -= (rest * weighted).sum(axis=1)[:, None] * smooth
+    apart = rest[:, rule.pairs[:, 0]] - rest[:, rule.pairs[:, 1]]
+    return np.ascontiguousarray(apart * np.sqrt(rule.pair_weight))
 
 
 def _smooth(offsets: np.ndarray, share: np.ndarray, degree: int) -> np.ndarray:
@@ -148,17 +167,17 @@ def _lobe(window_name: str) -> np.ndarray:
 @owning(nogil=True)
 def _errors(points, sizes, segments, row, footprint, peaks, lobe, rule, out):
     """Errors of all points, (n,)."""
-    offset, doppler, strength = (
+    offset, doppler, echo = (
         borrowed(footprint[0]), borrowed(footprint[1]), borrowed(footprint[2])
     )  # fmt: skip
     bins, magnitude = peaks
     lobe = borrowed(lobe)
     rule = (
         borrowed(rule[0]), borrowed(rule[1]), borrowed(rule[2]), borrowed(rule[3]),
-        borrowed(rule[4]), borrowed(rule[5]), borrowed(rule[6]),
+        borrowed(rule[4]), borrowed(rule[5]), borrowed(rule[6]), borrowed(rule[7]),
     )  # fmt: skip
-    delta, power, nothing = np.empty((3, strength.shape[1]))
-    ones, apart = np.ones(strength.shape[1]), np.empty(rule[6].size)
+    delta, power, nothing = np.empty((3, echo.shape[1]))
+    ones, apart = np.ones(echo.shape[1]), np.empty(rule[6].size)
     rest, p, no_phases = np.empty(rule[0].size), np.empty(points.shape[0]), np.empty(0)
     for i in range(out.size):
         p[:] = points[:, i]
@@ -174,11 +193,11 @@ def _errors(points, sizes, segments, row, footprint, peaks, lobe, rule, out):
                 continue
             origin = segment_lines(
                 (SIGNS[s], p[9] if s == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-                (p[6], sizes[0], sizes[1], p[7]), offset[at], doppler[at], strength[at],
-                no_phases, delta, power, nothing, True,
+                (p[6], sizes[0], sizes[1], p[7]), offset[at], doppler[at], ones, no_phases,
+                delta, power, nothing, True,
             )  # fmt: skip
-            _in_bin(delta, bins[i, s] - origin, sizes[1] / sizes[0], lobe, power)
-            relative = min(_roughness(power, rule, rest, apart, ones), 1.0)
+            _in_bin(delta, bins[i, s] - origin, sizes[1] / sizes[0], lobe, echo[at], power)
+            relative = min(_roughness(power, rule, rest, apart), 1.0)
             total += _change(a, b, relative)
             largest = max(largest, _in_magnitude(a, relative))
         out[i] = min(max(total, largest), 1.0)
@@ -191,6 +210,8 @@ def _change(a, b, relative):
     dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the nearest to b that a comes.
     """
     away = max(abs(a - b) - 0.5 * relative * a, 0.0)
+    if away > _FAR:
+        return 0.0
     return min(0.5 * relative * math.sqrt(a * b / (2 * math.pi)) * math.exp(-0.5 * away**2), 1.0)
 
 
@@ -201,26 +222,35 @@ def _in_magnitude(a, relative):
 
 
 @inlined()
-def _in_bin(delta, k, ratio, lobe, power):
-    """Powers of lines, as a bin has them."""
+def _in_bin(delta, k, ratio, lobe, echo, power):
+    """Powers of lines, as a bin has them, from those of lines of an echo of 1."""
     for b in range(delta.size):
         place = abs(delta[b] - k) * ratio * _STEPS
         low = int(min(place, lobe.size - 2.0))
         part = min(place - low, 1.0)
-        power[b] *= lobe[low] + (lobe[low + 1] - lobe[low]) * part
+        power[b] *= echo[b] * (lobe[low] + (lobe[low + 1] - lobe[low]) * part)
 
 
 @inlined()
-def _roughness(power, rule, rest, apart, weighed):
+def _roughness(power, rule, rest, apart):
     """Error of the sum of powers, over the sum: see the module."""
-    first, second, per_share, smooth, weighted, pairs, pair_weight = rule
-    whole = dot(power, weighed, power.size)
-    if not whole > 0.0:
-        return 1.0
-    per_whole = 1.0 / whole
+    first, second, per_share, smooth, weighted, pairs, pair_weight, at_once = rule
+    whole = 0.0
     for f in range(first.size):
         both = power[first[f]] + (power[second[f]] if second[f] != first[f] else 0.0)
-        rest[f] = both * per_share[f] * per_whole
+        whole += both
+        rest[f] = both * per_share[f]
+    if not whole > 0.0:
+        return 1.0
+    if at_once.shape[0]:
+        apart[:] = 0.0
+        for f in range(first.size):
+            for k in range(apart.size):
+                apart[k] += at_once[f, k] * rest[f]
+        return math.sqrt(dot(apart, apart, apart.size)) / whole
+    per_whole = 1.0 / whole
+    for f in range(first.size):
+        rest[f] *= per_whole
     for j in range(smooth.shape[0]):  # orthonormal: one after the other is all at once
         part = dot(weighted[j], rest, first.size)
         for f in range(first.size):

@@ -55,7 +55,7 @@ EFFECTS_SHARE = 0.8
 
 FINEST = int(quadrature.COUNTS[-1])
 
-RAYS = (7, 19, 37, 109, 439, 2029, 8017, 31987, 127999)
+RAYS = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
 """Rays that may be cast for a shot of a flight: whole shells of the lattice, as only these are
 alike on opposite sides, which makes smooth ground a hundred times more exact. The fewest are those
 whose error can be told from themselves; each costs some 80 ns."""
@@ -63,7 +63,7 @@ whose error can be told from themselves; each costs some 80 ns."""
 LEAST_RAYS_TOLERANCE = 1e-6
 """Tighter tolerances call for no more rays than this one."""
 
-_FEWEST = ((0.05, 7), (1e-2, 19), (1e-5, 37), (0.0, 109))
+_FEWEST = ((1e-2, 19), (1e-5, 37), (0.0, 109))
 """Rays that every shot has from a tolerance on: what none of them hits no estimate knows of."""
 
 _LEAST_STEP, _MOST_STEP = 2, 10

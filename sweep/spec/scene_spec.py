@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import Field, PrivateAttr
 
 from sweep.model import VERSION
-from sweep.model.resolution import BEAMLETS, LEAST_RAYS_TOLERANCE, PATTERN, is_open, rays_needed
+from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
 from sweep.spec.detector_check import is_method, not_on_flights
@@ -148,11 +148,6 @@ class SceneSpec(Study):
     def rays_by_tolerance(self) -> bool:
         """Whether the tolerance says how many rays there are of each shot."""
         return self.footprint.beamlets == 0 and is_open(self.parameters())
-
-    @property
-    def rays_tolerance(self) -> float:
-        """What rays may leave of each shot, where the tolerance says how many there are."""
-        return max(float(self.accuracy.tolerance), LEAST_RAYS_TOLERANCE)
 
     def surfaces(self) -> tuple[Surface, ...]:
         """What surface numbers mean; no file is looked at."""

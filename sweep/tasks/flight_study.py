@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.resolution import LEAST_RAYS_TOLERANCE
 from sweep.model.scene_outputs import POINTS, SHOTS
 from sweep.storage.locations import Location
 from sweep.tasks import flight_layout
@@ -222,7 +223,7 @@ class FlightStudy:
                 self.surfaces,
                 modes=self._modes,
                 rotating=self._rotating,
-                rays_by_tolerance=self.spec.rays_by_tolerance,
+                rays_by_tolerance=self.rays_tolerance > 0,
             )
         return self._calling[part.axes].plans(eyepoints, tiles)
 
@@ -275,8 +276,9 @@ class FlightStudy:
             some = rows[index]
             cloud = self._cloud(part, draws, effects)
             results = cloud(eyepoints.some(some), numbers[some])
-            if self.spec.rays_by_tolerance:
-                self._refine(part.scanner, numbers[some], results, cloud)
+            if self.rays_tolerance:
+                rays = eyepoints.weight.size
+                self._refine(part.scanner, numbers[some], rays, results, cloud)
             yield Patch(some, draws, results)
 
     def _cloud(
@@ -296,7 +298,7 @@ class FlightStudy:
             method=self.spec.draws.method,
             returns=int(self.spec.draws.returns),
             effects=effects,
-            estimates_rays=self.spec.rays_by_tolerance,
+            estimates_rays=self.rays_tolerance > 0,
         )
         keys = partial(point_keys, domain=DOMAIN, seed=int(self.spec.seed))
         return lambda seen, numbers: make(seen, keys=keys(numbers[:, None].astype(float)))
@@ -305,20 +307,20 @@ class FlightStudy:
         self,
         scanner: str,
         numbers: np.ndarray,
+        rays: int,
         results: Results,
         cloud: Callable[[Eyepoints, np.ndarray], Results],
     ) -> None:
         """Put points of shots that need more rays in the place of their results."""
 
-        def again(places: np.ndarray, rays: int) -> np.ndarray:
+        def again(places: np.ndarray, more: int) -> np.ndarray:
             some = numbers[places]
-            finer = cloud(self._finer_rays.see(scanner, some, rays), some)
+            finer = cloud(self._finer_rays.see(scanner, some, more), some)
             for name, values in finer.items():
                 results[name][places] = values
             return finer["beamlets_error"]
 
-        rays = int(self.spec.parameters()["footprint.beamlets"])
-        refine(rays, results["beamlets_error"], self.spec.rays_tolerance, again)
+        refine(rays, results["beamlets_error"], self.rays_tolerance, again)
 
     def _solutions(
         self, stretches: Stretches, shots: Results, found: Results, cycles: np.ndarray, draws: slice
@@ -356,6 +358,12 @@ class FlightStudy:
     def surfaces(self) -> tuple[Surface, ...]:
         """What surface numbers mean."""
         return self.spec.surfaces()
+
+    @cached_property
+    def rays_tolerance(self) -> float:
+        """What rays may leave of a shot, where the tolerance says how many there are; else 0."""
+        by_tolerance = self.spec.rays_by_tolerance
+        return max(self.spec.accuracy.tolerance, LEAST_RAYS_TOLERANCE) if by_tolerance else 0.0
 
     @cached_property
     def _modes(self) -> Mapping[str, str]:

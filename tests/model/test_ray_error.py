@@ -68,9 +68,8 @@ def _cloud(seen, parameters, **keywords):
 
 
 def test_the_fewest_follow_from_the_tolerance_alone():
-    tolerances = (1.0, 0.05, 0.049, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)
-    numbers = [rays_needed(INCOHERENT, t) for t in tolerances]
-    assert numbers == [7, 7, 19, 19, 37, 37, 109, 109] and set(numbers) < set(RAYS)
+    numbers = [rays_needed(INCOHERENT, t) for t in (1.0, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)]
+    assert numbers == [19, 19, 37, 37, 109, 109] and set(numbers) < set(RAYS)
 
 
 @pytest.mark.parametrize("rays", RAYS)
@@ -126,7 +125,7 @@ def _by_hand(seen, parameters, number):
     (x, y), weight = beamlets(number)
     apart = np.hypot(x[:, None] - x, y[:, None] - y)
     near = np.argwhere(np.triu(apart < 1.3 * apart[0, 1:].min(), 1))
-    degrees = (0, 2, 4)[: 1 if number < 19 else 2 if number < 37 else 3]
+    degrees = (0, 2, 4)[: 2 if number < 37 else 3]
     fit = np.stack([x ** (d - i) * y**i for d in degrees
                     for i in range(d + 1)], axis=1)  # fmt: skip
     taken = (number + 1) / (number + 1 - 2 * fit.shape[1])
@@ -153,7 +152,7 @@ def _by_hand(seen, parameters, number):
     return np.maximum(errors, of_magnitude)
 
 
-@pytest.mark.parametrize("number", [7, 19, 109])
+@pytest.mark.parametrize("number", [19, 109])
 def test_it_is_what_the_formula_gives(table_4_1, number):
     """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0."""
     parameters = _parameters(table_4_1)

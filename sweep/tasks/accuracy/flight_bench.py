@@ -238,9 +238,7 @@ class FlightBench:
     ) -> Seen:
         """Statistics of shots, of those that see anything; more rays are cast where they must."""
         whole = _nothing(len(called.flags))
-        tolerance = rung.rays_error
-        if not tolerance and study.spec.rays_by_tolerance:
-            tolerance = study.spec.rays_tolerance
+        tolerance, rays = rung.rays_error or study.rays_tolerance, eyepoints.weight.size
         for flag in np.unique(called.flags):
             index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
             if index.size:
@@ -248,13 +246,14 @@ class FlightBench:
                 look = partial(_look, study, tiles, names, look_of(rung), bool(tolerance))
                 error = _put(whole, index, look(eyepoints.some(index)))
                 if tolerance:
-                    self._refine(study, tiles, (whole, index, error), tolerance, look)
+                    self._refine(study, tiles, rays, (whole, index, error), tolerance, look)
         return whole
 
     def _refine(
         self,
         study: FlightStudy,
         tiles: Tiles,
+        rays: int,
         found: tuple[Seen, np.ndarray, np.ndarray],
         tolerance: float,
         look: Callable[[Eyepoints], tuple[Seen, np.ndarray]],
@@ -265,14 +264,14 @@ class FlightBench:
             make = partial(_Caster, world=world_of(self.spec))
             self._finer[id(study)] = FinerRays(study.spec, make)
 
-        def again(places: np.ndarray, rays: int) -> np.ndarray:
+        def again(places: np.ndarray, more: int) -> np.ndarray:
             some = index[places]
-            seen = self._finer[id(study)].see(tiles.part.scanner, tiles.index[some], rays)
+            seen = self._finer[id(study)].see(tiles.part.scanner, tiles.index[some], more)
             there, error = np.flatnonzero(seen.seen), np.zeros(len(some))
             error[there] = _put(whole, some[there], look(seen.some(there)))
             return error
 
-        refine(int(study.spec.parameters()["footprint.beamlets"]), error, tolerance, again)
+        refine(rays, error, tolerance, again)
 
 
 def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
