@@ -92,7 +92,7 @@ def ray_error(
         What their rays have hit: a hexagonal lattice of whole shells. All of it is looked at, even
         where the effect of its spread on the lines is left out.
     bins, magnitude : (n, 3) ndarray
-        Bin of each segment's peak, -1 for none, and |X| there.
+        Bin of each segment's peak, -1 or nan for none, and |X| there.
     """
     out = np.empty(shots.size)
     _errors(
@@ -183,12 +183,12 @@ def _errors(points, sizes, segments, row, footprint, peaks, lobe, rule, out):
         p[:] = points[:, i]
         at, total, largest = row[i], 0.0, 0.0
         for s in range(3):
-            if not segments[s] or bins[i, s] < 0:
+            if not (segments[s] and bins[i, s] >= 0):
                 continue
             a, b = magnitude[i, s] / p[13], p[11] / p[13]
             # The down-chirp's lines lie as those of the up-chirp, and Doppler's closer together,
             # which makes them smoother: one magnitude tells of all.
-            of_magnitude = _in_magnitude(a, 1.0) if s == 0 or bins[i, 0] < 0 else 0.0
+            of_magnitude = _in_magnitude(a, 1.0) if s == 0 or not bins[i, 0] >= 0 else 0.0
             if of_magnitude < _NOTHING and _change(a, b, 1.0) < _NOTHING:
                 continue
             origin = segment_lines(

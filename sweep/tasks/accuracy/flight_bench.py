@@ -333,8 +333,7 @@ def _look(
     seen = seen_in(statistics(shots, found), MEAN, 0)._replace(beamlets=rays)
     error = np.zeros(shots.size)
     if estimates:
-        frequency = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
-        bins = np.where(np.isfinite(frequency), np.rint(frequency), -1).astype(np.int64)
+        bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
         error = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
     return seen, error
 
