@@ -106,8 +106,8 @@ def resolve(
         up, doppler, down, carrier, bandwidth, duration, sample_rate, FOLD_PENALTY * bin_width,
     )  # fmt: skip
     columns = np.empty((len(values), *np.broadcast(*values).shape))
-    for column, value in zip(columns, values, strict=True):
-        column[...] = value
+    for number, value in enumerate(values):
+        columns[number, ...] = value
     found = np.empty((2, *columns.shape[1:]))
     resolve_each(columns.reshape(len(values), -1), found.reshape(2, -1))
     return Resolution(*found)
