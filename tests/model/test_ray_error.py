@@ -153,9 +153,13 @@ def _by_hand(seen, parameters, number):
 
 
 @pytest.mark.parametrize("number", [19, 109])
-def test_it_is_what_the_formula_gives(table_4_1, number):
-    """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0."""
-    parameters = _parameters(table_4_1)
+@pytest.mark.parametrize("power", [6e-5, 0.006, 1.0])
+def test_it_is_what_the_formula_gives(table_4_1, number, power):
+    """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0.
+
+    Of faint shots and of bright ones, whose pd is decided, it is the magnitude's.
+    """
+    parameters = _parameters(table_4_1, power)
     seen = _seen("rough ground", number).some(np.arange(0, SHOTS, 40))
     _, ground = seen_ground(seen, parameters, SURFACES)
     shots = prepare_eyepoints(seen, parameters, SURFACES, ["footprint"])

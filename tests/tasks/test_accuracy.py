@@ -278,11 +278,12 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     assert dataset.attrs["study_points"] == 2 * cycles
 
 
-def test_what_a_flight_is_measured_with_is_what_its_run_gives():
-    """Statistics of a trial against those of the flight's own machinery."""
+@pytest.mark.parametrize("rays", [7, "auto"])
+def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
+    """Statistics of a trial against those of the flight's own machinery, more rays and all."""
     from sweep.tasks.calling import TILE_SHOTS
 
-    spec = small_scene()
+    spec = small_scene(footprint={"beamlets": rays}, accuracy={"tolerance": 1e-6})
     bench = FlightBench(spec, 10_000)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     part = bench.parts(1)[0]
@@ -299,6 +300,9 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives():
     found = study.look(tiles.part, shots, eyepoints, called, tiles.index)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
     assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
+    there = np.isfinite(seen.beamlets)
+    assert np.array_equal(found["beamlets"][there], seen.beamlets[there])
+    assert (seen.beamlets[there] > caster.beamlets).any() == (rays == "auto")
 
 
 def seen(pd, magnitude=1.0):
