@@ -80,10 +80,14 @@ def kernels_of(*key: Hashable, further: int = 0) -> np.ndarray:
     """
     kept = _SCRATCH.__dict__.setdefault("kept", OrderedDict())
     if key not in kept:
-        kept[key] = _untouched((ROWS + further, WIDTH))
+        while len(kept) >= MOST_KEPT:  # before there is one more: each is a GiB of addresses
+            kept.popitem(last=False)
+        try:
+            kept[key] = _untouched((ROWS + further, WIDTH))
+        except OSError:  # a limit on addresses: what is kept only saves time
+            kept.clear()
+            kept[key] = _untouched((ROWS + further, WIDTH))
     kept.move_to_end(key)
-    while len(kept) > MOST_KEPT:
-        kept.popitem(last=False)
     return kept[key]
 
 

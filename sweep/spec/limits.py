@@ -22,8 +22,13 @@ RANGE = "target.range"
 DURATION = "instrument.chirp.duration"
 DELAY = "instrument.processing.acquisition_delay"
 SAMPLE_RATE = "instrument.processing.sample_rate"
+FFT_SIZE = "instrument.processing.fft_size"
+WINDOW = "instrument.processing.window"
 RESPONSIVITY = "instrument.receiver.responsivity"
 WAVELENGTH = "instrument.laser.wavelength"
+
+_TRIED = 16
+"""Samples with which windows are tried as they are read: with more they can be had."""
 
 Condition = Callable[[np.ndarray], np.ndarray]
 """What holds or does not for each of several values."""
@@ -97,7 +102,7 @@ def grid_findings(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[Fin
         The axes.
     """
     known = set(values) | {member.path for axis in axes for member in axis.members}
-    findings = _time_findings(values, axes, known)
+    findings = _time_findings(values, axes, known) or _window_findings(values, axes, known)
     if {RESPONSIVITY, WAVELENGTH} <= known:
         per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
         spare = _smallest_sum({WAVELENGTH: per_metre, RESPONSIVITY: -1.0}, values, axes)
@@ -134,6 +139,35 @@ def _time_findings(
             rule = f"must leave 2 samples after the acquisition delay, and leaves {samples:.3g}"
             return [Finding(location, rule, "raise the sample rate or lengthen the chirp", ABSENT)]
     return []
+
+
+def _window_findings(
+    values: Mapping[str, Any], axes: tuple[Axis, ...], known: set[str]
+) -> list[Finding]:
+    """What is wrong with a window for the shortest record: some have none of a few samples."""
+    if not {WINDOW, FFT_SIZE, DURATION, DELAY, SAMPLE_RATE} <= known:
+        return []
+    from sweep.model.window import samples
+
+    length = int(min(_of(FFT_SIZE, values, axes).min(), _fewest_samples(values, axes) + 1e-6))
+    for name in dict.fromkeys(_of(WINDOW, values, axes).tolist()):
+        try:
+            samples(name, min(length, _TRIED))
+        except ValueError:
+            rule = f"must be one that has {length} samples, as many as the shortest record, and "
+            rule += f"{name} has none of so few"
+            remedy = "write another one, or raise instrument.processing.fft_size"
+            return [Finding(place_on_grid(WINDOW, axes), rule, remedy, ABSENT)]
+    return []
+
+
+def _of(path: str, values: Mapping[str, Any], axes: tuple[Axis, ...]) -> np.ndarray:
+    """Values of a parameter over the grid."""
+    for axis in axes:
+        for member in axis.members:
+            if member.path == path:
+                return np.asarray(member.values)
+    return np.atleast_1d(values[path])
 
 
 def _sum_along(axis: Axis, weights: Mapping[str, float]) -> np.ndarray | float:

@@ -89,6 +89,11 @@ TOGETHER = {
         {"instrument.processing.sample_rate": "3 kHz"}, "instrument.chirp.duration",
         "must leave 2 samples", "leaves 1.5", "raise the sample rate",
     ),
+    "window that a record of few samples has not": (
+        {"instrument.processing.fft_size": 5, "instrument.processing.window": "dpss(2.5)"},
+        "instrument.processing.window", "must be one that has 5 samples",
+        "dpss(2.5) has none of so few", "raise instrument.processing.fft_size",
+    ),
     "more electrons than photons": (
         {"instrument.receiver.responsivity": "1.4 A/W"}, "instrument.receiver.responsivity",
         "one electron a photon", "by 0.15 A/W", "'apd_gain'",
