@@ -15,8 +15,8 @@ ray has hit, and takes smooth ground for rougher than it is, for 19 rays most of
 are off by more than 1e-6 (scan pattern comparison, gale crater descent, forest scan and square high
 descent, powers adding, 1,000 shots or more of each, against 8,017 or 16,021 rays) it is less than
 half of that in the forest alone, for one in a thousand, whatever the number of rays; its median is
-7 to 60 times as much for 19 rays, 2 to 10 times from 61 on. It takes 0.5, 1 and 2 us a shot for 19,
-37 and 109 rays.
+7 to 60 times as much for 19 rays, 2 to 10 times from 61 on. It takes 0.4, 0.7 and 2 us a shot for
+19, 37 and 109 rays.
 """
 
 import math
