@@ -106,9 +106,12 @@ class Absence:
     def __init__(self) -> None:
         self._since, self._ever, self._patience = time.monotonic(), False, ABSENT
 
-    def told(self, workers: int) -> str:
-        """What to say now that there are so many workers; mostly nothing."""
-        if workers:
+    def told(self, workers: int, *, worked: bool = False) -> str:
+        """What to say now that there are so many workers; mostly nothing.
+
+        ``worked`` says that one has answered since, which may have gone before it was counted.
+        """
+        if workers or worked:
             self._since, self._ever, self._patience = time.monotonic(), True, ABSENT
         waited = time.monotonic() - self._since
         if waited < self._patience:
@@ -289,7 +292,7 @@ class Session:
                 if not _is_there(self._path):
                     raise FileNotFoundError(self._path)
                 return "another process took the store's lock"
-            if missing := absence.told(answer.workers):
+            if missing := absence.told(answer.workers, worked=bool(answer.receipts)):
                 self._progress.say(missing)
             self._commit(answer, todo)
             if interrupts.stopping and not told:

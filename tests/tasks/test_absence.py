@@ -83,3 +83,12 @@ def test_word_of_absent_workers_comes_ever_less_often(monkeypatch):
         if absence.told(workers):
             said.append(clock[0])
     assert said == [20, 40, 80, 160, 329, 349, 389, 469, 629, 949]
+
+
+def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(session.time, "monotonic", lambda: clock[0])
+    absence = session.Absence()
+    assert absence.told(0) == absence.told(0, worked=True) == ""
+    clock[0] = session.ABSENT + 1
+    assert absence.told(0).startswith("no worker is left (")
