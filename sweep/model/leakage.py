@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from sweep.model import far_field
-from sweep.model.bundles import STRENGTH_IM, STRENGTH_RE
 from sweep.model.compiling import borrowing
 from sweep.model.crossings import (
     added_crossings,
@@ -75,7 +74,6 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
     total, lowest, highest = bundle(n, kind, power, room)
-    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     near, mirrored, fits = near_bins(
         origin, lowest, highest, CLEARANCE + len(kernel[1][2]), image, kernel
     )
@@ -83,7 +81,7 @@ def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
         return 0, 0, 0, 0, 0.0
     spread = lowest, highest
     poles = len(kernel[1][2])
-    total = math.sqrt(total) if power else sum_afar(re, im, n, total, spread, poles)
+    total = math.sqrt(total) if power else sum_afar(n, total, spread, poles, room)
     centre = seen_from(origin, spread, kernel[0][0])
     crossing = stays_below(noise[1], total * kernel[2][0], highest - lowest, centre, image, kernel)
     clearance = CLEARANCE + poles

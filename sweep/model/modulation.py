@@ -111,6 +111,8 @@ def _alike(shots: Shots, levels: np.ndarray) -> Alike:
     if not values:
         return Alike(*np.empty((3, 0), np.int64))
     varying = [v for v in (levels, *values) if v.size and (v != v[0]).any()]
+    if not shots.alike and any(v is not levels for v in varying):
+        return Alike(np.arange(shots.size), np.arange(shots.size), levels)
     if not varying:
         one = np.zeros(min(shots.size, 1), np.int64)
         return Alike(one, np.zeros(shots.size, np.int64), levels[one])
@@ -162,30 +164,26 @@ def _by_modes(shots: Shots) -> bool:
 def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     """Places and weights of the lines that each line is split into, by segment and point."""
     size = alike.point.size if shots.phase_errors else 0
-    modes = _in_modes(shots, alike) if size and _by_modes(shots) else np.empty((3, 0, NUMBERS))
-    splits = []
-    for segment in map(int, np.flatnonzero(shots.segments)) if size else ():
-        left = np.arange(size)
-        if modes.size:
-            left = np.flatnonzero(modes[segment, :, NUMBER] == 0)
-        for level in np.unique(alike.level[left]) if left.size else ():
-            some = left[alike.level[left] == level]
-            own = _split(shots, alike.point[some], segment, SPLIT_TOLERANCES[level])
-            splits.append((segment, some, own))
     number, unknown = np.zeros((3, size), np.int64), np.full((3, size), np.nan)
-    if modes.size and not splits:  # of whose parts nobody looks at any but the real weights
+    modes = np.empty((3, size, 0))
+    if size == 0:
         return modes, modes, modes, number, alike.which, unknown
-    most = max((own.offset.shape[1] for _, _, own in splits), default=0)
-    most = max(most, NUMBERS) if modes.size else most
+    which, segments = np.arange(size), np.flatnonzero(shots.segments)
+    if _by_modes(shots):
+        modes = _in_modes(shots, alike)
+        which = np.flatnonzero((modes[segments, :, NUMBER] == 0).any(axis=0))
+        if not which.size:  # of whose parts nobody looks at any but the real weights
+            return modes, modes, modes, number, alike.which, unknown
+    own = _split(shots, alike.point[which], _TOLERANCES[alike.level[which]])
+    most = max(own.offset.shape[2], NUMBERS if modes.size else 0)
     offset, re, im = np.zeros((3, 3, size, most))
-    for segment, some, own in splits:
-        lines = own.offset.shape[1]
-        offset[segment, some, :lines] = own.offset
-        re[segment, some, :lines] = own.weight.real
-        im[segment, some, :lines] = own.weight.imag
-        number[segment, some] = own.number
+    at = segments[:, None], which, slice(own.offset.shape[2])
+    offset[at], re[at], im[at] = own.offset, own.weight.real, own.weight.imag
+    number[at[:2]] = own.number
     if modes.size:
-        re[:, :, :NUMBERS] = np.where((number == 0)[..., None], modes, re[:, :, :NUMBERS])
+        in_modes = modes[:, :, NUMBER] > 0
+        number[in_modes] = 0
+        re[in_modes, :NUMBERS] = modes[in_modes]
     known_as = digests(offset, re, im) if shots.alike else unknown
     return offset, re, im, number, alike.which, known_as
 
@@ -213,26 +211,40 @@ def _errors(shots: Shots, points: np.ndarray, segment: int, *, once: bool = Fals
     )
 
 
-def _split(shots: Shots, points: np.ndarray, segment: int, tolerance: float) -> Split:
-    """Lines that each line of some points is split into; what one point has is remembered."""
-    errors = _errors(shots, points, segment)
+def _split(shots: Shots, points: np.ndarray, tolerance: np.ndarray) -> Split:
+    """Lines that each line of some points is split into, by segment that there is.
+
+    What one point has is remembered.
+    """
+    errors = tuple(_errors(shots, points, int(s)) for s in np.flatnonzero(shots.segments))
     if points.size > 1:
-        return split(partial(_total_phase, errors), tolerance=tolerance)
+        return split(partial(_phases, errors), tolerance)
     alone = tuple(
-        (phase, sign, tuple((name, float(value[0])) for name, value in values))
-        for phase, sign, values in errors
+        tuple(
+            (phase, sign, tuple((name, float(value[0])) for name, value in values))
+            for phase, sign, values in own
+        )
+        for own in errors
     )
-    return _split_alone(alone, tolerance)
+    return _split_alone(alone, float(tolerance[0]))
 
 
 @lru_cache(maxsize=64)
 def _split_alone(errors: tuple, tolerance: float) -> Split:
-    """Lines of one point; errors as of :func:`_total_phase`, their values numbers."""
+    """Lines of one point; errors as of :func:`_phases`, their values numbers."""
     arrays = tuple(
-        (phase, sign, tuple((name, np.array([value])) for name, value in values))
-        for phase, sign, values in errors
+        tuple(
+            (phase, sign, tuple((name, np.array([value])) for name, value in values))
+            for phase, sign, values in own
+        )
+        for own in errors
     )
-    return split(partial(_total_phase, arrays), tolerance=tolerance)
+    return split(partial(_phases, arrays), np.array([tolerance]))
+
+
+def _phases(errors: tuple, x: np.ndarray) -> np.ndarray:
+    """Phases [cycles] of points in segments, (segments, n, m), from their errors."""
+    return np.stack([_total_phase(own, x) for own in errors])
 
 
 def _total_phase(errors: tuple, x: np.ndarray) -> np.ndarray:

@@ -63,12 +63,11 @@ def detect(origin, n, kind, level, choices, kernel, room, exempt):
     half_size = kernel[0][0] // 2
     power, image = choices[0], choices[1]
     total, lowest, highest = bundle(n, kind, power, room)
-    re, im = room[STRENGTH_RE], room[STRENGTH_IM]
     spread = lowest, highest
     poles = len(kernel[1][2])
     clearance = CLEARANCE + poles + served_beside(kind, kernel)
     total = math.sqrt(total) if power else total
-    afar = total if power else sum_afar(re, im, n, total, spread, poles)
+    afar = total if power else sum_afar(n, total, spread, poles, room)
     centre = seen_from(origin, spread, kernel[0][0])
     needed = _lifted(level, total, afar, highest - lowest, centre, image, kernel)
     while True:
@@ -139,18 +138,45 @@ def stays_below(level, weight, spread, centre, image, kernel):
 
 
 @borrowing()
-def sum_afar(re, im, n, total, spread, poles):
-    """Magnitude of the amplitudes' sum as it is seen from afar, at most that of all of them.
+def sum_afar(n, total, spread, poles, room):
+    """Bound on the magnitude of n strengths' sum as it is seen from afar, in rows DELTA ..
 
-    By how much kernels may differ over the bundle, from the clearance on: the spread times their
-    derivative, (2 poles + 1) over the distance.
+    Over that of the kernel at the nearest end of their ``spread``, from the clearance on. With x
+    the lines' places over half of it, and h that half over the distance of the kernel's nearest
+    pole, Taylor's series about the middle has, for P = 2 poles,
+
+        |sum s| + sum_j (P + j over j) h^j |sum s x^j|,  j = 1..3
+
+    and, with h as the lines next to a bin have it, (P + 4 over 4) h^4 sum |s| x^4 for the rest: a
+    kernel's j-th derivative is at most j! (P + j over j) of itself over the distance's j-th power.
+    Never more than ``total``, the sum of the magnitudes.
     """
-    sum_re, sum_im = 0.0, 0.0
+    half, middle = 0.5 * (spread[1] - spread[0]), 0.5 * (spread[0] + spread[1])
+    inverse = 1.0 / half if half > 0.0 else 0.0
+    delta, re, im = room[DELTA], room[STRENGTH_RE], room[STRENGTH_IM]
+    re_0, re_1, re_2, re_3 = 0.0, 0.0, 0.0, 0.0
+    im_0, im_1, im_2, im_3, rest = 0.0, 0.0, 0.0, 0.0, 0.0
     for b in range(n):
-        sum_re += re[b]
-        sum_im += im[b]
-    differ = (2 * poles + 1) * 0.5 * (spread[1] - spread[0]) / CLEARANCE
-    return min(total, math.hypot(sum_re, sum_im) + differ * total)
+        x = (delta[b] - middle) * inverse
+        square = x * x
+        re_0 += re[b]
+        im_0 += im[b]
+        re_1 += x * re[b]
+        im_1 += x * im[b]
+        re_2 += square * re[b]
+        im_2 += square * im[b]
+        re_3 += square * x * re[b]
+        im_3 += square * x * im[b]
+        rest += square * square * math.sqrt(re[b] * re[b] + im[b] * im[b])
+    share, nearest, order = half / (CLEARANCE + half), half / CLEARANCE, 2 * poles
+    first = order + 1.0
+    second = first * (order + 2) / 2
+    third = second * (order + 3) / 3
+    found = math.hypot(re_0, im_0) + third * (order + 4) / 4 * nearest**4 * rest
+    found += share * first * math.hypot(re_1, im_1)
+    found += share * share * second * math.hypot(re_2, im_2)
+    found += share * share * share * third * math.hypot(re_3, im_3)
+    return min(total, found)
 
 
 @borrowing()

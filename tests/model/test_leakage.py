@@ -9,6 +9,7 @@ from scipy.stats import ncx2
 from windows import SLOW, marked
 
 from sweep.model import modulation, truth
+from sweep.model.bundles import DELTA, ROOM, STRENGTH_IM, STRENGTH_RE
 from sweep.model.chain import prepare, prepare_cast
 from sweep.model.crossings import (
     MOST_TERMS,
@@ -17,9 +18,11 @@ from sweep.model.crossings import (
     crossing_series,
     silence,
 )
+from sweep.model.far_field import CLEARANCE
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.leakage import _all_beyond, _at_most
+from sweep.model.runs import sum_afar
 from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 from sweep.model.window import samples
@@ -81,6 +84,45 @@ def test_what_a_tone_leaks_far_from_it_is_bounded_and_not_by_much_more(name, nea
         leaked.append(((ncx2.sf(level**2, 2, a**2) - alarm) / (1 - alarm)).sum())
     bound = _all_beyond(weight / shape.sum, first, np.inf, (1.0, level, 0.0), kernel)
     assert max(leaked) <= bound <= most * max(leaked)
+
+
+def kernels(shape, y):
+    """Kernel of a cosine sum y bins from its line, over the window's sum, without sin(pi y)."""
+    c, length = shape.coefficients, shape.length
+    theta = np.pi * np.asarray(y) / length
+    found = c[0] / np.tan(theta) + 1j * sum((-1) ** m * x for m, x in enumerate(c))
+    for m in range(1, len(c)):
+        a = np.pi * m / length
+        found += (-1) ** m * c[m] / 2 * (1 / np.tan(theta - a) + 1 / np.tan(theta + a))
+    return found / (length * c[0])
+
+
+def strengths_without_moments(places, degree, generator):
+    """Random strengths whose moments below a degree are nothing: what cancels best from afar."""
+    strength = generator.normal(size=places.size) + 1j * generator.normal(size=places.size)
+    powers = np.array([places**j for j in range(degree)]).reshape(degree, places.size)
+    return strength - np.linalg.pinv(powers) @ (powers @ strength)
+
+
+@pytest.mark.parametrize("name", EVERY_FORM)
+@pytest.mark.parametrize("half", [0.05, 1.0, 2.5, 6.0, 40.0])
+def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(name, half):
+    """Against the kernels of all of them, from the clearance to the other end of the record."""
+    generator, shape = np.random.default_rng(5), shape_of(name, 4096)
+    poles, room, gained = len(shape.poles), np.zeros((ROOM, 64)), []
+    for degree in (0, 0, 1, 2, 3, 4, 6):
+        places = np.append(generator.uniform(-half, half, 10), [-half, half])
+        s = strengths_without_moments(places / half, degree, generator)
+        n, total = places.size, abs(s).sum()
+        room[DELTA, :n], room[STRENGTH_RE, :n], room[STRENGTH_IM, :n] = places, s.real, s.imag
+        bound = sum_afar(n, total, (-half, half), poles, room)
+        away = np.arange(CLEARANCE + poles, 2048.0) + generator.uniform(0, 1)
+        seen = abs(kernels(shape, half + away[:, None] - places) @ s)
+        envelope = shape.envelope[np.searchsorted(shape.reach, away - 1.5, "right") - 1]
+        assert (seen <= bound * envelope * (1 + 1e-9)).all()
+        assert bound <= total
+        gained.append(bound / total)
+    assert min(gained) < {0.05: 1e-5, 1.0: 0.02, 2.5: 0.5}.get(half, 1.1)
 
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])

@@ -19,12 +19,13 @@ from sweep.model.effects.line_modes import (
     IM,
     MODES,
     NUMBER,
+    NUMBERS,
     PLACES,
     RE,
-    in_modes,
     mode_weights,
+    segments_in_modes,
 )
-from sweep.model.effects.line_splitting import TOLERANCE, Phase, Split, split_lines
+from sweep.model.effects.line_splitting import Phase, Split, split_lines
 from sweep.model.elementary import sincos_cycles
 
 STEPS = ((1, 1.0), (3, 0.2), (5, 0.2), (7, 0.2), (9, 0.2), (11, 0.25), (15, 0.35), (21, 0.5),
@@ -39,6 +40,7 @@ class _Made(NamedTuple):
     """Of what the modes are made up, by step; rows end in zeros."""
 
     number: np.ndarray
+    """(steps + 1,): the last for where there is none."""
     offset: np.ndarray
     """(steps, lines)."""
     strength: np.ndarray
@@ -47,41 +49,46 @@ class _Made(NamedTuple):
     """(steps, modes)."""
 
 
-def split(phase: Phase, *, tolerance: float = TOLERANCE) -> Split:
-    """Lines of which each of n lines with a phase error over the record is made up.
+def split(phase: Phase, tolerance: np.ndarray) -> Split:
+    """Lines of which each of n lines with a phase error over the record is made up, by segment.
 
     As :func:`sweep.model.effects.line_splitting.split_lines`, which is asked for what wanders too
-    far for modes; parameters, result and errors are its own.
+    far for modes; but that ``phase`` and results have a first dimension, that of segments, and that
+    each line has a tolerance of its own, (n,).
     """
     at, made = np.ascontiguousarray(phase(PLACES)), _made()
-    found = in_modes(at, np.full(at.shape[0], 2 * LEFT_OUT * tolerance))
-    step, error = _steps_needed(found, tolerance, made.error)
-    number = np.append(made.number, 0)[step]
-    room = at.shape[0], int(number.max(initial=1))
-    whole = Split(np.zeros(room), np.zeros(room, complex), number, error)
-    _put_together(found, at, step, number, made.offset, made.strength, whole.offset, whole.weight)
-    rest = np.flatnonzero(number == 0)
-    if rest.size == 0:
-        return whole
-    return _with(whole, rest, split_lines(partial(_some, phase, rest), tolerance=tolerance))
+    segments, n, _ = at.shape
+    allowed = np.broadcast_to(tolerance, (segments, n)).ravel()
+    found = segments_in_modes(at, 2 * LEFT_OUT * tolerance).reshape(-1, NUMBERS)
+    step, error = _steps_needed(found, allowed, made.error)
+    number = made.number[step]
+    whole = _room(number, error)
+    _put_together(found, at.reshape(-1, PLACES.size), step, made, whole)
+    for each in np.unique(allowed[number == 0]):
+        rest = np.flatnonzero((number == 0) & (allowed == each))
+        whole = _with(whole, rest, split_lines(partial(_some, phase, rest), tolerance=float(each)))
+    return Split(*(values.reshape(segments, n, *values.shape[1:]) for values in whole))
 
 
 def _some(phase: Phase, rows: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return phase(x)[rows]
+    return phase(x).reshape(-1, x.size)[rows]
+
+
+def _room(number: np.ndarray, error: np.ndarray) -> Split:
+    """Room for so many lines of each row."""
+    room = number.size, max(int(number.max(initial=0)), 1)
+    return Split(np.zeros(room), np.zeros(room, complex), number, error)
 
 
 def _with(whole: Split, rows: np.ndarray, own: Split) -> Split:
     """A split with some rows from another one."""
-    most = max(int(whole.number.max()), own.offset.shape[1])
-    found = Split(
-        np.zeros((whole.number.size, most)), np.zeros((whole.number.size, most), complex),
-        whole.number, whole.error,
-    )  # fmt: skip
-    shared = min(most, whole.offset.shape[1])
+    number, error = whole.number.copy(), whole.error.copy()
+    number[rows], error[rows] = own.number, own.error
+    found = _room(number, error)
+    shared = whole.offset.shape[1]
     for out, before, values in zip(found[:2], whole[:2], own[:2], strict=True):
-        out[:, :shared] = before[:, :shared]
+        out[:, :shared] = before
         out[rows, : values.shape[1]] = values
-    found.number[rows], found.error[rows] = own.number, own.error
     return found
 
 
@@ -89,7 +96,7 @@ def _with(whole: Split, rows: np.ndarray, own: Split) -> Split:
 def _made() -> _Made:
     most = STEPS[-1][0]
     made = _Made(
-        np.array([lines for lines, _ in STEPS]), np.zeros((len(STEPS), most)),
+        np.array([*(lines for lines, _ in STEPS), 0]), np.zeros((len(STEPS), most)),
         np.zeros((len(STEPS), MODES, most)), np.zeros((len(STEPS), MODES)),
     )  # fmt: skip
     for step, (lines, spacing) in enumerate(STEPS):
@@ -105,24 +112,26 @@ def _steps_needed(found, tolerance, errors):
     step, error = np.full(found.shape[0], -1), np.zeros(found.shape[0])
     size = np.empty(MODES)
     for row in range(found.shape[0]):
-        own = found[row]
+        own, allowed = found[row], tolerance[row]
         if own[NUMBER] == 0.0 and own[NUMBER + 1] == 0.0:
             continue
         for k in range(MODES):
             size[k] = math.sqrt(own[RE + k] * own[RE + k] + own[IM + k] * own[IM + k])
         for tried in range(errors.shape[0]):
-            off = LEFT_OUT * tolerance
+            off = LEFT_OUT * allowed
             for k in range(MODES):
                 off += size[k] * errors[tried, k]
-            if off <= tolerance:
+            if off <= allowed:
                 step[row], error[row] = tried, off
                 break
     return step, error
 
 
 @njit(cache=True, error_model="numpy")
-def _put_together(found, phase, step, number, offsets, strengths, offset, weight):
+def _put_together(found, phase, step, made, out):
     """Lines of rows in modes, of the step of each; none of rows without."""
+    _, offsets, strengths, _ = made
+    offset, weight, number, _ = out
     for row in range(found.shape[0]):
         own = found[row]
         evens, odds = int(own[NUMBER]), int(own[NUMBER + 1])

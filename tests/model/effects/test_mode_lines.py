@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.effects.line_splitting import split_lines
-from sweep.model.effects.mode_lines import STEPS, split
+from sweep.model.effects.line_splitting import Split, split_lines
+from sweep.model.effects.mode_lines import STEPS
+from sweep.model.effects.mode_lines import split as split_segments
 
 PLACES = np.linspace(-1, 1, 1001)
 
@@ -20,6 +21,13 @@ def phases(wander, rows=50, seed=7):
         return c[:, :4] @ powers + 0.1 * c[:, 4:] * np.sin(4 * x)
 
     return phase
+
+
+def split(phase, *, tolerance):
+    """Lines of rows that are all of one segment."""
+    rows = phase(np.zeros(1)).shape[0]
+    found = split_segments(lambda x: phase(x)[None], np.broadcast_to(tolerance, rows))
+    return Split(*(values[0] for values in found))
 
 
 def factor_of(found, x):
@@ -76,3 +84,27 @@ def test_a_row_does_not_depend_on_those_beside_it():
         np.testing.assert_array_equal(whole.offset[row, :lines], alone.offset[0, :lines])
         np.testing.assert_array_equal(whole.weight[row, :lines], alone.weight[0, :lines])
         assert not whole.weight[row, lines:].any()
+
+
+def test_each_line_has_a_tolerance_of_its_own_in_every_segment():
+    """Bit for bit as alone; up and down chirp are each other's opposite, the Doppler segment is
+    none, and the farthest wanders too far for modes."""
+    scale = np.array([1e-4, 0.02, 0.3, 4.0, 0.02])
+    tolerance = np.array([1e-8, 1e-5, 1e-5, 1e-6, 1e-3])
+
+    def phase(x):
+        return np.stack([sign * scale[:, None] * (x**2 + 0.3 * x**3) for sign in (1, 0, -1)])
+
+    whole = split_segments(phase, tolerance)
+    assert whole.number.shape == (3, 5) and (whole.number[1] == 1).all()
+    assert (whole.error <= tolerance).all() and (whole.number[0, 4] < whole.number[0, 1])
+    for segment in range(3):
+        for row in range(5):
+            alone = split(
+                lambda x, s=segment, r=row: phase(x)[s, r : r + 1], tolerance=tolerance[row]
+            )
+            lines = alone.number[0]
+            assert whole.number[segment, row] == lines
+            own = whole.offset[segment, row, :lines], whole.weight[segment, row, :lines]
+            np.testing.assert_array_equal(own[0], alone.offset[0, :lines])
+            np.testing.assert_array_equal(own[1], alone.weight[0, :lines])
