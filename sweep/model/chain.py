@@ -49,7 +49,12 @@ def prepare(
         yield index, replace(shots, alike=True)
 
 
-def prepare_cast(parameters: Parameters, ground: Cast, effects: Collection[str] = CORE) -> Shots:
+def prepare_cast(
+    parameters: Parameters,
+    ground: Cast,
+    effects: Collection[str] = CORE,
+    flags: np.ndarray | None = None,
+) -> Shots:
     """Shots whose footprints are given, all of one category.
 
     Parameters
@@ -59,19 +64,35 @@ def prepare_cast(parameters: Parameters, ground: Cast, effects: Collection[str] 
         grazing angle and law are not looked at.
     ground : Cast
         The footprints.
+    flags : (n,) uint32 ndarray, optional
+        Of the effects that each shot has, where that are not all of them; they may differ in
+        those that are not computed :attr:`~sweep.model.effects.effect.Effect.apart`.
     """
-    return assembled(
-        as_arrays(DEFAULTS | dict(parameters)), ground.beamlets.row.size, ground, effects
-    )
+    p = as_arrays(DEFAULTS | dict(parameters))
+    return assembled(p, ground.beamlets.row.size, ground, effects, flags)
 
 
 def assembled(
-    p: Mapping[str, np.ndarray], size: int, ground: Ground, effects: Collection[str]
+    p: Mapping[str, np.ndarray],
+    size: int,
+    ground: Ground,
+    effects: Collection[str],
+    flags: np.ndarray | None = None,
 ) -> Shots:
     """Bare shots with the effects put to them, but for random ones."""
-    scene = Scene(p, ground)
+    scene = Scene(p, ground, {} if flags is None else _where(effects, flags))
     shots = bare(p, size, ground)
     for effect in nodes(effects):
         if effect.act is not None:
             shots = effect.act(shots, scene)
     return shots
+
+
+def _where(effects: Collection[str], flags: np.ndarray) -> dict[str, np.ndarray]:
+    """Of effects that not all points have: 1.0 for those that do, else 0.0."""
+    lacking = int(np.bitwise_or.reduce(~flags)) if flags.size else 0
+    return {
+        effect.name: (flags >> k & 1).astype(float)
+        for k, effect in enumerate(EFFECTS)
+        if effect.name in effects and not effect.apart and lacking >> k & 1
+    }

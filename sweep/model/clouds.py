@@ -45,6 +45,7 @@ def cloud(
     method: str = "probabilities",
     returns: int = 4,
     effects: Collection[str] = CORE,
+    flags: np.ndarray | None = None,
     estimates_rays: bool = False,
 ) -> dict[str, np.ndarray]:
     """Statistics and points of n shots.
@@ -68,6 +69,8 @@ def cloud(
         shot and draw; at least 1.
     effects : collection of str
         Names of the effects that are simulated.
+    flags : (n,) uint32 ndarray, optional
+        As of :func:`sweep.model.chain.prepare_cast`.
     estimates_rays : bool
         Whether ``beamlets_error`` is estimated, for which powers have to add (0 where not).
 
@@ -92,7 +95,8 @@ def cloud(
     for first in range(0, n, step):
         part = slice(first, first + step)
         seen = eyepoints.some(part)
-        shots, rays, found = _groups(seen, parameters, surfaces, returns, effects)
+        own = None if flags is None else flags[part]
+        shots, rays, found = _groups(seen, parameters, surfaces, returns, (effects, own))
         drawn = draw_returns(
             shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
         )
@@ -116,7 +120,7 @@ def _groups(
     parameters: Parameters,
     surfaces: Sequence[Surface],
     most: int,
-    effects: Collection[str],
+    called: tuple[Collection[str], np.ndarray | None],
 ) -> tuple[Shots, Footprints, Groups]:
     """Prepared shots, what their rays hit, and groups in their spectra; none for no target."""
     seen = eyepoints.seen
@@ -125,7 +129,7 @@ def _groups(
         radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
     )
     given, ground = seen_ground(somewhere, parameters, surfaces)
-    shots = prepare_cast(given, ground, effects)
+    shots = prepare_cast(given, ground, *called)
     found = groups(shots, most=most)
     if not seen.all():
         blind = ~seen

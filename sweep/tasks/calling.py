@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.flags import flag_attributes, flags_of, names_of
+from sweep.model.effects.flags import flag_attributes, flags_apart, flags_of, names_of
 from sweep.tasks.study import ArrayLayout
 from sweep.tasks.tiles import Tiles
 
@@ -43,6 +43,14 @@ class Called(NamedTuple):
         """Points that call for the same effects, and these."""
         for flags in np.unique(self.flags):
             yield np.flatnonzero(self.flags == flags), names_of(int(flags))
+
+    def together(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
+        """Points that are computed together, the effects of all of them, and their flags."""
+        apart = self.flags & flags_apart()
+        for each in np.unique(apart):
+            index = np.flatnonzero(apart == each)
+            own = self.flags[index]
+            yield index, names_of(int(np.bitwise_or.reduce(own))), own
 
 
 class Calling:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.model.resolution import LEAST_RAYS_TOLERANCE
-from sweep.model.scene_outputs import POINTS, SHOTS
 from sweep.storage.locations import Location
 from sweep.tasks import flight_layout
 from sweep.tasks.calling import TILE_SHOTS, Called, ShotsCalling, ShotsPlan
@@ -20,6 +19,7 @@ from sweep.tasks.earlier import Earlier
 from sweep.tasks.eyepoint_reader import EyepointReader
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path, world_of
 from sweep.tasks.finer_rays import FinerRays, refine
+from sweep.tasks.flight_navigation import solved
 from sweep.tasks.grid_study import coordinates
 from sweep.tasks.patches import KnownCloud, Patch, completed
 from sweep.tasks.stretches import Part, Stretches
@@ -258,7 +258,7 @@ class FlightStudy:
         found = completed(known.points, (number, draws), clouds)
         if not stretches.navigates:
             return found
-        solutions = partial(self._solutions, stretches, shots, found)
+        solutions = partial(solved, self.spec, stretches, shots, found)
         cycles = number // stretches.shots_a_cycle
         return found | completed(known.navigation, (cycles, draws), solutions)
 
@@ -271,20 +271,20 @@ class FlightStudy:
         rows: np.ndarray,
         draws: slice,
     ) -> Iterator[Patch]:
-        """Points of some of the shots, those together that call for the same."""
-        for index, effects in called.some(rows).groups():
+        """Points of some of the shots, those together that call for much the same."""
+        for index, effects, flags in called.some(rows).together():
             some = rows[index]
             cloud = self._cloud(part, draws, effects)
-            results = cloud(eyepoints.some(some), numbers[some])
+            results = cloud(eyepoints.some(some), numbers[some], flags)
             if self.rays_tolerance:
-                rays = eyepoints.weight.size
-                self._refine(part.scanner, numbers[some], rays, results, cloud)
+                own = numbers[some], flags, eyepoints.weight.size
+                self._refine(part.scanner, own, results, cloud)
             yield Patch(some, draws, results)
 
     def _cloud(
         self, part: Part, draws: slice, effects: tuple[str, ...]
-    ) -> Callable[[Eyepoints, np.ndarray], Results]:
-        """What makes points of eyepoints and the shots' numbers."""
+    ) -> Callable[[Eyepoints, np.ndarray, np.ndarray], Results]:
+        """What makes points of eyepoints, the shots' numbers and flags."""
         from sweep.model.clouds import cloud
         from sweep.model.philox import point_keys
 
@@ -301,46 +301,31 @@ class FlightStudy:
             estimates_rays=self.rays_tolerance > 0,
         )
         keys = partial(point_keys, domain=DOMAIN, seed=int(self.spec.seed))
-        return lambda seen, numbers: make(seen, keys=keys(numbers[:, None].astype(float)))
+        return lambda seen, numbers, flags: make(
+            seen, keys=keys(numbers[:, None].astype(float)), flags=flags
+        )
 
     def _refine(
         self,
         scanner: str,
-        numbers: np.ndarray,
-        rays: int,
+        own: tuple[np.ndarray, np.ndarray, int],
         results: Results,
-        cloud: Callable[[Eyepoints, np.ndarray], Results],
+        cloud: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
-        """Put points of shots that need more rays in the place of their results."""
+        """Put points of shots that need more rays in the place of their results.
+
+        ``own``: the shots' numbers, flags, and how many rays they had.
+        """
+        numbers, flags, rays = own
 
         def again(places: np.ndarray, more: int) -> np.ndarray:
             some = numbers[places]
-            finer = cloud(self._finer_rays.see(scanner, some, more), some)
+            finer = cloud(self._finer_rays.see(scanner, some, more), some, flags[places])
             for name, values in finer.items():
                 results[name][places] = values
             return finer["beamlets_error"]
 
         refine(rays, results["beamlets_error"], self.rays_tolerance, again)
-
-    def _solutions(
-        self, stretches: Stretches, shots: Results, found: Results, cycles: np.ndarray, draws: slice
-    ) -> Iterator[Patch]:
-        """Navigation from the points of some of the cycles."""
-        from sweep.model.cycles import solve
-
-        navigation, each = self.spec.navigation, stretches.shots_a_cycle
-        rows = (cycles[:, None] * each + np.arange(each)).ravel()
-        some = slice(None) if rows.size == len(found["flags"]) else rows
-        results = solve(
-            {name: values[some] for name, values in shots.items() if name in SHOTS},
-            {name: found[name][some, draws] for name in POINTS},
-            shots_a_cycle=each,
-            test_level=navigation.test_level,
-            ground_slope=navigation.ground_slope,
-            relief=navigation.relief,
-            jitter=self.spec.platform.jitter,
-        )
-        yield Patch(cycles, draws, results)
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
         """SI values of all parameters at a block's place along the axes, which is asked often."""

@@ -7,6 +7,8 @@ from small_scenes import flight, instrument, observed, plate
 
 from sweep.model import clouds, philox
 from sweep.model.clouds import cloud
+from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES
+from sweep.model.effects.flags import flags_of, names_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.beams import cone
 from sweep.model.geometry.jitter import PointingJitter
@@ -100,6 +102,32 @@ def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
             names = "true_radial_velocity", "radial_velocity_interpolated", "radial_velocity"
             for name, bins in zip(names, (0.1, 0.3, 1.2), strict=True):
                 np.testing.assert_allclose(got[name][shot][own], closing, atol=bins * VELOCITY_BIN)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has(table_4_1, phases):
+    """Bit for bit, all combinations of effects that shots are not kept apart for."""
+    free = [k for k, effect in enumerate(EFFECTS) if not effect.apart]
+    assert {NAMES[k] for k in free} == {
+        "several_returns", "doppler_spread", "signal_shot_noise", "solar_background",
+    }  # fmt: skip
+    every = flags_of(np.array([[name in CORE] for name in NAMES]))[0]
+    off = [sum(1 << free[i] for i in range(4) if n >> i & 1) for n in range(16)]
+    flags = np.array([int(every) & ~bits for bits in off], np.uint32)
+    seen = _edge([BOTH] * 16, lift=5.0, velocity=(3.0, 0.0, -20.0))
+    parameters = _strong(table_4_1, power=1e-2, phases=phases)
+    parameters["target.solar_irradiance"] = 1e9
+    got = _cloud(seen, parameters, effects=CORE, flags=flags, draws=3)
+    for shot in range(16):
+        own = names_of(int(flags[shot]))
+        key, one = _keys([shot]), np.array([shot])
+        alone = _cloud(seen.some(one), parameters, effects=own, draws=3, keys=key)
+        for name, values in alone.items():
+            np.testing.assert_array_equal(got[name][shot], values[0], err_msg=f"{name} {own}")
+    for i in range(4):  # each of them makes a difference
+        other = 1 << i
+        differs = [name for name in STATISTICS if (got[name][0] != got[name][other]).any()]
+        assert differs, NAMES[free[i]]
 
 
 def test_points_lie_along_the_beam_as_commanded(table_4_1):

@@ -6,7 +6,7 @@ from small import small
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.effects.flags import flag_attributes, flags_of, names_of
-from sweep.tasks.calling import Calling
+from sweep.tasks.calling import Called, Calling
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.tiles import TILE_POINTS, Tiles, tile_shape
@@ -54,6 +54,17 @@ def test_every_point_lies_in_one_tile_whose_spans_hold_its_parameters():
             for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
                 span, values = alike.parameters[path], points[path][within]
                 assert (span.low[at] <= values).all() and (values <= span.high[at]).all()
+
+
+def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
+    bit = {name: np.uint32(1 << k) for k, name in enumerate(NAMES)}
+    base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
+    flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
+    found = {tuple(index): names for index, names, own in Called(flags, flags * 0.0).together()}
+    plain = ("footprint", "doppler", "signal_shot_noise")
+    assert found == {(0, 1, 3): plain, (2, 4): (*plain, "image")}
+    for index, _, own in Called(flags, flags * 0.0).together():
+        np.testing.assert_array_equal(own, flags[index])
 
 
 def test_flags_and_names_are_each_other():

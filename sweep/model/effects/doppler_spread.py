@@ -19,6 +19,8 @@ from sweep.model.preparation import Shots
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
+NAME = "doppler_spread"
+
 
 def bound(block: "Block") -> Change | None:
     """What differences of velocity can change in the largest bin.
@@ -40,15 +42,18 @@ def bound(block: "Block") -> Change | None:
 def act(shots: Shots, scene: Scene) -> Shots:
     """Beamlets at their own radial velocities, where there are beamlets."""
     doppler = scene.ground.beamlets.doppler
-    return replace(shots, doppler=doppler) if shots.doppler.shape == doppler.shape else shots
+    if shots.doppler.shape != doppler.shape:
+        return shots
+    return replace(shots, doppler=scene.beamlets(NAME, shots.row, doppler, shots.doppler))
 
 
 EFFECT = Effect(
-    name="doppler_spread",
+    name=NAME,
     about="radial velocities that differ over the footprint",
     stage="lines",
     bound=bound,
     act=act,
+    apart=False,
     parameters=(
         Parameter(
             path="target.transverse_velocity",

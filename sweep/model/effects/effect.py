@@ -8,6 +8,7 @@ not, nothing of it is computed.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -60,6 +61,22 @@ class Scene(NamedTuple):
     parameters: Mapping[str, np.ndarray]
     """By dotted path, (n,) or scalar."""
     ground: Ground
+    where: Mapping[str, np.ndarray] = MappingProxyType({})
+    """Of effects that not all points have: 1.0 for those that do, else 0.0; (n,)."""
+
+    def share(self, effect: str) -> np.ndarray | float:
+        """1 for points that have an effect, 0 for others: (n,), or one number for all."""
+        return self.where.get(effect, 1.0)
+
+    def beamlets(
+        self, effect: str, row: np.ndarray, having: np.ndarray, lacking: np.ndarray
+    ) -> np.ndarray:
+        """Numbers of beamlets, (rows, beamlets), by whether the rows' points have an effect."""
+        if effect not in self.where:
+            return having
+        rows = np.ones((len(having), 1), np.bool_)
+        rows[row, 0] = self.where[effect] > 0
+        return np.where(rows, having, lacking)
 
 
 class Realisation(NamedTuple):
@@ -92,6 +109,9 @@ class Effect:
     parameters: tuple[Parameter, ...] = ()
     within: str = ""
     """An effect that this is part of: kept wherever this is; where it is off, so is this."""
+    apart: bool = True
+    """Whether points that have it are computed apart from those that don't. Where not, `act` looks
+    at :attr:`Scene.where`, and leaves the bits of other points as they would be without it."""
     needs: tuple[str, ...] = ()
     """Effects that this one is simulated with, however little they change by themselves."""
 

@@ -4,13 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.effects.catalogue import NAMES
+from sweep.model.effects.catalogue import EFFECTS, NAMES
 
 
 def flags_of(kept: np.ndarray) -> np.ndarray:
     """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
     bits = np.uint32(1) << np.arange(len(kept), dtype=np.uint32)
     return np.asarray((kept * bits[:, None]).sum(axis=0), np.uint32)
+
+
+def flags_apart() -> np.uint32:
+    """Flags of effects that points with and without them are computed apart by."""
+    return np.uint32(sum(1 << k for k, effect in enumerate(EFFECTS) if effect.apart))
 
 
 def names_of(flags: int) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from sweep.model.preparation import Shots
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
+NAME = "several_returns"
+
 
 def bound(block: "Block") -> Change | None:
     """What the other surfaces' ranges can change in the largest bin.
@@ -56,14 +58,15 @@ def act(shots: Shots, scene: Scene) -> Shots:
     offset = scene.ground.beamlets.offset
     if scene.ground.beside is None or shots.offset.shape != offset.shape:
         return shots
-    return replace(shots, offset=offset)
+    return replace(shots, offset=scene.beamlets(NAME, shots.row, offset, shots.offset))
 
 
 EFFECT = Effect(
-    name="several_returns",
+    name=NAME,
     about="more than one surface in a footprint",
     stage="lines",
     bound=bound,
     act=act,
     within="footprint",
+    apart=False,
 )

@@ -19,6 +19,8 @@ from sweep.model.preparation import Shots
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
+NAME = "signal_shot_noise"
+
 
 def bound(block: "Block") -> Change:
     """Change by the echo's shot noise, which the threshold does not follow."""
@@ -34,14 +36,16 @@ def bound(block: "Block") -> Change:
 
 def act(shots: Shots, scene: Scene) -> Shots:
     """Shot noise of the whole echo."""
-    sources = {"signal_shot": np.asarray(shots.shot_noise_scale * shots.echo_power)}
+    variance = shots.shot_noise_scale * shots.echo_power * scene.share(NAME)
+    sources = {"signal_shot": np.asarray(variance)}
     return replace(shots, noise_sources=shots.noise_sources | sources)
 
 
 EFFECT = Effect(
-    name="signal_shot_noise",
+    name=NAME,
     about="shot noise of the echo itself",
     stage="noise",
     bound=bound,
     act=act,
+    apart=False,
 )

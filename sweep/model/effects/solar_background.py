@@ -22,6 +22,8 @@ from sweep.model.preparation import Shots
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
+NAME = "solar_background"
+
 
 _SCATTERING = {
     "reflectance": "target.reflectance",
@@ -119,17 +121,18 @@ def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def act(shots: Shots, scene: Scene) -> Shots:
     """Shot noise of sunlight; the air dims it on its way up."""
-    light = received(scene.parameters) * shots.ground_transmission
+    light = received(scene.parameters) * shots.ground_transmission * scene.share(NAME)
     sun = {"solar_shot": np.asarray(shots.shot_noise_scale * light)}
     return replace(shots, noise_sources=shots.noise_sources | sun)
 
 
 EFFECT = Effect(
-    name="solar_background",
+    name=NAME,
     about="shot noise of sunlight on the target",
     stage="noise",
     bound=bound,
     act=act,
+    apart=False,
     parameters=(
         Parameter(
             path=_DISTANCE,

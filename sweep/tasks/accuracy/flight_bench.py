@@ -155,7 +155,8 @@ class FlightBench:
         eyepoints = cast.eyepoints.some(one)
         if not eyepoints.seen.all():
             return _nothing(1), _nothing(1)
-        names = [n for n in names_of(int(called.flags[one[0]])) if n not in NOT_IN_TRUTH]
+        every = names_of(int(called.flags[one[0]]))
+        names = tuple(name for name in every if name not in NOT_IN_TRUTH)
         in_time, ordinary = (
             _look(study, tiles, names, look, False, eyepoints)[0]
             for look in (truth.find, shot.find)
@@ -239,14 +240,14 @@ class FlightBench:
         """Statistics of shots, of those that see anything; more rays are cast where they must."""
         whole = _nothing(len(called.flags))
         tolerance, rays = rung.rays_error or study.rays_tolerance, eyepoints.weight.size
-        for flag in np.unique(called.flags):
-            index = np.flatnonzero((called.flags == flag) & eyepoints.seen)
-            if index.size:
-                names = list(names_of(int(flag)))
-                look = partial(_look, study, tiles, names, look_of(rung), bool(tolerance))
-                error = _put(whole, index, look(eyepoints.some(index)))
-                if tolerance:
-                    self._refine(study, tiles, rays, (whole, index, error), tolerance, look)
+        seen = np.flatnonzero(eyepoints.seen)
+        for among, names, flags in called.some(seen).together():
+            index = seen[among]
+            look = partial(_look, study, tiles, names, look_of(rung), bool(tolerance))
+            error = _put(whole, index, look(eyepoints.some(index), flags))
+            if tolerance:
+                found = whole, index, flags, error
+                self._refine(study, tiles, rays, found, tolerance, look)
         return whole
 
     def _refine(
@@ -254,12 +255,12 @@ class FlightBench:
         study: FlightStudy,
         tiles: Tiles,
         rays: int,
-        found: tuple[Seen, np.ndarray, np.ndarray],
+        found: tuple[Seen, np.ndarray, np.ndarray, np.ndarray],
         tolerance: float,
-        look: Callable[[Eyepoints], tuple[Seen, np.ndarray]],
+        look: Callable[[Eyepoints, np.ndarray], tuple[Seen, np.ndarray]],
     ) -> None:
         """As the study does where the tolerance says how many rays there are."""
-        whole, index, error = found
+        whole, index, flags, error = found
         if id(study) not in self._finer:
             make = partial(_Caster, world=world_of(self.spec))
             self._finer[id(study)] = FinerRays(study.spec, make)
@@ -268,7 +269,8 @@ class FlightBench:
             some = index[places]
             seen = self._finer[id(study)].see(tiles.part.scanner, tiles.index[some], more)
             there, error = np.flatnonzero(seen.seen), np.zeros(len(some))
-            error[there] = _put(whole, some[there], look(seen.some(there)))
+            own = flags[places][there]
+            error[there] = _put(whole, some[there], look(seen.some(there), own))
             return error
 
         refine(rays, error, tolerance, again)
@@ -312,10 +314,11 @@ def _put(whole: Seen, index: np.ndarray, found: tuple[Seen, np.ndarray]) -> np.n
 def _look(
     study: FlightStudy,
     tiles: Tiles,
-    names: list[str],
+    names: tuple[str, ...],
     look: Look,
     estimates: bool,
     eyepoints: Eyepoints,
+    flags: np.ndarray | None = None,
 ) -> tuple[Seen, np.ndarray]:
     """Statistics of shots that see something, from a way to look at their spectra.
 
@@ -327,7 +330,7 @@ def _look(
     from sweep.model.shot import statistics
 
     given, ground = seen_ground(eyepoints, study.parameters_at(tiles.part), study.surfaces)
-    shots = prepare_cast(given, ground, names)
+    shots = prepare_cast(given, ground, names, flags)
     found = look(shots)
     rays = np.full(shots.size, float(eyepoints.weight.size))
     seen = seen_in(statistics(shots, found), MEAN, 0)._replace(beamlets=rays)
