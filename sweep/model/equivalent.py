@@ -153,7 +153,20 @@ def put_on_nodes(
     for b in range(n):
         x[b] = (delta[b] - middle) * inverse
     chebyshev_moments(x, re, im, n, nodes, power, work[1], work[2], moment_re, moment_im)
-    chebyshev, following_node = work[0], work[1]
+    put_moments_on_nodes(
+        nodes, middle, half, moment_re, moment_im, out_delta, out_re, out_im, work[0], work[1]
+    )
+    return nodes
+
+
+@borrowing()
+def put_moments_on_nodes(
+    nodes, middle, half, moment_re, moment_im, out_delta, out_re, out_im, chebyshev, following_node
+):  # fmt: skip
+    """Weights at Chebyshev nodes within ``middle`` +- ``half`` that have these first moments.
+
+    The last two are scratch.
+    """
     for i in range(nodes):
         chebyshev[i] = 1.0
         following_node[i] = CHEBYSHEV[nodes, i]
@@ -171,7 +184,6 @@ def put_on_nodes(
             following_node[i] = after
     for i in range(nodes):
         out_delta[i] = middle + half * out_delta[i]
-    return nodes
 
 
 @borrowing()

@@ -22,16 +22,19 @@ from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, relative_error,
 from sweep.model.compiling import borrowing
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_modes import (
+    CENTRE,
     NUMBER,
     NUMBERS,
     PLACES,
     is_plain,
+    middles_of,
     segments_in_modes,
 )
 from sweep.model.effects.line_splitting import Split
 from sweep.model.effects.mode_lines import split
 from sweep.model.equivalent import MOST_NODES, equivalent_lines
 from sweep.model.kernel_rows import digests
+from sweep.model.phase_moments import ALONE, take_phases
 from sweep.model.preparation import LINE_STEPS, Shots
 
 POINTS = 256
@@ -56,7 +59,8 @@ class Stretch(NamedTuple):
     """Footprint; parts of lines: places [bins of fs/L], real and imaginary weight (3, u, k), how
     many count (3, u), which of the u each point has (m,), digests (3, u), nan where no other points
     have the same; shifts [bins of fs/L] and their weights (m, k). Empty where there is none.
-    Of lines in modes no parts count, and real weights are what they are known by."""
+    Of lines in modes no parts count, real weights are what they are known by, and imaginary ones
+    cosine and sine of the phase's middle."""
     lines: int
     """Lines that one point may have at the most."""
 
@@ -137,7 +141,7 @@ def _stretch(shots: Shots, table: np.ndarray, part: slice, parts: tuple) -> Stre
     index = np.arange(part.start, part.stop)
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
-    times = max(parts[0].shape[2], shifts[0].shape[1])
+    times = max(parts[0].shape[2], shifts[0].shape[1], ALONE if parts[0].size else 0)
     return Stretch(
         part,
         np.ascontiguousarray(table[:, part]),
@@ -156,9 +160,9 @@ def choices(shots: Shots, *, every_bin: bool = False) -> tuple[bool, bool, bool,
 
 
 def _by_modes(shots: Shots) -> bool:
-    """Whether each shot's phase error is its own, and its lines add as powers."""
+    """Whether each shot's phase error is its own; powers are in modes where spectra are smooth."""
     closed = not shots.window.table.size and shots.window.length == shots.fft_size
-    return bool(shots.phase_errors) and shots.incoherent and not shots.alike and closed
+    return bool(shots.phase_errors) and not shots.alike and (closed or not shots.incoherent)
 
 
 def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
@@ -169,11 +173,12 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     if size == 0:
         return modes, modes, modes, number, alike.which, unknown
     which, segments = np.arange(size), np.flatnonzero(shots.segments)
+    middles = np.empty((3, size, 2))
     if _by_modes(shots):
-        modes = _in_modes(shots, alike)
-        which = np.flatnonzero((modes[segments, :, NUMBER] == 0).any(axis=0))
-        if not which.size:  # of whose parts nobody looks at any but the real weights
-            return modes, modes, modes, number, alike.which, unknown
+        modes, middles = _in_modes(shots, alike)
+        which = np.flatnonzero((modes[segments, :, NUMBER:CENTRE] == 0).all(axis=2).any(axis=0))
+        if not which.size:
+            return modes, modes, middles, number, alike.which, unknown
     own = _split(shots, alike.point[which], _TOLERANCES[alike.level[which]])
     most = max(own.offset.shape[2], NUMBERS if modes.size else 0)
     offset, re, im = np.zeros((3, 3, size, most))
@@ -181,19 +186,19 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     offset[at], re[at], im[at] = own.offset, own.weight.real, own.weight.imag
     number[at[:2]] = own.number
     if modes.size:
-        in_modes = modes[:, :, NUMBER] > 0
+        in_modes = (modes[:, :, NUMBER:CENTRE] > 0).any(axis=2)
         number[in_modes] = 0
-        re[in_modes, :NUMBERS] = modes[in_modes]
+        re[in_modes, :NUMBERS], im[in_modes, :2] = modes[in_modes], middles[in_modes]
     known_as = digests(offset, re, im) if shots.alike else unknown
     return offset, re, im, number, alike.which, known_as
 
 
-def _in_modes(shots: Shots, alike: Alike) -> np.ndarray:
-    """Lines in modes by segment and point, (3, u, NUMBERS)."""
+def _in_modes(shots: Shots, alike: Alike) -> tuple[np.ndarray, np.ndarray]:
+    """Lines in modes by segment and point, (3, u, NUMBERS), and cosine and sine of middles."""
     phase = np.zeros((3, alike.point.size, PLACES.size))
     for segment in map(int, np.flatnonzero(shots.segments)):
         phase[segment] = _total_phase(_errors(shots, alike.point, segment, once=True), PLACES)
-    return segments_in_modes(phase, _TOLERANCES[alike.level])
+    return segments_in_modes(phase, _TOLERANCES[alike.level]), middles_of(phase)
 
 
 def _errors(shots: Shots, points: np.ndarray, segment: int, *, once: bool = False) -> tuple:
@@ -285,8 +290,11 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
     """
     parts, shifts = scene[1], scene[2]
     count = shifts[0].shape[1] if power else parts[0].shape[2]
-    if count == 0 or (not power and is_whole(segment, i, scene)):
+    if count == 0 or (not power and is_whole(segment, i, scene, power)):
         return n
+    if not power and parts[3][segment, parts[4][i]] == 0:
+        numbers, middle = parts[1][segment, parts[4][i]], parts[2][segment, parts[4][i]]
+        return take_phases(n, numbers, middle, fold, allowed, kernel, room)
     fft_size, length = kernel[0]
     bins = fold * fft_size / length
     few = reduce_lines(n, power, allowed, n - 1, kernel, room)
@@ -316,12 +324,13 @@ def modulate(segment, i, n, fold, scene, power, allowed, kernel, room):
 
 
 @borrowing()
-def is_whole(segment, i, scene):
+def is_whole(segment, i, scene, power):
     """Whether a segment's lines stay what they are, as the Doppler segment's under range walk."""
     parts = scene[1]
     own = parts[4][i]
     if parts[3][segment, own] == 0:
-        return is_plain(parts[1][segment, own])
+        turned = not power and parts[2][segment, own, 0] != 1.0
+        return is_plain(parts[1][segment, own]) and not turned
     whole = parts[3][segment, own] == 1 and parts[0][segment, own, 0] == 0.0
     return whole and parts[1][segment, own, 0] == 1.0 and parts[2][segment, own, 0] == 0.0
 

@@ -173,7 +173,7 @@ def _smooth_lines(segment, p, scene, at, power, kernel, room):
     here, as where they are too many or spread too wide for bundles.
     """
     parts, own = scene[1], -1
-    if parts[0].size and not is_whole(segment, at[1], scene):
+    if parts[0].size and not is_whole(segment, at[1], scene, power):
         own = parts[4][at[1]]
     alone = own >= 0 and math.isnan(parts[5][segment, own])
     origin, n, fold = _lines_of(segment, p, scene, at, power, alone, kernel, room)

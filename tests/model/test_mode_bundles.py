@@ -113,10 +113,10 @@ def test_shots_beside_a_shot_change_no_bit_of_it(phases, table_4_1):
     """Kernels serve all shots of a thread; those of one tolerance are not those of another."""
     shots = shots_of_a_flight(table_4_1, phases)
     together = find(shots)
-    order = np.random.default_rng(3).permutation(shots.size)
+    order, split = np.random.default_rng(3).permutation(shots.size), []
     for i in order[:20]:
         point = modulation.single(shots, int(i))
-        assert phases == "incoherent" or (point.scene[1][3] > 0).all()
+        split.append(point.scene[1][3].any())
         kernel, chosen = shots.kernel(), modulation.choices(shots)
         out = np.full((3, 6, 1), np.nan)
         evaluate_segments(
@@ -124,3 +124,18 @@ def test_shots_beside_a_shot_change_no_bit_of_it(phases, table_4_1):
             workspace(point.lines, shots.fft_size), out,
         )  # fmt: skip
         np.testing.assert_array_equal(out[..., 0], together[..., i])
+    assert 0 < sum(split) < 5  # most are in modes, some wander too far
+
+
+@pytest.mark.parametrize("allowed", [1e-9, 1e-5, 1e-2])
+def test_amplitudes_in_modes_are_those_of_the_lines_that_each_line_is_split_into(
+    allowed, table_4_1
+):
+    """As shots of a grid have them, whose kernels are shared."""
+    shots = shots_of_a_flight(table_4_1, "coherent")
+    shots = replace(shots, line_tolerance=np.asarray(allowed), leakage_tolerance=np.asarray(0.0))
+    split = replace(shots, alike=True, line_tolerance=np.asarray(1e-10))
+    fast, slow = find(shots), find(split)
+    pd, magnitude = (abs(fast - slow)[:, k] for k in (0, 2))
+    assert (pd <= allowed).all()
+    assert (magnitude <= allowed * shots.bin_deviation + 1e-9 * slow[:, 2]).all()

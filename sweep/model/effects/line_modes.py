@@ -113,6 +113,25 @@ def segments_in_modes(phase: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
     return found
 
 
+def middles_of(phase: np.ndarray) -> np.ndarray:
+    """Cosine and sine of the constant phases that modes leave out, (segments, n, 2)."""
+    found = np.empty((*phase.shape[:2], 2))
+    _turn_middles(np.ascontiguousarray(phase), found)
+    return found
+
+
+@borrowing()
+def _turn_middles(phase, found):
+    """Cosine and sine of the middle of every row of every segment."""
+    for segment in range(phase.shape[0]):
+        for row in range(phase.shape[1]):
+            middle = 0.0
+            for i in range(COLUMNS):
+                middle += phase[segment, row, i] / COLUMNS
+            sine, cosine = sincos_cycles(middle)
+            found[segment, row, 0], found[segment, row, 1] = cosine, sine
+
+
 @borrowing()
 def _fit_all(phase, tolerance, errors, to_degrees, room, found):
     """Fit the modes of every row of every segment."""
