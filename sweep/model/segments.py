@@ -69,7 +69,7 @@ def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
     power, image = choices[0], choices[1]
     origin, n, fold = _lines_of(segment, p, scene, at, power, True, kernel, room)
     few = reduce_lines(n, power, allowed(p), n - 1, kernel, room)
-    split, further = parts_at(segment, at[1], fold, scene, kernel)
+    split, further = parts_at(segment, at[1], fold, scene, power, kernel)
     reach = extent_of(at[1], few, split, further, scene[2], power, kernel, room)
     low, high = bins_above(level, reach, origin, kernel)
     while True:

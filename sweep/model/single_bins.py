@@ -14,7 +14,7 @@ from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 
 @owning()
-def parts_at(segment, i, fold, scene, kernel):
+def parts_at(segment, i, fold, scene, power, kernel):
     """Parts of the lines of a point, and how much farther and stronger lines are for them.
 
     Returns
@@ -26,7 +26,7 @@ def parts_at(segment, i, fold, scene, kernel):
     """
     parts = scene[1]
     each, below, above = 1.0, 0.0, 0.0
-    if not parts[0].size:
+    if not power or not parts[0].size:  # amplitudes are lines of their own already
         return (parts[0][0, 0], parts[0][0, 0], parts[0][0, 0]), (each, below, above)
     bins, own = fold * kernel[0][0] / kernel[0][1], parts[4][i]
     number = parts[3][segment, own]
