@@ -141,7 +141,7 @@ def _stretch(shots: Shots, table: np.ndarray, part: slice, parts: tuple) -> Stre
     index = np.arange(part.start, part.stop)
     shifts = _shifts(shots, index)
     beamlets = shots.offset.shape[1]
-    times = max(parts[0].shape[2], shifts[0].shape[1], ALONE if parts[0].size else 0)
+    times = max(parts[0].shape[2], shifts[0].shape[1], ALONE if _by_modes(shots) else 0)
     return Stretch(
         part,
         np.ascontiguousarray(table[:, part]),

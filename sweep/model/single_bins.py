@@ -15,7 +15,9 @@ from sweep.model.spectrum import bin_magnitudes, split_magnitudes
 
 @owning()
 def parts_at(segment, i, fold, scene, power, kernel):
-    """Parts of the lines of a point, and how much farther and stronger lines are for them.
+    """Parts of the lines of a point that add as powers, and how much farther and stronger they are.
+
+    Amplitudes have none: they are lines of their own by then.
 
     Returns
     -------
@@ -26,7 +28,7 @@ def parts_at(segment, i, fold, scene, power, kernel):
     """
     parts = scene[1]
     each, below, above = 1.0, 0.0, 0.0
-    if not power or not parts[0].size:  # amplitudes are lines of their own already
+    if not power or not parts[0].size:
         return (parts[0][0, 0], parts[0][0, 0], parts[0][0, 0]), (each, below, above)
     bins, own = fold * kernel[0][0] / kernel[0][1], parts[4][i]
     number = parts[3][segment, own]
