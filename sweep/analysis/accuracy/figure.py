@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from sweep.analysis import canvas, labels
@@ -38,6 +39,9 @@ MARKS = {
     of.WRITTEN: ("*", canvas.LINES[6], "as written"),
 }
 """Marker, colour and words of each kind."""
+
+HALO = [withStroke(linewidth=2.5, foreground="white")]
+"""What keeps a name readable upon lines and marks."""
 
 
 def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
@@ -92,10 +96,12 @@ def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
         names = list(dict.fromkeys(filter(None, ladder)))
         if names:
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            beside = together[-1] if above else together[0]
             axes.annotate(
-                text, (1e6 * together[-1].seconds, _place(together[-1])),
-                xytext=(6, 5 if above else -10), textcoords="offset points", fontsize=7.5,
-                color=MARKS[together[0].kind][1],
+                text, (1e6 * beside.seconds, _place(beside)),
+                xytext=(6, 5) if above else (-6, -10), ha="left" if above else "right",
+                textcoords="offset points", fontsize=7.5, color=MARKS[beside.kind][1],
+                path_effects=HALO, zorder=5,
             )  # fmt: skip
 
 
