@@ -26,9 +26,9 @@ from sweep.model.effects.line_modes import (
     NUMBER,
     NUMBERS,
     PLACES,
+    in_modes,
     is_plain,
     middles_of,
-    segments_in_modes,
 )
 from sweep.model.effects.line_splitting import Split
 from sweep.model.effects.mode_lines import split
@@ -175,7 +175,7 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     which, segments = np.arange(size), np.flatnonzero(shots.segments)
     middles = np.empty((3, size, 2))
     if _by_modes(shots):
-        modes, middles = _in_modes(shots, alike)
+        modes, middles = _modes_of(shots, alike)
         which = np.flatnonzero((modes[segments, :, NUMBER:CENTRE] == 0).all(axis=2).any(axis=0))
         if not which.size:
             return modes, modes, middles, number, alike.which, unknown
@@ -186,19 +186,19 @@ def _parts(shots: Shots, alike: Alike) -> tuple[np.ndarray, ...]:
     offset[at], re[at], im[at] = own.offset, own.weight.real, own.weight.imag
     number[at[:2]] = own.number
     if modes.size:
-        in_modes = (modes[:, :, NUMBER:CENTRE] > 0).any(axis=2)
-        number[in_modes] = 0
-        re[in_modes, :NUMBERS], im[in_modes, :2] = modes[in_modes], middles[in_modes]
+        as_modes = (modes[:, :, NUMBER:CENTRE] > 0).any(axis=2)
+        number[as_modes] = 0
+        re[as_modes, :NUMBERS], im[as_modes, :2] = modes[as_modes], middles[as_modes]
     known_as = digests(offset, re, im) if shots.alike else unknown
     return offset, re, im, number, alike.which, known_as
 
 
-def _in_modes(shots: Shots, alike: Alike) -> tuple[np.ndarray, np.ndarray]:
+def _modes_of(shots: Shots, alike: Alike) -> tuple[np.ndarray, np.ndarray]:
     """Lines in modes by segment and point, (3, u, NUMBERS), and cosine and sine of middles."""
     phase = np.zeros((3, alike.point.size, PLACES.size))
     for segment in map(int, np.flatnonzero(shots.segments)):
         phase[segment] = _total_phase(_errors(shots, alike.point, segment, once=True), PLACES)
-    return segments_in_modes(phase, _TOLERANCES[alike.level]), middles_of(phase)
+    return in_modes(phase, _TOLERANCES[alike.level]), middles_of(phase)
 
 
 def _errors(shots: Shots, points: np.ndarray, segment: int, *, once: bool = False) -> tuple:

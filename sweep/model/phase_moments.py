@@ -11,25 +11,38 @@ their derivative are
 over H, as those are Chebyshev's coefficients of a function's derivative. So T_k(t) is a recurrence
 over some fifteen numbers, however many lines there are.
 
-What is left out is what few lines for many leave out, as no T_k exceeds 1, as long as H takes in
-how far the phase error spreads lines. Were it less, moments would grow from each to the next, and
-errors with them: measured up to the farthest that modes reach, two nodes more and a H of
-:data:`LEAST` leave less than is allowed.
+What moments from the J-th on leave out is what few lines for many leave out
+(:func:`sweep.model.equivalent.node_limits`), as many times as derivatives magnify it: by about
+T_k(y), where the J-th moment grows y-fold by each, y = J / (z s), z = pi r H, s = sqrt(1 - x^2) at
+the outermost line. So H takes in a little beside the lines, and there are as many moments as leave
+out sum_k |a_k| T_k(y) times less than is allowed. With y that of :data:`MORE` moments more, of
+:data:`LEAST_GROWTH` at the least, this bounds each mode, line, window and tolerance of a dense grid
+(tests/model/test_phase_moments.py); as all is linear in a_k and C, it bounds their sums.
 """
 
 import math
 
 from sweep.model.bundles import DELTA, STRENGTH_IM, STRENGTH_RE, extent, relative_error
 from sweep.model.compiling import borrowing
-from sweep.model.effects.line_modes import CENTRE, EVENS, IM, MODES, NUMBER, RE
+from sweep.model.effects.line_modes import CENTRE, EVENS, IM, NUMBER, RE
 from sweep.model.equivalent import MOST_NODES, chebyshev_moments, nodes_for, put_moments_on_nodes
 
-LEAST, SLOPE, DEGREE, MOST = 0.5, 3.0, 0.0125, 8.0
-"""Bins of fs/L beside lines that H takes in: at the least, by the phase error's steepest slope, by
-the square of the modes' degree, and at the most."""
+LEAST, DEGREE, MOST = 0.5, 1 / 64, 12.0
+"""Bins of fs/L beside lines that H takes in: at the least, by the square of the modes' degree, at
+the most."""
 
-ALONE = 48
-"""Lines at the most that take the place of one."""
+LEAST_GROWTH, MORE = 1.02, 4
+"""The least y there is; moments by which it is that of a later one."""
+
+LARGEST = 100.0
+"""To which derivatives may magnify, by this bound, until H takes in the most: strengths grow as
+well, and kernels are as exact as these are large."""
+
+FLOOR = 1e-10
+"""Error below which none is asked for, as modes make up a phase error to 1e-9."""
+
+ALONE = 72
+"""Lines at the most that take the place of one: at the most beside it, to the least tolerance."""
 
 STRIDE = 2 * MOST_NODES
 """Numbers of a row of scratch that hold a vector of moments."""
@@ -53,19 +66,20 @@ def take_phases(n, numbers, constant, fold, allowed, kernel, room):
         As of :func:`sweep.model.segments.segment_spectrum`.
     """
     fft_size, length = kernel[0]
-    if _degree_of(numbers) == 0:
-        return _shift(n, numbers, constant, fold, fold * fft_size / length, room)
     band, bins = math.pi * length / fft_size, fft_size / length
-    largest, beside = _reach_of(numbers)
-    tolerance = relative_error(n, False, allowed, kernel, room) / largest
+    if _degree_of(numbers) == 0:
+        return _shift(n, numbers, constant, fold, fold * bins, room)
+    tolerance = max(relative_error(n, False, allowed, kernel, room), FLOOR)
     lowest, highest = extent(room[DELTA], n)
-    beside *= bins
-    middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest) + beside
+    middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
     apart = bins * fold * numbers[CENTRE]
-    nodes = nodes_for(band * half, tolerance, kernel[3]) + 2
-    alone = min(nodes_for(band * beside, tolerance, kernel[3]) + 2, ALONE)
+    nodes, beside = nodes_beside(band * half, numbers, tolerance, kernel[3])
+    alone, near = nodes, beside
+    if nodes > min(MOST_NODES, n):
+        alone, near = nodes_beside(0.0, numbers, tolerance, kernel[3])
     lines = room[12], room[13], room[14]
     if nodes <= min(MOST_NODES, n * alone):
+        half += beside / band
         _moments(0, n, middle, half, nodes, room)
         _turn(nodes, numbers, constant, fold, 1.0 / (band * half), room)
         _put(0, nodes, middle + apart, half, lines, room)
@@ -73,9 +87,9 @@ def take_phases(n, numbers, constant, fold, allowed, kernel, room):
     else:
         for b in range(n):
             middle = room[DELTA, b]
-            _moments(b, 1, middle, beside, alone, room)
-            _turn(alone, numbers, constant, fold, 1.0 / (band * beside), room)
-            _put(b * alone, alone, middle + apart, beside, lines, room)
+            _moments(b, 1, middle, near / band, alone, room)
+            _turn(alone, numbers, constant, fold, 1.0 / near, room)
+            _put(b * alone, alone, middle + apart, near / band, lines, room)
         n *= alone
     for j in range(n):
         room[DELTA, j], room[STRENGTH_RE, j] = lines[0][j], lines[1][j]
@@ -99,16 +113,52 @@ def _shift(n, numbers, constant, fold, bins, room):
 
 
 @borrowing()
-def _reach_of(numbers):
-    """Bound on |sum a_k T_k|; bins of fs/L that H takes in beside the lines."""
-    largest, slope = 0.0, 0.0
-    for k in range(MODES):
-        degree = 2 * k if k < EVENS else 2 * (k - EVENS) + 1
-        size = math.hypot(numbers[RE + k], numbers[IM + k])
-        largest += size
-        slope += degree * degree * size
-    beside = max(LEAST, SLOPE * slope / math.pi, DEGREE * _degree_of(numbers) ** 2)
-    return largest, min(beside, MOST)
+def nodes_beside(own, numbers, tolerance, limits):
+    """Moments that serve lines with a phase error; what H takes in beside the lines.
+
+    Parameters
+    ----------
+    own : float
+        Half of what the lines spread over, times the band [rad].
+    numbers : (NUMBERS,) float64
+        The phase error in modes.
+    tolerance : float
+        Error allowed, relative to the sum of the lines' magnitudes.
+    limits
+        As of :func:`sweep.model.equivalent.nodes_for`.
+
+    Returns
+    -------
+    nodes, beside
+        More nodes than there can be where lines spread too wide; radians.
+    """
+    degree = _degree_of(numbers)
+    beside = math.pi * max(LEAST, DEGREE * degree * degree)
+    while True:
+        turn = own + beside
+        scale = math.sqrt(beside * (own + turn))
+        nodes, more = 0, nodes_for(turn, tolerance, limits)
+        while nodes < more <= MOST_NODES:
+            nodes = more
+            magnified = _magnified(numbers, max(LEAST_GROWTH, (nodes + MORE) / scale))
+            if magnified > LARGEST and beside < math.pi * MOST:
+                more = 0
+            else:
+                more = max(nodes_for(turn, tolerance / magnified, limits), nodes)
+        if more > 0:
+            return more, beside
+        beside = min(1.5 * beside, math.pi * MOST)
+
+
+@borrowing()
+def _magnified(numbers, growth):
+    """sum_k |a_k| T_k(growth)."""
+    total, now, after = 0.0, 1.0, growth
+    for k in range(_degree_of(numbers) + 1):
+        at = k // 2 + (EVENS if k & 1 else 0)
+        total += math.sqrt(numbers[RE + at] ** 2 + numbers[IM + at] ** 2) * now
+        now, after = after, 2.0 * growth * after - now
+    return total
 
 
 @borrowing()

@@ -1,14 +1,35 @@
 """Few lines for many with a phase error, against the record that they stand for."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sweep.model.bundles import DELTA, ROOM, STRENGTH_IM, STRENGTH_RE, WIDTH
-from sweep.model.effects.line_modes import NUMBER, PLACES, in_modes, middles_of
-from sweep.model.phase_moments import take_phases
-from sweep.model.window import samples, window
+from sweep.model.effects.line_modes import (
+    EVENS,
+    IM,
+    MODES,
+    NUMBER,
+    NUMBERS,
+    ORDER,
+    PLACES,
+    RE,
+    in_modes,
+    middles_of,
+)
+from sweep.model.equivalent import MOST_NODES, nodes_for
+from sweep.model.phase_moments import (
+    ALONE,
+    LEAST_GROWTH,
+    MORE,
+    MOST,
+    nodes_beside,
+    take_phases,
+)
+from sweep.model.window import COSINE_SUMS, samples, window
 
 SIZE = 512
 
@@ -30,8 +51,8 @@ def taken(places, weights, phase, kernel, *, fold=1.0, tolerance, relative):
     room[DELTA, :n], room[STRENGTH_RE, :n], room[STRENGTH_IM, :n] = (
         places, weights.real, weights.imag,
     )  # fmt: skip
-    at = phase(PLACES)[None]
-    numbers, middle = in_modes(at, np.array([tolerance]))[0], middles_of(at[None])[0, 0]
+    at = phase(PLACES)[None, None]
+    numbers, middle = in_modes(at, np.array([tolerance]))[0, 0], middles_of(at)[0, 0]
     assert numbers[NUMBER : NUMBER + 2].any()
     together = min(np.sqrt(n), max(3.0, 0.1 * np.sqrt(n)))
     error = relative * kernel[2][0] * np.sqrt((abs(weights) ** 2).sum()) * together
@@ -57,7 +78,7 @@ def wandering(generator, degree, size):
 @pytest.mark.parametrize("padding", [1, 2])
 @given(
     seed=st.integers(0, 2**32 - 1), lines=st.sampled_from([1, 2, 5, 37, 109]),
-    spread=st.floats(-3, 1.5), wander=st.floats(-9, 0.2), degree=st.integers(0, 5),
+    spread=st.floats(-3, 1.5), wander=st.floats(-9, 0.6), degree=st.integers(0, 5),
     tolerance=st.sampled_from([1e-9, 1e-6, 1e-3]), fold=st.sampled_from([1.0, -1.0]),
 )  # fmt: skip
 def test_spectra_are_those_of_the_records_with_the_phase_error(
@@ -68,7 +89,9 @@ def test_spectra_are_those_of_the_records_with_the_phase_error(
     places = padding * 10.0**spread * generator.uniform(-1, 1, lines) + generator.uniform(-3, 3)
     weights = generator.normal(size=lines) + 1j * generator.normal(size=lines)
     phase = wandering(generator, degree, 10.0**wander)
-    assume(in_modes(phase(PLACES)[None], np.array([tolerance]))[0, NUMBER : NUMBER + 2].any())
+    assume(
+        in_modes(phase(PLACES)[None, None], np.array([tolerance]))[..., NUMBER : NUMBER + 2].any()
+    )
     found, allowed = taken(
         places, weights, phase, kernel, fold=fold, tolerance=tolerance, relative=tolerance
     )
@@ -79,6 +102,75 @@ def test_spectra_are_those_of_the_records_with_the_phase_error(
     missed = abs(turns @ (w * (few - own * factor))).max()
     rounding = 1e-11 * kernel[2][0] * abs(weights).sum()
     assert missed <= allowed + rounding
+
+
+def left_out(z, own, nodes, weights):
+    """What so many moments of a line leave out of exp(i z x t) T_k(t), k to 16: the mean over t.
+
+    By dense matrices, for the worst of places x; own are the radians they lie within.
+    """
+    t, x, m = np.linspace(0, 1, len(weights)), np.linspace(0, own / z, 9), np.arange(nodes)
+    odd = (m[:, None] > m) & ((m[:, None] - m) % 2 == 1)
+    derivative = np.where(odd, 2.0 * m[:, None], 0) / np.where(m == 0, 2, 1)
+    moments = [np.cos(np.outer(m, np.arccos(x))) + 0j]
+    before = moments[0]
+    for k in range(1, MODES):
+        now = (1 if k == 1 else 2) * derivative @ moments[-1] / (1j * z)
+        moments.append(now - (before if k > 1 else 0))
+        before = moments[-2]
+    places = np.pi * (m + 0.5) / nodes
+    put = (2 / nodes) * np.cos(np.outer(places, m))
+    put[:, 0] /= 2
+    seen, exact = np.exp(1j * z * np.outer(t, np.cos(places))), np.exp(1j * z * np.outer(t, x))
+    wave = [np.cos(k * np.arccos(t))[:, None] * exact for k in range(MODES)]
+    missed = [abs(seen @ (put @ own) - one) for own, one in zip(moments, wave, strict=True)]
+    return np.array([(weights @ each).max() for each in missed])
+
+
+@pytest.mark.parametrize("name", COSINE_SUMS)
+def test_what_moments_leave_out_grows_with_derivatives_as_the_bound_has_it(name):
+    """All that adds up to any phase error of any lines: each mode of one line anywhere."""
+    shape = window(name, SIZE)
+    limits, weights, k = shape.node_limits(False), np.array(shape.band_weights), np.arange(MODES)
+    for beside, own, tolerance in product(
+        np.pi * np.array([0.25, 0.5, 1, 3, 8, 12]), [0, 0.3, 1, 5, 20, 60], limits[4::3, 0]
+    ):
+        z = own + beside
+        scale = np.sqrt(z**2 - own**2)
+        least = nodes_for(z, tolerance, limits)
+        for nodes in sorted({max(least, 2), max(least, 5), max(least, 9), max(least, MODES)}):
+            if nodes > MOST_NODES:
+                continue
+            bound = np.cosh(k * np.arccosh(max(LEAST_GROWTH, (nodes + MORE) / scale)))
+            told = bound * 1e-15 < tolerance  # else rounding shows
+            missed = left_out(z, own, nodes, weights)
+            assert (missed <= tolerance * bound)[told].all()
+
+
+@pytest.mark.parametrize("name", COSINE_SUMS)
+def test_as_many_moments_are_taken_as_leave_out_less_than_is_allowed(name):
+    shape = window(name, SIZE)
+    limits, weights = shape.node_limits(False), np.array(shape.band_weights)
+    for size, own, tolerance in product(np.geomspace(0.01, 3, 9), [0, 1, 20], [1e-9, 1e-6, 1e-3]):
+        phase = size * (PLACES**2 + PLACES**3 / 3)
+        numbers = in_modes(phase[None, None], np.array([tolerance]))[0, 0]
+        if not numbers[NUMBER : NUMBER + 2].any():
+            continue  # too far for so few
+        nodes, beside = nodes_beside(own, numbers, tolerance, limits)
+        amplitude = np.zeros(MODES)
+        amplitude[list(ORDER)] = np.hypot(numbers[RE : RE + MODES], numbers[IM : IM + MODES])
+        assert amplitude @ left_out(own + beside, own, nodes, weights) < tolerance
+
+
+def test_one_line_becomes_no_more_than_there_is_room_for():
+    """At the most beside it, and the least error there is: where growth is bounded by nothing."""
+    numbers = np.zeros(NUMBERS)
+    numbers[[NUMBER, NUMBER + 1]] = EVENS, MODES - EVENS
+    numbers[RE : RE + MODES] = 1e3
+    for name in COSINE_SUMS:
+        limits = window(name, SIZE).node_limits(False)
+        nodes, beside = nodes_beside(0.0, numbers, 0.0, limits)
+        assert beside == np.pi * MOST and MODES < nodes <= ALONE
 
 
 def test_many_lines_are_as_few_as_their_spread_takes_and_far_ones_stay_apart():

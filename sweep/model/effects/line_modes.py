@@ -83,29 +83,23 @@ def in_modes(phase: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    phase : (n, COLUMNS) ndarray
+    phase : (segments, n, COLUMNS) ndarray
         Phase errors at :data:`PLACES` [cycles].
     tolerance : (n,) ndarray
         Error of the phase factor that may remain anywhere in the record.
 
     Returns
     -------
-    (n, NUMBERS) ndarray
+    (segments, n, NUMBERS) ndarray
         See :data:`NUMBER`; no modes count where there are not enough for a phase.
 
     Notes
     -----
     A drift of two bins within the record (psi = x^2 / 4) is within the reach at 1e-9, one of four
     bins at 1e-5.
-    """
-    return segments_in_modes(phase[None], tolerance)[0]
 
-
-def segments_in_modes(phase: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-    """The same of some segments, (segments, n, COLUMNS): (segments, n, NUMBERS).
-
-    Where the last drifts just as the first does, but the other way, as a target's motion has it in
-    the two chirps, its modes are those of the first, conjugated.
+    Where the last segment drifts just as the first does, but the other way, as a target's motion
+    has it in the two chirps, its modes are those of the first, conjugated.
     """
     found = np.zeros((*phase.shape[:2], NUMBERS))
     phase, room = np.ascontiguousarray(phase), np.empty((6, COLUMNS))

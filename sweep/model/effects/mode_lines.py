@@ -22,8 +22,8 @@ from sweep.model.effects.line_modes import (
     NUMBERS,
     PLACES,
     RE,
+    in_modes,
     mode_weights,
-    segments_in_modes,
 )
 from sweep.model.effects.line_splitting import Phase, Split, split_lines
 from sweep.model.elementary import sincos_cycles
@@ -59,7 +59,7 @@ def split(phase: Phase, tolerance: np.ndarray) -> Split:
     at, made = np.ascontiguousarray(phase(PLACES)), _made()
     segments, n, _ = at.shape
     allowed = np.broadcast_to(tolerance, (segments, n)).ravel()
-    found = segments_in_modes(at, 2 * LEFT_OUT * tolerance).reshape(-1, NUMBERS)
+    found = in_modes(at, 2 * LEFT_OUT * tolerance).reshape(-1, NUMBERS)
     step, error = _steps_needed(found, allowed, made.error)
     number = made.number[step]
     whole = _room(number, error)

@@ -10,6 +10,11 @@ from sweep.model.effects.line_modes import CENTRE, IM, MODES, NUMBER, ORDER, PLA
 X = np.linspace(-1, 1, 401)
 
 
+def in_modes(phase, tolerance):
+    """Modes of lines of one segment."""
+    return line_modes.in_modes(phase[None], np.asarray(tolerance))[0]
+
+
 def drift(bins):
     """A drift of so many bins over the record, off its middle, and a cubic phase [cycles]."""
     bins = np.atleast_1d(bins)[:, None]
@@ -27,7 +32,7 @@ def factor(numbers, x):
 def test_modes_make_up_the_phase_factor(tolerance, reach):
     bins = np.concatenate([[0.0], np.geomspace(1e-4, reach, 30), [30.0]])
     bins[1::2] *= -1
-    found = line_modes.in_modes(drift(bins)(PLACES), np.full(bins.size, tolerance))
+    found = in_modes(drift(bins)(PLACES), np.full(bins.size, tolerance))
     for numbers, exact in zip(found[:-1], np.exp(2j * np.pi * drift(bins)(X)), strict=False):
         assert numbers[NUMBER] > 0
         for made in (factor(numbers, X), from_lines(numbers, X)):
@@ -44,13 +49,13 @@ def from_lines(numbers, x):
 
 
 def test_even_phases_take_even_modes_alone():
-    found = line_modes.in_modes(np.array([0.1 * PLACES**2]), np.array([1e-9]))[0]
+    found = in_modes(np.array([0.1 * PLACES**2]), [1e-9])[0]
     assert found[NUMBER] > 3 and found[NUMBER + 1] == 0 and abs(found[CENTRE]) < 1e-15
 
 
 def test_no_phase_is_a_plain_line():
-    found = line_modes.in_modes(np.zeros((1, PLACES.size)), np.array([1e-9]))[0]
+    found = in_modes(np.zeros((1, PLACES.size)), [1e-9])[0]
     assert line_modes.is_plain(found)
-    assert not line_modes.is_plain(line_modes.in_modes(drift(0.1)(PLACES), np.array([1e-5]))[0])
-    shifted = line_modes.in_modes(np.array([0.5 * PLACES]), np.array([1e-9]))[0]
+    assert not line_modes.is_plain(in_modes(drift(0.1)(PLACES), [1e-5])[0])
+    shifted = in_modes(np.array([0.5 * PLACES]), [1e-9])[0]
     assert shifted[CENTRE] == pytest.approx(1.0) and not line_modes.is_plain(shifted)
