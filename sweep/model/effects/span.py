@@ -64,7 +64,7 @@ class Span:
     def holds(self, value: ArrayLike, rounding: float = 0.0) -> np.ndarray:
         """Whether a value lies within, by tile; ``rounding`` is relative room."""
         v = np.asarray(value, float)
-        room = rounding * np.abs(v)
+        room = rounding * np.abs(v) if rounding else 0.0
         return np.asarray((v >= self.low - room) & (v <= self.high + room))
 
     def __add__(self, other: Operand) -> "Span":
@@ -97,6 +97,10 @@ class Span:
 
     def __truediv__(self, other: Operand) -> "Span":
         """Infinite to both sides where the divisor's span holds 0 and is not 0 itself."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # as by denormals
+            return self._over(other)
+
+    def _over(self, other: Operand) -> "Span":
         if isinstance(other, float | int) and other > 0:
             return Span(self.low / other, self.high / other)
         o = Span.of(other)
@@ -106,9 +110,9 @@ class Span:
             return _extremes(
                 self.low / o.low, self.low / o.high, self.high / o.low, self.high / o.high
             )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = [np.divide(a, b) for a in (self.low, self.high) for b in (o.low, o.high)]
-            found = _extremes(*ends)
+        found = _extremes(
+            *(np.divide(a, b) for a in (self.low, self.high) for b in (o.low, o.high))
+        )
         through = np.less_equal(o.low, 0) & np.greater_equal(o.high, 0)
         return Span(np.where(through, -np.inf, found.low), np.where(through, np.inf, found.high))
 

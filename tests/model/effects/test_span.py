@@ -32,6 +32,14 @@ def test_what_points_give_lies_within_what_spans_give(operation, a, b, u, c, d, 
     assert operation(x, two).holds(operation(x, y)).all()
 
 
+@pytest.mark.parametrize("many", [1.0, np.array([1.0])])
+def test_denormals_divide_to_infinity_without_a_warning(many):
+    least = 2.0**-1040
+    for divisor in (least, np.float64(least), Span(many * least, many)):
+        for one in (Span.of(many), Span(-many, many)):
+            assert (one / divisor).high == np.inf
+
+
 @given(number, number, share)
 def test_powers_roots_and_magnitudes_lie_within(a, b, u):
     span, x = span_and_point(a, b, u)
