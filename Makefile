@@ -24,7 +24,7 @@ test: $(READY) forget-kernels
 
 test-all: $(READY) forget-kernels
 	$(MAKE) --jobs 2 compile-grids compile-flights
-	$(BIN)/pytest -n auto --dist worksteal -m ''
+	$(BIN)/pytest -n auto --dist worksteal -m '' --hypothesis-profile anew
 
 lint: $(READY)
 	$(BIN)/ruff check .

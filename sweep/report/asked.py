@@ -97,8 +97,8 @@ def effects(arrays: list[xr.DataArray], modes: Mapping[str, str], coordinates: A
     rows.sort(key=lambda row: -row[2])
     names = ["effect", "asked", "% of points", "within", "what it is"]
     caption = [
-        "Asked: auto simulates an effect where leaving it out could change a probability by more "
-        "than the tolerance allows.",
+        "Asked: auto simulates an effect where leaving it out could change a probability, or the "
+        "magnitude of a bin, by more than the tolerance allows.",
         "Within: the smallest part of the study that holds all points with the effect.",
     ]
     return Table("Effects", caption, pandas.DataFrame(rows, columns=names), "effects")
