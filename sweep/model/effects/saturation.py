@@ -181,7 +181,8 @@ def act(shots: Shots, scene: Scene) -> Shots:
     amplitude = np.maximum(beat_amplitude(shots), _SMALLEST)
     deviation = np.sqrt(shots.noise_variance)
     limit = np.where(limited, full_scale, _NO_LIMIT)
-    beyond = float((np.maximum(amplitude, deviation) / limit).max())
+    with np.errstate(over="ignore"):  # a denormal limit is exceeded endlessly
+        beyond = float((np.maximum(amplitude, deviation) / limit).max())
     if beyond > MOST_BEYOND:
         raise UnsupportedShot(
             f"instrument.processing.full_scale is exceeded {beyond:.3g} times by signal or noise, "
