@@ -41,7 +41,7 @@ MARKS = {
 """Marker, colour and words of each kind."""
 
 HALO = [withStroke(linewidth=2.5, foreground="white")]
-"""What keeps a name readable upon lines and marks."""
+"""What keeps a name readable upon lines; marks are drawn upon it."""
 
 
 def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
@@ -101,7 +101,7 @@ def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
                 text, (1e6 * beside.seconds, _place(beside)),
                 xytext=(6, 5) if above else (-6, -10), ha="left" if above else "right",
                 textcoords="offset points", fontsize=7.5, color=MARKS[beside.kind][1],
-                path_effects=HALO, zorder=5,
+                path_effects=HALO, zorder=3,
             )  # fmt: skip
 
 

@@ -220,7 +220,7 @@ def test_lines_spread_over_all_bins_and_beyond_may_leak_in_any(table_4_1, phases
 
 
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("window", ["hann", "hamming", "blackman"])
+@pytest.mark.parametrize("window", marked(("hann", "hamming", "blackman")))
 def test_as_many_bins_as_expected_are_moved_across_the_threshold_by_images(
     table_4_1, phases, window
 ):
