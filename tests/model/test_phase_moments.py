@@ -122,8 +122,8 @@ def left_out(z, own, nodes, weights):
     put = (2 / nodes) * np.cos(np.outer(places, m))
     put[:, 0] /= 2
     seen, exact = np.exp(1j * z * np.outer(t, np.cos(places))), np.exp(1j * z * np.outer(t, x))
-    wave = [np.cos(k * np.arccos(t))[:, None] * exact for k in range(MODES)]
-    missed = [abs(seen @ (put @ own) - one) for own, one in zip(moments, wave, strict=True)]
+    waves = [np.cos(k * np.arccos(t))[:, None] * exact for k in range(MODES)]
+    missed = [abs(seen @ (put @ m_k) - wave) for m_k, wave in zip(moments, waves, strict=True)]
     return np.array([(weights @ each).max() for each in missed])
 
 
