@@ -15,6 +15,9 @@ from scipy import fft
 _NEGLIGIBLE = 1e-6
 """Share of the variance that may be missing where rounding makes a spectrum negative."""
 
+_AT_ONCE = 1 << 20
+"""Nodes whose covariance is worked out at a time."""
+
 
 def fractal(
     generator: np.random.Generator,
@@ -166,11 +169,15 @@ def _field(generator, shape, steps, covariance, period):  # type: ignore[no-unty
         (np.minimum(np.arange(n), n - np.arange(n)) * step) ** 2
         for n, step in zip(size, steps, strict=True)
     ]
-    distance = np.sqrt(squares[0][:, None] + squares[1])
-    power = fft.rfft2(covariance(distance)).real
+    covariances = np.empty(size)  # a torus may be large; what makes it need not be
+    rows = max(_AT_ONCE // size[1], 1)
+    for part in (slice(first, first + rows) for first in range(0, size[0], rows)):
+        covariances[part] = covariance(np.sqrt(squares[0][part, None] + squares[1]))
+    power = fft.rfft2(covariances, overwrite_x=True).real.copy()
+    del covariances
     negative = -power[power < 0].sum() / power[power > 0].sum()
     if negative > _NEGLIGIBLE:
         raise ArithmeticError(f"{negative:.1e} of the relief's variance is negative on this grid")
-    noise = fft.rfft2(generator.standard_normal(size))
-    noise *= np.sqrt(np.maximum(power, 0.0))
-    return fft.irfft2(noise, s=size)[: shape[0], : shape[1]]
+    noise = fft.rfft2(generator.standard_normal(size), overwrite_x=True)
+    noise *= np.sqrt(np.maximum(power, 0.0, out=power), out=power)
+    return fft.irfft2(noise, s=size, overwrite_x=True)[: shape[0], : shape[1]]
