@@ -100,19 +100,18 @@ def measured(spec: Spec, grid: Grid) -> float:
     """
     compile_kernels(spec, grid)
     calling = Calling(spec, grid)
-    points, begun = 0, time.perf_counter()
-    rows = 1
-    while time.perf_counter() - begun < MEASURING / 2:
+    rows, begun = 1, time.perf_counter()
+    while True:  # once at the least, however long this process has been held up
         points, left_out = 0, 0.0
         round_begun = time.perf_counter()
         for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
             more, seconds = _evaluate_some(spec, calling, int(block), rows)
             points, left_out = points + more, left_out + seconds
-        taken = time.perf_counter() - round_begun
-        if points >= grid.points or taken > MEASURING / 4:
-            break
+        now = time.perf_counter()
+        taken = now - round_begun
+        if points >= grid.points or taken > MEASURING / 4 or now - begun > MEASURING / 2:
+            return (taken + left_out) / points
         rows *= 4
-    return (taken + left_out) / points
 
 
 def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple[int, float]:

@@ -13,6 +13,8 @@ Interval = tuple[ArrayLike, ArrayLike]
 
 NONE: Interval = (1.0, 1.0)
 _HUGE = 1e12
+_NO_NOISE = 1e-200
+"""Factor of noise that is as good as none, as of what saturates."""
 
 
 class Change(NamedTuple):
@@ -58,7 +60,9 @@ def within_changes(
     lower, upper = np.asarray(threshold.low), np.asarray(threshold.high)
     added: np.ndarray = np.zeros(1)
     for change in changes:
-        quiet, loud = (1.0, 1.0) if change.noise is NONE else (1 / np.sqrt(v) for v in change.noise)
+        quiet, loud = np.ones(()), np.ones(())
+        if change.noise is not NONE:
+            quiet, loud = (1 / np.sqrt(np.maximum(v, _NO_NOISE)) for v in change.noise)
         weak, strong = (np.asarray(v, float) for v in change.signal)
         low = low * np.minimum(weak * loud, 1.0)
         high = high * np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.effects.change import Change, pd_change
+from sweep.model.effects.change import Change, pd_change, within_changes
+from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1
 
 positive = st.floats(0.0, 30.0)
@@ -32,3 +33,11 @@ def test_no_change_is_none_and_no_signal_stays_none():
     boundless = Change(signal=(0.0, np.inf))
     np.testing.assert_array_equal(pd_change(boundless, amplitude=0.0, threshold=4.0), 0.0)
     assert pd_change(boundless, amplitude=3.0, threshold=4.0) > 0.8
+
+
+def test_an_effect_that_leaves_no_noise_leaves_finite_magnitudes():
+    """As where all is far beyond full scale."""
+    nothing = Change(signal=(0.0, 0.0), noise=(0.0, 0.0))
+    found, threshold = within_changes([nothing], amplitude=Span(1.0, 2.0), threshold=Span(3.0, 4.0))
+    assert found.low == 0 and 2 <= found.high < np.inf and threshold.low <= 3
+    assert 4 <= threshold.high < np.inf
