@@ -234,3 +234,10 @@ def test_leakage_is_bounded_where_the_signal_s_noise_drowns_the_threshold(tmp_pa
         "target.reflectance": 1.0, "draws.limit": 40,
     }  # fmt: skip
     assert not judged(tmp_path, plain(loud)).refusals
+
+
+def test_a_plan_measures_once_however_late_it_is(monkeypatch):
+    """As of a process that is held up between two looks at the clock."""
+    monkeypatch.setattr("sweep.tasks.plan.MEASURING", 0.0)
+    found = plan(Spec.from_mapping(plain({})))
+    assert np.isfinite(found.seconds) and found.seconds > 0
