@@ -6,8 +6,10 @@ import ctypes
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
 
 #: Seconds that a thread has, after its time, to come back from compiled code and be interrupted.
 GRACE = 10.0
@@ -72,9 +74,8 @@ def _raise_in(thread: int, error: type[BaseException] | None) -> None:
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), raised)
 
 
-@contextmanager
-def time_limit(seconds: float | None) -> Iterator[None]:
-    """Limit what is done within to some seconds; None sets no limit.
+def limited(work: Callable[[], T], seconds: float | None) -> T:
+    """Do some work, for no longer than some seconds; None sets no limit.
 
     Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
     later ends itself; a process that computes on its own account waits for it to return.
@@ -85,19 +86,22 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         Where it took longer.
     """
     if seconds is None:
-        yield
-        return
-    alarm, where = _Alarm(seconds, deadly=_is_worker_process()), None
+        return work()
+    alarm = _Alarm(seconds, deadly=_is_worker_process())
+    where: _Interruption | None = None
+    # No context manager: an interruption on the way into its exit would go past it.
     try:
         try:
             alarm.set()
-            yield
+            found = work()
         finally:
             alarm.put_off()
     except _Interruption as interruption:
+        alarm.put_off()  # the only one there is may have come before that was begun
         where = interruption
     if alarm.rung:
         raise Overtime(f"took longer than the {seconds:g} s that a block may take") from where
+    return found
 
 
 def _is_worker_process() -> bool:

@@ -9,6 +9,7 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from sweep.storage.locations import located
@@ -16,7 +17,7 @@ from sweep.tasks import store, versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import Failure, Receipt
 from sweep.tasks.study import Evaluate, Study
-from sweep.tasks.time_limit import time_limit, worker_address
+from sweep.tasks.time_limit import limited, worker_address
 
 #: Errors of the place that results go to: every further block would meet them too.
 STORAGE_ERRORS = {
@@ -158,8 +159,8 @@ def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
 def _one(opened: Opened, block: int, terms: Terms) -> Receipt:
     held = opened.study
     begun = time.perf_counter()
-    with time_limit(terms.seconds):
-        results = terms.evaluate(held, block) if terms.evaluate else held.evaluate(block)
+    evaluate = partial(terms.evaluate, held) if terms.evaluate else held.evaluate
+    results = limited(partial(evaluate, block), terms.seconds)
     evaluated = time.perf_counter()
     _refuse_another(str(opened.arrays.path), held.id)  # its driver may be long dead
     written = opened.arrays.write(block, results)

@@ -1,8 +1,10 @@
 """Blocks that take too long, too much memory or their worker with them."""
 
+import contextlib
 import os
 import threading
 import time
+from functools import partial
 
 import dask
 import pytest
@@ -109,27 +111,48 @@ def test_a_block_that_failed_goes_to_another_worker(tmp_path):
     assert first != second
 
 
+def forever():
+    while True:
+        time.sleep(0.001)
+
+
+def until_about(seconds):
+    until = time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        pass
+    return "done"
+
+
 def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
-    with pytest.raises(Overtime, match=r"longer than the 0\.05 s"), time_limit.time_limit(0.05):
-        while True:
-            time.sleep(0.001)
+    with pytest.raises(Overtime, match=r"longer than the 0\.05 s"):
+        time_limit.limited(forever, 0.05)
     for _ in range(200):  # ends about when the alarm rings
-        try:
-            with time_limit.time_limit(0.002):
-                until = time.perf_counter() + 0.002
-                while time.perf_counter() < until:
-                    pass
-        except Overtime:
-            pass
+        with contextlib.suppress(Overtime):
+            assert time_limit.limited(partial(until_about, 0.002), 0.002) == "done"
         sum(range(1000))  # where a stray interruption would arrive
-    with time_limit.time_limit(60.0):
-        pass
-    with time_limit.time_limit(None):
-        pass
+    assert time_limit.limited(lambda: "done", 60.0) == "done"
+    assert time_limit.limited(lambda: "done", None) == "done"
     deadline = time.monotonic() + 10
     while any(isinstance(t, threading.Timer) and t.is_alive() for t in threading.enumerate()):
         assert time.monotonic() < deadline, "an alarm is still set"
         time.sleep(0.01)
+
+
+def test_an_interruption_on_the_way_into_putting_the_alarm_off_is_overtime(monkeypatch):
+    put_off, came = time_limit._Alarm.put_off, []
+
+    def late(alarm):
+        if not came:
+            came.append(alarm)
+            alarm.rung = True
+            raise time_limit._Interruption
+        put_off(alarm)
+
+    monkeypatch.setattr(time_limit._Alarm, "put_off", late)
+    with pytest.raises(Overtime):
+        time_limit.limited(lambda: "done", 60.0)
+    came[0]._timer.join(10)
+    assert came[0]._over and not came[0]._timer.is_alive()
 
 
 def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts(
