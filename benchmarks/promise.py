@@ -219,7 +219,7 @@ def of_rays(number: np.ndarray) -> str:
 
 def with_more_rays(bench: Bench, whole: Ladder, own: Trial, label: str, more: int) -> Row:
     """The reference's number of rays against more of them, at a part of the sample."""
-    reference, part = whole.reference, bench.parts(POINTS)[0]
+    reference, part = whole.reference, bench.parts(bench.size)[0]
     finer = replace(
         reference, name=f"{more} rays", overrides={**reference.overrides, BEAMLETS: more}
     )

@@ -163,7 +163,12 @@ class EyepointStudy:
         self.see(np.arange(self.shots_a_cycle))
 
     def see(self, index: np.ndarray) -> Results:
-        """What shots see, by number (n,), in whole cycles."""
+        """What shots see, by number (n,), in whole cycles, and these."""
+        shots = self.cast(index)
+        return shots | self._cycles(shots)
+
+    def cast(self, index: np.ndarray) -> Results:
+        """What any shots see, by number (n,)."""
         from sweep.scenes.eyepoint_arrays import to_arrays
 
         step = max(1, CAST_BEAMLETS // self.beamlets)
@@ -171,10 +176,9 @@ class EyepointStudy:
             to_arrays(self.observe(index[start : start + step]))
             for start in range(0, len(index), step)
         ]
-        shots = parts[0]
-        if len(parts) > 1:
-            shots = {name: np.concatenate([part[name] for part in parts]) for name in shots}
-        return shots | self._cycles(shots)
+        if len(parts) == 1:
+            return parts[0]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def spread(self, cycles: int) -> np.ndarray:
         """Numbers of the shots of some cycles, spread over the flight."""

@@ -11,13 +11,14 @@ from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
 from sweep.tasks import progress
-from sweep.tasks.accuracy import measure, rungs
+from sweep.tasks.accuracy import flight_bench, measure, rungs
 from sweep.tasks.accuracy.bench import Seen
-from sweep.tasks.accuracy.flight_bench import FlightBench
+from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
 from sweep.tasks.accuracy.grid_bench import GridBench
 from sweep.tasks.accuracy.run import measure as measured
 from sweep.tasks.accuracy.sample import by_chance, neighbours, spread
 from sweep.tasks.errors import StoreError
+from sweep.tasks.stretches import Part
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}
 
@@ -276,6 +277,36 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
     assert dataset.attrs["truth_pd_difference"] < 1e-4
     cycles = spec.cycles("three") * 3 + spec.cycles("line") * spec.shots_a_cycle("line")
     assert dataset.attrs["study_points"] == 2 * cycles
+
+
+def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
+    """What is computed beside a part takes part in its time, and changes nothing it sees."""
+    monkeypatch.setattr(flight_bench, "TILE_SHOTS", 32)
+    bench = FlightBench(small_scene(footprint={"beamlets": 7}), 400)
+    parts = bench.parts(64)
+    assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
+    stretches = [bench._of(int(part[0])) for part in parts]
+    first = [stretch.start for stretch in stretches[: bench.least_parts]]
+    assert len(set(first)) == bench.least_parts == 4 and len(parts) > 4
+    tiles = [
+        {(s.part, t) for t in s.tile[part - s.start]}
+        for s, part in zip(stretches, parts, strict=True)
+    ]
+    assert sum(map(len, tiles)) == len(set().union(*tiles)) and max(map(len, tiles)) == 2
+    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
+    for part in (parts[0], parts[-1]):
+        alone, beside = (bench.try_on(rung, part, times).seen for times in (1, 10_000))
+        assert len(alone.sigma) == len(part)
+        for one, other in zip(alone, beside, strict=True):
+            assert np.array_equal(one, other, equal_nan=True)
+
+
+def test_shots_are_timed_with_so_many_that_follow_round_the_end():
+    stretch = Tiles(Part("three", (), 0, 0), np.arange(256 * 4 + 100), 1000)
+    rows = stretch.around(np.arange(768, 1024), 600)
+    assert np.array_equal(np.unique(stretch.tile[rows]), [0, 3, 4]) and len(rows) == 612
+    assert np.array_equal(stretch.around(np.arange(300, 400), 1), np.arange(256, 512))
+    assert len(stretch.around(np.arange(1), 10_000)) == len(stretch.index)
 
 
 @pytest.mark.parametrize("rays", [7, "auto"])

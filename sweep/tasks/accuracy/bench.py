@@ -70,6 +70,10 @@ class Bench(Protocol):
         """Points of the sample."""
 
     @property
+    def least_parts(self) -> int:
+        """Parts of a sample, at the least: whole ones are kept where it is broken off."""
+
+    @property
     def whole(self) -> int:
         """Points of the study, each computed once: draws of a flight are none of their own."""
 

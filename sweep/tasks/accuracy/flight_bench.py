@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from time import thread_time
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -42,18 +43,41 @@ TOGETHER, PLACES = 8, 2
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """Whole cycles of one scanner that cover some tiles of its shots, at one place of the axes."""
+    """Shots of one scanner, in whole tiles, at one place of the axes."""
 
     part: Part
     index: np.ndarray
     """Numbers of the shots, rising."""
     start: int
-    """Place of the first in the sample."""
+    """Place in the sample of the first of the stretch that they are of."""
 
     @property
-    def places(self) -> np.ndarray:
-        """Places of its shots in the sample."""
-        return np.arange(self.start, self.start + len(self.index))
+    def tile(self) -> np.ndarray:
+        """Number of each shot's tile."""
+        return self.index // TILE_SHOTS
+
+    def parts(self, number: int) -> list[np.ndarray]:
+        """Places in the sample, in parts of so many tiles at the most."""
+        places = np.arange(self.start, self.start + len(self.index))
+        tiles = np.split(places, np.flatnonzero(np.diff(self.tile)) + 1)
+        parts = np.array_split(np.arange(len(tiles)), -(-len(tiles) // number))
+        return [np.concatenate([tiles[k] for k in part]) for part in parts]
+
+    def around(self, rows: np.ndarray, number: int) -> np.ndarray:
+        """Rows of whole tiles, those of some shots and what follows, round the end, rising.
+
+        As many tiles as make so many shots, or all.
+        """
+        tiles, counts = np.unique(self.tile, return_counts=True)
+        own = np.unique(self.tile[rows])
+        order = np.roll(np.arange(tiles.size), -int(np.searchsorted(tiles, own[0])))
+        enough = int(np.searchsorted(np.cumsum(counts[order]), number)) + 1
+        chosen = np.union1d(own, tiles[order[:enough]])
+        return np.flatnonzero(np.isin(self.tile, chosen))
+
+    def some(self, rows: np.ndarray) -> Tiles:
+        """Some of the shots."""
+        return Tiles(self.part, self.index[rows], self.start)
 
 
 class Cast(NamedTuple):
@@ -93,12 +117,12 @@ class FlightBench:
     """
 
     unit = "shots"
-    most_times = 1
+    most_times = TOGETHER * TILE_SHOTS
 
     def __init__(self, spec: SceneSpec, points: int) -> None:
         self.spec = spec
         self._studies: dict[str, FlightStudy] = {}
-        self._cast: dict[tuple[str, int], Cast] = {}
+        self._cast: dict[tuple[str, int, bytes], Cast] = {}
         self._geometry: dict[tuple[int, str], str] = {}
         self._casters: dict[str, _Caster] = {}
         self._finer: dict[int, FinerRays] = {}
@@ -116,9 +140,16 @@ class FlightBench:
         stretches = self._study(Rung(name="as written", kind=WRITTEN)).scanners.values()
         return sum(s.total_cycles * s.shots_a_cycle * math.prod(s.axes) for s in stretches)
 
+    @property
+    def least_parts(self) -> int:
+        """One for each scanner and place along the axes."""
+        return len(self._tiles)
+
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample scanner by scanner, and place by place along the axes."""
-        return [tiles.places for tiles in self._tiles]
+        """The sample in parts of about so many shots, from all scanners and places in turn."""
+        number = max(1, round(points / TILE_SHOTS))
+        turns = zip_longest(*(tiles.parts(number) for tiles in self._tiles))
+        return [part for turn in turns for part in turn if part is not None]
 
     def effects(self, rung: Rung) -> frozenset[str]:
         """Effects that a rung calls for anywhere in the sample."""
@@ -131,14 +162,19 @@ class FlightBench:
         return self._names[rung.name]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample; its rays count, `times` does not."""
-        study, tiles = self._study(rung), self._of(int(part[0]))
+        """A rung on a part of the sample, timed with its rays and the tiles beside it."""
+        study, stretch = self._study(rung), self._of(int(part[0]))
+        own = part - stretch.start
+        rows = stretch.around(own, times)
+        tiles = stretch.some(rows)
         cast = self._seen(study, tiles)
         called, planning = self._planned(rung, study, tiles, cast)
         begun = thread_time()
         seen = self._looked(rung, study, tiles, cast.eyepoints, called)
         spent = thread_time() - begun + cast.seconds + planning
-        return Trial(seen, spent / len(part), planning / len(part))
+        chosen = np.searchsorted(rows, own)
+        of_part = Seen(*(values[chosen] for values in seen))
+        return Trial(of_part, spent / len(rows), planning / len(rows))
 
     def forget(self) -> None:
         """Drop the rays that rungs of the same geometry share."""
@@ -148,10 +184,13 @@ class FlightBench:
         """A shot in the time domain, and as the rung has it without what the truth lacks."""
         from sweep.model import shot, truth
 
-        study, tiles = self._study(rung), self._of(place)
+        study, stretch = self._study(rung), self._of(place)
+        row = np.array([place - stretch.start])
+        rows = stretch.around(row, 1)
+        tiles = stretch.some(rows)
         cast = self._seen(study, tiles)
         called, _ = self._planned(rung, study, tiles, cast)
-        one = np.array([place - tiles.start])
+        one = np.searchsorted(rows, row)
         eyepoints = cast.eyepoints.some(one)
         if not eyepoints.seen.all():
             return _nothing(1), _nothing(1)
@@ -196,7 +235,7 @@ class FlightBench:
         return found
 
     def _of(self, place: int) -> Tiles:
-        """The tiles that a place of the sample is in."""
+        """The stretch that a place of the sample is in."""
         return next(tiles for tiles in reversed(self._tiles) if tiles.start <= place)
 
     def _study(self, rung: Rung) -> FlightStudy:
@@ -210,18 +249,21 @@ class FlightBench:
         from sweep.scenes.eyepoint_arrays import from_arrays
 
         scanner = tiles.part.scanner
-        which = id(study), scanner
-        if which not in self._geometry:
-            self._geometry[which] = study.spec.geometry_id(scanner)
-        geometry = self._geometry[which]
+        geometry = self._geometry_of(study, scanner)
         if geometry not in self._casters:
             self._casters[geometry] = _Caster(study.spec, scanner, world_of(self.spec))
-        if (geometry, tiles.start) not in self._cast:
+        which_shots = geometry, tiles.start, tiles.index.tobytes()
+        if which_shots not in self._cast:
             caster = self._casters[geometry]
             begun = thread_time()
-            eyepoints = from_arrays(caster.see(tiles.index), caster.weight)
-            self._cast[geometry, tiles.start] = Cast(eyepoints, thread_time() - begun)
-        return self._cast[geometry, tiles.start]
+            eyepoints = from_arrays(caster.cast(tiles.index), caster.weight)
+            self._cast[which_shots] = Cast(eyepoints, thread_time() - begun)
+        return self._cast[which_shots]
+
+    def _geometry_of(self, study: FlightStudy, scanner: str) -> str:
+        if (id(study), scanner) not in self._geometry:
+            self._geometry[id(study), scanner] = study.spec.geometry_id(scanner)
+        return self._geometry[id(study), scanner]
 
     def _planned(
         self, rung: Rung, study: FlightStudy, tiles: Tiles, cast: Cast
@@ -289,7 +331,7 @@ def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
 def _called(study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints) -> Called:
     """What is simulated of shots, planned in their tiles."""
     number = len(tiles.index)
-    planned = study.planned(tiles.part, eyepoints, tiles.index // TILE_SHOTS)
+    planned = study.planned(tiles.part, eyepoints, tiles.tile)
     nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
     return nothing if planned is None else planned.called(number)
 

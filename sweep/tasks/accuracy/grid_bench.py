@@ -39,6 +39,7 @@ class GridBench:
 
     unit = "points"
     most_times = 8192
+    least_parts = 2
 
     def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
         self.spec = spec

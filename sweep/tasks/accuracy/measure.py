@@ -11,6 +11,7 @@ import numpy as np
 
 from sweep.tasks.accuracy.bench import Bench, Seen, Trial
 from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, DRAWN, Ladder, Rung, ladder
+from sweep.tasks.accuracy.sample import spread
 
 if TYPE_CHECKING:
     from sweep.tasks.accuracy.rungs import Declared
@@ -21,9 +22,6 @@ POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
 
 MOST_ROUNDS = 9
-
-PARTS = 2
-"""Parts of a sample, at the least: whole ones are kept where it is broken off."""
 
 LONG_ENOUGH = 0.003
 """Share of the time limit that a trial takes: its calls then cost little beside its points."""
@@ -39,6 +37,9 @@ FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 
 LEAST_IN_TRUTH = 3
 """Points in the time domain, however long they take."""
+
+TRUTH_POINTS = 500
+"""Points in the time domain, at the most."""
 
 TRUTH_BEAMLETS = 109
 """Beamlets in the time domain where accuracy decides on their number: each is a record."""
@@ -154,10 +155,12 @@ class Measurement:
 
     def _part_points(self) -> int:
         """Points of a part: a few parts, and more where a point takes its time."""
-        first = self._bench.parts(1)[0]
+        first, least = self._bench.parts(1)[0], self._bench.least_parts
         spent = sum(self._timed(i, first) for i in range(len(self._rungs)))
-        fitting = FIRST_ROUND * self._limit * len(first) / spent
-        return max(1, min(self._bench.size, int(fitting)) // PARTS)
+        left = FIRST_ROUND * self._limit - (time.monotonic() - self._begun)
+        fitting = left * len(first) / spent
+        # One part more, on which all are tried before the first round.
+        return max(1, min(self._bench.size // least, int(fitting / (least + 1))))
 
     def _compile(self) -> None:
         """Compile what rungs compile, on those that are not long runs; it is not counted."""
@@ -251,7 +254,7 @@ class Measurement:
         rung = self._in_time_domain()
         if rung is not self._ladder.reference:
             measured.truth_beamlets = TRUTH_BEAMLETS
-        for place in measured.done.tolist():
+        for place in measured.done[spread(measured.done.shape, TRUTH_POINTS)].tolist():
             late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
             if self._interrupts.stopping or (late and len(measured.truth) >= LEAST_IN_TRUTH):
                 break
