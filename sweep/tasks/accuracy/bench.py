@@ -58,8 +58,10 @@ class Bench(Protocol):
     """A sample of a study's points."""
 
     unit: str
-    most_times: int
-    """Points of the longest stretch that may be timed."""
+
+    @property
+    def most_times(self) -> int:
+        """Points of the longest stretch that may be timed."""
 
     @property
     def spec(self) -> Declared:

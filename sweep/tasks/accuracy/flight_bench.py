@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from sweep.spec.world import World
     from sweep.tasks.accuracy.bench import Look
 
-#: Tiles that are computed together, so many that a call costs nothing beside them, as in a study's
-#: blocks, where the flight has them; places along the axes at which each scanner is looked at.
-TOGETHER, PLACES = 8, 2
+#: Places along the axes at which each scanner is looked at.
+PLACES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,6 @@ class FlightBench:
     """
 
     unit = "shots"
-    most_times = TOGETHER * TILE_SHOTS
 
     def __init__(self, spec: SceneSpec, points: int) -> None:
         self.spec = spec
@@ -144,6 +142,14 @@ class FlightBench:
     def least_parts(self) -> int:
         """One for each scanner and place along the axes."""
         return len(self._tiles)
+
+    @property
+    def most_times(self) -> int:
+        """Shots of a block of the study, where the flight has as many.
+
+        What costs the same for any number of shots, as planning mostly does, is shared by these.
+        """
+        return max(int(self.spec.storage.block_shots), TILE_SHOTS)
 
     def parts(self, points: int) -> list[np.ndarray]:
         """The sample in parts of about so many shots, from all scanners and places in turn."""
@@ -222,13 +228,13 @@ class FlightBench:
         """Tiles spread over scanners, axes and flight."""
         study = self._study(Rung(name="as written", kind=WRITTEN))
         found: list[Tiles] = []
-        start = 0
+        start, together = 0, self.most_times // TILE_SHOTS
         for name, stretches in study.scanners.items():
             axes = stretches.axes
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
             wanted = points / TILE_SHOTS / len(study.scanners) / len(places)
             for place in places:
-                index = _spread_shots(stretches, max(TOGETHER, math.ceil(wanted)))
+                index = _spread_shots(stretches, max(together, math.ceil(wanted)))
                 part = Part(name, tuple(int(i) for i in place), 0, 0)
                 found.append(Tiles(part, index, start))
                 start += len(index)
