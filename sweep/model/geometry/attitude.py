@@ -16,6 +16,9 @@ from sweep.model.geometry import quaternion as quat
 _VERTICAL = 1e-9
 """Horizontal share of the speed under which a movement has no heading."""
 
+_MOST_SCALED = 1000
+"""Powers of two by which velocities are scaled: no larger number has an inverse."""
+
 Turn = tuple[np.ndarray, np.ndarray]
 """Quaternion (n, 4), body to world, and angular velocity (n, 3) [rad/s] in the world frame."""
 
@@ -53,7 +56,9 @@ class Nadir:
         """Attitude and angular velocity."""
         if self.heading is not None:
             return np.tile(quat.about(2, self.heading), (len(t), 1)), np.zeros((len(t), 3))
-        heading, yaw_rate, _ = _track(velocity, acceleration)
+        unit, scale = _scaled(velocity)
+        heading, yaw_rate, _ = _track(unit, acceleration)
+        yaw_rate = _rate(yaw_rate, scale)
         return quat.about(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
 
 
@@ -71,20 +76,38 @@ class AlongTrack:
 
     def turn(self, t: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> Turn:
         """Attitude and angular velocity."""
-        heading, yaw_rate, level = _track(velocity, acceleration)
-        speed2 = (velocity**2).sum(axis=1)
-        pitch = np.arctan2(velocity[:, 2], level)
-        level_rate = (velocity[:, :2] * acceleration[:, :2]).sum(axis=1) / level
-        pitch_rate = (acceleration[:, 2] * level - velocity[:, 2] * level_rate) / speed2
+        unit, scale = _scaled(velocity)
+        heading, yaw_rate, level = _track(unit, acceleration)
+        speed2 = (unit**2).sum(axis=1)
+        pitch = np.arctan2(unit[:, 2], level)
+        level_rate = (unit[:, :2] * acceleration[:, :2]).sum(axis=1) / level
+        pitch_rate = (acceleration[:, 2] * level - unit[:, 2] * level_rate) / speed2
+        yaw_rate, pitch_rate = _rate(yaw_rate, scale), _rate(pitch_rate, scale)
         left = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(t))])
         rate = yaw_rate[:, None] * [0.0, 0.0, 1.0] - pitch_rate[:, None] * left
         return quat.from_heading(heading=heading, pitch=pitch, roll=self.roll), rate
 
 
+def _scaled(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities times powers of two, so that their squares are numbers however slow; and these."""
+    _, exponent = np.frexp(np.abs(velocity).max(axis=1))
+    scale = np.ldexp(1.0, np.clip(-exponent, -_MOST_SCALED, _MOST_SCALED))
+    return velocity * scale[:, None], scale
+
+
+def _rate(rate: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Rate of an angle between velocities [rad/s], (n,), from that of scaled ones."""
+    with np.errstate(over="ignore"):
+        found = rate * scale
+    if not np.isfinite(found).all():
+        raise ValueError("so slow a movement that turns has no heading to follow: state one")
+    return found
+
+
 def _track(
     velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heading [rad], its rate [rad/s] and the horizontal speed [m/s], each (n,)."""
+    """Heading [rad], its rate and the horizontal speed, each (n,), in the velocities' unit."""
     vx, vy = velocity[:, 0], velocity[:, 1]
     level = np.hypot(vx, vy)
     if not (level > _VERTICAL * np.linalg.norm(velocity, axis=1)).all():

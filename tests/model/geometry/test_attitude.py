@@ -138,6 +138,26 @@ def test_along_track_the_nose_follows_the_velocity_and_the_wings_are_level():
     assert (quat.rotate(q, UP)[:, 2] > 0).all()
 
 
+@pytest.mark.parametrize("law", [AlongTrack(roll=0.3), Nadir(None)])
+@pytest.mark.parametrize("power", [-1000, -700, 700])
+def test_a_movement_in_slow_motion_turns_the_same_way(law, power):
+    """Turns follow from ratios of velocity and acceleration: powers of two change no bit."""
+    t = np.linspace(0, 6, 25)
+    _, velocity, acceleration = PATH.motion(t)[:3]
+    slow = np.ldexp(velocity, power), np.ldexp(acceleration, power)
+    for one, other in zip(law.turn(t, velocity, acceleration), law.turn(t, *slow), strict=True):
+        assert np.array_equal(one, other)
+    straight = law.turn(t, slow[0], np.zeros_like(velocity))[1]
+    assert not straight.any()
+
+
+@pytest.mark.parametrize("law", [AlongTrack(), Nadir(None)])
+def test_what_turns_at_next_to_no_speed_has_no_heading(law):
+    velocity, acceleration = np.array([[1e-320, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="has no heading to follow"):
+        law.turn(np.zeros(1), velocity, acceleration)
+
+
 def test_a_bank_lifts_the_left_wing_by_its_angle():
     level, banked = (turned(AlongTrack(roll=r), np.array([1.0]))[0] for r in (0.0, 0.4))
     left, lifted = quat.rotate(level, LEFT), quat.rotate(banked, LEFT)
