@@ -36,7 +36,7 @@ compile-%: $(READY)
 	$(BIN)/python tests/compiling.py $*
 
 stability: $(READY)
-	$(BIN)/python tests/stability/stability_table.py
+	PYTHONPATH=tests $(BIN)/python tests/stability/stability_table.py
 
 # 10,000 random specs and 10,000 spoilt ones, some 40 minutes; failures are saved in results/fuzz.
 fuzz: $(READY)

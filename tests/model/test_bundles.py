@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from engine import lines_of, run_of_bins
 from test_optional_lines import exact, prepared, scene
 from windows import marked
 
-from sweep.model import modulation, segments
-from sweep.model.crossings import crossing_series
 from sweep.model.kernel_rows import digests
 from sweep.model.preparation import PhaseError
 
@@ -35,19 +34,6 @@ def drifting(shots, drift):
     return replace(shots, phase_errors=(PhaseError(phase, {"drift": np.array([drift])}),))
 
 
-def run_of_bins(shots, segment):
-    """Bins that detection and leakage look at one by one, |X| there, and whether it was a form."""
-    point = modulation.single(shots, 0)
-    room, exempt, series = segments.workspace(point.lines, shots.fft_size)
-    crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
-    shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
-    _, number, kind = segments._smooth_lines(*shot, True, shots.kernel(), room)
-    low, count, *_ = segments.inspect_segment(
-        *shot, modulation.choices(shots), shots.kernel(), room, exempt, series
-    )
-    return np.arange(low, low + count), room[0, :count].copy(), kind[5] and number > 0
-
-
 def apart(shots, segment):
     """Largest difference of a bin from the time domain's, and the peak of all lines in phase."""
     found, true, peak, form = both(shots, segment)
@@ -62,12 +48,14 @@ def allowed(shots, true):
 
 def both(shots, segment):
     """|X| of bins, the same from the time domain; the peak of all lines in phase."""
-    bins, fast, form = run_of_bins(shots, segment)
+    low, fast = run_of_bins(shots, segment)
+    number, _, _, form = lines_of(shots, segment)
+    bins = np.arange(low, low + fast.size)
     slow = exact(shots, 0, segment, NO_WIDTH)
     assert slow.argmax() in bins
     amplitudes = shots.amplitude[shots.row[0]]
     peak = 0.5 * shots.beat_scale * shots.window.sum * np.sqrt((amplitudes**2).sum())
-    return fast, slow[bins], float(peak), form
+    return fast, slow[bins], float(peak), form and number > 0
 
 
 @pytest.mark.parametrize(
@@ -127,16 +115,11 @@ def test_wide_bundles_stand_side_by_side(phases, table_4_1):
                 grazing_angle=grazing_angle, **PLACES[place],
             )  # fmt: skip
             shots = drifting(prepared(parameters), 1.5)
-            point = modulation.single(shots, 0)
-            room, exempt, series = segments.workspace(point.lines, shots.fft_size)
-            crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
-            shot = 0, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
-            chosen, kernel = modulation.choices(shots), shots.kernel()
-            _, _, (_, number, *_) = segments._smooth_lines(*shot, chosen[0], kernel, room)
-            low, count, *_ = segments.inspect_segment(*shot, chosen, kernel, room, exempt, series)
+            _, _, number, _ = lines_of(shots, 0)
+            low, found = run_of_bins(shots, 0)
             slow = exact(shots, 0, 0, NO_WIDTH)
             peak = 0.5 * shots.beat_scale * shots.window.sum * shots.amplitude.sum()
-            assert abs(room[0, :count] - slow[low : low + count]).max() < AGREEMENT * peak
+            assert abs(found - slow[low : low + found.size]).max() < AGREEMENT * peak
             numbers.add(number)
     assert max(numbers) > 5 and 1 in numbers
 

@@ -3,15 +3,15 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import engine
 import numpy as np
 import pytest
 from test_bundles import PLACES, WINDOWS
 from test_bundles import allowed as powers_allowed
 from test_optional_lines import prepared, scene
 
-from sweep.model import modulation, segments, spectra
+from sweep.model import modulation, spectra
 from sweep.model.chain import prepare
-from sweep.model.crossings import crossing_series
 from sweep.model.kernel_rows import HALVES, KEY
 from sweep.model.shot import find
 
@@ -21,15 +21,9 @@ ROUNDING = 1e-11
 
 def run_of_bins(shots, segment):
     """First bin and |X| of those that are looked at one by one; the level of the moments, or -1."""
-    point = modulation.single(shots, 0)
-    room, exempt, series = segments.workspace(point.lines, shots.fft_size)
-    crossing_series(shots.threshold[0] / shots.bin_deviation[0], series)
-    chosen, kernel = modulation.choices(shots), shots.kernel()
-    shot = segment, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0)
-    _, _, (row, *_, form, _) = segments._smooth_lines(*shot, chosen[0], kernel, room)
+    _, row, _, form = engine.lines_of(shots, segment)
     assert not form
-    low, count, *_ = segments.inspect_segment(*shot, chosen, kernel, room, exempt, series)
-    return low, room[0, :count].copy(), row
+    return *engine.run_of_bins(shots, segment), row
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from engine import run_of_bins
 from scipy.stats import ncx2
 from windows import SLOW, marked
 
-from sweep.model import modulation, truth
+from sweep.model import truth
 from sweep.model.bundles import DELTA, ROOM, STRENGTH_IM, STRENGTH_RE
 from sweep.model.chain import prepare, prepare_cast
 from sweep.model.crossings import (
@@ -23,7 +24,6 @@ from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.runs import sum_afar
-from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 from sweep.model.window import samples
 from sweep.model.window import window as shape_of
@@ -303,18 +303,11 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
                 "target.radial_velocity": v,
             }
         )
-        room, exempt, series = workspace(19, 8192)
-        alone = modulation.single(shots, 0)
-        point = alone.points[:, 0].copy()
-        crossing_series(point[11] / point[10], series)
         for segment in range(3):
-            low, count, *_ = inspect_segment(
-                segment, point, alone.scene, (0, 0), modulation.choices(shots), shots.kernel(),
-                room, exempt, series,
-            )  # fmt: skip
+            low, found = run_of_bins(shots, segment)
             exact = truth.spectrum(shots, 0, segment, range_walk=False)
-            assert 20 < count < 4097
-            error = np.abs(room[0, :count] - exact[low : low + count]).max()
+            assert 20 < found.size < 4097
+            error = np.abs(found - exact[low : low + found.size]).max()
             assert error < 1e-10 * exact.max()
 
 

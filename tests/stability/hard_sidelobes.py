@@ -7,12 +7,11 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 from cases import EPS, Family
+from engine import run_of_bins
 from exact_spectrum import magnitudes, transform
 from hard_marcum import mixture
 from table_shots import shots
 
-from sweep.model import modulation
-from sweep.model.segments import inspect_segment, workspace
 from sweep.model.shot import find
 from sweep.model.spectrum import bin_magnitudes, tangents
 from sweep.model.window import COSINE_SUMS, samples, window
@@ -199,13 +198,8 @@ def few_sources() -> float:
     worst = 0.0
     for name in ("hann", "hamming", "blackman", "rectangular"):
         one = shots(LEAKING, **STRONG, window=name)
-        point = modulation.single(one, 0)
-        room, exempt, series = workspace(point.lines, one.fft_size)
-        low, count, *_ = inspect_segment(
-            0, point.points[:, 0].copy(), point.scene, (int(point.row[0]), 0),
-            modulation.choices(one), one.kernel(), room, exempt, series,
-        )  # fmt: skip
-        found = room[0, :count]
+        low, found = run_of_bins(one, 0)
+        count = found.size
         top = int(np.argmax(found))
         near = {0, top - 30, top - 9, top - 3, top - 1, top, top + 2, top + 17, count - 1}
         chosen = sorted({k for k in near if 0 <= k < count})
