@@ -14,18 +14,23 @@ from small import STUDY, quiet, small
 from small_flights import small_scene
 
 
+def of_window(name: str, place: Path) -> None:
+    """The engine for windows of as many terms."""
+    processing = STUDY["instrument"]["processing"] | {"window": name}
+    quiet(small(axes={}, instrument=STUDY["instrument"] | {"processing": processing}), place / name)
+
+
 def grids(place: Path) -> None:
-    """The engine for windows of two terms, and all ways to draw."""
+    """The engine for windows of two terms and of one, and all ways to draw."""
     for method in ("probabilities", "noise", "spectra"):
         quiet(small(axes={}, draws={"method": method, "number": 1}), place / method)
+    of_window("rectangular", place)
 
 
 def flights(place: Path) -> None:
-    """The engine for windows of five terms; then meshes and points, which need that of two."""
-    processing = STUDY["instrument"]["processing"] | {"window": "flattop"}
-    quiet(
-        small(axes={}, instrument=STUDY["instrument"] | {"processing": processing}), place / "five"
-    )
+    """The engine for windows of five and three terms; meshes and points, which need that of two."""
+    of_window("flattop", place)
+    of_window("blackman", place)
     draws = {"method": "noise", "number": 1, "returns": 2}
     quiet(small_scene(axes={}, draws=draws), place / "flight")
 

@@ -3,13 +3,15 @@
 import os
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small import quiet, small
 
 import sweep
-from sweep.tasks import user_code
+from sweep.tasks import plan as planned
+from sweep.tasks import timing, user_code
 from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
 
@@ -169,7 +171,23 @@ def test_a_page_of_whole_spectra_shows_what_is_stored(tmp_path):
     assert "false_alarms" in text and "Noise by source" in text and "pfa_segment" not in text
 
 
-def test_a_plan_measures_what_draws_take():
+def test_a_plan_measures_what_draws_take(monkeypatch):
+    """By a clock that ticks ten times for a point and once for each of its draws.
+
+    A point is looked at once before, with one draw, and once after, where draws are left out.
+    """
+    ticks = [0.0]
+
+    def evaluated(spec, parameters, count, effects):
+        ticks[0] += count * (10 + spec.draws.number)
+        return {}
+
+    clock = SimpleNamespace(perf_counter=lambda: ticks[0])
+    monkeypatch.setattr(timing, "evaluate_points", evaluated)
+    for module in (timing, planned):
+        monkeypatch.setattr(module, "time", clock)
     few, many = (study() for _ in range(2))
     many = many.model_copy(update={"draws": many.draws.model_copy(update={"number": 10_000})})
-    assert plan(many).seconds_a_point > 5 * plan(few).seconds_a_point
+    assert few.draws.number == 3
+    assert plan(few).seconds_a_point == 11 + 13
+    assert plan(many).seconds_a_point == 11 + (10 + 10_000) + 11
