@@ -13,14 +13,20 @@ from sweep.model.segments import _smooth_lines, inspect_segment, lent
 
 
 @owning(nogil=True)
+def _point(points, row):
+    """Values of the first point, and where its lines are."""
+    p = np.empty(points.shape[0])
+    p[:] = points[:, 0]
+    return p, (row[0], points.shape[1] - 1)
+
+
+@owning(nogil=True)
 def _run(segment, points, row, scene, choices, kernel, work):
     """First bin and number of those that are looked at; |X| is in the room's first row."""
     seen, known, (room, exempt, series) = lent(scene, kernel, work)
     scene, kernel = lend(seen), lend(known)
-    p = np.empty(points.shape[0])
-    p[:] = points[:, 0]
+    p, at = _point(points, row)
     crossing_series(p[11] / p[10], series)
-    at = row[0], points.shape[1] - 1
     low, count, _, _, _ = inspect_segment(
         segment, p, scene, at, choices, kernel, room, exempt, series
     )
@@ -29,11 +35,10 @@ def _run(segment, points, row, scene, choices, kernel, work):
 
 @owning(nogil=True)
 def _kind(segment, points, row, scene, choices, kernel, work):
+    """What :func:`lines_of` tells."""
     seen, known, (room, _, _) = lent(scene, kernel, work)
     scene, kernel = lend(seen), lend(known)
-    p = np.empty(points.shape[0])
-    p[:] = points[:, 0]
-    at = row[0], points.shape[1] - 1
+    p, at = _point(points, row)
     _, number, kind = _smooth_lines(segment, p, scene, at, choices[0], kernel, room)
     return number, kind[0], kind[1], kind[5]
 
