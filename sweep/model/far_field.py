@@ -60,8 +60,8 @@ for _n in range(1, _LARGEST_ORDER + 1):
 def strengths(delta, re, im, n, power, sines):
     """Turns C_b of n lines into C_b sin(pi delta_b), |C_b|^2 into |C_b|^2 sin^2(pi delta_b).
 
-    Lines on a bin are moved off it by the last digit of their place, so that both sine and pole
-    are left; ``delta`` is changed. ``sines`` is scratch.
+    Lines on a bin, or as good as on it, are moved off it by the last digit of their place, so that
+    both sine and pole are left, and their squares; ``delta`` is changed. ``sines`` is scratch.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def strengths(delta, re, im, n, power, sines):
     """
     total, lowest, highest = 0.0, delta[0], delta[0]
     for b in range(n):  # simple loops one after the other, as each of them vectorises
-        on_bin = delta[b] == math.floor(delta[b])
+        on_bin = delta[b] == math.floor(delta[b]) or abs(delta[b]) < 1e-30
         delta[b] += max(3e-16 * abs(delta[b]), 1e-30) if on_bin else 0.0
     for b in range(n):
         sines[b] = sincos_cycles(0.5 * delta[b])[0]

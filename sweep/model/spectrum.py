@@ -66,7 +66,7 @@ def _table_kernel(y, table):
     index = math.floor(position)
     t = position - index
     start = int(index) + _TABLE_PAD - 4
-    if t == 0.0:
+    if t < 1e-30:  # on it, or so close that the weight beside it would be past all numbers
         return table[start + 4]
     top, bottom, weight = 0.0, 0.0, 1.0
     for j in range(10):

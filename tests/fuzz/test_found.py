@@ -241,3 +241,29 @@ def test_a_plan_measures_once_however_late_it_is(monkeypatch):
     monkeypatch.setattr("sweep.tasks.plan.MEASURING", 0.0)
     found = plan(Spec.from_mapping(plain({})))
     assert np.isfinite(found.seconds) and found.seconds > 0
+
+
+@pytest.mark.parametrize("window", ["hann", "rectangular", "tukey(0.6)"])
+@pytest.mark.parametrize("width", ["1e-290 Hz", "1e-200 Hz", "1e-100 Hz", "1e-40 Hz"])
+def test_lines_that_lie_next_to_nothing_off_a_bin_are_on_it(window, width):
+    """Kernels beside a bin divided by their distance from it, and by its square.
+
+    A target at rest has its Doppler line on bin 0, and shifts of a narrow Gaussian line about it.
+    """
+    with_width, without = (
+        GridStudy(Spec.from_mapping(plain(instrument_with(window) | own))).evaluate(0)
+        for own in (
+            {"instrument.laser.line_width": width, "effects": {"line_width": "on"}},
+            {"effects": {"line_width": "off"}},
+        )
+    )
+    for name in ("snr_up", "snr_doppler", "snr_down"):
+        assert with_width[name] == pytest.approx(without[name], rel=1e-9), name
+
+
+def instrument_with(window):
+    """A plain study's, at rest, with a window, its lines as exact as they can be."""
+    return {
+        "instrument.processing.window": window, "target.radial_velocity": "0 m/s",
+        "accuracy.line_error": 1e-9,
+    }  # fmt: skip
