@@ -53,7 +53,7 @@ DEARER = 1.1
 """What timings may be off."""
 ALIKE, NOTHING = 1.1, 1e-9
 """Errors that count as the same, relative to each other, and as none."""
-WHAT = ("pd", "log10 pfa", "magnitude")
+WHAT = ("pd", "log10 pfa", "leakage", "magnitude")
 VARIANTS = {
     "range_angle_over_rough_ground": (
         "range_angle", {"footprint.phases": "incoherent", "footprint.beamlets": "auto"},

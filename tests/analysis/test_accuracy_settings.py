@@ -35,6 +35,7 @@ def dataset():
         {
             "pd_error": error,
             "log10_pfa_error": error,
+            "leakage_error": error,
             "magnitude_error": error,
             "standard_error": (("rung", "point"), np.full((len(names), 3), np.nan)),
             "seconds": (("rung", "round"), seconds),
@@ -46,7 +47,7 @@ def dataset():
             "title": "Made up", "study_points": 1_000_000, "unit": "points", "points": 3,
             "reference": "all effects on", "truth_points": 2, "truth_beamlets": 109,
             "truth_pd_difference": 1e-12, "truth_magnitude_difference": 2e-9,
-            "notes": ["a note"], "stopped": "",
+            "notes": ["a note"], "stopped": "", "thesis_beamlets": 109,
             "study_id": "0123456789", "model_version": "4",
         },
     )  # fmt: skip
@@ -120,12 +121,22 @@ def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
     assert "can be improved to: auto at 0.001 is 6 times as fast as thesis 2^12, folded" in told
 
 
+def test_with_other_beamlets_than_the_thesis_has_nothing_is_asked_for(dataset):
+    dataset.attrs["thesis_beamlets"] = 19
+    told = " ".join(text.sentences(dataset, settings.settings_in(dataset)))
+    assert "9 times as fast as thesis 2^12" in told and "At least 5 times" not in told
+    assert "With this scene's 19 beamlets" in told
+
+
 def test_what_counts_is_the_largest_of_all_that_is_promised(dataset):
     dataset["magnitude_error"] = 10 * dataset.pd_error
     dataset["log10_pfa_error"] = 0.0 * dataset.pd_error
     named = {s.name: s for s in settings.settings_in(dataset)}
     assert named["auto at 0.001"].error == pytest.approx(5e-3)
     assert named["auto at 0.001"].quantile(1.0) == pytest.approx(5e-4)
+    dataset["leakage_error"] = 20 * dataset.pd_error
+    assert settings.settings_in(dataset)[2].error == pytest.approx(1e-2)
+    dataset["leakage_error"] = 0.0 * dataset.pd_error
     dataset["magnitude_error"] = np.nan * dataset.pd_error  # as of detections counted
     assert settings.settings_in(dataset)[2].error == pytest.approx(5e-4)
 
@@ -171,7 +182,7 @@ def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dat
     four = [
         replace(
             like, name=f"auto at {t:g}", tolerance=t, rounds=1e-6 * np.array([us]),
-            pd_error=np.full(3, error), log10_pfa_error=0.0, magnitude_error=0.0,
+            pd_error=np.full(3, error), log10_pfa_error=0.0, leakage_error=0.0, magnitude_error=0.0,
         )
         for t, us, error in (
             (0.1, 8.0, 8e-5), (0.01, 8.2, 8e-5), (1e-4, 8.7, 1e-5), (1e-3, 8.8, 8e-5),

@@ -336,12 +336,13 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     assert (seen.beamlets[there] > caster.beamlets).any() == (rays == "auto")
 
 
-def seen(pd, magnitude=1.0):
+def seen(pd, magnitude=1.0, leakage=(0.0, 0.0)):
     """A point of given probabilities and magnitude, sigma 0.5."""
     alarms = np.array([[-np.inf, -3.0]])
     return Seen(
         np.array([pd]),
         alarms,
+        np.array([leakage]),
         np.array([[magnitude]]),
         np.array([np.nan]),
         np.array([0.5]),
@@ -350,15 +351,21 @@ def seen(pd, magnitude=1.0):
 
 
 def test_what_sees_nothing_detects_nothing():
-    pd, pfa, magnitude = measure.apart(
+    pd, pfa, leakage, magnitude = measure.apart(
         seen([0.5, np.nan, 0.2, np.nan]), seen([0.4, 0.3, 0.2, np.nan])
     )
-    assert (pd, pfa, magnitude) == (pytest.approx([0.3]), [0.0], [0.0])
+    assert (pd, pfa, leakage, magnitude) == (pytest.approx([0.3]), [0.0], [0.0], [0.0])
+
+
+def test_what_leaks_counts_as_a_probability_does():
+    """A setting that leaves leakage out is off by all of it, which changes nothing else."""
+    found = measure.apart(seen([1.0], leakage=(np.nan, 0.1)), seen([1.0], leakage=(0.4, 0.3)))
+    assert found == (0.0, 0.0, pytest.approx([0.4]), 0.0)
 
 
 @pytest.mark.parametrize(("true", "found", "error"), [(2.0, 2.2, 0.1), (0.1, 0.2, 0.2)])
 def test_magnitudes_are_off_by_so_much_of_themselves_or_of_sigma(true, found, error):
-    assert measure.apart(seen([1.0], found), seen([1.0], true))[2] == pytest.approx([error])
+    assert measure.apart(seen([1.0], found), seen([1.0], true))[3] == pytest.approx([error])
 
 
 def test_a_store_in_the_way_is_refused_and_left_alone(tmp_path, undisturbed):

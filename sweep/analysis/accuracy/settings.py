@@ -23,6 +23,9 @@ FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COU
 AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0
 """What adaptive settings are held to: against the best fixed one, against the thesis's way."""
 
+OF_THESIS = 109
+"""Beamlets of the thesis's way."""
+
 LIKELY = 0.95
 """Share of the points whose error counts where errors are random; else all of them do."""
 
@@ -41,7 +44,8 @@ class Setting:
     pd_error: np.ndarray
     """By point."""
     log10_pfa_error: float
-    """Largest over the points; nan where it has none, as the next."""
+    """Largest over the points; nan where it has none, as the next two."""
+    leakage_error: float
     magnitude_error: float
     likely: float
     """Share of the points that :attr:`error` is of."""
@@ -59,8 +63,8 @@ class Setting:
         """
         if self.likely < 1.0:
             return self.quantile(self.likely)
-        promised = self.quantile(1.0), self.log10_pfa_error, self.magnitude_error
-        return float(np.fmax.reduce(promised))
+        others = self.log10_pfa_error, self.leakage_error, self.magnitude_error
+        return float(np.fmax.reduce([self.quantile(1.0), *others]))
 
     def quantile(self, share: float) -> float:
         """Error of pd that this share of the points stays below."""
@@ -87,6 +91,7 @@ def settings_in(dataset: xr.Dataset) -> list[Setting]:
                 planning=float(rung.planning.values[np.argmin(rounds)]),
                 pd_error=rung.pd_error.values,
                 log10_pfa_error=_largest(rung.log10_pfa_error.values),
+                leakage_error=_largest(rung.leakage_error.values),
                 magnitude_error=_largest(rung.magnitude_error.values),
                 likely=likely,
             )

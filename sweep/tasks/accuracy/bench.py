@@ -33,6 +33,8 @@ class Seen(NamedTuple):
     """(n, 4): probability of detection: up, Doppler, down, shot."""
     log10_pfa: np.ndarray
     """(n, k): log10 of probabilities of false alarm."""
+    leakage: np.ndarray
+    """(n, 2): probability of leakage in the chirps, up and down."""
     magnitude: np.ndarray
     """(n, k): |X| of the peak bins, in a unit of all rungs."""
     standard_error: np.ndarray
@@ -124,7 +126,8 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         pd = np.stack(counts, axis=1) / draws
         nothing = np.full((len(pd), 3), np.nan)
         error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / draws)
-        return Seen(pd, nothing[:, :2], nothing, error.max(axis=1), *nothing[:, :2].T)
+        unknown = nothing[:, :2], nothing[:, :2], nothing
+        return Seen(pd, *unknown, error.max(axis=1), *nothing[:, :2].T)
     pd = np.stack([outputs[name] for name in names], axis=1)
     alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
     magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]
@@ -132,6 +135,7 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
     return Seen(
         pd,
         np.stack(alarms, axis=1),
+        np.stack([outputs[f"p_leakage_{name}"] for name in ("up", "down")], axis=1),
         np.stack(magnitude, axis=1),
         np.fmax.reduce(errors) if errors else np.full(len(pd), np.nan),
         np.sqrt(outputs["noise_variance"] / 2),

@@ -390,5 +390,5 @@ def _look(
 
 
 def _nothing(shots: int) -> Seen:
-    sizes = ((shots, 4), (shots, 2), (shots, 3), shots, shots, shots)
+    sizes = ((shots, 4), (shots, 2), (shots, 2), (shots, 3), shots, shots, shots)
     return Seen(*(np.full(size, np.nan) for size in sizes))

@@ -291,21 +291,28 @@ def differences(measured: Measured) -> Iterator[tuple[str, np.ndarray]]:
         yield name, np.array(values)
 
 
-ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error")
+ERRORS = ("pd_error", "log10_pfa_error", "leakage_error", "magnitude_error")
 
 
-def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Largest differences of pd, of log10 pfa and of magnitudes from others, (n,) each.
+def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
+    """Largest differences from others, (n,) each: of pd, log10 pfa, leakage, magnitudes.
 
     Magnitudes in relation to the other, or to sigma where it is below that.
     """
-    either = np.isfinite(seen.pd) | np.isfinite(other.pd)
-    # What sees nothing detects nothing.
-    pd = np.where(either, np.abs(np.nan_to_num(seen.pd) - np.nan_to_num(other.pd)), np.nan)
+    pd, leakage = (
+        _chances_apart(one, two)
+        for one, two in ((seen.pd, other.pd), (seen.leakage, other.leakage))
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         pfa = np.abs(seen.log10_pfa - other.log10_pfa)
         least = np.maximum(other.magnitude, other.sigma[:, None])
         magnitude = np.abs(seen.magnitude - other.magnitude) / least
     same = seen.log10_pfa == other.log10_pfa
     pfa = np.where(same, 0.0, pfa)
-    return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, magnitude))  # type: ignore[return-value]
+    return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, leakage, magnitude))
+
+
+def _chances_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Differences of probabilities: what sees nothing detects nothing, and leaks nothing."""
+    either = np.isfinite(one) | np.isfinite(other)
+    return np.where(either, np.abs(np.nan_to_num(one) - np.nan_to_num(other)), np.nan)

@@ -18,7 +18,7 @@ from sweep.tasks.accuracy.measure import (
     bench_of,
     differences,
 )
-from sweep.tasks.accuracy.rungs import REFERENCE, Rung
+from sweep.tasks.accuracy.rungs import REFERENCE, THESIS, Rung
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _ABOUT = {
     "pd_error": ("1", "largest error of a probability of detection, of segments and shot"),
     "log10_pfa_error": ("1", "error of log10 of a probability of false alarm"),
+    "leakage_error": ("1", "error of a probability of leakage, of the two chirps"),
     "magnitude_error": ("1", "error of the magnitude of the peak bins, over it or sigma if larger"),
     "standard_error": ("1", "standard error that the setting itself tells, where it draws"),
 }
@@ -137,6 +138,7 @@ class Content:
             "points": len(self._measured.done),
             "study_points": self._bench.whole,
             "notes": list(measured.ladder.notes),
+            "thesis_beamlets": self._thesis_beamlets(),
             "stopped": measured.stopped,
             "coordinates": " ".join(["kind", *self._bench.coordinates()]),
         }
@@ -147,13 +149,19 @@ class Content:
         found = [apart(*pair) for pair in self._measured.truth.values()]
         if not found:
             return {"truth_points": 0}
-        pd, _, magnitude = np.fmax.reduce(np.array(found), axis=(0, 2))
+        pd, _, _, magnitude = np.fmax.reduce(np.array(found), axis=(0, 2))
         return {
             "truth_points": len(found),
             "truth_beamlets": self._measured.truth_beamlets,
             "truth_pd_difference": float(pd),
             "truth_magnitude_difference": float(magnitude),
         }
+
+    def _thesis_beamlets(self) -> int:
+        """Beamlets of a point in the thesis's way; 0 where it was not tried, or nothing is seen."""
+        tried = zip(self._measured.ladder.rungs, self._measured.seen, strict=True)
+        numbers = [seen.beamlets for rung, seen in tried if rung.kind == THESIS]
+        return int(np.nan_to_num(np.fmax.reduce(numbers, axis=None))) if numbers else 0
 
     def groups(self) -> dict[str, dict[str, Any]]:
         """None."""

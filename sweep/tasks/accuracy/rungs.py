@@ -61,7 +61,9 @@ MEAN, COUNTS = "mean", "counts"
 _TOLERANCE = "accuracy.tolerance"
 _BEAMLETS, _PATTERN = "footprint.beamlets", "footprint.pattern"
 _LINE = "line"
-_EXACTLY = dict.fromkeys(("accuracy.line_error", "accuracy.leakage_error"), FINEST_TOLERANCE)
+_EXACTLY = dict.fromkeys(
+    ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), FINEST_TOLERANCE
+)
 
 DRAWN = "draws.number"
 """Field that holds the number of draws."""
