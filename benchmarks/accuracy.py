@@ -94,8 +94,8 @@ ones, and `sweep accuracy` says so.
 The **error** of a setting is the largest, over the points, of the differences from the reference
 in a probability of detection, of the segments and the shot, in log10 of a probability of false
 alarm, in the magnitude of a peak's bin over itself or sigma, and in a probability of leakage: else
-a setting that leaves leakage out would be taken for as accurate. The reference has all effects on, lines and leakage to 1e-9 and the finest footprint of
-all. The figures show as
+a setting that leaves leakage out would be taken for as accurate. The reference has all effects on,
+lines and leakage to 1e-9 and the finest footprint of all. The figures show as
 well what 90 % and half of the points stay below in pd. Where draws make errors random, the error
 is that of pd at 95 % of the points. The reference itself is held against the time domain, sample
 by sample, at some of the same points.

@@ -71,6 +71,10 @@ relative to itself or to sigma if that is larger? A cell has the error of the wo
 it, where not all points are within the tolerance, the share of those that are: 99.9 % is what is
 asked for. Points that are drawn have a table of their own.
 
+Leakage has a column too, the probability in the up- or the down-chirp. What is left out of it
+itself keeps the tolerance; what other effects that are left out would change of it is not reckoned
+with ([effects](effects.md)), and is seen here.
+
 One bin more or fewer that a detection occupies, of the 65,536 that could raise a false alarm, is
 6.6e-6 of log10 pfa.
 

@@ -27,6 +27,30 @@ def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
     return tnr * bin_deviation * RAYLEIGH_DEVIATION
 
 
+def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarray:
+    """Signal [sigma] below which bins may count as noise alone, at the price of a chance, (n,).
+
+    With x = a^2/2 and y = b^2/2 a bin of a sigma leaks with no more than
+
+        x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
+
+    (:mod:`sweep.model.leakage`), here with a b <= 1.
+
+    Parameters
+    ----------
+    chance : (n,) ndarray
+        Leakage of all those bins together that may be left out, 0..1.
+    level : (n,) ndarray
+        Threshold b over sigma, > 0.
+    bins : int
+        Number of bins.
+    """
+    y = 0.5 * np.square(level)
+    with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
+        each = np.where(y > 0, y / np.expm1(y), 1.0)
+        return np.minimum(np.sqrt(2 * chance / (bins * math.exp(1 / 8) * each)), 1 / level)
+
+
 @borrowing()
 def mark(magnitude, count, level, exempt):
     """Detection in a run of bins, and the bins that it keeps from raising a false alarm.

@@ -96,6 +96,7 @@ class Shots:
     detector_bandwidth: np.ndarray
     amplifier_bandwidth: np.ndarray
     leakage_floor: np.ndarray
+    """Of :attr:`_floor`; :data:`AUTOMATIC` where it follows from the chance below."""
     leakage_tolerance: np.ndarray
     """Chance of leakage, of all bins far from the lines, that need not be looked for."""
     line_tolerance: np.ndarray
@@ -196,6 +197,17 @@ class Shots:
         """Threshold on |X| [V], (n,)."""
         return detection.threshold(tnr=self.tnr, bin_deviation=self._deviation(self.quiet_variance))
 
+    @property
+    def _floor(self) -> np.ndarray:
+        """Signal over sigma below which bins that are taken one by one count as noise alone."""
+        given, bins = self.leakage_floor, self.fft_size // 2 + 1
+        if not np.any(given == AUTOMATIC):
+            return given
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            level = self.threshold / self.bin_deviation
+        floor = detection.quiet_below(chance=self.leakage_tolerance, level=level, bins=bins)
+        return np.where(given == AUTOMATIC, floor, given)
+
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
         energy = np.asarray(self.window.energy)
         return noise.bin_deviation(noise_variance=variance, window_energy=energy)
@@ -215,7 +227,7 @@ class Shots:
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
-            self.carriers[2], self.bin_deviation, self.threshold, self.leakage_floor,
+            self.carriers[2], self.bin_deviation, self.threshold, self._floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
         return in_rows(columns, (self.size,))
@@ -328,7 +340,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         acquisition_delay=p[PROCESSING + "acquisition_delay"],
         detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
-        leakage_floor=p["accuracy.leakage_floor"],
+        leakage_floor=np.asarray(p["accuracy.leakage_floor"], float),
         leakage_tolerance=_allowed(p, "accuracy.leakage_error", LEAKAGE_SHARE),
         beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
         line_tolerance=_allowed(p, "accuracy.line_error", LINE_SHARE),

@@ -147,12 +147,14 @@ class Accuracy(Part):
         float,
         Numeric(
             about="Bins with less leaked signal than so many noise sigmas count as noise alone, "
-            "where bins are taken one by one: in draws, padded FFTs, tabulated windows",
+            "where bins are taken one by one: in draws, padded FFTs, tabulated windows, under a "
+            "Gaussian line; auto: as accuracy.leakage_error allows",
             example="0.1",
             at_least="1e-9",
             at_most="1000",
+            words=(("auto", int(AUTOMATIC)),),
         ),
-    ] = 0.1
+    ] = AUTOMATIC
 
 
 SPECTRA = "spectra"

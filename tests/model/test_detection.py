@@ -1,5 +1,8 @@
 """Threshold, groups, leakage and probabilities of detection: closed forms, brute force, noise."""
 
+import math
+from functools import partial
+
 import mpmath
 import numpy as np
 import pytest
@@ -7,8 +10,9 @@ from scipy import integrate, stats
 
 from sweep.model import shot, truth
 from sweep.model.chain import prepare
-from sweep.model.detection import RAYLEIGH_DEVIATION, assess, threshold
-from sweep.model.marcum import marcum_q1
+from sweep.model.detection import RAYLEIGH_DEVIATION, assess, quiet_below, threshold
+from sweep.model.marcum import excess_crossing, marcum_q1
+from sweep.model.preparation import AUTOMATIC
 from sweep.model.spectra import segment_spectrum
 from sweep.model.window import samples
 
@@ -189,8 +193,33 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
         assert results["pfa_shot"][0] == pytest.approx(alarms["up"] * alarms["down"], rel=1e-10)
 
 
+@pytest.mark.parametrize("tnr", [1e-3, 0.1, 1.0, 5.0, 12.0, 60.0, 1e3])
+@pytest.mark.parametrize("chance", [0.05, 5e-4, 5e-7, 1e-12])
+def test_bins_below_the_floor_leak_no_more_together_than_is_allowed(tnr, chance):
+    level, bins = threshold(tnr=tnr, bin_deviation=1.0), 2**15 + 1
+    floor = quiet_below(chance=np.array(chance), level=np.array(level), bins=bins)
+    each = excess_crossing(float(floor), level) / -math.expm1(-0.5 * level * level)
+    assert bins * each <= chance * (1 + 1e-9)
+    # and are no fewer than that asks for, but for those near the threshold
+    assert bins * each >= 0.8 * chance or floor == pytest.approx(1 / level)
+
+
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-5])
+def test_bins_taken_one_by_one_leak_to_within_the_tolerance(table_4_1, tolerance):
+    """Many faint bins near a low threshold: below 0.1 sigma they leak 0.1 in some of these."""
+    scene = table_4_1(range=np.geomspace(200, 3000, 12), tnr=1.0, leakage_floor=AUTOMATIC)
+    scene |= {"accuracy.tolerance": tolerance, "accuracy.leakage_error": AUTOMATIC}
+    one_by_one = partial(shot.find, every_bin=True)
+    every = shot.evaluate(scene | {"accuracy.leakage_floor": 0.0}, look=one_by_one)
+    found = shot.evaluate(scene, look=one_by_one)
+    for name in ("p_leakage_up", "p_leakage_down"):
+        assert found[name] == pytest.approx(every[name], abs=tolerance / 2), name
+    fixed = shot.evaluate(scene | {"accuracy.leakage_floor": 0.1}, look=one_by_one)
+    assert (every["p_leakage_up"] - fixed["p_leakage_up"]).max() > 0.05
+
+
 def test_a_leakage_floor_leaves_out_faint_bins_and_nothing_else(table_4_1):
-    """0.1 sigma, the default: a bin there crosses 1 % of a b^2/2 more often than noise alone."""
+    """0.1 sigma: a bin there crosses 1 % of a b^2/2 more often than noise alone."""
     scene = table_4_1(fft_size=4096, range=np.geomspace(50, 5000, 40), beamlets=19, tnr=5.0)
     exact = shot.evaluate(scene | {"accuracy.leakage_floor": 0.0})
     floored = shot.evaluate(scene | {"accuracy.leakage_floor": 0.1})
