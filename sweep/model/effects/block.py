@@ -173,12 +173,17 @@ class Block(TileLink):
         return 0.5 * self.beat_scale * relative * self.window.sum
 
     @cached_property
+    def peak(self) -> Span:
+        """The same over sigma."""
+        return self.beat / self.deviation
+
+    @cached_property
     def amplitude(self) -> Span:
         """Magnitude of the largest bin of the bare line, moving, over sigma, (3, tiles).
 
         No image is in it. In direct detection's Doppler segment, which does not exist, it is 0.
         """
-        line, peak = self.lines, self.beat / self.deviation
+        line, peak = self.lines, self.peak
         low = peak.low * line.transfer_least * line.lobe.least(line.bin_offset)
         most = np.where(
             line.bin_offset == line.bin_offset_least,

@@ -12,6 +12,7 @@ from that by no more than max |W'| sum_b a_b |X_b|.
 """
 
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -46,6 +47,7 @@ class Sum(NamedTuple):
     """sum_b a_b |X_b| [bins], at the most; 0 where powers add."""
 
 
+@lru_cache(maxsize=2)
 def footprint_sum(block: "Block") -> Sum:
     """Sums of the footprints of a block's tiles."""
     ratio = np.maximum(block.echo_ratio.high, 1.0)

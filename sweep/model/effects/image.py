@@ -18,11 +18,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 
 from sweep.model.effects.change import Change
+from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.footprint_sum import footprint_sum
 from sweep.model.effects.line_spread import power_range
+from sweep.model.effects.lobes import lobe_least, lobe_tail, lobe_within
 from sweep.model.preparation import PROCESSING, Shots
 
 if TYPE_CHECKING:
@@ -40,19 +43,32 @@ def bound(block: "Block") -> Change:
     most E(e) of all lines in phase.
     """
     line, spread = block.lines, block.spread
-    apart = line.edge - np.asarray(spread.extreme, float)
-    inside, beside, outside = (line.lobe.tail(m * apart) for m in (1.5, 0.5, 1.0))
     least_power, _ = power_range(line, spread, block.number)
-    with np.errstate(divide="ignore", over="ignore"):
-        far = (beside**2 + outside**2) / least_power
-        high = np.sqrt(np.maximum(1 + inside**2 / least_power, far))
+    uphill = np.exp(np.minimum(line.tilt * np.asarray(spread.extreme), 50.0))
+    table, shape = columns(line.edge, spread.extreme, least_power, uphill, line.bin_offset)
+    found, lobe = np.empty((2, *shape)), line.lobe
+    _put_bounds(table, (lobe.lowest, lobe.reach, lobe.envelope), found.reshape(2, -1))
+    high, added = found
     alarms = alarm_change(block)
     if not block.adds_amplitudes:
         return Change(signal=(1.0, high), alarms=alarms)
-    uphill = np.exp(np.minimum(line.tilt * np.asarray(spread.extreme), 50.0))
-    added = uphill * outside / line.lobe.least(line.bin_offset)
     most = 1.0 if block.architecture == "direct" else high
     return Change(signal=(1.0, most), added=added, alarms=alarms)
+
+
+@njit(cache=True, error_model="numpy")
+def _put_bounds(table, lobe, out):
+    """Largest factor on the largest bin's magnitude, and what is added to a sum, (2, n)."""
+    lowest, reach, envelope = lobe
+    for i in range(table.shape[1]):
+        edge, extreme, least_power, uphill, offset = table[:, i]
+        apart = edge - extreme
+        inside = lobe_tail(reach, envelope, 1.5 * apart)
+        beside = lobe_tail(reach, envelope, 0.5 * apart)
+        outside = lobe_tail(reach, envelope, 1.0 * apart)
+        far = (beside * beside + outside * outside) / least_power
+        out[0, i] = np.sqrt(np.maximum(1 + inside * inside / least_power, far))
+        out[1, i] = uphill * outside / lobe_least(lowest, offset)
 
 
 def alarm_change(block: "Block") -> np.ndarray:
@@ -77,19 +93,34 @@ def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
         one.
     """
     line, lobe, half = block.lines, block.lines.lobe, block.fft_size / 2
-    extreme = np.fmin(block.spread.extreme, half)
-    uphill = np.exp(np.minimum(line.tilt * extreme, 50.0))
-    peak = (block.beat / block.deviation).high * np.minimum(line.transfer * uphill, 1.0)
-    in_phase = np.maximum(peak * footprint_sum(block).in_phase, 1e-300)
-    level = np.asarray(block.threshold.low)
-    away = np.minimum(lobe.within(level / in_phase), half)
-    apart = line.edge - extreme
-    moved = np.zeros_like(apart)
-    for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
-        share = np.minimum(in_phase * lobe.tail(distance) / level, 1.0)
-        moved += share if block.adds_amplitudes else share**2 / 2
-    reach = away + extreme
-    return (moved * reach)[_CHIRPS].sum(axis=0), 2 * reach[_CHIRPS].max(axis=0) + 4
+    uphill = np.exp(np.minimum(line.tilt * np.fmin(block.spread.extreme, half), 50.0))
+    table, shape = columns(
+        line.edge, block.spread.extreme, line.transfer, uphill, block.peak.high,
+        footprint_sum(block).in_phase, block.threshold.low,
+    )  # fmt: skip
+    found = np.empty((2, *shape))
+    _put_moved_bins(
+        table, half, (lobe.reach, lobe.envelope), block.adds_amplitudes, found.reshape(2, -1)
+    )
+    bins, reach = found[:, _CHIRPS]
+    return bins.sum(axis=0), 2 * reach.max(axis=0) + 4
+
+
+@njit(cache=True, error_model="numpy")
+def _put_moved_bins(table, half, lobe, amplitudes, out):
+    """Expected bins that a segment's images move, and how far from the axis's they may lie."""
+    reach, envelope = lobe
+    for i in range(table.shape[1]):
+        edge, extreme, transfer, uphill, peak, in_phase, level = table[:, i]
+        extreme = np.fmin(extreme, half)
+        whole = np.maximum(peak * np.minimum(transfer * uphill, 1.0) * in_phase, 1e-300)
+        away = np.minimum(lobe_within(reach, envelope, level / whole), half)
+        apart = edge - extreme
+        moved = 0.0
+        for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
+            share = np.minimum(whole * lobe_tail(reach, envelope, distance) / level, 1.0)
+            moved += share if amplitudes else share * share / 2
+        out[0, i], out[1, i] = moved * (away + extreme), away + extreme
 
 
 def act(shots: Shots, scene: Scene) -> Shots:

@@ -74,7 +74,7 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     """
     lines, extreme = block.lines, np.fmin(block.spread.extreme, block.fft_size)
     uphill = np.exp(np.minimum(lines.tilt * extreme, 50.0))
-    peak = (block.beat / block.deviation).high * np.minimum(lines.transfer * uphill, 1.0)
+    peak = block.peak.high * np.minimum(lines.transfer * uphill, 1.0)
     most, together, lean = (peak * value for value in footprint_sum(block))
     shape = block.window
     table, ratio = sidelobes(shape.name, shape.length), shape.length / block.fft_size

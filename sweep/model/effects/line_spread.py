@@ -25,14 +25,16 @@ from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.lobes import Lobe, lobe, lobe_least, lobe_most
+from sweep.model.effects.columns import columns
+from sweep.model.effects.line_powers import (
+    put_image_factors,
+    put_moved_changes,
+    put_power_ranges,
+)
+from sweep.model.effects.lobes import Lobe, lobe
 from sweep.model.effects.span import Span
 from sweep.model.footprint import beamlets
 from sweep.model.window import Window
-
-_CHEBYSHEV = (1.4, 1.8, 2.5, 4.0, 8.0)
-_NEAR_EDGE = 8.0
-"""Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
 
 
 class Line(NamedTuple):
@@ -256,48 +258,23 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
 
     ``spread`` is that of the lines in it; images are in it.
     """
-    f, double = line.lobe, image_factor(line, spread.extreme)
-    values = (line.bin_offset, line.bin_offset_least, line.tilt, double, *spread)
-    columns = np.empty((len(values), *np.broadcast(*values).shape))
-    for column, value in zip(columns, values, strict=True):
-        column[...] = value
-    found = np.empty((2, *columns.shape[1:]))
-    _power_ranges(
-        columns.reshape(len(values), -1), beamlets, (f.highest, f.lowest),
-        (f.slope, f.curvature, f.margin, f.energy), found.reshape(2, -1),
-    )  # fmt: skip
+    table, shape = columns(line.bin_offset, line.bin_offset_least, line.edge, line.tilt, *spread)
+    found = np.empty((2, *shape))
+    put_power_ranges(table, beamlets, *_sizes(line.lobe), found.reshape(2, -1))
     return found[0], found[1]
 
 
-@njit(cache=True, error_model="numpy")
-def _power_ranges(columns, beamlets, tables, sizes, out):
-    """Least and largest powers (2, n), from one column of values each."""
-    (highest, lowest), (slope, curvature, margin, energy) = tables, sizes
-    worst, top = lobe_least(lowest, 0.5) ** 2 / beamlets, lobe_most(highest, 0.0) ** 2
-    for i in range(columns.shape[1]):
-        offset, offset_least, tilt, double, mean, rms, extreme = columns[:, i]
-        on_axis = lobe_least(lowest, offset) ** 2
-        second = 0.5 * curvature * rms**2
-        slant = min(slope, curvature * offset)
-        least = on_axis - slant * mean - second - tilt * rms
-        uphill = np.exp(np.minimum(tilt * extreme, 50.0))
-        one_place = offset == offset_least and rms == 0
-        most = on_axis if one_place else lobe_most(highest, offset_least) ** 2
-        most = np.fmin(most + slope * mean + second, top)
-        most = double * most * (1 + uphill * np.fmin(tilt * rms, 50.0))
-        least = np.fmax(least, np.exp(-tilt * extreme) * worst)
-        if rms > 0:
-            for t in _CHEBYSHEV:
-                wide = t * rms
-                mean_bin = (1 - 1 / t**2) * energy / (2 * wide + 2 * margin + 1)
-                least = np.fmax(least, mean_bin * np.exp(-tilt * wide))
-        out[0, i], out[1, i] = np.minimum(least, most), most
+def _sizes(f: Lobe) -> tuple[tuple[np.ndarray, ...], tuple[float, ...]]:
+    """What compiled formulas take of a lobe."""
+    return (f.highest, f.lowest), (f.slope, f.curvature, f.margin, f.energy)
 
 
 def image_factor(line: Line, extreme: ArrayLike) -> np.ndarray:
     """How much larger images can make powers: 2 near DC and Nyquist."""
-    apart = (line.edge - np.asarray(extreme)) / line.lobe.margin
-    return np.where(2 * apart > _NEAR_EDGE, 1.01, 2.0)
+    table, shape = columns(line.edge, extreme)
+    found = np.empty(shape)
+    put_image_factors(table, line.lobe.margin, found.reshape(-1))
+    return found
 
 
 def spread_change(line: Line, added: Moments, present: Moments, beamlets: int) -> Change:
@@ -334,27 +311,12 @@ def moved_change(
     added, present, beamlets
         As for :func:`spread_change`.
     """
-    shift = np.asarray(shift, float)
-    mean, rms, extreme = (np.asarray(value, float) for value in added)
-    f, wide = still.lobe, np.asarray(present.extreme) + extreme
-    together = Moments(present.mean + mean, present.rms + rms, wide)
-    with_least, with_most = power_range(moved, together, beamlets)
-    least, most = power_range(still, present, beamlets)
-    double = np.maximum(image_factor(still, wide + shift), 1.05)
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        uphill = np.exp(np.minimum(still.tilt * (wide + shift), 50.0))
-        change = f.slope * (mean + shift) + f.curvature * (present.rms * rms + rms**2 / 2)
-        change = double * uphill * (change + still.tilt * (rms + shift)) / least
-        change = np.where(np.isnan(change), np.inf, change)
-        less, more = _gain(moved, still, shift)
-        low = np.fmax(1 - change, less * with_least / most)
-        high = np.fmin(1 + change, more * with_most / least)
-    same = (extreme == 0) & (shift == 0)
-    return Change(signal=(np.sqrt(np.where(same, 1.0, low)), np.sqrt(np.where(same, 1.0, high))))
-
-
-def _gain(moved: Line, still: Line, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest factor on |H|^2 by a shift."""
-    steepest = np.exp(np.minimum(still.tilt * shift, 50.0))
-    less = np.maximum((moved.transfer_least / still.transfer) ** 2, 1 / steepest)
-    return less, np.minimum((moved.transfer / still.transfer_least) ** 2, steepest)
+    table, shape = columns(shift, *added, *present, *moved[:-1], *still[:-1], 0.0, 0.0)
+    ways, tilt = table[-2:], table[-3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        ways[0] = table[6] + table[3] + table[0]
+        ways[1] = table[0]
+        np.exp(np.minimum(tilt * ways, 50.0), out=ways)
+    found = np.empty((2, *shape))
+    put_moved_changes(table, beamlets, *_sizes(still.lobe), found.reshape(2, -1))
+    return Change(signal=(found[0], found[1]))

@@ -52,13 +52,16 @@ class Lobe(NamedTuple):
     def tail(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
         away = np.asarray(distance, float)
-        place = np.searchsorted(self.reach, np.fmax(away, 0.0), "right") - 1
-        return np.asarray(self.envelope[place])
+        found = np.empty(away.shape)
+        _put_tails(self.reach, self.envelope, away.ravel(), found.reshape(-1))
+        return found
 
     def within(self, magnitude: np.ndarray) -> np.ndarray:
         """Distance [bins] from which on all bins are smaller; infinite where none is known."""
-        ends = np.append(self.reach, np.inf)
-        return np.asarray(ends[np.searchsorted(-self.envelope, -np.asarray(magnitude, float))])
+        sizes = np.asarray(magnitude, float)
+        found = np.empty(sizes.shape)
+        _put_within(self.reach, self.envelope, sizes.ravel(), found.reshape(-1))
+        return found
 
     def most(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line, 0..1/2."""
@@ -100,6 +103,39 @@ def lobe_most(highest, distance):
 def lobe_least(lowest, distance):
     """:meth:`Lobe.least` of one distance, compiled."""
     return _at(lowest, distance) * (1 - _ROUNDING)
+
+
+@njit(cache=True, error_model="numpy")
+def lobe_tail(reach, envelope, distance):
+    """:meth:`Lobe.tail` of one distance, compiled."""
+    return envelope[np.searchsorted(reach, np.fmax(distance, 0.0), "right") - 1]
+
+
+@njit(cache=True, error_model="numpy")
+def lobe_within(reach, envelope, magnitude):
+    """:meth:`Lobe.within` of one magnitude, compiled."""
+    if np.isnan(magnitude):
+        return np.inf
+    first, last = 0, envelope.size
+    while first < last:
+        middle = (first + last) // 2
+        if envelope[middle] > magnitude:
+            first = middle + 1
+        else:
+            last = middle
+    return reach[first] if first < reach.size else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _put_tails(reach, envelope, distance, found):
+    for i in range(distance.size):
+        found[i] = lobe_tail(reach, envelope, distance[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _put_within(reach, envelope, magnitude, found):
+    for i in range(magnitude.size):
+        found[i] = lobe_within(reach, envelope, magnitude[i])
 
 
 @lru_cache(maxsize=32)

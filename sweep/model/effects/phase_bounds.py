@@ -40,7 +40,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
-from sweep.model.effects.line_spread import Moments, image_factor, power_range
+from sweep.model.effects.columns import columns
+from sweep.model.effects.line_spread import Moments, power_range
+from sweep.model.effects.phase_formulas import (
+    put_added,
+    put_images,
+    put_missed,
+    put_moved,
+    put_phase_changes,
+    put_reaches,
+)
 from sweep.model.effects.span import Span, any_holds
 from sweep.model.window import Window, samples
 
@@ -50,12 +59,8 @@ if TYPE_CHECKING:
 DEVIATION_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
 """Standard deviation of a Gaussian over its full width at half maximum."""
 
-MARGIN = 1.01
-"""What a and b are raised by, for the means being sums over nodes."""
-
 _SHAPE_MARGIN = 1e-4
 _NODES = 256
-_HUGE = 1e12
 _MANY = 10**12
 """Lines of which none is strong enough to be looked at alone."""
 _IMAGE = 0.9
@@ -209,70 +214,29 @@ def phase_change(
     others : Error
         Phase errors that may be there besides: they lower the bin, and turn what changes.
     """
-    form, peak = shape(window), peak or one_line(window)
-    besides, turned = np.zeros(()), np.zeros(())
-    if others is not NO_ERROR:
-        besides = missed(others, window)
-        turned = missed(error, window) * np.minimum(_largest(others), 2.0)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        c = np.asarray(peak.least) - besides
-        if peak.single:
-            c = np.fmax(c, _matched(others, window))
-        c = np.where(c > 0, c, 0.0)
-        a, b = _parts(error, window, shifted=False)
-        a_rest, _ = _parts(error, window, shifted=True)
-        a, b, edge = a + turned, b + turned, form.edge
-        most = np.asarray(peak.most) + besides
-        low = 1 - (a + b * edge / c) / c
-        low = np.fmax(low, (c - a_rest - b * edge / c) / most)
-        if peak.single:
-            low = np.fmax(low, _matched(error + others, window) / most)
-        high = np.sqrt((1 + a / c) ** 2 + (2 * b * edge + b**2) / c**2)
-        high = np.fmin(high, (np.hypot(form.top + a_rest, b + edge) + besides) / c)
-        high = np.fmin(high, form.absolute / c)
-    return _within(low, high)
+    form, known, peak = shape(window), means(window), peak or one_line(window)
+    beside = others is not NO_ERROR
+    table, found_shape = columns(
+        *error.powers, error.rest, *others.powers, others.rest, peak.least, peak.most
+    )
+    reaches = np.empty((2, 2, table.shape[1]))
+    put_reaches(table, known.slope, reaches[0])
+    np.tanh(np.pi * reaches[0], out=reaches[1])
+    found = np.empty((2, *found_shape))
+    put_phase_changes(
+        table, reaches, (known.absolute, known.bent, known.square),
+        (form.absolute, form.edge, form.top, known.hann), (beside, bool(peak.single)),
+        found.reshape(2, -1),
+    )  # fmt: skip
+    return Change(signal=(found[0], found[1]))
 
 
 def missed(error: Error, window: Window) -> np.ndarray:
     """<|phi|>, by which any bin of a line changes at most, relative to its peak."""
-    known = means(window)
-    turns = [2 * np.pi * np.asarray(v, float) for v in (*error.powers, error.rest)]
-    scales = (*known.absolute, shape(window).absolute)
-    total = sum(turn * scale for turn, scale in zip(turns, scales, strict=True))
-    return np.asarray(MARGIN * np.minimum(total, 2 * shape(window).absolute))
-
-
-def _largest(error: Error) -> np.ndarray:
-    """Largest phase [rad] anywhere in the record."""
-    return np.asarray(2 * np.pi * (sum(np.asarray(v) for v in error.powers) + error.rest))
-
-
-def _within(low: np.ndarray, high: np.ndarray) -> Change:
-    low = np.where(np.isnan(low), 0.0, low)
-    high = np.where(np.isnan(high), _HUGE, high)
-    return Change(signal=(np.clip(low, 0.0, 1.0), np.clip(high, 1.0, _HUGE)))
-
-
-def _parts(error: Error, window: Window, *, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds a, b [rad], (n,) each; ``shifted`` without the odd part's best line."""
-    known, most = means(window), shape(window).absolute
-    turns = [2 * np.pi * np.asarray(v, float) for v in error.powers]
-    rest = 2 * np.pi * np.asarray(error.rest, float)
-    scales = known.bent if shifted else known.absolute
-    odd = rest * most + sum(turns[k] * scales[k] for k in (0, 2))
-    even = rest * most + sum(turns[k] * known.absolute[k] for k in (1, 3))
-    root = rest * np.sqrt(most) + sum(turns[k] * known.square[k] for k in (1, 3))
-    a = np.minimum(odd, 2 * most) + np.minimum(root**2 / 2, 2 * most)
-    return MARGIN * a, MARGIN * np.minimum(even, most)
-
-
-def _matched(error: Error, window: Window) -> np.ndarray:
-    """Lower bound from a Hann window that carries the same phase error."""
-    known = means(window)
-    bins = sum(np.multiply(v, s) for v, s in zip(error.powers, known.slope, strict=True))
-    reach = np.sqrt(1 / 3 + MARGIN * np.asarray(bins) ** 2)
-    room = 2 * (3 / 8) * np.pi * reach / np.tanh(np.pi * reach)
-    return np.where(np.asarray(error.rest) > 0, 0.0, known.hann / np.sqrt(room) / MARGIN)
+    table, found_shape = columns(*error.powers, error.rest)
+    found = np.empty(found_shape)
+    put_missed(table, means(window).absolute, shape(window).absolute, found.reshape(-1))
+    return found
 
 
 Own = Callable[["Block"], Error | None]
@@ -303,33 +267,36 @@ def error_change(block: "Block", own: Own) -> Change | None:
     others, window = errors_of(block, own), block.window
     images, cancelling = images_of(block, error + others)
     change = phase_change(error, window=window, peak=peak_of(block, images), others=others)
-    steady = zip((*error.powers, error.rest), means(window).steady, strict=True)
-    moved = np.asarray(sum(v * slope for v, slope in steady))
+    table, found_shape = columns(*error.powers, error.rest)
+    moved = np.empty(found_shape)
+    put_moved(table, means(window).steady, (block.fft_size, window.length), moved.reshape(-1))
+    if not any_holds(cancelling):
+        return change._replace(shift=moved)
     low, high = (np.where(cancelling, 1.0, end) for end in change.signal)
-    return Change(
-        signal=(low, high),
-        added=np.where(cancelling, added(block, error, images), 0.0)
-        if any_holds(cancelling)
-        else 0.0,
-        shift=2 * moved * block.fft_size / window.length,
-    )
+    lines_added = np.where(cancelling, added(block, error, images), 0.0)
+    return Change(signal=(low, high), added=lines_added, shift=moved)
 
 
 def images_of(block: "Block", error: Error) -> tuple[np.ndarray, np.ndarray]:
     """By how much images may make powers larger, and where amplitudes may cancel, (3, tiles)."""
-    slopes = (k * np.asarray(v, float) for k, v in enumerate(error.powers, 1))
-    reach = np.asarray(2 * sum(slopes)) * block.fft_size / block.window.length
-    images = image_factor(block.lines, block.spread.extreme + reach)
+    lines = block.lines
+    table, found_shape = columns(*error.powers, lines.edge, block.spread.extreme)
+    images = np.empty(found_shape)
+    sizes = block.fft_size, block.window.length, lines.lobe.margin
+    put_images(table, sizes, images.reshape(-1))
     amplitudes = block.adds_amplitudes or block.has("target.roughness")
     return images, amplitudes & ((images > 1.5) | (block.number > 1))
 
 
 def added(block: "Block", error: Error, images: np.ndarray) -> np.ndarray:
     """What a phase error adds to sums of amplitudes, lines and images, as of :class:`Change`."""
-    anywhere = _largest(error) + 2 * np.pi * np.asarray(error.constant)
-    beside = MARGIN * shape(block.window).absolute * np.minimum(anywhere, 2.0)
-    each = np.where(images > 1.5, beside, missed(error, block.window))
-    return 2 * each / block.lines.lobe.least(np.asarray(0.5))
+    table, found_shape = columns(*error.powers, error.rest, error.constant, images)
+    found, window = np.empty(found_shape), block.window
+    least = float(block.lines.lobe.least(np.asarray(0.5)))
+    put_added(
+        table, means(window).absolute, shape(window).absolute, least, found.reshape(-1)
+    )  # fmt: skip
+    return found
 
 
 def peak_of(block: "Block", images: ArrayLike, *, broadened: bool = True) -> Peak:
@@ -349,8 +316,7 @@ def peak_of(block: "Block", images: ArrayLike, *, broadened: bool = True) -> Pea
         width = block[_WIDTH].high * DEVIATION_OF_FWHM / block.bin_width.low
         spread = Moments(spread.mean, np.hypot(spread.rms, width), spread.extreme + 6 * width)
         number = _MANY
-    half, none = np.full_like(lines.edge, 0.5), np.zeros_like(lines.edge)
-    anywhere = lines._replace(bin_offset=half, bin_offset_least=none)
+    anywhere = lines._replace(bin_offset=np.array(0.5), bin_offset_least=np.array(0.0))
     least, most = power_range(anywhere, spread, number)
     uneven = np.asarray(images) * np.exp(np.minimum(lines.tilt * spread.extreme, 50.0))
     c = np.sqrt(least / uneven)

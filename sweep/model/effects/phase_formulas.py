@@ -1,0 +1,170 @@
+"""What phase errors make of the largest bin: compiled formulas of :mod:`.phase_bounds`.
+
+Errors are rows: largest coefficients of x .. x^4 and what is no power [cycles].
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sweep.model.effects.line_powers import image_factor_of
+
+MARGIN = 1.01
+"""What a and b are raised by, for the means being sums over nodes."""
+HUGE = 1e12
+
+_TURN = 2 * math.pi
+_ROWS = 5
+
+
+@njit(cache=True, error_model="numpy")
+def put_reaches(table, slopes, out):
+    """Roots B of second moments of the slope's place [bins], (2, n): of errors and others; others.
+
+    Rows of the table: an error, and the others.
+    """
+    for i in range(table.shape[1]):
+        both, others = 0.0, 0.0
+        for k in range(4):
+            both += (table[k, i] + table[_ROWS + k, i]) * slopes[k]
+            others += table[_ROWS + k, i] * slopes[k]
+        out[0, i] = np.sqrt(1 / 3 + MARGIN * (both * both))
+        out[1, i] = np.sqrt(1 / 3 + MARGIN * (others * others))
+
+
+@njit(cache=True, error_model="numpy")
+def put_phase_changes(table, reaches, known, sizes, flags, out):
+    """Least and largest factor on magnitudes, (2, n).
+
+    Parameters
+    ----------
+    table : (12, n) float64
+        An error, the others, least and largest peak.
+    reaches : (2, 2, n) float64
+        Those of :func:`put_reaches`, and the hyperbolic tangent of pi times these.
+    known : ((4,), (4,), (4,)) tuples of float
+        Means of powers: absolute, without the odd ones' best line, square.
+    sizes : (float, float, float, float)
+        Of the window: <|w|>, first sample, top, <h>.
+    flags : (bool, bool)
+        Whether there are others; whether the peak is one line's.
+    """
+    absolute, bent, square = known
+    most_of, edge, top, hann = sizes
+    beside, single = flags
+    for i in range(table.shape[1]):
+        error, others = table[:_ROWS, i], table[_ROWS : 2 * _ROWS, i]
+        least, largest = table[10, i], table[11, i]
+        besides, turned = 0.0, 0.0
+        if beside:
+            besides = missed_of(others, absolute, most_of)
+            turned = missed_of(error, absolute, most_of) * np.minimum(largest_of(others), 2.0)
+        c = least - besides
+        if single:
+            c = np.fmax(c, _matched(reaches[0, 1, i], reaches[1, 1, i], others[4], hann))
+        c = c if c > 0 else 0.0
+        a, b = _parts(error, absolute, absolute, square, most_of)
+        a_rest, _ = _parts(error, bent, absolute, square, most_of)
+        a, b = a + turned, b + turned
+        most = largest + besides
+        low = 1 - (a + b * edge / c) / c
+        low = np.fmax(low, (c - a_rest - b * edge / c) / most)
+        if single:
+            kept = _matched(reaches[0, 0, i], reaches[1, 0, i], error[4] + others[4], hann)
+            low = np.fmax(low, kept / most)
+        rise = 1 + a / c
+        high = np.sqrt(rise * rise + (2 * b * edge + b * b) / (c * c))
+        high = np.fmin(high, (math.hypot(top + a_rest, b + edge) + besides) / c)
+        high = np.fmin(high, most_of / c)
+        low = 0.0 if np.isnan(low) else low
+        high = HUGE if np.isnan(high) else high
+        out[0, i], out[1, i] = min(max(low, 0.0), 1.0), min(max(high, 1.0), HUGE)
+
+
+@njit(cache=True, error_model="numpy")
+def put_missed(table, absolute, most, out):
+    """<|phi|> of errors, (n,)."""
+    for i in range(out.size):
+        out[i] = missed_of(table[:, i], absolute, most)
+
+
+@njit(cache=True, error_model="numpy")
+def missed_of(error, absolute, most):
+    """<|phi|> [rad]: by which any bin of a line changes at most, relative to its peak."""
+    total = 0.0
+    for k in range(4):
+        total += _TURN * error[k] * absolute[k]
+    total += _TURN * error[4] * most
+    return MARGIN * np.minimum(total, 2 * most)
+
+
+@njit(cache=True, error_model="numpy")
+def largest_of(error):
+    """Largest phase [rad] anywhere in the record."""
+    return _TURN * (0.0 + error[0] + error[1] + error[2] + error[3] + error[4])
+
+
+@njit(cache=True, error_model="numpy")
+def _parts(error, odd_means, absolute, square, most):
+    """Bounds a, b [rad]."""
+    rest = _TURN * error[4]
+    one, two, three, four = (
+        _TURN * error[0], _TURN * error[1], _TURN * error[2], _TURN * error[3],
+    )  # fmt: skip
+    odd = rest * most + (one * odd_means[0] + three * odd_means[2])
+    even = rest * most + (two * absolute[1] + four * absolute[3])
+    root = rest * np.sqrt(most) + (two * square[1] + four * square[3])
+    a = np.minimum(odd, 2 * most) + np.minimum(root * root / 2, 2 * most)
+    return MARGIN * a, MARGIN * np.minimum(even, most)
+
+
+@njit(cache=True, error_model="numpy")
+def _matched(reach, tangent, rest, hann):
+    """Lower bound from a Hann window that carries the same phase error."""
+    if rest > 0:
+        return 0.0
+    room = 2 * (3 / 8) * math.pi * reach / tangent
+    return hann / np.sqrt(room) / MARGIN
+
+
+@njit(cache=True, error_model="numpy")
+def put_images(table, sizes, out):
+    """Images' factors on powers, (n,).
+
+    Rows of the table: x .. x^4 of an error; edge of lines, extreme of their spread.
+    """
+    fft_size, length, margin = sizes
+    for i in range(out.size):
+        slopes = 0.0
+        for k in range(4):
+            slopes += (k + 1) * table[k, i]
+        reach = 2 * slopes * fft_size / length
+        out[i] = image_factor_of(table[4, i], table[5, i] + reach, margin)
+
+
+@njit(cache=True, error_model="numpy")
+def put_added(table, absolute, most, least, out):
+    """What errors add to sums of amplitudes, (n,).
+
+    Rows of the table: an error, its size in the record's middle, the images' factors.
+    """
+    for i in range(out.size):
+        error = table[:_ROWS, i]
+        if table[6, i] > 1.5:
+            anywhere = largest_of(error) + _TURN * table[5, i]
+            each = MARGIN * most * np.minimum(anywhere, 2.0)
+        else:
+            each = missed_of(error, absolute, most)
+        out[i] = 2 * each / least
+
+
+@njit(cache=True, error_model="numpy")
+def put_moved(table, steady, factor, out):
+    """Bins, (n,), by which errors' best lines move what is measured."""
+    fft_size, length = factor
+    for i in range(out.size):
+        moved = 0.0
+        for k in range(_ROWS):
+            moved += table[k, i] * steady[k]
+        out[i] = 2 * moved * fft_size / length
