@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 
 from sweep.model import ground, resolution
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_spread, tile_geometry
-from sweep.model.effects.line_spread import NOT_AWAY, Line, Moments
-from sweep.model.effects.span import Span, any_holds, monotone
+from sweep.model.effects.columns import columns
+from sweep.model.effects.line_spread import Line, Moments
+from sweep.model.effects.span import Span, monotone
 from sweep.model.effects.tile_geometry import Geometry
 from sweep.model.effects.tile_link import Parameters, TileLink
 from sweep.model.ground import Footprints
@@ -122,47 +122,35 @@ class Block(TileLink):
         """
         if self._at_rest:
             return self.resting_lines
-        slow = np.any(self.doppler_shift <= NOT_AWAY, axis=0) & (self.beta.magnitude > 0)
-        beta = self.beta
-        if any_holds(slow):
-            either = Span.hull(beta, 0.0)
-            beta = Span(
-                np.where(slow, either.low, beta.low), np.where(slow, either.high, beta.high)
-            )
-        return self._lines(beta)
+        return self._lines(line_spread.with_and_without(self._ends, self.doppler_shift))
 
     @cached_property
     def resting_lines(self) -> Line:
         """The same at no radial velocity."""
-        return self._lines(Span.of(0.0))
+        return self._lines(self._axis_ends(Span.of(0.0)))
 
     @cached_property
     def doppler_shift(self) -> np.ndarray:
-        """Bins by which the Doppler effect moves lines at the most, >= 0 (unfolded), (3, tiles).
+        """Bins by which the Doppler effect moves lines at the most, >= 0 (unfolded), (3, tiles)."""
+        return line_spread.doppler_shifts(self._ends)
 
-        f beta, and the S tau beta by which it stretches the beat of the range.
-        """
-        beat = self.chirp_rate * (2 / SPEED_OF_LIGHT) * self.range
-        shifts = [
-            self.beta.magnitude * ((carrier + beat) / self.bin_width).high
-            for carrier in self.carriers
-        ]
-        return np.stack([np.broadcast_to(shift, (self.size,)) for shift in shifts])
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        return self._axis_ends(self.beta)
 
-    def _lines(self, beta: Span) -> Line:
-        lines = line_spread.axis_lines(
-            window=self.window,
-            fft_size=self.fft_size,
+    def _axis_ends(self, beta: Span) -> np.ndarray:
+        return line_spread.axis_ends(
+            self.size,
             range=self.range,
             beta=beta,
             chirp_rate=self.chirp_rate,
             carriers=self.carriers,
-            sample_rate=self.sample_rate,
+            bin_width=self.bin_width,
             **self._receiver("detector_bandwidth", "amplifier_bandwidth"),
         )
-        if lines.edge.shape == (3, self.size):
-            return lines
-        return lines.over(self.size)
+
+    def _lines(self, ends: np.ndarray) -> Line:
+        return line_spread.axis_lines(ends, window=self.window, fft_size=self.fft_size)
 
     @cached_property
     def beat(self) -> Span:
@@ -210,24 +198,26 @@ class Block(TileLink):
         """Bins by which ranges put the lines off the axis's, (3, tiles) at the most."""
         return self.of_ranges(self.ranges)
 
+    @cached_property
+    def own_range_spread(self) -> Moments:
+        """The same of beamlets on the axis's surface."""
+        return self.of_ranges(self.geometry.own_ranges)
+
     def of_ranges(self, ranges: Moments) -> Moments:
-        """Moments of relative ranges in bins, (3, tiles) or (3, 1)."""
-        factor = np.outer([1.0, 0.0, 1.0], np.atleast_1d(self.range_bins))
-        return Moments(*(np.where(factor > 0, factor * v, 0.0) for v in _finite(ranges)))
+        """Moments of relative ranges in bins, (3, tiles)."""
+        return line_spread.range_moments_in_bins(self.range_bins, ranges, self.size)
 
     @cached_property
     def velocity_spread(self) -> Moments:
         """Bins by which velocities put the lines off the axis's, (3, tiles) at the most."""
-        factors = [
-            line_spread.velocity_to_bins(
-                range=self.range.high,
-                carrier=carrier.high,
-                chirp_rate=self.chirp_rate.high,
-                bin_width=self.bin_width.low,
-            )
-            for carrier in self.carriers
-        ]
-        return self.velocities.scaled(np.stack([np.atleast_1d(f) for f in factors]))
+        carriers, _ = columns(*(carrier.high for carrier in self.carriers))
+        factors = line_spread.velocity_to_bins(
+            range=self.range.high,
+            carrier=carriers,
+            chirp_rate=self.chirp_rate.high,
+            bin_width=self.bin_width.low,
+        )
+        return self.velocities.scaled(factors)
 
     @cached_property
     def spread(self) -> Moments:
@@ -240,8 +230,3 @@ def _beamlets(link: TileLink) -> tuple[int, str]:
     """Beamlets and their pattern; the most there may be where they follow from the tolerance."""
     number, words = link.whole(resolution.BEAMLETS), link.words
     return (number, ground.pattern(words)) if number else resolution.finest(words)
-
-
-def _finite(moments: Moments) -> list[np.ndarray]:
-    """Infinite moments as numbers that may be multiplied by 0."""
-    return [np.minimum(value, 1e200) for value in moments]

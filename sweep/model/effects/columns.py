@@ -8,6 +8,6 @@ def columns(*values: ArrayLike) -> tuple[np.ndarray, tuple[int, ...]]:
     """Values side by side, (values, n) float64, and the shape that their n entries have."""
     shape = np.broadcast(*values).shape
     table = np.empty((len(values), *shape))
-    for row, value in zip(table, values, strict=True):
-        row[...] = value
+    for k, value in enumerate(values):
+        table[k] = value
     return table.reshape(len(values), -1), shape

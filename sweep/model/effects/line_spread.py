@@ -17,7 +17,7 @@ less than its strongest beamlet's line. No bin holds more than all power on the 
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -54,15 +54,6 @@ class Line(NamedTuple):
     """Bound c on the relative change of |H|^2 a bin, near the line [1/bin]."""
     lobe: Lobe
 
-    def over(self, tiles: int) -> "Line":
-        """All three segments' for a number of tiles."""
-        arrays: dict[str, Any] = {
-            name: np.broadcast_to(getattr(self, name), (3, tiles))
-            for name in self._fields
-            if name != "lobe"
-        }
-        return self._replace(**arrays)
-
 
 class Moments(NamedTuple):
     """Bounds on the lines' offsets from the axis [bins], weighted by echo power, (n,) each."""
@@ -78,36 +69,81 @@ class Moments(NamedTuple):
 
 NO_SPREAD = Moments(0.0, 0.0, 0.0)
 
+_BETA = 3
 NOT_AWAY = 0.1
 """Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
 
-def axis_lines(
+def axis_ends(
+    tiles: int,
     *,
-    window: Window,
-    fft_size: int,
     range: Span,
     beta: Span,
     chirp_rate: Span,
     carriers: Sequence[Span],
-    sample_rate: Span,
+    bin_width: Span,
     detector_bandwidth: Span,
     amplifier_bandwidth: Span,
-) -> Line:
-    """The axis's line in up, Doppler and down segment, (3, tiles), as :mod:`sweep.model.lines`."""
+) -> np.ndarray:
+    """Ends of what the axis's line follows from, (9, 2, tiles): what the others here take.
+
+    Carriers of the three segments, Doppler ratio, chirp rate times 2/c, range, bin width, and
+    bandwidths of detector and amplifier.
+    """
     spans = (
-        *carriers, beta, chirp_rate * (2 / SPEED_OF_LIGHT), range, sample_rate / fft_size,
+        *carriers, beta, chirp_rate * (2 / SPEED_OF_LIGHT), range, bin_width,
         detector_bandwidth, amplifier_bandwidth,
     )  # fmt: skip
-    ends = [end for span in spans for end in (span.low, span.high)]
-    tiles = max(np.size(end) for end in ends)
-    given, found = np.empty((len(ends), tiles)), np.empty((6, 3, tiles))
-    for row, end in zip(given, ends, strict=True):
-        row[:] = end
-    _put_lines(given.reshape(-1, 2, tiles), fft_size / 2, found)
+    ends = np.empty((len(spans), 2, tiles))
+    for row, span in zip(ends, spans, strict=True):
+        row[0], row[1] = span.low, span.high
+    return ends
+
+
+def axis_lines(ends: np.ndarray, *, window: Window, fft_size: int) -> Line:
+    """The axis's line in up, Doppler and down segment, (3, tiles), as :mod:`sweep.model.lines`."""
+    found = np.empty((6, 3, ends.shape[2]))
+    _put_lines(ends, fft_size / 2, found)
     offset, least, edge, transfer, transfer_least, tilt = found
     form = lobe(window.name, window.length, fft_size)
     return Line(offset, least, edge, transfer, transfer_least, tilt, form)
+
+
+def doppler_shifts(ends: np.ndarray) -> np.ndarray:
+    """Bins by which the Doppler effect moves lines at the most, >= 0 (unfolded), (3, tiles).
+
+    f beta, and the S tau beta by which it stretches the beat of the range.
+    """
+    found = np.empty((3, ends.shape[2]))
+    _put_shifts(ends, found)
+    return found
+
+
+def with_and_without(ends: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """Ends with Doppler ratios down to none where these move some line so little."""
+    either = ends.copy()
+    _widen(either[_BETA], shifts)
+    return either
+
+
+@njit(cache=True, error_model="numpy")
+def _widen(beta, shifts):
+    for t in range(shifts.shape[1]):
+        slow = np.any(shifts[:, t] <= NOT_AWAY)
+        if slow and np.maximum(abs(beta[0, t]), abs(beta[1, t])) > 0.0:
+            beta[0, t], beta[1, t] = np.minimum(beta[0, t], 0.0), np.maximum(beta[1, t], 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _put_shifts(ends, out):
+    """Shifts (3, tiles)."""
+    for t in range(out.shape[1]):
+        size = np.maximum(abs(ends[_BETA, 0, t]), abs(ends[_BETA, 1, t]))
+        beat = _product((ends[4, 0, t], ends[4, 1, t]), (ends[5, 0, t], ends[5, 1, t]))
+        width = ends[6, 0, t], ends[6, 1, t]
+        for s in range(3):
+            frequency = ends[s, 0, t] + beat[0], ends[s, 1, t] + beat[1]
+            out[s, t] = size * _quotient(frequency, width)[1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -251,6 +287,28 @@ def velocity_to_bins(
     """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta stretches."""
     beat = np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)
     return np.asarray((2 / SPEED_OF_LIGHT) * (np.asarray(carrier) + beat) / np.asarray(bin_width))
+
+
+def range_moments_in_bins(bins: ArrayLike, ranges: Moments, tiles: int) -> Moments:
+    """Moments of relative ranges in bins, (3, tiles): none of the Doppler segment's.
+
+    ``bins`` are those of a chirped segment for a relative difference of range of 1.
+    """
+    table = np.empty((4, tiles))
+    for row, value in zip(table, (bins, *ranges), strict=True):
+        row[:] = value
+    found = np.zeros((3, 3, tiles))
+    _put_moments(table, found)
+    return Moments(*found)
+
+
+@njit(cache=True, error_model="numpy")
+def _put_moments(table, out):
+    """Moments (3, 3, tiles); infinite ones as numbers that may be multiplied by 0."""
+    for t in range(table.shape[1]):
+        if table[0, t] > 0:
+            for k in range(3):
+                out[k, 0, t] = out[k, 2, t] = table[0, t] * np.minimum(table[1 + k, t], 1e200)
 
 
 def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray, np.ndarray]:

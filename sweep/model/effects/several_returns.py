@@ -38,7 +38,7 @@ def bound(block: "Block") -> Change | None:
         return None
     f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
     apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme
-    spread = block.of_ranges(block.geometry.own_ranges)
+    spread = block.own_range_spread
     own = (1 - f) * power_range(line, spread, block.number)[0]
     _, on_axis = power_range(line, NO_SPREAD, block.number)
     elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer_least**-2.0)
