@@ -177,7 +177,8 @@ class ShotsCalling:
             return None
         some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
         theirs = tiles[seen]
-        edges = np.flatnonzero(np.r_[True, theirs[1:] != theirs[:-1], True])
+        inner = 1 + np.flatnonzero(theirs[1:] != theirs[:-1])
+        edges = np.concatenate([[0], inner, [seen.size]])
         block = block_of(some, self._instrument, self._surfaces, edges, self._rotating)
         planned = plan(block, modes=self._modes, tolerance=self._tolerance(some))
         return ShotsPlan(seen, np.repeat(np.arange(edges.size - 1), np.diff(edges)), planned)

@@ -4,14 +4,17 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
+from sweep.model.effects.columns import columns
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1
 
 Interval = tuple[ArrayLike, ArrayLike]
 
 NONE: Interval = (1.0, 1.0)
+NOTHING = 0.0
 _HUGE = 1e12
 _NO_NOISE = 1e-200
 """Factor of noise that is as good as none, as of what saturates."""
@@ -30,13 +33,13 @@ class Change(NamedTuple):
     threshold_follows: bool = True
     """Whether the threshold is set on the changed noise, as for noise that is always there; else
     it stays where it was, as for noise that comes with the signal."""
-    added: ArrayLike = 0.0
+    added: ArrayLike = NOTHING
     """What is besides added to that magnitude, or taken from it, at the most: as a share of the
     block's amplitude times what the other effects make of it. For sums of amplitudes, which may
     cancel: a share of what they leave cannot be told."""
-    shift: ArrayLike = 0.0
+    shift: ArrayLike = NOTHING
     """Bins by which it moves what is measured; they count as a change of a probability does."""
-    alarms: ArrayLike = 0.0
+    alarms: ArrayLike = NOTHING
     """Change of log10 of a shot's probability of a false alarm as it lifts bins over the threshold
     or lets them fall below, (tiles,) or a scalar; 0 where it hardly ever does."""
 
@@ -56,20 +59,41 @@ def within_changes(
     changes: Iterable[Change], *, amplitude: Span, threshold: Span
 ) -> tuple[Span, Span]:
     """Magnitudes and thresholds over sigma that any of some changes may leave."""
-    low, high = np.asarray(amplitude.low), np.asarray(amplitude.high)
+    parts = [change for change in changes if not _is_none(change)]
     lower, upper = np.asarray(threshold.low), np.asarray(threshold.high)
-    added: np.ndarray = np.zeros(1)
-    for change in changes:
-        quiet, loud = np.ones(()), np.ones(())
+    ends: list[ArrayLike] = [amplitude.low, amplitude.high]
+    for change in parts:
+        quiet, loud = NONE
         if change.noise is not NONE:
             quiet, loud = (1 / np.sqrt(np.maximum(v, _NO_NOISE)) for v in change.noise)
-        weak, strong = (np.asarray(v, float) for v in change.signal)
-        low = low * np.minimum(weak * loud, 1.0)
-        high = high * np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)
-        added = added + np.asarray(change.added, float)
+        ends += [*change.signal, quiet, loud, change.added]
         if not change.threshold_follows:
             lower, upper = lower * np.minimum(loud, 1.0), upper * np.maximum(quiet, 1.0)
-    return Span(np.maximum(low - high * added, 0.0), high * (1 + added)), Span(lower, upper)
+    table, shape = columns(*ends)
+    found = np.empty((2, *shape))
+    _put_magnitudes(table, found.reshape(2, -1))
+    return Span(found[0], found[1]), Span(lower, upper)
+
+
+def _is_none(change: Change) -> bool:
+    return change.signal is NONE and change.noise is NONE and change.added is NOTHING
+
+
+@njit(cache=True, error_model="numpy")
+def _put_magnitudes(table, out):
+    """Least and largest magnitude, (2, n).
+
+    Rows of the table: their ends without the changes; weakest and strongest signal, factors on
+    1/sigma in quiet and in loud noise, and what is added, of one change after the other.
+    """
+    for i in range(table.shape[1]):
+        low, high, added = table[0, i], table[1, i], 0.0
+        for first in range(2, table.shape[0], 5):
+            weak, strong, quiet, loud, more = table[first : first + 5, i]
+            low *= np.minimum(weak * loud, 1.0)
+            high *= np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)
+            added += more
+        out[0, i], out[1, i] = np.maximum(low - high * added, 0.0), high * (1 + added)
 
 
 def pd_change(change: Change, *, amplitude: ArrayLike, threshold: ArrayLike) -> np.ndarray:

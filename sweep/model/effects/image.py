@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
-_CHIRPS = [0, 2]
 
 
 def bound(block: "Block") -> Change:
@@ -94,33 +93,35 @@ def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
     """
     line, lobe, half = block.lines, block.lines.lobe, block.fft_size / 2
     uphill = np.exp(np.minimum(line.tilt * np.fmin(block.spread.extreme, half), 50.0))
-    table, shape = columns(
+    table, _ = columns(
         line.edge, block.spread.extreme, line.transfer, uphill, block.peak.high,
         footprint_sum(block).in_phase, block.threshold.low,
     )  # fmt: skip
-    found = np.empty((2, *shape))
-    _put_moved_bins(
-        table, half, (lobe.reach, lobe.envelope), block.adds_amplitudes, found.reshape(2, -1)
-    )
-    bins, reach = found[:, _CHIRPS]
-    return bins.sum(axis=0), 2 * reach.max(axis=0) + 4
+    found = np.empty((2, block.size))
+    by_segment = table.reshape(len(table), 3, block.size)
+    _put_moved_bins(by_segment, half, (lobe.reach, lobe.envelope), block.adds_amplitudes, found)
+    return found[0], found[1]
 
 
 @njit(cache=True, error_model="numpy")
 def _put_moved_bins(table, half, lobe, amplitudes, out):
-    """Expected bins that a segment's images move, and how far from the axis's they may lie."""
+    """Expected bins that both chirps' images move, and most that a detection takes, (2, tiles)."""
     reach, envelope = lobe
-    for i in range(table.shape[1]):
-        edge, extreme, transfer, uphill, peak, in_phase, level = table[:, i]
-        extreme = np.fmin(extreme, half)
-        whole = np.maximum(peak * np.minimum(transfer * uphill, 1.0) * in_phase, 1e-300)
-        away = np.minimum(lobe_within(reach, envelope, level / whole), half)
-        apart = edge - extreme
-        moved = 0.0
-        for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
-            share = np.minimum(whole * lobe_tail(reach, envelope, distance) / level, 1.0)
-            moved += share if amplitudes else share * share / 2
-        out[0, i], out[1, i] = moved * (away + extreme), away + extreme
+    for t in range(out.shape[1]):
+        bins, furthest = 0.0, -np.inf
+        for s in (0, 2):
+            edge, extreme, transfer, uphill, peak, in_phase, level = table[:, s, t]
+            extreme = np.fmin(extreme, half)
+            whole = np.maximum(peak * np.minimum(transfer * uphill, 1.0) * in_phase, 1e-300)
+            away = np.minimum(lobe_within(reach, envelope, level / whole), half)
+            apart = edge - extreme
+            moved = 0.0
+            for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
+                share = np.minimum(whole * lobe_tail(reach, envelope, distance) / level, 1.0)
+                moved += share if amplitudes else share * share / 2
+            bins += moved * (away + extreme)
+            furthest = np.maximum(furthest, away + extreme)
+        out[0, t], out[1, t] = bins, 2 * furthest + 4
 
 
 def act(shots: Shots, scene: Scene) -> Shots:

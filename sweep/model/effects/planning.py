@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import EFFECTS
@@ -151,15 +152,36 @@ def _left_out(
     out = np.zeros(change.shape, bool)
     if not chosen:
         return out
-    key = change.copy()
-    rows = sorted(chosen, reverse=True)
-    for row in rows:
-        if row in within:
-            key[within[row]] = np.maximum(key[within[row]], key[row])
-    order = np.argsort(key[rows], axis=0, kind="stable")
-    sizes = np.take_along_axis(change[rows], order, axis=0)
+    parents = np.full(len(change), -1)
+    for row, parent in within.items():
+        parents[row] = parent
     room = np.maximum(tolerance - change[list(off)].sum(axis=0), 0.0)
-    gone = np.empty(order.shape, bool)
-    np.put_along_axis(gone, order, np.cumsum(sizes, axis=0) <= room, axis=0)
-    out[rows] = gone
+    _leave_out(change, np.array(sorted(chosen, reverse=True)), parents, room, out)
     return out
+
+
+@njit(cache=True, error_model="numpy")
+def _leave_out(change, rows, parents, room, out):
+    """Mark the smallest of some rows, last ones first where they are alike, while there is room."""
+    key, order = np.empty(len(change)), np.empty(len(rows), np.int64)
+    for t in range(change.shape[1]):
+        key[:] = change[:, t]
+        for i in range(len(rows)):
+            parent = parents[rows[i]]
+            if parent >= 0:
+                key[parent] = np.maximum(key[parent], key[rows[i]])
+        for i in range(len(rows)):
+            place = i
+            while place > 0 and _is_less(key[rows[i]], key[order[place - 1]]):
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = rows[i]
+        total = 0.0
+        for row in order:
+            total += change[row, t]
+            out[row, t] = total <= room[t]
+
+
+@njit(cache=True, error_model="numpy")
+def _is_less(one, other):
+    return one < other or (np.isnan(other) and not np.isnan(one))

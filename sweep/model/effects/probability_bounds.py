@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.change import Change
+from sweep.model.effects.change import NOTHING, Change
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1_pair
 
@@ -74,8 +74,11 @@ def probability_changes(
     out = np.empty((len(bounds), tiles))
     for row, bound in zip(out, bounds, strict=True):
         if isinstance(bound, Change):
-            shift = np.max(np.atleast_2d(bound.shift), axis=0)
-            row[:] = np.maximum(np.maximum(next(found), shift), bound.alarms)
+            row[:] = next(found)
+            if bound.shift is not NOTHING:
+                np.maximum(row, np.max(np.atleast_2d(bound.shift), axis=0), out=row)
+            if bound.alarms is not NOTHING:
+                np.maximum(row, bound.alarms, out=row)
         else:
             value = np.asarray(bound, float)
             row[:] = value.sum(axis=0) if value.ndim > 1 else value
