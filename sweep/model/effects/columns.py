@@ -3,10 +3,14 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+_MOST = 32
+"""Values that numpy broadcasts at once."""
+
 
 def columns(*values: ArrayLike) -> tuple[np.ndarray, tuple[int, ...]]:
     """Values side by side, (values, n) float64, and the shape that their n entries have."""
-    shape = np.broadcast(*values).shape
+    few = len(values) <= _MOST
+    shape = np.broadcast(*values).shape if few else np.broadcast_shapes(*map(np.shape, values))
     table = np.empty((len(values), *shape))
     for k, value in enumerate(values):
         table[k] = value

@@ -13,12 +13,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
+from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.line_spread import Line, Moments
+from sweep.model.effects.lobes import lobe_tail
 from sweep.model.effects.span import Span
 from sweep.model.preparation import CHIRP, Shots
 
@@ -42,7 +45,7 @@ def phase_reach(block: "Block", ranges: Moments, velocities: Moments) -> np.ndar
         Bins by which velocities put the lines off the axis's.
     """
     bandwidth = block[CHIRP + "bandwidth"].high
-    highest = np.stack([np.atleast_1d(c.high + 2 * bandwidth) for c in block.carriers])
+    highest, _ = columns(*(c.high + 2 * bandwidth for c in block.carriers))
     away = block.range.high * np.asarray(ranges.extreme, float)
     further = 4 * np.pi * highest / SPEED_OF_LIGHT * away
     return np.asarray(further + velocities.extreme * turn_of_bin(block))
@@ -72,19 +75,31 @@ def sum_change(
     most : array_like
         What no phases can exceed.
     """
-    f, extreme = line.lobe, np.asarray(spread.extreme, float)
-    apart = line.edge - extreme
-    near = 2 * apart < 8 * f.margin
-    worst = f.least(np.asarray(0.5))
-    image = f.tail(2 * apart - 1) / worst
-    with np.errstate(invalid="ignore", over="ignore"):
+    f = line.lobe
+    table, shape = columns(
+        line.edge, line.tilt, spread.extreme, phase, gain.low, gain.high, most
+    )  # fmt: skip
+    found = np.empty((2, *shape))
+    sizes = f.curvature, f.margin, float(f.least(np.asarray(0.5)))
+    _put_sum_changes(table, sizes, (f.reach, f.envelope), found.reshape(2, -1))
+    return Change(signal=(found[0], found[1]))
+
+
+@njit(cache=True, error_model="numpy")
+def _put_sum_changes(table, sizes, lobe, out):
+    """Least and largest factor on magnitudes, (2, n)."""
+    (curvature, margin, worst), (reach, envelope) = sizes, lobe
+    for i in range(table.shape[1]):
+        edge, poles, extreme, phase, less, more, most = table[:, i]
+        apart = edge - extreme
         # by how much a bin may differ from line to line
-        tilt = np.sqrt(f.curvature) * extreme / worst + line.tilt * extreme
-        low = gain.low * (1 - phase**2 / 2) * (1 - tilt) - gain.high * image
-        high = gain.high * ((1 + tilt) / (1 - tilt) + image)
-    tight = ~near & (tilt < 0.5)
-    low = np.where(tight & (low > 0), low, 0.0)
-    return Change(signal=(low, np.where(tight, np.fmin(high, most), most)))
+        tilt = np.sqrt(curvature) * extreme / worst + poles * extreme
+        out[0, i], out[1, i] = 0.0, most
+        if tilt < 0.5 and not 2 * apart < 8 * margin:
+            image = lobe_tail(reach, envelope, 2 * apart - 1) / worst
+            low = less * (1 - phase * phase / 2) * (1 - tilt) - more * image
+            out[0, i] = low if low > 0 else 0.0
+            out[1, i] = np.fmin(more * ((1 + tilt) / (1 - tilt) + image), most)
 
 
 def sum_added(block: "Block", lines: Line, bins: ArrayLike) -> np.ndarray:

@@ -27,9 +27,10 @@ import numpy as np
 from numba import njit
 
 from sweep.model.effects.change import Mean
+from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.footprint_sum import footprint_sum
-from sweep.model.effects.lobes import lobe
+from sweep.model.effects.lobes import lobe, lobe_tail
 from sweep.model.effects.sidelobes import CELLS, LEVELS, STEEPEST, sidelobes
 from sweep.model.effects.span import Span
 from sweep.model.marcum import excess_crossing
@@ -72,31 +73,21 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     threshold : Span
         Threshold over sigma, likewise.
     """
-    lines, extreme = block.lines, np.fmin(block.spread.extreme, block.fft_size)
-    uphill = np.exp(np.minimum(lines.tilt * extreme, 50.0))
-    peak = block.peak.high * np.minimum(lines.transfer * uphill, 1.0)
-    most, together, lean = (peak * value for value in footprint_sum(block))
+    lines, main = block.lines, block.lines.lobe
+    extreme = np.fmin(block.spread.extreme, block.fft_size)
     shape = block.window
     table, ratio = sidelobes(shape.name, shape.length), shape.length / block.fft_size
-    edge = lines.edge - extreme
-    image, sloping = lines.lobe.tail(edge), STEEPEST * lines.lobe.tail(edge - 1 / ratio)
-    steepest = table.steepest[LEVELS, 0]
-    askew = np.minimum(lean * sloping * ratio, most * image)
-    values = (
-        most, together, np.asarray(amplitude.low), np.asarray(threshold.low),
-        np.asarray(threshold.high), extreme, lines.bin_offset_least, lines.bin_offset, image,
-        np.minimum(together * image + askew, most * image),
-        askew + np.minimum(lean * ratio * steepest, 2 * most), lean * ratio,
+    given, size = columns(
+        block.peak.high, lines.transfer, np.exp(np.minimum(lines.tilt * extreme, 50.0)),
+        *footprint_sum(block), amplitude.low, threshold.low, threshold.high, extreme, lines.edge,
+        lines.bin_offset_least, lines.bin_offset,
     )  # fmt: skip
-    columns = np.empty((len(values), *np.shape(most)))
-    for column, value in zip(columns, values, strict=True):
-        column[...] = value
     found = _union(
-        columns.reshape(len(values), -1), (table.highest, table.lowest, table.steepest),
+        given, (main.reach, main.envelope), (table.highest, table.lowest, table.steepest),
         _far(shape.name, shape.length, block.fft_size),
         (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
         not block.adds_amplitudes,
-    ).reshape(columns[0].shape)  # fmt: skip
+    ).reshape(size)  # fmt: skip
     if not block.segment_exists[1]:
         found[1] = 0.0
     low = np.asarray(threshold.low, float)
@@ -124,11 +115,11 @@ def _far(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray,
 
 
 @njit(cache=True, error_model="numpy")
-def _union(columns, table, far, sizes, powers):
+def _union(given, lobe, table, far, sizes, powers):
     """Largest sum of the chances of all bins that may leak, (n,)."""
-    out = np.empty(columns.shape[1])
+    out, column = np.empty(given.shape[1]), np.empty(12)
     for i in range(out.size):
-        column = columns[:, i]
+        _put_column(given[:, i], lobe, table[2][LEVELS, 0], sizes[0], column)
         together, b = column[1], column[3]
         first, second, limit, sure = _starts(column, table, sizes[0])
         total = 0.0
@@ -139,6 +130,23 @@ def _union(columns, table, far, sizes, powers):
             total = max(total, _sum(other, 0.0, 1.0, column, table, far, sizes, powers))
         out[i] = min(total / -math.expm1(-0.5 * b * b), 1.0)
     return out
+
+
+@njit(cache=True, error_model="numpy")
+def _put_column(given, lobe, steepest, ratio, out):
+    """What a segment's bins follow from: sums of lines, ends of what they may be, sidelobes."""
+    peak, transfer, uphill, in_phase, most, lean, low, b, upper, extreme, edge, _, _ = given
+    reach, envelope = lobe
+    peak *= np.minimum(transfer * uphill, 1.0)
+    in_phase, most, lean = peak * in_phase, peak * most, peak * lean
+    image = lobe_tail(reach, envelope, edge - extreme)
+    sloping = STEEPEST * lobe_tail(reach, envelope, edge - extreme - 1 / ratio)
+    askew = np.minimum(lean * sloping * ratio, in_phase * image)
+    out[0], out[1], out[2], out[3], out[4], out[5] = in_phase, most, low, b, upper, extreme
+    out[6], out[7], out[8] = given[11], given[12], image
+    out[9] = np.minimum(most * image + askew, in_phase * image)
+    out[10] = askew + np.minimum(lean * ratio * steepest, 2 * in_phase)
+    out[11] = lean * ratio
 
 
 @njit(cache=True, error_model="numpy")

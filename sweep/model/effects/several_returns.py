@@ -8,15 +8,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 
 from sweep.model.effects.change import Change
+from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.line_spread import (
-    NO_SPREAD,
-    Moments,
-    image_factor,
-    power_range,
-)
+from sweep.model.effects.line_powers import image_factor_of
+from sweep.model.effects.line_spread import NO_SPREAD, Moments, power_range
+from sweep.model.effects.lobes import lobe_least
 from sweep.model.effects.span import any_holds
 from sweep.model.preparation import Shots
 
@@ -38,19 +37,31 @@ def bound(block: "Block") -> Change | None:
         return None
     f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
     apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme
-    spread = block.own_range_spread
-    own = (1 - f) * power_range(line, spread, block.number)[0]
+    own, _ = power_range(line, block.own_range_spread, block.number)
     _, on_axis = power_range(line, NO_SPREAD, block.number)
     elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer_least**-2.0)
-    elsewhere = elsewhere * image_factor(line, apart)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        less, more = own / (own + f * on_axis), 1 + f * elsewhere / own
-    there = (f > 0) & (np.asarray(apart) > 0)
-    low, high = np.sqrt(np.where(there, less, 1.0)), np.sqrt(np.where(there, more, 1.0))
-    if block.adds_amplitudes:
-        all_in_phase = 2 / (line.transfer_least * line.lobe.least(np.asarray(0.5)))
-        low, high = np.where(f > 0, 0.0, low), np.where(f > 0, np.maximum(high, all_in_phase), high)
-    return Change(signal=(low, high))
+    table, shape = columns(f, apart, own, on_axis, elsewhere, line.edge, line.transfer_least)
+    found, lobe = np.empty((2, *shape)), line.lobe
+    _put_changes(
+        table, lobe.margin, lobe.lowest, block.adds_amplitudes, found.reshape(2, -1)
+    )  # fmt: skip
+    return Change(signal=(found[0], found[1]))
+
+
+@njit(cache=True, error_model="numpy")
+def _put_changes(table, margin, lowest, amplitudes, out):
+    """Least and largest factor on magnitudes, (2, n)."""
+    for i in range(table.shape[1]):
+        f, apart, least, on_axis, elsewhere, edge, transfer = table[:, i]
+        own = (1 - f) * least
+        low, high = 1.0, 1.0
+        if f > 0 and apart > 0:
+            more = elsewhere * image_factor_of(edge, apart, margin)
+            low, high = np.sqrt(own / (own + f * on_axis)), np.sqrt(1 + f * more / own)
+        if amplitudes and f > 0:
+            all_in_phase = 2 / (transfer * lobe_least(lowest, 0.5))
+            low, high = 0.0, np.maximum(high, all_in_phase)
+        out[0, i], out[1, i] = low, high
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
