@@ -1,6 +1,7 @@
-"""Values that broadcast against each other as a table: what compiled formulas take, row by row."""
+"""What compiled formulas take: values that broadcast as a table, row by row, and spans' ends."""
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 _MOST = 32
@@ -15,3 +16,17 @@ def columns(*values: ArrayLike) -> tuple[np.ndarray, tuple[int, ...]]:
     for k, value in enumerate(values):
         table[k] = value
     return table.reshape(len(values), -1), shape
+
+
+@njit(cache=True, error_model="numpy")
+def product_of(one, other):
+    """Product of two spans."""
+    a, b, c, d = one[0] * other[0], one[0] * other[1], one[1] * other[0], one[1] * other[1]
+    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+
+
+@njit(cache=True, error_model="numpy")
+def quotient_of(one, other):
+    """Quotient of two spans, of which the other is positive."""
+    a, b, c, d = one[0] / other[0], one[0] / other[1], one[1] / other[0], one[1] / other[1]
+    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))

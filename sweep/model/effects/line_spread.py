@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
-from sweep.model.effects.columns import columns
+from sweep.model.effects.columns import columns, product_of, quotient_of
 from sweep.model.effects.line_powers import (
     put_image_factors,
     put_moved_changes,
@@ -139,11 +139,11 @@ def _put_shifts(ends, out):
     """Shifts (3, tiles)."""
     for t in range(out.shape[1]):
         size = np.maximum(abs(ends[_BETA, 0, t]), abs(ends[_BETA, 1, t]))
-        beat = _product((ends[4, 0, t], ends[4, 1, t]), (ends[5, 0, t], ends[5, 1, t]))
+        beat = product_of((ends[4, 0, t], ends[4, 1, t]), (ends[5, 0, t], ends[5, 1, t]))
         width = ends[6, 0, t], ends[6, 1, t]
         for s in range(3):
             frequency = ends[s, 0, t] + beat[0], ends[s, 1, t] + beat[1]
-            out[s, t] = size * _quotient(frequency, width)[1]
+            out[s, t] = size * quotient_of(frequency, width)[1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -152,11 +152,11 @@ def _put_lines(given, half, out):
     for t in range(given.shape[2]):
         ends = given[:, :, t]
         beta, width = (ends[3, 0], ends[3, 1]), (ends[6, 0], ends[6, 1])
-        stretched = _product((ends[4, 0], ends[4, 1]), (1.0 + beta[0], 1.0 + beta[1]))
-        beat = _product(stretched, (ends[5, 0], ends[5, 1]))
+        stretched = product_of((ends[4, 0], ends[4, 1]), (1.0 + beta[0], 1.0 + beta[1]))
+        beat = product_of(stretched, (ends[5, 0], ends[5, 1]))
         tilt = (1.0 / ends[7, 0] + 1.0 / ends[8, 0]) * width[1]
         for s in range(3):
-            low, high = _product((ends[s, 0], ends[s, 1]), beta)
+            low, high = product_of((ends[s, 0], ends[s, 1]), beta)
             if s == 0:
                 low, high = low - beat[1], high - beat[0]
             elif s == 2:
@@ -164,7 +164,7 @@ def _put_lines(given, half, out):
             one, other = abs(low), abs(high)
             furthest = max(one, other)
             nearest = 0.0 if low <= 0.0 and high >= 0.0 else min(one, other)
-            position = _quotient((low, high), width)
+            position = quotient_of((low, high), width)
             out[0, s, t], out[1, s, t] = _from_whole(position)
             out[2, s, t] = _from_edge(position, half)
             out[3, s, t] = 1.0 / (
@@ -174,20 +174,6 @@ def _put_lines(given, half, out):
                 math.hypot(1.0, furthest / ends[7, 0]) * math.hypot(1.0, furthest / ends[8, 0])
             )
             out[5, s, t] = tilt
-
-
-@njit(cache=True, error_model="numpy")
-def _product(one, other):
-    """Product of two spans."""
-    a, b, c, d = one[0] * other[0], one[0] * other[1], one[1] * other[0], one[1] * other[1]
-    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-
-
-@njit(cache=True, error_model="numpy")
-def _quotient(one, other):
-    """Quotient of two spans, of which the other is positive."""
-    a, b, c, d = one[0] / other[0], one[0] / other[1], one[1] / other[0], one[1] / other[1]
-    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
 
 
 @njit(cache=True, error_model="numpy")

@@ -47,6 +47,7 @@ from sweep.model.effects.phase_formulas import (
     put_images,
     put_missed,
     put_moved,
+    put_over_record,
     put_phase_changes,
     put_reaches,
 )
@@ -335,13 +336,20 @@ def over_record(terms: Mapping[int, Span], *, start: Span, duration: Span) -> Er
     start, duration : Span
         Acquisition delay and length of the record [s].
     """
+    ends = (end for c in terms.values() for end in (c.low, c.high))
+    table, found_shape = columns(*_powers(start, duration), *ends)
+    found = np.empty((5, *found_shape))
+    put_over_record(table, np.array(list(terms)), found.reshape(5, -1))
+    return Error(tuple(found[1:]), constant=found[0])
+
+
+@lru_cache(maxsize=8)
+def _powers(start: Span, duration: Span) -> tuple[Sizes, ...]:
+    """Powers 0..4 of half a record's length at the most, and ends of those of its middle."""
     half = 0.5 * duration
     middle = start + half
-    parts = []
-    for k in range(5):
-        each = [math.comb(j, k) * c * middle ** (j - k) for j, c in terms.items() if j >= k]
-        parts.append(sum(each, Span.of(0.0)).magnitude * half.high**k)
-    return Error(tuple(parts[1:]), constant=parts[0])
+    spans = [middle**k for k in range(5)]
+    return (*(half.high**k for k in range(5)), *(e for s in spans for e in (s.low, s.high)))
 
 
 def by_segment(block: "Block", *errors: Error | None) -> Error:

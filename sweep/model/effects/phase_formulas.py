@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
+from sweep.model.effects.columns import product_of
 from sweep.model.effects.line_powers import image_factor_of
 
 MARGIN = 1.01
@@ -16,6 +17,7 @@ HUGE = 1e12
 
 _TURN = 2 * math.pi
 _ROWS = 5
+_BINOMIAL = np.array([[math.comb(j, k) for k in range(5)] for j in range(5)], float)
 
 
 @njit(cache=True, error_model="numpy")
@@ -168,3 +170,26 @@ def put_moved(table, steady, factor, out):
         for k in range(_ROWS):
             moved += table[k, i] * steady[k]
         out[i] = 2 * moved * fft_size / length
+
+
+@njit(cache=True, error_model="numpy")
+def put_over_record(table, exponents, out):
+    """Largest coefficients of x^0 .. x^4 of sums of powers of time, (5, n).
+
+    Rows of the table: powers 0..4 of half the record; ends of those of its middle; ends of each
+    term's coefficient, whose exponents are given.
+    """
+    for i in range(table.shape[1]):
+        for k in range(5):
+            low, high = 0.0, 0.0
+            for m in range(exponents.size):
+                j = exponents[m]
+                if j < k:
+                    continue
+                ways, own, place = _BINOMIAL[j, k], 15 + 2 * m, 5 + 2 * (j - k)
+                least, most = product_of(
+                    (ways * table[own, i], ways * table[own + 1, i]),
+                    (table[place, i], table[place + 1, i]),
+                )
+                low, high = low + least, high + most
+            out[k, i] = np.maximum(abs(low), abs(high)) * table[k, i]
