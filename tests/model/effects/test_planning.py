@@ -181,6 +181,14 @@ def test_the_smallest_go_first_tile_by_tile_and_the_sum_counts():
     assert np.array_equal(made.change, np.array(list(bounds.values())))
 
 
+def test_of_effects_that_are_alike_the_last_goes_first_and_one_of_unknown_size_never():
+    bounds = {"a": np.full(2, 0.4), "b": np.array([np.nan, 0.4]), "c": np.full(2, 0.4)}
+    made = plan(Tiles(np.ones(2), 1.0), {}, 0.5, catalogue(bounds))
+    assert made.kept.tolist() == [[True, True], [True, True], [False, False]]
+    made = plan(Tiles(np.ones(2), 1.0), {}, 1.0, catalogue(bounds))
+    assert made.kept.tolist() == [[False, True], [True, False], [False, False]]
+
+
 def test_forced_effects_stay_and_go_and_the_error_is_told():
     bounds = {"a": 1e-6, "b": 0.3, "c": 1e-7, "nothing": 0.0, "absent": None, "far": None}
     bounds = {n: None if v is None else np.full(2, v) for n, v in bounds.items()}
