@@ -10,8 +10,9 @@ _MOST = 32
 
 def columns(*values: ArrayLike) -> tuple[np.ndarray, tuple[int, ...]]:
     """Values side by side, (values, n) float64, and the shape that their n entries have."""
-    few = len(values) <= _MOST
-    shape = np.broadcast(*values).shape if few else np.broadcast_shapes(*map(np.shape, values))
+    shape = np.broadcast(*values[:_MOST]).shape
+    for k in range(_MOST, len(values), _MOST - 1):
+        shape = np.broadcast(np.empty(shape), *values[k : k + _MOST - 1]).shape
     table = np.empty((len(values), *shape))
     for k, value in enumerate(values):
         table[k] = value
