@@ -85,11 +85,11 @@ the sample, round after round, so that whatever slows the machine slows them ali
 costs depends on those that are computed beside it, as they share what is worked out for them: so
 times are taken on stretches of the blocks that the study computes, some thousands of points each,
 around points of the sample. They are those that the processor spends on the work. The best round
-counts for them, and ratios are medians of those within each round. Planning is counted with what it
-plans; storing is not counted. Of a flight it takes 1 ms and more a block, however few shots that
-has: a tenth and more of the time of one or two thousand shots, which take some 10 to 20 ms in all.
-So it is with a few points of a grid. In studies as short as these fixed settings are the faster
-ones, and `sweep accuracy` says so.
+counts for them, and ratios are medians of those within each round, or of the best where there are
+but two. Planning is counted with what it plans; storing is not counted. Of a flight it takes about
+1 ms a block, however few shots that has: a tenth of the time of a thousand shots, which take some
+12 ms in all. So it is with a few points of a grid. In studies as short as these fixed settings are
+the faster ones, and `sweep accuracy` says so.
 
 The **error** of a setting is the largest, over the points, of the differences from the reference
 in a probability of detection, of the segments and the shot, in log10 of a probability of false

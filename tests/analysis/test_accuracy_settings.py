@@ -121,6 +121,18 @@ def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
     assert "can be improved to: auto at 0.001 is 6 times as fast as thesis 2^12, folded" in told
 
 
+def test_one_slow_trial_of_two_does_not_count():
+    """A median of two would be moved by it."""
+    whole = {"kind": "", "tolerance": 0.0, "planning": 0.0, "pd_error": np.zeros(1), "likely": 1.0}
+    whole |= dict.fromkeys(("log10_pfa_error", "leakage_error", "magnitude_error"), 0.0)
+    one = settings.Setting(name="one", rounds=np.array([1.0, 1.5]), **whole)
+    other = settings.Setting(name="other", rounds=np.array([0.9, 0.9]), **whole)
+    assert one.times_faster(other) == pytest.approx(0.9)
+    longer = replace(one, rounds=np.array([1.0, 1.5, 2.0]))
+    steady = replace(other, rounds=np.array([0.9, 0.9, 0.9]))
+    assert longer.times_faster(steady) == pytest.approx(0.6)
+
+
 def test_with_other_beamlets_than_the_thesis_has_nothing_is_asked_for(dataset):
     dataset.attrs["thesis_beamlets"] = 19
     told = " ".join(text.sentences(dataset, settings.settings_in(dataset)))
