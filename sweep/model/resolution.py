@@ -154,7 +154,7 @@ def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -
 def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
     """Where the tolerance alone says how finely points are computed, effects apart; or a scalar."""
     given = parameters[BEAMLETS] > np.asarray(0)
-    for path in ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"):
+    for path in ("accuracy.line_error", "accuracy.leakage_error"):
         given = given & (np.asarray(parameters[path]) != AUTOMATIC)
     return ~given
 
