@@ -26,7 +26,7 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
         list(text.SHORT), text.short_rows(settings), "setting",
     )  # fmt: skip
     print_table(
-        "Cheapest setting for each error of pd", list(text.CHEAPEST), text.cheapest_rows(settings),
+        "Cheapest setting for each error", list(text.CHEAPEST), text.cheapest_rows(settings),
         "cheapest setting",
     )  # fmt: skip
     for sentence in text.sentences(dataset, settings):
