@@ -288,9 +288,15 @@ def to_look_at(
         eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
         eyepoints.surface,
     )  # fmt: skip
-    weight = np.tile(eyepoints.weight, together(len(eyepoints.weight)))
+    beamlets = len(eyepoints.weight)
+    weight = np.empty((together(beamlets), beamlets))
+    weight[:] = eyepoints.weight
     bright, laws = _materials(tuple(surfaces))
-    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
+    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (
+        weight.reshape(-1),
+        bright,
+        laws,
+    )
 
 
 @lru_cache(maxsize=16)

@@ -59,8 +59,9 @@ def block_of(
     for row, value in zip(values[FIELDS + 1 :], axes.values(), strict=True):
         row[:] = value
     spans = tile_geometry.over(values, edges)
-    seen = {path: spans.some(k) for k, path in enumerate((SUNLIGHT, *axes), FIELDS)}
-    geometry = tile_geometry.of_fields(spans.some(slice(0, FIELDS)), rotating)
+    low, high = np.asarray(spans.low), np.asarray(spans.high)
+    seen = {path: Span(low[k], high[k]) for k, path in enumerate((SUNLIGHT, *axes), FIELDS)}
+    geometry = tile_geometry.of_fields(spans, rotating)
     parameters = {**instrument.parameters, "target.reflectance": Span.of(1.0), **seen}
     return Block(parameters, len(edges) - 1, geometry, instrument=instrument)
 

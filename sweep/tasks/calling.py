@@ -172,16 +172,14 @@ class ShotsCalling:
         from sweep.model.effects.planning import plan
         from sweep.model.seen_tiles import block_of
 
-        seen = np.flatnonzero(eyepoints.seen)
+        seen = eyepoints.seen.nonzero()[0]
         if not seen.size:
             return None
         some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
-        theirs = tiles[seen]
-        inner = 1 + np.flatnonzero(theirs[1:] != theirs[:-1])
-        edges = np.concatenate([[0], inner, [seen.size]])
+        edges, tile = _stretches(tiles[seen])
         block = block_of(some, self._instrument, self._surfaces, edges, self._rotating)
         planned = plan(block, modes=self._modes, tolerance=self._tolerance(some))
-        return ShotsPlan(seen, np.repeat(np.arange(edges.size - 1), np.diff(edges)), planned)
+        return ShotsPlan(seen, tile, planned)
 
     def _tolerance(self, eyepoints: Eyepoints) -> float:
         """What of the tolerance is for effects."""
@@ -189,6 +187,15 @@ class ShotsCalling:
 
         number = 0 if self._rays_by_tolerance else eyepoints.offset.shape[1]
         return effects_tolerance(self._parameters, number, self._parameters[TOLERANCE])
+
+
+def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
+    tile = np.zeros(tiles.size, np.int64)
+    np.not_equal(tiles[1:], tiles[:-1], out=tile[1:])
+    edges = np.empty(np.count_nonzero(tile) + 2, np.int64)
+    edges[0], edges[1:-1], edges[-1] = 0, tile.nonzero()[0], tiles.size
+    return edges, tile.cumsum()
 
 
 def layouts(

@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from sweep.model import ground, resolution
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.columns import columns
 from sweep.model.effects.line_spread import Line, Moments
@@ -40,7 +39,7 @@ class Block(TileLink):
         super().__init__(parameters, instrument)
         self.size, self.geometry = size, geometry
         self._at_rest = at_rest
-        self.number, self.pattern = _beamlets(self)
+        self.number, self.pattern = self.beamlets
         self.coherent = self.word("footprint.phases") == "coherent"
         self.segment_exists = (True, self.architecture != "direct", True)
         self.adds_amplitudes = self.coherent or self.architecture == "direct"
@@ -66,7 +65,7 @@ class Block(TileLink):
         sizes = {end.size for end in ends if isinstance(end, np.ndarray) and end.ndim} - {1}
         if len(sizes) > 1:
             raise ValueError(f"spans over different numbers of tiles: {sizes}")
-        geometry = tile_geometry.plane(parameters, *_beamlets(TileLink(parameters)))
+        geometry = tile_geometry.plane(parameters, *TileLink(parameters).beamlets)
         return cls(parameters, max(sizes, default=1), geometry)
 
     @classmethod
@@ -224,9 +223,3 @@ class Block(TileLink):
         """Bins by which ranges and velocities put the lines off the axis's, (3, tiles)."""
         pairs = zip(self.range_spread, self.velocity_spread, strict=True)
         return Moments(*(np.add(one, two) for one, two in pairs))
-
-
-def _beamlets(link: TileLink) -> tuple[int, str]:
-    """Beamlets and their pattern; the most there may be where they follow from the tolerance."""
-    number, words = link.whole(resolution.BEAMLETS), link.words
-    return (number, ground.pattern(words)) if number else resolution.finest(words)

@@ -88,9 +88,9 @@ class Realisation(NamedTuple):
     """(n,) int64: number of each point's draw."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
-    """A physical effect."""
+    """A physical effect, the same as no other."""
 
     name: str
     about: str

@@ -3,14 +3,24 @@
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 
 
 def flags_of(kept: np.ndarray) -> np.ndarray:
     """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
-    bits = np.uint32(1) << np.arange(len(kept), dtype=np.uint32)
-    return np.asarray((kept * bits[:, None]).sum(axis=0), np.uint32)
+    flags = np.zeros(kept.shape[1], np.uint32)
+    _put_flags(kept, flags)
+    return flags
+
+
+@njit(cache=True)
+def _put_flags(kept, flags):
+    for k in range(kept.shape[0]):
+        for t in range(flags.size):
+            if kept[k, t]:
+                flags[t] |= np.uint32(1 << k)
 
 
 def flags_apart() -> np.uint32:

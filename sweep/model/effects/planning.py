@@ -8,6 +8,7 @@ changes, whichever of the others are there.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -66,54 +67,77 @@ def plan(
         For a mode that is none of these, a name that is no effect's, or an effect that is on
         within one that is off.
     """
-    modes = dict(modes or {})
-    names = tuple(effect.name for effect in effects)
-    within = {effect.name: effect.within for effect in effects if effect.within in names}
-    decided = _decided(names, modes, within)
-    rest = block.at_rest() if decided.get("doppler") == "off" else block
+    rules = _rules(tuple(effects), tuple((modes or {}).items()))
+    rest = block.at_rest() if rules.at_rest else block
     bounds = _bounds(effects, block, rest)
-    change = np.zeros((len(names), block.size))
-    there = [names.index(name) for name in bounds]
-    if there:
-        change[there] = probability_changes(
+    change = np.zeros((len(effects), block.size))
+    if bounds:
+        change[list(bounds)] = probability_changes(
             list(bounds.values()),
             amplitude=rest.amplitude,
             threshold=block.threshold,
         )
-    chosen = [i for i in there if names[i] not in decided]
-    out = _left_out(
-        change,
-        chosen,
-        [names.index(name) for name, mode in decided.items() if mode == "off"],
-        {names.index(child): names.index(parent) for child, parent in within.items()},
-        tolerance,
-    )
-    kept = np.zeros(change.shape, bool)
-    kept[chosen] = ~out[chosen]
-    kept[[names.index(name) for name, mode in decided.items() if mode == "on"]] = True
-    for effect in effects:
-        for need in effect.needs:
-            if need in names and decided.get(need) != "off":
-                kept[names.index(need)] |= kept[names.index(effect.name)]
-    return Plan(names, kept, change, np.where(kept, 0.0, change).sum(axis=0))
+    kept = _kept(change, [row for row in bounds if row not in rules.decided], rules, tolerance)
+    return Plan(rules.names, kept, change, np.where(kept, 0.0, change).sum(axis=0))
 
 
-def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[str, Change | np.ndarray]:
+def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, Change | np.ndarray]:
     """Bounds of the effects that the scene has; all but Doppler's from lines as they are left."""
-    asked: dict[str, Bound] = {}
-    for effect in effects:
+    asked: dict[int, Bound] = {}
+    for row, effect in enumerate(effects):
         bound = effect.bound(block if effect.name == "doppler" else rest)
         if bound is not None:
-            asked[effect.name] = bound
-    told: dict[str, Change | np.ndarray] = {}
-    for name, bound in asked.items():
+            asked[row] = bound
+    told: dict[int, Change | np.ndarray] = {}
+    for row, bound in asked.items():
         if isinstance(bound, Mean):
-            others = (b for n, b in asked.items() if n != name and isinstance(b, Change))
+            others = (b for k, b in asked.items() if k != row and isinstance(b, Change))
             bound = bound.change(
                 *within_changes(others, amplitude=rest.amplitude, threshold=rest.threshold)
             )
-        told[name] = bound
+        told[row] = bound
     return told
+
+
+class _Rules(NamedTuple):
+    """What modes say of effects, by row, whatever the bounds do."""
+
+    names: tuple[str, ...]
+    decided: frozenset[int]
+    """Those that are on or off."""
+    on: list[int]
+    off: list[int]
+    parents: np.ndarray
+    """Of each, what it is within; -1 for none."""
+    needs: tuple[tuple[int, int], ...]
+    """Effects, and what each is simulated with."""
+    at_rest: bool
+    """Whether the Doppler effect is off."""
+
+
+@lru_cache(maxsize=16)
+def _rules(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> _Rules:
+    """What modes say, the same for all blocks of a study."""
+    names = tuple(effect.name for effect in effects)
+    within = {effect.name: effect.within for effect in effects if effect.within in names}
+    decided = _decided(names, dict(modes), within)
+    parents = np.full(len(names), -1)
+    for child, parent in within.items():
+        parents[names.index(child)] = names.index(parent)
+    return _Rules(
+        names=names,
+        decided=frozenset(map(names.index, decided)),
+        on=[names.index(name) for name, mode in decided.items() if mode == "on"],
+        off=[names.index(name) for name, mode in decided.items() if mode == "off"],
+        parents=parents,
+        needs=tuple(
+            (row, names.index(need))
+            for row, effect in enumerate(effects)
+            for need in effect.needs
+            if need in names and decided.get(need) != "off"
+        ),
+        at_rest=decided.get("doppler") == "off",
+    )
 
 
 def _decided(
@@ -137,32 +161,26 @@ def _decided(
     return decided
 
 
-def _left_out(
-    change: np.ndarray,
-    chosen: Sequence[int],
-    off: Sequence[int],
-    within: Mapping[int, int],
-    tolerance: float,
-) -> np.ndarray:
-    """Effects to leave out among those to choose from, (effects, tiles) bool.
+def _kept(change: np.ndarray, chosen: Sequence[int], rules: _Rules, tolerance: float) -> np.ndarray:
+    """Effects to keep, of those to choose from and of all that modes say, (effects, tiles) bool.
 
-    The smallest go first, as long as their sum is within what the tolerance leaves; an effect
-    never before those within it.
+    The smallest are left out first, as long as their sum is within what the tolerance leaves; an
+    effect never before those within it.
     """
-    out = np.zeros(change.shape, bool)
-    if not chosen:
-        return out
-    parents = np.full(len(change), -1)
-    for row, parent in within.items():
-        parents[row] = parent
-    room = np.maximum(tolerance - change[list(off)].sum(axis=0), 0.0)
-    _leave_out(change, np.array(sorted(chosen, reverse=True)), parents, room, out)
-    return out
+    kept = np.zeros(change.shape, np.bool_)
+    if chosen:
+        room = np.maximum(tolerance - change[rules.off].sum(axis=0), 0.0)
+        _keep(change, np.array(chosen[::-1]), rules.parents, room, kept)
+    if rules.on:
+        kept[rules.on] = True
+    for row, need in rules.needs:
+        kept[need] |= kept[row]
+    return kept
 
 
 @njit(cache=True, error_model="numpy")
-def _leave_out(change, rows, parents, room, out):
-    """Mark the smallest of some rows, last ones first where they are alike, while there is room."""
+def _keep(change, rows, parents, room, kept):
+    """Mark all but the smallest of some rows, last ones first where they are alike, that fit."""
     key, order = np.empty(len(change)), np.empty(len(rows), np.int64)
     for t in range(change.shape[1]):
         key[:] = change[:, t]
@@ -179,7 +197,7 @@ def _leave_out(change, rows, parents, room, out):
         total = 0.0
         for row in order:
             total += change[row, t]
-            out[row, t] = total <= room[t]
+            kept[row, t] = not total <= room[t]
 
 
 @njit(cache=True, error_model="numpy")

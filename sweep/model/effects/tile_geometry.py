@@ -172,19 +172,17 @@ def cast(
 
 
 def of_fields(fields: Span, rotating: bool = False) -> Geometry:
-    """Tiles by what is found in the footprints of their shots, (fields, tiles)."""
+    """Tiles by what is found in the footprints of their shots, (fields and more, tiles)."""
     low, high = np.asarray(fields.low), np.asarray(fields.high)
-    ranges, own, velocities = (
-        Moments(*high[first : first + 3]) for first in (RANGES, OWN_RANGES, VELOCITIES)
-    )
+    doppler = high[VELOCITIES : VELOCITIES + 3]
     return Geometry(
         grazing_angle=Span(0.0, np.pi / 2),
         echo=Span(low[WHOLE], high[WHOLE]),
         echo_ratio=Span.of(1.0),
         gain=Span(low[GAIN], high[GAIN]),
-        ranges=ranges,
-        own_ranges=own,
-        velocities=velocities.scaled(SPEED_OF_LIGHT / 2),
+        ranges=Moments(*high[RANGES : RANGES + 3]),
+        own_ranges=Moments(*high[OWN_RANGES : OWN_RANGES + 3]),
+        velocities=Moments(*(doppler * (SPEED_OF_LIGHT / 2))),
         beside_share=Span(low[BESIDE], high[BESIDE]),
         beside_apart=high[APART],
         rotating=rotating,

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from sweep.model import detection, link, noise, receiver, waveform
+from sweep.model import detection, ground, link, noise, receiver, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, TELESCOPE
@@ -16,7 +17,7 @@ Parameters = Mapping[str, Span | str]
 _INSTRUMENT = (
     "architecture", "fft_size", "window", "carriers", "chirp_rate", "bin_width", "record_duration",
     "electrical_bandwidth", "noise_scale", "shot_noise_scale", "noise_variance", "deviation",
-    "threshold",
+    "threshold", "beamlets", "words",
 )  # fmt: skip
 """What the instrument alone makes, whatever the beams meet."""
 
@@ -36,7 +37,7 @@ class TileLink:
     def __init__(self, parameters: Parameters, instrument: "TileLink | None" = None) -> None:
         self._parameters = parameters
         if instrument is not None:
-            self.__dict__.update((name, getattr(instrument, name)) for name in _INSTRUMENT)
+            self.__dict__.update(instrument._of_instrument)
             return
         self.architecture = self.word(RECEIVER + "architecture")
         self.fft_size = self.whole(PROCESSING + "fft_size")
@@ -57,10 +58,22 @@ class TileLink:
         """All parameters."""
         return self._parameters
 
-    @property
+    @cached_property
     def words(self) -> dict[str, str]:
         """Parameters that are words."""
         return {path: v for path, v in self._parameters.items() if isinstance(v, str)}
+
+    @cached_property
+    def beamlets(self) -> tuple[int, str]:
+        """Beamlets and their pattern; the most there may be where they follow from the tolerance.
+
+        Raises
+        ------
+        ValueError
+            As of :meth:`whole`.
+        """
+        number = self.whole(resolution.BEAMLETS)
+        return (number, ground.pattern(self.words)) if number else resolution.finest(self.words)
 
     def whole(self, path: str) -> int:
         """A parameter that is a number shared by all points.
@@ -228,6 +241,10 @@ class TileLink:
     def threshold(self) -> Span:
         """Threshold over sigma."""
         return monotone(detection.threshold, tnr=self[PROCESSING + "tnr"], bin_deviation=1.0)
+
+    @cached_property
+    def _of_instrument(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in _INSTRUMENT}
 
     def _receiver(self, *names: str) -> dict[str, Span]:
         return {name: self[RECEIVER + name] for name in names}
