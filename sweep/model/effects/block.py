@@ -13,6 +13,7 @@ import numpy as np
 
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.columns import columns
+from sweep.model.effects.line_powers import put_amplitudes
 from sweep.model.effects.line_spread import Line, Moments
 from sweep.model.effects.span import Span, monotone
 from sweep.model.effects.tile_geometry import Geometry
@@ -171,16 +172,15 @@ class Block(TileLink):
         No image is in it. In direct detection's Doppler segment, which does not exist, it is 0.
         """
         line, peak = self.lines, self.peak
-        low = peak.low * line.transfer_least * line.lobe.least(line.bin_offset)
-        most = np.where(
-            line.bin_offset == line.bin_offset_least,
-            line.lobe.least(line.bin_offset),
-            line.lobe.most(line.bin_offset_least),
-        )
-        high = peak.high * line.transfer * most
+        table, shape = columns(
+            peak.low, peak.high, line.bin_offset, line.bin_offset_least, line.transfer,
+            line.transfer_least,
+        )  # fmt: skip
+        found = np.empty((2, *shape))
+        put_amplitudes(table, line.lobe.highest, line.lobe.lowest, found.reshape(2, -1))
         if self.architecture == "direct":
-            low[1] = high[1] = 0.0
-        return Span(low, high)
+            found[:, 1] = 0.0
+        return Span(found[0], found[1])
 
     @cached_property
     def range_bins(self) -> np.ndarray:
@@ -209,10 +209,9 @@ class Block(TileLink):
     @cached_property
     def velocity_spread(self) -> Moments:
         """Bins by which velocities put the lines off the axis's, (3, tiles) at the most."""
-        carriers, _ = columns(*(carrier.high for carrier in self.carriers))
         factors = line_spread.velocity_to_bins(
             range=self.range.high,
-            carrier=carriers,
+            carrier=self.highest_carriers,
             chirp_rate=self.chirp_rate.high,
             bin_width=self.bin_width.low,
         )

@@ -38,7 +38,7 @@ def bound(block: "Block") -> Change | None:
         ratio = ratio.sqrt()
     else:
         uphill = np.exp(np.minimum(block.lines.tilt * spread.extreme, 50.0))
-        most = 2.1 * uphill / block.lines.lobe.least(np.asarray(0.5))  # all, and their images
+        most = 2.1 * uphill / block.lines.lobe.worst  # all, and their images
         phase = footprint_phase.phase_reach(block, block.geometry.own_ranges, NO_SPREAD)
         change = footprint_phase.sum_change(
             block.lines, phase=phase, gain=Span.of(1.0), spread=spread, most=most

@@ -16,14 +16,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.line_spread import Line, Moments
 from sweep.model.effects.lobes import lobe_tail
 from sweep.model.effects.span import Span
-from sweep.model.preparation import CHIRP, Shots
+from sweep.model.preparation import Shots
 
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
@@ -44,17 +43,9 @@ def phase_reach(block: "Block", ranges: Moments, velocities: Moments) -> np.ndar
     velocities : Moments
         Bins by which velocities put the lines off the axis's.
     """
-    bandwidth = block[CHIRP + "bandwidth"].high
-    highest, _ = columns(*(c.high + 2 * bandwidth for c in block.carriers))
     away = block.range.high * np.asarray(ranges.extreme, float)
-    further = 4 * np.pi * highest / SPEED_OF_LIGHT * away
-    return np.asarray(further + velocities.extreme * turn_of_bin(block))
-
-
-def turn_of_bin(block: "Block") -> np.ndarray | float:
-    """Largest phase [rad] at the record's middle of a line one bin away: pi for L = N, t_0 = 0."""
-    middle = block.start.high + 0.5 * block.record_duration.high
-    return 2 * np.pi * middle * block.bin_width.high
+    further = block.most_turns * away
+    return np.asarray(further + velocities.extreme * block.turn_of_bin)
 
 
 def sum_change(
@@ -80,7 +71,7 @@ def sum_change(
         line.edge, line.tilt, spread.extreme, phase, gain.low, gain.high, most
     )  # fmt: skip
     found = np.empty((2, *shape))
-    sizes = f.curvature, f.margin, float(f.least(np.asarray(0.5)))
+    sizes = f.curvature, f.margin, f.worst
     _put_sum_changes(table, sizes, (f.reach, f.envelope), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))
 
@@ -118,11 +109,11 @@ def sum_added(block: "Block", lines: Line, bins: ArrayLike) -> np.ndarray:
         Largest distance that it moves any line, (3, tiles).
     """
     f, reach = lines.lobe, np.asarray(block.spread.extreme) + bins
-    each = np.sqrt(f.curvature) + 2 * lines.tilt + turn_of_bin(block)
+    each = np.sqrt(f.curvature) + 2 * lines.tilt + block.turn_of_bin
     with np.errstate(over="ignore", invalid="ignore"):
         uphill = np.exp(np.minimum(lines.tilt * reach, 50.0))
         # with its image, as its magnitude may lie between two bins
-        change = 2 * uphill * np.minimum(each * bins, 2.0) / f.least(np.asarray(0.5))
+        change = 2 * uphill * np.minimum(each * bins, 2.0) / f.worst
     return np.asarray(np.where(np.asarray(bins) > 0, change, 0.0))
 
 

@@ -28,6 +28,20 @@ def put_image_factors(table, margin, out):
 
 
 @njit(cache=True, error_model="numpy")
+def put_amplitudes(table, highest, lowest, out):
+    """Least and largest magnitudes of one line's largest bin (2, n).
+
+    Rows of the table: ends of what it has on a bin; offset, least offset, transfer and least
+    transfer of the line.
+    """
+    for i in range(table.shape[1]):
+        low, high, offset, offset_least, transfer, transfer_least = table[:, i]
+        least = lobe_least(lowest, offset)
+        most = least if offset == offset_least else lobe_most(highest, offset_least)
+        out[0, i], out[1, i] = low * transfer_least * least, high * transfer * most
+
+
+@njit(cache=True, error_model="numpy")
 def put_power_ranges(table, beamlets, tables, sizes, out):
     """Least and largest powers (2, n).
 

@@ -48,6 +48,8 @@ class Lobe(NamedTuple):
     """(k,): distances [bins], 0 and up."""
     envelope: np.ndarray
     """(k,): largest magnitude at or beyond each."""
+    worst: float
+    """Least magnitude of the bin nearest to a line."""
 
     def tail(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
@@ -152,15 +154,17 @@ def lobe(name: str, length: int, fft_size: int) -> Lobe:
     coefficients = _series(w, place)
     distance = np.linspace(0.0, 0.5, _STEPS + 1)
     value = main_lobe(shape, coefficients, distance * ratio)
+    lowest = np.minimum.accumulate(value)
     return Lobe(
         highest=np.maximum.accumulate(value[::-1])[::-1].copy(),
-        lowest=np.minimum.accumulate(value),
+        lowest=lowest,
         slope=excess * math.sqrt(curvature),
         curvature=curvature,
         margin=1 / ratio,
         energy=_least_energy(shape, coefficients, ratio, excess * math.sqrt(curvature)),
         reach=np.concatenate([[0.0], shape.reach / ratio]),
         envelope=np.concatenate([[max(1.0, value.max(), shape.envelope[0])], shape.envelope]),
+        worst=lobe_least(lowest, 0.5),
     )
 
 

@@ -293,10 +293,8 @@ def added(block: "Block", error: Error, images: np.ndarray) -> np.ndarray:
     """What a phase error adds to sums of amplitudes, lines and images, as of :class:`Change`."""
     table, found_shape = columns(*error.powers, error.rest, error.constant, images)
     found, window = np.empty(found_shape), block.window
-    least = float(block.lines.lobe.least(np.asarray(0.5)))
-    put_added(
-        table, means(window).absolute, shape(window).absolute, least, found.reshape(-1)
-    )  # fmt: skip
+    least = block.lines.lobe.worst
+    put_added(table, means(window).absolute, shape(window).absolute, least, found.reshape(-1))
     return found
 
 

@@ -245,7 +245,7 @@ def bound(block: "Block") -> Change | None:
         record=block.window.length / block.fft_size,
         spread=2 * np.asarray(block.velocity_spread.extreme),
         edge=block.lines.edge,
-        tail=lambda bins: lobe.tail(bins) / lobe.least(np.asarray(0.5)),
+        tail=lambda bins: lobe.tail(bins) / lobe.worst,
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from sweep.model import detection, ground, link, noise, receiver, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.columns import columns
 from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, TELESCOPE
 from sweep.model.window import Window, canonical_name, window
@@ -17,7 +18,7 @@ Parameters = Mapping[str, Span | str]
 _INSTRUMENT = (
     "architecture", "fft_size", "window", "carriers", "chirp_rate", "bin_width", "record_duration",
     "electrical_bandwidth", "noise_scale", "shot_noise_scale", "noise_variance", "deviation",
-    "threshold", "beamlets", "words",
+    "threshold", "beamlets", "words", "highest_carriers", "most_turns", "turn_of_bin",
 )  # fmt: skip
 """What the instrument alone makes, whatever the beams meet."""
 
@@ -140,6 +141,24 @@ class TileLink:
         else:
             start = SPEED_OF_LIGHT / self[LASER + "wavelength"]
         return start, start, start + self[CHIRP + "bandwidth"]
+
+    @cached_property
+    def highest_carriers(self) -> np.ndarray:
+        """The largest of each, (3, tiles), or (3, 1) for all tiles."""
+        return columns(*(carrier.high for carrier in self.carriers))[0]
+
+    @cached_property
+    def most_turns(self) -> np.ndarray:
+        """Phase [rad] of 1 m further off at a carrier and two bandwidths, likewise."""
+        bandwidth = self[CHIRP + "bandwidth"].high
+        highest, _ = columns(*(carrier.high + 2 * bandwidth for carrier in self.carriers))
+        return np.asarray(4 * np.pi * highest / SPEED_OF_LIGHT)
+
+    @cached_property
+    def turn_of_bin(self) -> np.ndarray | float:
+        """Most phase [rad] at the record's middle of a line one bin away: pi for L = N, t_0 = 0."""
+        middle = self.start.high + 0.5 * self.record_duration.high
+        return 2 * np.pi * middle * self.bin_width.high
 
     @cached_property
     def chirp_rate(self) -> Span:
