@@ -126,7 +126,7 @@ def _errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _largest_bin(shape: Lobe, deviation: np.ndarray) -> np.ndarray:
     """Least power of the largest bin, over that of all lines on a bin: as of `power_range`."""
-    narrow = shape.worst ** 2 - 0.5 * shape.curvature * deviation**2
+    narrow = shape.worst**2 - 0.5 * shape.curvature * deviation**2
     wide = (1 - 1 / _CHEBYSHEV**2) * shape.energy
     return np.maximum(
         narrow, (wide / (2 * _CHEBYSHEV * deviation + 2 * shape.margin + 1)).max(axis=0)

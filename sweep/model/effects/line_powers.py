@@ -47,10 +47,10 @@ def put_power_ranges(table, beamlets, tables, sizes, out):
 
     Rows of the table: offset, least offset, edge and tilt of lines; mean, rms, extreme of a spread.
     """
-    bounds = _extremes(beamlets, tables)
+    bounds = extremes_of(beamlets, tables)
     for i in range(table.shape[1]):
         offset, offset_least, edge, tilt, mean, rms, extreme = table[:, i]
-        out[0, i], out[1, i] = _power_range(
+        out[0, i], out[1, i] = power_range_of(
             (offset, offset_least, edge, tilt), (mean, rms, extreme), bounds, tables, sizes
         )
 
@@ -63,7 +63,7 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
     transfer, least transfer and tilt of the line that is moved, and of the one that is not; the
     receiver's factors over all of the reach and over the shift.
     """
-    bounds = _extremes(beamlets, tables)
+    bounds = extremes_of(beamlets, tables)
     slope, curvature, margin, _ = sizes
     for i in range(table.shape[1]):
         own = table[:, i]
@@ -75,8 +75,8 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
         wide, tilt = own[6] + extreme, own[18]
         together = own[4] + mean, own[5] + rms, wide
         moved, still = (own[7], own[8], own[9], own[12]), (own[13], own[14], own[15], tilt)
-        with_least, with_most = _power_range(moved, together, bounds, tables, sizes)
-        least, most = _power_range(still, (own[4], own[5], own[6]), bounds, tables, sizes)
+        with_least, with_most = power_range_of(moved, together, bounds, tables, sizes)
+        least, most = power_range_of(still, (own[4], own[5], own[6]), bounds, tables, sizes)
         double = max(image_factor_of(own[15], wide + shift, margin), 1.05)
         change = slope * (mean + shift) + curvature * (own[5] * rms + rms * rms / 2)
         change = double * uphill * (change + tilt * (rms + shift)) / least
@@ -89,14 +89,14 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _extremes(beamlets, tables):
+def extremes_of(beamlets, tables):
     """Power of the weakest beamlet's line half a bin away, and of all on the lobe's peak."""
     highest, lowest = tables
     return lobe_least(lowest, 0.5) ** 2 / beamlets, lobe_most(highest, 0.0) ** 2
 
 
 @njit(cache=True, error_model="numpy")
-def _power_range(line, spread, extremes, tables, sizes):
+def power_range_of(line, spread, extremes, tables, sizes):
     """Least and largest power of the largest bin, over that of all lines on a bin."""
     (highest, lowest), (slope, curvature, margin, energy) = tables, sizes
     offset, offset_least, edge, tilt = line

@@ -304,11 +304,11 @@ def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray,
     """
     table, shape = columns(line.bin_offset, line.bin_offset_least, line.edge, line.tilt, *spread)
     found = np.empty((2, *shape))
-    put_power_ranges(table, beamlets, *_sizes(line.lobe), found.reshape(2, -1))
+    put_power_ranges(table, beamlets, *sizes_of(line.lobe), found.reshape(2, -1))
     return found[0], found[1]
 
 
-def _sizes(f: Lobe) -> tuple[tuple[np.ndarray, ...], tuple[float, ...]]:
+def sizes_of(f: Lobe) -> tuple[tuple[np.ndarray, ...], tuple[float, ...]]:
     """What compiled formulas take of a lobe."""
     return (f.highest, f.lowest), (f.slope, f.curvature, f.margin, f.energy)
 
@@ -362,5 +362,5 @@ def moved_change(
         ways[1] = table[0]
         np.exp(np.minimum(tilt * ways, 50.0), out=ways)
     found = np.empty((2, *shape))
-    put_moved_changes(table, beamlets, *_sizes(still.lobe), found.reshape(2, -1))
+    put_moved_changes(table, beamlets, *sizes_of(still.lobe), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))

@@ -38,7 +38,7 @@ from sweep.model.effects.phase_bounds import (
     Peak,
     added,
     errors_of,
-    images_of,
+    may_cancel,
     missed,
     peak_of,
 )
@@ -276,8 +276,8 @@ def bound(block: "Block") -> Change | None:
             cnr=0.5 * power / block.noise_variance,
         )
     errors = errors_of(block)
-    images, cancelling = images_of(block, errors)
-    peak = peak_of(block, images, broadened=False)
+    peak, images = peak_of(block, errors, broadened=False)
+    cancelling = may_cancel(block, images)
     beside = missed(errors, block.window)
     peak = Peak(
         np.maximum(peak.least - beside, 0.0), peak.most + beside, peak.single and not beside.any()

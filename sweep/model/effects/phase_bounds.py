@@ -41,13 +41,13 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
-from sweep.model.effects.line_spread import Moments, power_range
+from sweep.model.effects.line_spread import Moments, sizes_of
 from sweep.model.effects.phase_formulas import (
     put_added,
-    put_images,
     put_missed,
     put_moved,
     put_over_record,
+    put_peaks,
     put_phase_changes,
     put_reaches,
 )
@@ -215,8 +215,12 @@ def phase_change(
     others : Error
         Phase errors that may be there besides: they lower the bin, and turn what changes.
     """
-    form, known, peak = shape(window), means(window), peak or one_line(window)
-    beside = others is not NO_ERROR
+    return _changed(error, others, peak or one_line(window), window)[0]
+
+
+def _changed(error: Error, others: Error, peak: Peak, window: Window) -> tuple[Change, np.ndarray]:
+    """What :func:`phase_change` tells, and the table of what it follows from, the error first."""
+    form, known = shape(window), means(window)
     table, found_shape = columns(
         *error.powers, error.rest, *others.powers, others.rest, peak.least, peak.most
     )
@@ -226,10 +230,10 @@ def phase_change(
     found = np.empty((2, *found_shape))
     put_phase_changes(
         table, reaches, (known.absolute, known.bent, known.square),
-        (form.absolute, form.edge, form.top, known.hann), (beside, bool(peak.single)),
-        found.reshape(2, -1),
+        (form.absolute, form.edge, form.top, known.hann),
+        (others is not NO_ERROR, bool(peak.single)), found.reshape(2, -1),
     )  # fmt: skip
-    return Change(signal=(found[0], found[1]))
+    return Change(signal=(found[0], found[1])), table
 
 
 def missed(error: Error, window: Window) -> np.ndarray:
@@ -266,10 +270,10 @@ def error_change(block: "Block", own: Own) -> Change | None:
     if error is None:
         return None
     others, window = errors_of(block, own), block.window
-    images, cancelling = images_of(block, error + others)
-    change = phase_change(error, window=window, peak=peak_of(block, images), others=others)
-    table, found_shape = columns(*error.powers, error.rest)
-    moved = np.empty(found_shape)
+    peak, images = peak_of(block, error + others)
+    cancelling = may_cancel(block, images)
+    change, table = _changed(error, others, peak, window)
+    moved = np.empty(np.shape(change.signal[0]))
     put_moved(table, means(window).steady, (block.fft_size, window.length), moved.reshape(-1))
     if not any_holds(cancelling):
         return change._replace(shift=moved)
@@ -278,15 +282,10 @@ def error_change(block: "Block", own: Own) -> Change | None:
     return Change(signal=(low, high), added=lines_added, shift=moved)
 
 
-def images_of(block: "Block", error: Error) -> tuple[np.ndarray, np.ndarray]:
-    """By how much images may make powers larger, and where amplitudes may cancel, (3, tiles)."""
-    lines = block.lines
-    table, found_shape = columns(*error.powers, lines.edge, block.spread.extreme)
-    images = np.empty(found_shape)
-    sizes = block.fft_size, block.window.length, lines.lobe.margin
-    put_images(table, sizes, images.reshape(-1))
+def may_cancel(block: "Block", images: np.ndarray) -> np.ndarray:
+    """Where amplitudes, or lines and images that make powers so much larger, may cancel."""
     amplitudes = block.adds_amplitudes or block.has("target.roughness")
-    return images, amplitudes & ((images > 1.5) | (block.number > 1))
+    return amplitudes & ((images > 1.5) | (block.number > 1))
 
 
 def added(block: "Block", error: Error, images: np.ndarray) -> np.ndarray:
@@ -298,30 +297,39 @@ def added(block: "Block", error: Error, images: np.ndarray) -> np.ndarray:
     return found
 
 
-def peak_of(block: "Block", images: ArrayLike, *, broadened: bool = True) -> Peak:
+def peak_of(block: "Block", error: Error, *, broadened: bool = True) -> tuple[Peak, np.ndarray]:
     """The largest bin of a block's lines as powers, (3, tiles), whichever effects there are.
 
     Parameters
     ----------
     block : Block
         The block.
-    images : array_like
-        By how much images make powers larger at the most.
+    error : Error
+        All phase errors that there may be.
     broadened : bool
         Whether the laser's line may have its width.
+
+    Returns
+    -------
+    Peak
+    (3, tiles) ndarray
+        By how much images make powers larger at the most.
     """
     lines, spread, number = block.lines, block.spread, block.number
     if broadened and block.word("instrument.laser.line_shape") == "gaussian" and block.has(_WIDTH):
         width = block[_WIDTH].high * DEVIATION_OF_FWHM / block.bin_width.low
         spread = Moments(spread.mean, np.hypot(spread.rms, width), spread.extreme + 6 * width)
         number = _MANY
-    anywhere = lines._replace(bin_offset=np.array(0.5), bin_offset_least=np.array(0.0))
-    least, most = power_range(anywhere, spread, number)
-    uneven = np.asarray(images) * np.exp(np.minimum(lines.tilt * spread.extreme, 50.0))
-    c = np.sqrt(least / uneven)
-    if block.adds_amplitudes:
-        c = _IMAGE * c
-    return Peak(c, np.sqrt(most) / _IMAGE, block.number == 1)
+    uphill = np.exp(np.minimum(lines.tilt * spread.extreme, 50.0))
+    table, found_shape = columns(
+        lines.edge, lines.tilt, *spread, uphill, block.spread.extreme, *error.powers
+    )
+    found = np.empty((3, *found_shape))
+    put_peaks(
+        table, number, sizes_of(lines.lobe), (block.fft_size, block.window.length),
+        (_IMAGE if block.adds_amplitudes else 1.0, _IMAGE), found.reshape(3, -1),
+    )  # fmt: skip
+    return Peak(found[0], found[1], block.number == 1), found[2]
 
 
 def over_record(terms: Mapping[int, Span], *, start: Span, duration: Span) -> Error:

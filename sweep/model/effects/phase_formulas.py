@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.effects.columns import product_of
-from sweep.model.effects.line_powers import image_factor_of
+from sweep.model.effects.line_powers import extremes_of, image_factor_of, power_range_of
 
 MARGIN = 1.01
 """What a and b are raised by, for the means being sums over nodes."""
@@ -131,18 +131,38 @@ def _matched(reach, tangent, rest, hann):
 
 
 @njit(cache=True, error_model="numpy")
-def put_images(table, sizes, out):
-    """Images' factors on powers, (n,).
+def put_peaks(table, beamlets, lobe, record, shares, out):
+    """Least and largest magnitudes of the largest bin, images' factors on powers, (3, n).
 
-    Rows of the table: x .. x^4 of an error; edge of lines, extreme of their spread.
+    Parameters
+    ----------
+    table : (11, n) float64
+        Edge and tilt of lines; mean, rms and extreme of the spread that they may have, what the
+        receiver's poles make of that, and the extreme without the laser's width; x .. x^4 of an
+        error.
+    beamlets : int
+        Lines at the most.
+    lobe : tuple, tuple
+        As of :func:`.line_powers.put_power_ranges`.
+    record : (float, float)
+        Size of the FFT, length of the record.
+    shares : (float, float)
+        What images leave of the least, and what the largest is of what they may make it.
     """
-    fft_size, length, margin = sizes
-    for i in range(out.size):
+    tables, sizes = lobe
+    fft_size, length = record
+    bounds = extremes_of(beamlets, tables)
+    for i in range(table.shape[1]):
+        edge, tilt, mean, rms, extreme, uphill, away = table[:7, i]
         slopes = 0.0
         for k in range(4):
-            slopes += (k + 1) * table[k, i]
+            slopes += (k + 1) * table[7 + k, i]
         reach = 2 * slopes * fft_size / length
-        out[i] = image_factor_of(table[4, i], table[5, i] + reach, margin)
+        images = image_factor_of(edge, away + reach, sizes[2])
+        anywhere, spread = (0.5, 0.0, edge, tilt), (mean, rms, extreme)
+        least, most = power_range_of(anywhere, spread, bounds, tables, sizes)
+        out[0, i] = shares[0] * np.sqrt(least / (images * uphill))
+        out[1, i], out[2, i] = np.sqrt(most) / shares[1], images
 
 
 @njit(cache=True, error_model="numpy")
