@@ -288,15 +288,9 @@ def to_look_at(
         eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
         eyepoints.surface,
     )  # fmt: skip
-    beamlets = len(eyepoints.weight)
-    weight = np.empty((together(beamlets), beamlets))
-    weight[:] = eyepoints.weight
+    weight = eyepoints.weight[None].repeat(together(len(eyepoints.weight)), axis=0).ravel()
     bright, laws = _materials(tuple(surfaces))
-    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (
-        weight.reshape(-1),
-        bright,
-        laws,
-    )
+    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
 
 
 @lru_cache(maxsize=16)

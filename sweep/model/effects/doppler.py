@@ -30,7 +30,7 @@ def bound(block: "Block") -> Change | None:
     if not block.has("target.radial_velocity"):
         return None
     moved = block.doppler_shift
-    away = np.any(moved > NOT_AWAY, axis=0)
+    away = (moved > NOT_AWAY).any(axis=0)
     change = Change(shift=np.where(away, 1.0, moved))
     if away.all():
         return change

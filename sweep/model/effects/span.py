@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Union
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 Operand = Union["Span", float, int, np.ndarray]
@@ -185,11 +186,27 @@ def monotone(
 
 
 def _never_negative(value: np.ndarray | float) -> bool:
-    return value >= 0 if isinstance(value, float) else all_hold(value >= 0)
+    return value >= 0 if isinstance(value, float) else _all_from_zero(np.ravel(value))
 
 
 def _positive(value: np.ndarray | float) -> bool:
-    return value > 0 if isinstance(value, float) else all_hold(value > 0)
+    return value > 0 if isinstance(value, float) else _all_above_zero(np.ravel(value))
+
+
+@njit(cache=True)
+def _all_from_zero(values):
+    found = True
+    for value in values:
+        found &= value >= 0
+    return found
+
+
+@njit(cache=True)
+def _all_above_zero(values):
+    found = True
+    for value in values:
+        found &= value > 0
+    return found
 
 
 def all_hold(conditions: np.ndarray | bool) -> bool:

@@ -243,7 +243,7 @@ def bound(block: "Block") -> Change | None:
     if several and not block.adds_amplitudes:
         kappa = Span.of(0.0)
     lines, extreme = block.lines, np.asarray(block.spread.extreme)
-    worst = lines.lobe.worst
+    worst = np.asarray(lines.lobe.worst)
     bins = 2 * extreme + 2 * lines.lobe.margin + 1
     image = lines.lobe.tail(2 * (lines.edge - extreme) - 1) / worst
     low, high = drawn_change(coherent_share=kappa, diffuse_over_found=1.0, bins=bins).signal
