@@ -91,14 +91,16 @@ but two. Planning is counted with what it plans; storing is not counted. Of a fl
 12 ms in all. So it is with a few points of a grid. In studies as short as these fixed settings are
 the faster ones, and `sweep accuracy` says so.
 
-The **error** of a setting is the largest, over the points, of the differences from the reference
-in a probability of detection, of the segments and the shot, in log10 of a probability of false
-alarm, in the magnitude of a peak's bin over itself or sigma, and in a probability of leakage: else
-a setting that leaves leakage out would be taken for as accurate. The reference has all effects on,
-lines and leakage to 1e-9 and the finest footprint of all. The figures show as
-well what 90 % and half of the points stay below in pd. Where draws make errors random, the error
-is that of pd at 95 % of the points. The reference itself is held against the time domain, sample
-by sample, at some of the same points.
+The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
+the differences from the reference in a probability of detection, of the segments and the shot, in
+log10 of a probability of false alarm, and in the magnitude of a peak's bin over itself or sigma.
+What a probability of leakage is off by stands beside it: it jumps where a bin comes to the
+threshold and counts as detected, so that no error of the spectrum bounds it. A setting that leaves
+leakage out where there is some does less than is asked for, and is none of the fixed ones that are
+compared. The reference has all effects on, lines and leakage to 1e-9 and the finest footprint of
+all. The figures show as well what 90 % and half of the points stay below in pd. Where draws make
+errors random, the error is that of pd at 95 % of the points. The reference itself is held against
+the time domain, sample by sample, at some of the same points.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
 cells a bin, convolves it with the window's transform by a complex FFT of 2^11 or 2^12, and samples

@@ -22,7 +22,7 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
 
     dataset, settings = report.opened(store)
     print_table(
-        "Time a point; errors of pd (at 90 %, largest), log10 pfa, leakage, magnitude",
+        "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
         list(text.SHORT), text.short_rows(settings), "setting",
     )  # fmt: skip
     print_table(

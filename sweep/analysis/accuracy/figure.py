@@ -158,7 +158,7 @@ def _finish(axes: Axes, least: float) -> None:
     axes.xaxis.set_major_formatter(plain)
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
     axes.set_xlabel("time a point on one core (µs)")
-    axes.set_ylabel("largest error of pd, log10 pfa, leakage and magnitudes")
+    axes.set_ylabel("largest error of pd, log10 pfa and magnitudes")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -9,7 +9,7 @@ changes, whichever of the others are there.
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,6 +19,10 @@ from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.change import Bound, Change, Mean, within_changes
 from sweep.model.effects.effect import MODES, Effect
 from sweep.model.effects.probability_bounds import probability_changes
+
+FREE_SHARE = 0.01
+"""Share of the tolerance that what is left out of the noise may take: a number added to a shot's
+variance costs nothing to simulate, so that leaving it out gains nothing but an error."""
 
 
 class Plan(NamedTuple):
@@ -76,6 +80,7 @@ def plan(
             list(bounds.values()),
             amplitude=rest.amplitude,
             threshold=block.threshold,
+            **_leaking(bounds, rules),
         )
     kept = _kept(change, [row for row in bounds if row not in rules.decided], rules, tolerance)
     return Plan(rules.names, kept, change, np.where(kept, 0.0, change).sum(axis=0))
@@ -99,10 +104,29 @@ def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, C
     return told
 
 
+def _leaking(bounds: Mapping[int, Change | np.ndarray], rules: "_Rules") -> dict[str, Any]:
+    """What of :func:`probability_changes` is told where a study asks for leakage.
+
+    Bins that leak are so much smaller than the largest that next to nothing of that is much of
+    them: it takes nearly all effects to tell leakage, and most studies look at detection.
+    """
+    row = rules.leakage
+    if row not in rules.on or row not in bounds:
+        return {}
+    leakage = np.atleast_2d(np.asarray(bounds[row], float)).sum(axis=0)
+    return {"spreads": [each in rules.spreading for each in bounds], "leakage": leakage}
+
+
 class _Rules(NamedTuple):
     """What modes say of effects, by row, whatever the bounds do."""
 
     names: tuple[str, ...]
+    free: np.ndarray
+    """Whether it costs nothing, (effects,) bool."""
+    spreading: frozenset[int]
+    """Those that move light from bins to others."""
+    leakage: int
+    """Row of the leakage; -1 for none."""
     decided: frozenset[int]
     """Those that are on or off."""
     on: list[int]
@@ -126,6 +150,13 @@ def _rules(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> _
         parents[names.index(child)] = names.index(parent)
     return _Rules(
         names=names,
+        free=np.array([effect.stage == "noise" for effect in effects]),
+        spreading=frozenset(
+            row
+            for row, effect in enumerate(effects)
+            if effect.stage in ("lines", "record", "spectrum")
+        ),
+        leakage=names.index("leakage") if "leakage" in names else -1,
         decided=frozenset(map(names.index, decided)),
         on=[names.index(name) for name, mode in decided.items() if mode == "on"],
         off=[names.index(name) for name, mode in decided.items() if mode == "off"],
@@ -165,12 +196,12 @@ def _kept(change: np.ndarray, chosen: Sequence[int], rules: _Rules, tolerance: f
     """Effects to keep, of those to choose from and of all that modes say, (effects, tiles) bool.
 
     The smallest are left out first, as long as their sum is within what the tolerance leaves; an
-    effect never before those within it.
+    effect never before those within it. Those that cost nothing have a share of it alone.
     """
     kept = np.zeros(change.shape, np.bool_)
     if chosen:
         room = np.maximum(tolerance - change[rules.off].sum(axis=0), 0.0)
-        _keep(change, np.array(chosen[::-1]), rules.parents, room, kept)
+        _keep(change, np.array(chosen[::-1]), rules.parents, rules.free, room, kept)
     if rules.on:
         kept[rules.on] = True
     for row, need in rules.needs:
@@ -179,7 +210,7 @@ def _kept(change: np.ndarray, chosen: Sequence[int], rules: _Rules, tolerance: f
 
 
 @njit(cache=True, error_model="numpy")
-def _keep(change, rows, parents, room, kept):
+def _keep(change, rows, parents, free, room, kept):
     """Mark all but the smallest of some rows, last ones first where they are alike, that fit."""
     key, order = np.empty(len(change)), np.empty(len(rows), np.int64)
     for t in range(change.shape[1]):
@@ -194,8 +225,13 @@ def _keep(change, rows, parents, room, kept):
                 order[place] = order[place - 1]
                 place -= 1
             order[place] = rows[i]
-        total = 0.0
+        total, unpaid = 0.0, 0.0
         for row in order:
+            if free[row]:
+                unpaid += change[row, t]
+                if not unpaid <= FREE_SHARE * room[t]:
+                    kept[row, t] = True
+                    continue
             total += change[row, t]
             kept[row, t] = not total <= room[t]
 

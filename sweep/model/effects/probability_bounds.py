@@ -41,7 +41,12 @@ _NEGLIGIBLE = 1e-12
 
 
 def probability_changes(
-    bounds: Sequence[Change | np.ndarray], *, amplitude: Span, threshold: Span
+    bounds: Sequence[Change | np.ndarray],
+    *,
+    amplitude: Span,
+    threshold: Span,
+    spreads: Sequence[bool] = (),
+    leakage: ArrayLike = 0.0,
 ) -> np.ndarray:
     """Largest change of a probability or of a magnitude by each effect, (effects, tiles), 0..1.
 
@@ -59,6 +64,11 @@ def probability_changes(
         Magnitude of the detecting bin without any of the effects over sigma, (3, tiles).
     threshold : Span
         Threshold over sigma, (tiles,) or a scalar.
+    spreads : sequence of bool
+        Whether an effect moves light from bins to others; by default none does.
+    leakage : array_like
+        Probability of leakage at the most, (tiles,) or a scalar. Bins that leak are taken to be
+        moved by such effects as far, in sigmas, as the largest; that counts up to this.
     """
     tiles = np.shape(amplitude.low)[1]
     factors = [bound for bound in bounds if isinstance(bound, Change)]
@@ -70,7 +80,13 @@ def probability_changes(
     ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
         amplitude.low, amplitude.high, threshold.low, threshold.high,
     )  # fmt: skip
-    found = iter(_changes(table, ends))
+    leaking = np.zeros((len(factors), tiles))
+    if spreads:
+        asked = zip(bounds, spreads, strict=True)
+        leaking[np.array([spread for bound, spread in asked if isinstance(bound, Change)])] = (
+            leakage
+        )
+    found = iter(_changes(table, ends, leaking))
     out = np.empty((len(bounds), tiles))
     for row, bound in zip(out, bounds, strict=True):
         if isinstance(bound, Change):
@@ -140,7 +156,7 @@ def _each_within(entry, ends):
 
 
 @njit(cache=True, error_model="numpy")
-def _changes(table, ends):
+def _changes(table, ends, leaking):
     """Changes of pd, summed over segments, of false alarms or of magnitudes, (effects, tiles)."""
     effects, _, segments, tiles = table.shape
     out = np.zeros((effects, tiles))
@@ -154,6 +170,9 @@ def _changes(table, ends):
                 low, high, lower, upper = _with_others(table, ends, i, s, t)
                 total += _within(own, low, high, lower, upper)
                 other = max(other, _magnitude_change(own, low, high))
+                if leaking[i, t] > 0.0:
+                    moved = (own[_SHARE] + own[_ADDED]) * min(high, _HUGE)
+                    other = max(other, min(moved, leaking[i, t]))
                 if own[_DOWN] != 1.0 or own[_UP] != 1.0:
                     other = max(other, _alarm_change(own, upper))
             out[i, t] = min(max(total, other), 1.0)

@@ -189,7 +189,9 @@ class Measurement:
         spent = took * cut / shorter
         self._once = spent > LONG
         left = 0.75 * (self._limit - (time.monotonic() - self._begun)) / len(parts)
-        further = (left - float(spent.sum())) / max(float(spent[~self._once].sum()), 1e-9)
+        after_truth = (1 - UNTIL_TRUTH) * self._limit / len(parts)
+        again = max(float(spent[~self._once].sum()), 1e-9)
+        further = max(left - float(spent.sum()), after_truth) / again
         return 1 + max(0, min(MOST_ROUNDS - 1, int(further)))
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
@@ -291,11 +293,13 @@ def differences(measured: Measured) -> Iterator[tuple[str, np.ndarray]]:
         yield name, np.array(values)
 
 
-ERRORS = ("pd_error", "log10_pfa_error", "leakage_error", "magnitude_error")
+ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error", "leakage_error")
+PROMISED = 3
+"""The first of these, which a tolerance promises to bound."""
 
 
 def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
-    """Largest differences from others, (n,) each: of pd, log10 pfa, leakage, magnitudes.
+    """Largest differences from others, (n,) each: of pd, log10 pfa, magnitudes, leakage.
 
     Magnitudes in relation to the other, or to sigma where it is below that.
     """
@@ -309,7 +313,7 @@ def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
         magnitude = np.abs(seen.magnitude - other.magnitude) / least
     same = seen.log10_pfa == other.log10_pfa
     pfa = np.where(same, 0.0, pfa)
-    return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, leakage, magnitude))
+    return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, magnitude, leakage))
 
 
 def _chances_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -33,11 +33,12 @@ class Tiles:
         self.size = self.amplitude.low.shape[1]
 
 
-def catalogue(bounds, within=None):
-    """Effects of given bounds."""
+def catalogue(bounds, within=None, stages=None):
+    """Effects of given bounds, on lines unless told otherwise."""
     return [
         Effect(
-            name=name, about=name, stage="lines", within=(within or {}).get(name, ""),
+            name=name, about=name, stage=(stages or {}).get(name, "lines"),
+            within=(within or {}).get(name, ""),
             bound=lambda block, bound=bound: bound,
         )
         for name, bound in bounds.items()
@@ -196,6 +197,40 @@ def test_forced_effects_stay_and_go_and_the_error_is_told():
     made = plan(Tiles(np.ones(2), 1.0), modes, 1e-3, catalogue(bounds))
     assert made.effects(0) == ("a", "c", "far")
     assert made.error == pytest.approx(0.3)
+
+
+def test_what_adds_to_the_noise_is_left_out_where_it_is_a_hundredth_of_the_tolerance():
+    """It costs nothing to simulate; what is left of the tolerance is for what does."""
+    sizes = np.array([0.9e-4, 1.1e-4, 0.6e-4, 0.6e-4])
+    bounds = {"sun": sizes, "shot": np.array([0.0, 0.0, 0.3e-4, 0.5e-4]), "walk": np.full(4, 9e-3)}
+    effects = catalogue(bounds, stages={"sun": "noise", "shot": "noise"})
+    made = plan(Tiles(np.ones(4), 1.0), {}, 1e-2, effects)
+    assert made.kept.tolist() == [
+        [False, True, False, True], [False, False, False, False], [False, False, False, False],
+    ]  # fmt: skip
+    assert made.error == pytest.approx([9.09e-3, 9e-3, 9.09e-3, 9.05e-3])
+    dearer = catalogue(bounds | {"walk": np.full(4, 9.95e-3)}, stages={"sun": "noise"})
+    assert plan(Tiles(np.ones(4), 1.0), {}, 1e-2, dearer).kept[2].tolist() == [
+        True,
+        False,
+        True,
+        True,
+    ]
+
+
+def test_who_asks_for_leakage_has_bins_counted_as_far_off_as_the_largest():
+    """A ten thousandth of 1,000 sigmas is a tenth of one, more than may leak in the last tile."""
+    leaks = np.array([0.3, 0.3, 0.02])
+    bounds = {"walk": Change(signal=(1 - 1e-4, 1.0)), "sun": Change(noise=(1.0, 1.0001)),
+              "leakage": np.stack([leaks / 2, np.zeros(3), leaks / 2])}  # fmt: skip
+    effects = catalogue(bounds, stages={"sun": "noise", "leakage": "detection"})
+    tiles = Tiles(np.array([1e3, 10.0, 1e3]), 4.0)
+    walk, sun, leakage = plan(tiles, {"leakage": "on"}, 1e-2, effects).change
+    assert walk == pytest.approx([0.1, 1e-3, 0.02], rel=0.01) and leakage == pytest.approx(leaks)
+    for mode in ("auto", "off"):
+        other = plan(tiles, {"leakage": mode}, 1e-2, effects).change
+        assert other[0] == pytest.approx([1e-4] * 3, rel=0.01)
+        assert np.array_equal(other[1], sun)
 
 
 def test_an_effect_within_another_needs_it():
