@@ -294,11 +294,12 @@ def missed(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """What does not keep its tolerance, in words."""
     for row in rows:
         for what, errors in zip(WHAT, row.errors, strict=True):
-            told = errors[np.isfinite(errors)]
-            kept = float((told <= row.tolerance).mean()) if told.size else 1.0
+            there = errors[np.isfinite(errors)]
+            kept = float((there <= row.tolerance).mean()) if there.size else 1.0
             if kept < KEPT:
                 share_missed = f"{100 * (1 - kept):.2f} %"
-                yield f"- {name} at {row.tolerance:g}: {what} of {share_missed} of the points"
+                told = f"- {name} at {row.tolerance:g}: {what} of {share_missed} of the points"
+                yield told + (", which is not promised" if what == "leakage" else "")
 
 
 class Page:
