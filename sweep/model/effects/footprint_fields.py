@@ -74,8 +74,8 @@ def set_fields(seen, number, several, by_roots, room, out):
         _put_sums(one, number, out[GAIN])
         for k in range(number):
             out[GAIN, k] = max(out[GAIN, k], 1.0)
-    _put_moments(offset, share, number, one, two, out[RANGES:])
-    _put_moments(doppler, share, number, one, two, out[VELOCITIES:])
+    _put_moments(offset, share, number, out[RANGES:])
+    _put_moments(doppler, share, number, out[VELOCITIES:])
     if not several:
         for k in range(number):
             for m in range(3):
@@ -90,7 +90,7 @@ def set_fields(seen, number, several, by_roots, room, out):
         one[j] = 0.0 if others[j] else echo[j]
     _put_sums(one, number, out[OWN_RANGES])
     _divide(one, number, out[OWN_RANGES], whole, share)
-    _put_moments(offset, share, number, one, two, out[OWN_RANGES:])
+    _put_moments(offset, share, number, out[OWN_RANGES:])
 
 
 @inlined(nogil=True)
@@ -106,18 +106,37 @@ def _divide(echo, number, sums, whole, share):
 
 
 @inlined(nogil=True)
-def _put_moments(values, weight, number, one, two, out):
+def _put_moments(values, weight, number, out):
     """Magnitudes of means, rms, and largest magnitudes of what has any weight."""
-    for j in range(values.size):
-        one[j] = weight[j] * values[j]
-        two[j] = one[j] * values[j]
-    _put_sums(one, number, out[0])
-    _put_sums(two, number, out[1])
-    for j in range(values.size):
-        one[j] = abs(values[j]) if weight[j] > 0.0 else 0.0
-    _put_largest(one, number, out[2])
+    beamlets = values.size // number
+    k = 0
+    while k + 4 <= number:
+        at = k * beamlets
+        a = b = c = d = (0.0, 0.0, 0.0)
+        for j in range(at, at + beamlets):
+            a = _and(a, values[j], weight[j])
+            b = _and(b, values[j + beamlets], weight[j + beamlets])
+            c = _and(c, values[j + 2 * beamlets], weight[j + 2 * beamlets])
+            d = _and(d, values[j + 3 * beamlets], weight[j + 3 * beamlets])
+        for m in range(3):
+            out[m, k], out[m, k + 1], out[m, k + 2], out[m, k + 3] = a[m], b[m], c[m], d[m]
+        k += 4
+    while k < number:
+        a = (0.0, 0.0, 0.0)
+        for j in range(k * beamlets, (k + 1) * beamlets):
+            a = _and(a, values[j], weight[j])
+        out[0, k], out[1, k], out[2, k] = a
+        k += 1
     for k in range(number):
         out[0, k], out[1, k] = abs(out[0, k]), math.sqrt(out[1, k])
+
+
+@inlined(nogil=True)
+def _and(found, value, weight):
+    """Weighted sum, that of squares and largest magnitude, with one value more."""
+    once = weight * value
+    size = abs(value) if weight > 0.0 else 0.0
+    return found[0] + once, found[1] + once * value, _larger(found[2], size)
 
 
 @inlined(nogil=True)
