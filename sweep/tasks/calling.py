@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sweep.model.effects.flags import flag_attributes, flags_apart, flags_of, names_of
 from sweep.tasks.study import ArrayLayout
@@ -191,11 +192,22 @@ class ShotsCalling:
 
 def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
-    tile = np.zeros(tiles.size, np.int64)
-    np.not_equal(tiles[1:], tiles[:-1], out=tile[1:])
-    edges = np.empty(np.count_nonzero(tile) + 2, np.int64)
-    edges[0], edges[1:-1], edges[-1] = 0, tile.nonzero()[0], tiles.size
-    return edges, tile.cumsum()
+    edges, tile = np.empty(tiles.size + 1, np.int64), np.empty(tiles.size, np.int64)
+    return edges[: _put_stretches(tiles, edges, tile)], tile
+
+
+@njit(cache=True)
+def _put_stretches(tiles, edges, tile):
+    """Fill in edges and indices; number of edges."""
+    last = 0
+    edges[0] = 0
+    for i in range(tiles.size):
+        if i > 0 and tiles[i] != tiles[i - 1]:
+            last += 1
+            edges[last] = i
+        tile[i] = last
+    edges[last + 1] = tiles.size
+    return last + 2
 
 
 def layouts(

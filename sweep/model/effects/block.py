@@ -14,7 +14,7 @@ import numpy as np
 from sweep.model.effects import line_spread, tile_geometry
 from sweep.model.effects.columns import columns
 from sweep.model.effects.line_powers import put_amplitudes
-from sweep.model.effects.line_spread import Line, Moments
+from sweep.model.effects.line_spread import Line, Moments, Spreads
 from sweep.model.effects.span import Span, monotone
 from sweep.model.effects.tile_geometry import Geometry
 from sweep.model.effects.tile_link import Parameters, TileLink
@@ -183,42 +183,25 @@ class Block(TileLink):
         return Span(found[0], found[1])
 
     @cached_property
-    def range_bins(self) -> np.ndarray:
-        """Bins of a chirped segment for a relative difference of range of 1, at the most."""
-        return line_spread.range_to_bins(
-            range=self.range.high,
-            beta=self.beta.magnitude,
-            chirp_rate=self.chirp_rate.high,
-            bin_width=self.bin_width.low,
-        )
-
-    @cached_property
-    def range_spread(self) -> Moments:
-        """Bins by which ranges put the lines off the axis's, (3, tiles) at the most."""
-        return self.of_ranges(self.ranges)
-
-    @cached_property
-    def own_range_spread(self) -> Moments:
-        """The same of beamlets on the axis's surface."""
-        return self.of_ranges(self.geometry.own_ranges)
+    def spreads(self) -> Spreads:
+        """Bins by which ranges and velocities put the lines off the axis's, (3, tiles)."""
+        return self._spreads(self.geometry.own_ranges)
 
     def of_ranges(self, ranges: Moments) -> Moments:
         """Moments of relative ranges in bins, (3, tiles)."""
-        return line_spread.range_moments_in_bins(self.range_bins, ranges, self.size)
+        return self._spreads(ranges).own_ranges
 
-    @cached_property
-    def velocity_spread(self) -> Moments:
-        """Bins by which velocities put the lines off the axis's, (3, tiles) at the most."""
-        factors = line_spread.velocity_to_bins(
-            range=self.range.high,
-            carrier=self.highest_carriers,
-            chirp_rate=self.chirp_rate.high,
-            bin_width=self.bin_width.low,
+    def _spreads(self, own_ranges: Moments) -> Spreads:
+        return line_spread.spreads(
+            self._ends, ranges=self.ranges, own_ranges=own_ranges, velocities=self.velocities
         )
-        return self.velocities.scaled(factors)
+
+    @property
+    def spread(self) -> Moments:
+        """Those of ranges and velocities together."""
+        return self.spreads.both
 
     @cached_property
-    def spread(self) -> Moments:
-        """Bins by which ranges and velocities put the lines off the axis's, (3, tiles)."""
-        pairs = zip(self.range_spread, self.velocity_spread, strict=True)
-        return Moments(*(np.add(one, two) for one, two in pairs))
+    def axis(self) -> np.ndarray:
+        """Fields of :attr:`lines` and :attr:`spread` as rows, (9, segments x tiles)."""
+        return np.concatenate((*self.lines[:-1], *self.spread)).reshape(9, -1)

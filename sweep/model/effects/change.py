@@ -1,13 +1,11 @@
 """What an effect can change, and what that can make of the probability of detection."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.columns import columns
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1
 
@@ -15,9 +13,6 @@ Interval = tuple[ArrayLike, ArrayLike]
 
 NONE: Interval = (1.0, 1.0)
 NOTHING = 0.0
-_HUGE = 1e12
-_NO_NOISE = 1e-200
-"""Factor of noise that is as good as none, as of what saturates."""
 
 
 class Change(NamedTuple):
@@ -53,47 +48,6 @@ class Mean(NamedTuple):
 
 Bound = Change | Mean | np.ndarray
 """Factors; or what can be told of a probability itself, (tiles,) or (3, tiles)."""
-
-
-def within_changes(
-    changes: Iterable[Change], *, amplitude: Span, threshold: Span
-) -> tuple[Span, Span]:
-    """Magnitudes and thresholds over sigma that any of some changes may leave."""
-    parts = [change for change in changes if not _is_none(change)]
-    lower, upper = np.asarray(threshold.low), np.asarray(threshold.high)
-    ends: list[ArrayLike] = [amplitude.low, amplitude.high]
-    for change in parts:
-        quiet, loud = NONE
-        if change.noise is not NONE:
-            quiet, loud = (1 / np.sqrt(np.maximum(v, _NO_NOISE)) for v in change.noise)
-        ends += [*change.signal, quiet, loud, change.added]
-        if not change.threshold_follows:
-            lower, upper = lower * np.minimum(loud, 1.0), upper * np.maximum(quiet, 1.0)
-    table, shape = columns(*ends)
-    found = np.empty((2, *shape))
-    _put_magnitudes(table, found.reshape(2, -1))
-    return Span(found[0], found[1]), Span(lower, upper)
-
-
-def _is_none(change: Change) -> bool:
-    return change.signal is NONE and change.noise is NONE and change.added is NOTHING
-
-
-@njit(cache=True, error_model="numpy")
-def _put_magnitudes(table, out):
-    """Least and largest magnitude, (2, n).
-
-    Rows of the table: their ends without the changes; weakest and strongest signal, factors on
-    1/sigma in quiet and in loud noise, and what is added, of one change after the other.
-    """
-    for i in range(table.shape[1]):
-        low, high, added = table[0, i], table[1, i], 0.0
-        for first in range(2, table.shape[0], 5):
-            weak, strong, quiet, loud, more = table[first : first + 5, i]
-            low *= np.minimum(weak * loud, 1.0)
-            high *= np.minimum(np.maximum(strong * quiet, 1.0), _HUGE)
-            added += more
-        out[0, i], out[1, i] = np.maximum(low - high * added, 0.0), high * (1 + added)
 
 
 def pd_change(change: Change, *, amplitude: ArrayLike, threshold: ArrayLike) -> np.ndarray:

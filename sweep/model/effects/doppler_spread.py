@@ -28,12 +28,12 @@ def bound(block: "Block") -> Change | None:
     That the ranges are there already makes no difference to whether this is a bound, as powers;
     of amplitudes that add, lines in phase change by their own moves.
     """
-    velocities = block.velocity_spread
+    velocities = block.spreads.velocities
     if not any_holds(np.greater(velocities.extreme, 0)):
         return None
     change = Change()
     if block.architecture != "direct":
-        change = spread_change(block.lines, velocities, block.range_spread, block.number)
+        change = spread_change(block.lines, velocities, block.spreads.ranges, block.number)
     if not block.adds_amplitudes:
         return change
     return change._replace(added=footprint_phase.sum_added(block, block.lines, velocities.extreme))

@@ -32,7 +32,7 @@ def bound(block: "Block") -> Change | None:
     """
     if block.number == 1:
         return None
-    spread, ratio = block.own_range_spread, block.echo_ratio
+    spread, ratio = block.spreads.own_ranges, block.echo_ratio
     if block.architecture != "direct":
         change = spread_change(block.lines, spread, NO_SPREAD, block.number)
         ratio = ratio.sqrt()

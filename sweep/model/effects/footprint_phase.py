@@ -9,6 +9,7 @@ powers make; where it is, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2)
 It acts on the sum of the lines: without it their powers add.
 """
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
+from sweep.model.effects.line_powers import uphill_of
 from sweep.model.effects.line_spread import Line, Moments
 from sweep.model.effects.lobes import lobe_tail
 from sweep.model.effects.span import Span
@@ -108,13 +110,22 @@ def sum_added(block: "Block", lines: Line, bins: ArrayLike) -> np.ndarray:
     bins : array_like
         Largest distance that it moves any line, (3, tiles).
     """
-    f, reach = lines.lobe, np.asarray(block.spread.extreme) + bins
-    each = np.sqrt(f.curvature) + 2 * lines.tilt + block.turn_of_bin
-    with np.errstate(over="ignore", invalid="ignore"):
-        uphill = np.exp(np.minimum(lines.tilt * reach, 50.0))
-        # with its image, as its magnitude may lie between two bins
-        change = 2 * uphill * np.minimum(each * bins, 2.0) / f.worst
-    return np.asarray(np.where(np.asarray(bins) > 0, change, 0.0))
+    table, shape = columns(lines.tilt, block.spread.extreme, bins, block.turn_of_bin)
+    found, lobe = np.empty(shape), lines.lobe
+    _put_added(table, math.sqrt(lobe.curvature), lobe.worst, found.reshape(-1))
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _put_added(table, steepest, worst, out):
+    """Largest changes of sums, (n,)."""
+    for i in range(out.size):
+        tilt, extreme, bins, turn = table[:, i]
+        out[i] = 0.0
+        if bins > 0.0:
+            each = (steepest + 2 * tilt + turn) * bins
+            # with its image, as its magnitude may lie between two bins
+            out[i] = 2 * uphill_of(tilt, extreme + bins) * np.minimum(each, 2.0) / worst
 
 
 def bound(block: "Block") -> Change | None:
@@ -125,7 +136,7 @@ def bound(block: "Block") -> Change | None:
     near = 2 * (lines.edge - np.asarray(spread.extreme)) < 8 * lines.lobe.margin
     return sum_change(
         lines,
-        phase=phase_reach(block, block.ranges, block.velocity_spread),
+        phase=phase_reach(block, block.ranges, block.spreads.velocities),
         gain=block.gain,
         spread=spread,
         most=np.sqrt(block.number * np.where(near, 2.0, 1.01)),

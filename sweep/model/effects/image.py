@@ -24,7 +24,8 @@ from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.footprint_sum import footprint_sum
-from sweep.model.effects.line_spread import power_range
+from sweep.model.effects.line_powers import extremes_of, power_range_of, uphill_of
+from sweep.model.effects.line_spread import sizes_of
 from sweep.model.effects.lobes import lobe_least, lobe_tail, lobe_within
 from sweep.model.preparation import PROCESSING, Shots
 
@@ -41,12 +42,11 @@ def bound(block: "Block") -> Change:
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
-    line, spread = block.lines, block.spread
-    least_power, _ = power_range(line, spread, block.number)
-    uphill = np.exp(np.minimum(line.tilt * np.asarray(spread.extreme), 50.0))
-    table, shape = columns(line.edge, spread.extreme, least_power, uphill, line.bin_offset)
-    found, lobe = np.empty((2, *shape)), line.lobe
-    _put_bounds(table, (lobe.lowest, lobe.reach, lobe.envelope), found.reshape(2, -1))
+    found, lobe = np.empty((2, 3, block.size)), block.lines.lobe
+    _put_bounds(
+        block.axis, block.number, *sizes_of(lobe), (lobe.reach, lobe.envelope),
+        found.reshape(2, -1),
+    )  # fmt: skip
     high, added = found
     alarms = alarm_change(block)
     if not block.adds_amplitudes:
@@ -56,18 +56,20 @@ def bound(block: "Block") -> Change:
 
 
 @njit(cache=True, error_model="numpy")
-def _put_bounds(table, lobe, out):
+def _put_bounds(axis, beamlets, tables, sizes, lobe, out):
     """Largest factor on the largest bin's magnitude, and what is added to a sum, (2, n)."""
-    lowest, reach, envelope = lobe
-    for i in range(table.shape[1]):
-        edge, extreme, least_power, uphill, offset = table[:, i]
+    bounds, (reach, envelope) = extremes_of(beamlets, tables), lobe
+    for i in range(axis.shape[1]):
+        offset, offset_least, edge, _, _, tilt, mean, rms, extreme = axis[:, i]
+        line, spread = (offset, offset_least, edge, tilt), (mean, rms, extreme)
+        least_power, _ = power_range_of(line, spread, bounds, tables, sizes)
         apart = edge - extreme
         inside = lobe_tail(reach, envelope, 1.5 * apart)
         beside = lobe_tail(reach, envelope, 0.5 * apart)
         outside = lobe_tail(reach, envelope, 1.0 * apart)
         far = (beside * beside + outside * outside) / least_power
         out[0, i] = np.sqrt(np.maximum(1 + inside * inside / least_power, far))
-        out[1, i] = uphill * outside / lobe_least(lowest, offset)
+        out[1, i] = uphill_of(tilt, extreme) * outside / lobe_least(tables[1], offset)
 
 
 def alarm_change(block: "Block") -> np.ndarray:
@@ -91,28 +93,27 @@ def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
         Expected number, were lines anywhere between two bins, of both chirps together; bins of
         one.
     """
-    line, lobe, half = block.lines, block.lines.lobe, block.fft_size / 2
-    uphill = np.exp(np.minimum(line.tilt * np.fmin(block.spread.extreme, half), 50.0))
-    table, _ = columns(
-        line.edge, block.spread.extreme, line.transfer, uphill, block.peak.high,
-        footprint_sum(block).in_phase, block.threshold.low,
+    lobe, found = block.lines.lobe, np.empty((2, block.size))
+    table, shape = columns(footprint_sum(block).in_phase, block.peak.high, block.threshold.low)
+    _put_moved_bins(
+        block.axis.reshape(-1, *shape), table.reshape(-1, *shape), block.fft_size / 2,
+        (lobe.reach, lobe.envelope), block.adds_amplitudes, found,
     )  # fmt: skip
-    found = np.empty((2, block.size))
-    by_segment = table.reshape(len(table), 3, block.size)
-    _put_moved_bins(by_segment, half, (lobe.reach, lobe.envelope), block.adds_amplitudes, found)
     return found[0], found[1]
 
 
 @njit(cache=True, error_model="numpy")
-def _put_moved_bins(table, half, lobe, amplitudes, out):
+def _put_moved_bins(axis, table, half, lobe, amplitudes, out):
     """Expected bins that both chirps' images move, and most that a detection takes, (2, tiles)."""
     reach, envelope = lobe
     for t in range(out.shape[1]):
         bins, furthest = 0.0, -np.inf
         for s in (0, 2):
-            edge, extreme, transfer, uphill, peak, in_phase, level = table[:, s, t]
+            _, _, edge, transfer, _, tilt, _, _, extreme = axis[:, s, t]
+            in_phase, peak, level = table[:, s, t]
             extreme = np.fmin(extreme, half)
-            whole = np.maximum(peak * np.minimum(transfer * uphill, 1.0) * in_phase, 1e-300)
+            transfer = np.minimum(transfer * uphill_of(tilt, extreme), 1.0)
+            whole = np.maximum(peak * transfer * in_phase, 1e-300)
             away = np.minimum(lobe_within(reach, envelope, level / whole), half)
             apart = edge - extreme
             moved = 0.0

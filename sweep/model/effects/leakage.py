@@ -30,6 +30,7 @@ from sweep.model.effects.change import Mean
 from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.footprint_sum import footprint_sum
+from sweep.model.effects.line_powers import uphill_of
 from sweep.model.effects.lobes import lobe, lobe_tail
 from sweep.model.effects.sidelobes import CELLS, LEVELS, STEEPEST, sidelobes
 from sweep.model.effects.span import Span
@@ -73,29 +74,21 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     threshold : Span
         Threshold over sigma, likewise.
     """
-    lines, main = block.lines, block.lines.lobe
-    extreme = np.fmin(block.spread.extreme, block.fft_size)
-    shape = block.window
+    main, shape = block.lines.lobe, block.window
     table, ratio = sidelobes(shape.name, shape.length), shape.length / block.fft_size
     given, size = columns(
-        block.peak.high, lines.transfer, np.exp(np.minimum(lines.tilt * extreme, 50.0)),
-        *footprint_sum(block), amplitude.low, threshold.low, threshold.high, extreme, lines.edge,
-        lines.bin_offset_least, lines.bin_offset,
-    )  # fmt: skip
+        *footprint_sum(block), block.peak.high, amplitude.low, threshold.low, threshold.high
+    )
     found = _union(
-        given, (main.reach, main.envelope), (table.highest, table.lowest, table.steepest),
+        block.axis, given, (main.reach, main.envelope),
+        (table.highest, table.lowest, table.steepest),
         _far(shape.name, shape.length, block.fft_size),
         (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
         not block.adds_amplitudes,
     ).reshape(size)  # fmt: skip
     if not block.segment_exists[1]:
         found[1] = 0.0
-    low = np.asarray(threshold.low, float)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        higher = np.divide(threshold.high, low) ** 4
-        higher = np.where(low > 2, np.minimum(higher, _HIGHER), higher)
-        # where other effects may drown the threshold, any bin may cross it
-        return np.where(low > 0, np.minimum(higher * found, 1.0), 1.0)
+    return found
 
 
 @lru_cache(maxsize=32)
@@ -115,12 +108,15 @@ def _far(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray,
 
 
 @njit(cache=True, error_model="numpy")
-def _union(given, lobe, table, far, sizes, powers):
+def _union(axis, given, lobe, table, far, sizes, powers):
     """Largest sum of the chances of all bins that may leak, (n,)."""
     out, column = np.empty(given.shape[1]), np.empty(12)
     for i in range(out.size):
-        _put_column(given[:, i], lobe, table[2][LEVELS, 0], sizes[0], column)
-        together, b = column[1], column[3]
+        _put_column(axis[:, i], given[:, i], lobe, table[2][LEVELS, 0], sizes, column)
+        together, b, upper = column[1], column[3], column[4]
+        if not b > 0.0:  # where other effects may drown the threshold, any bin may cross it
+            out[i] = 1.0
+            continue
         first, second, limit, sure = _starts(column, table, sizes[0])
         total = 0.0
         if limit < together:
@@ -128,22 +124,26 @@ def _union(given, lobe, table, far, sizes, powers):
         if not sure:
             other = min(together, limit)
             total = max(total, _sum(other, 0.0, 1.0, column, table, far, sizes, powers))
-        out[i] = min(total / -math.expm1(-0.5 * b * b), 1.0)
+        higher = (upper / b) ** 4
+        higher = min(higher, _HIGHER) if b > 2.0 else higher
+        out[i] = min(higher * min(total / -math.expm1(-0.5 * b * b), 1.0), 1.0)
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _put_column(given, lobe, steepest, ratio, out):
+def _put_column(axis, given, lobe, steepest, sizes, out):
     """What a segment's bins follow from: sums of lines, ends of what they may be, sidelobes."""
-    peak, transfer, uphill, in_phase, most, lean, low, b, upper, extreme, edge, _, _ = given
-    reach, envelope = lobe
-    peak *= np.minimum(transfer * uphill, 1.0)
+    offset, offset_least, edge, transfer, _, tilt, _, _, extreme = axis
+    in_phase, most, lean, peak, low, b, upper = given
+    (reach, envelope), (ratio, half, _) = lobe, sizes
+    extreme = np.fmin(extreme, 2.0 * half)
+    peak *= np.minimum(transfer * uphill_of(tilt, extreme), 1.0)
     in_phase, most, lean = peak * in_phase, peak * most, peak * lean
     image = lobe_tail(reach, envelope, edge - extreme)
     sloping = STEEPEST * lobe_tail(reach, envelope, edge - extreme - 1 / ratio)
     askew = np.minimum(lean * sloping * ratio, in_phase * image)
     out[0], out[1], out[2], out[3], out[4], out[5] = in_phase, most, low, b, upper, extreme
-    out[6], out[7], out[8] = given[11], given[12], image
+    out[6], out[7], out[8] = offset_least, offset, image
     out[9] = np.minimum(most * image + askew, in_phase * image)
     out[10] = askew + np.minimum(lean * ratio * steepest, 2 * in_phase)
     out[11] = lean * ratio

@@ -1,8 +1,4 @@
-"""The largest bin's power, line by line: compiled formulas of :mod:`.line_spread`.
-
-Exponentials of what the receiver's poles make of a distance are handed in where they have been
-taken of whole arrays.
-"""
+"""The largest bin's power, line by line: compiled formulas of :mod:`.line_spread`."""
 
 import numpy as np
 from numba import njit
@@ -60,8 +56,7 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
     """Least and largest factors on magnitudes (2, n).
 
     Rows of the table: shift; moments added and present, three each; offset, least offset, edge,
-    transfer, least transfer and tilt of the line that is moved, and of the one that is not; the
-    receiver's factors over all of the reach and over the shift.
+    transfer, least transfer and tilt of the line that is moved, and of the one that is not.
     """
     bounds = extremes_of(beamlets, tables)
     slope, curvature, margin, _ = sizes
@@ -71,8 +66,8 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
         if extreme == 0 and shift == 0:
             out[0, i], out[1, i] = 1.0, 1.0
             continue
-        uphill, steepest = own[19], own[20]
         wide, tilt = own[6] + extreme, own[18]
+        uphill, steepest = uphill_of(tilt, wide + shift), uphill_of(tilt, shift)
         together = own[4] + mean, own[5] + rms, wide
         moved, still = (own[7], own[8], own[9], own[12]), (own[13], own[14], own[15], tilt)
         with_least, with_most = power_range_of(moved, together, bounds, tables, sizes)
@@ -86,6 +81,12 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
         less, more = np.maximum(fall * fall, 1 / steepest), np.minimum(rise * rise, steepest)
         out[0, i] = np.sqrt(np.fmax(1 - change, less * with_least / most))
         out[1, i] = np.sqrt(np.fmin(1 + change, more * with_most / least))
+
+
+@njit(cache=True, error_model="numpy")
+def uphill_of(tilt, bins):
+    """Most that the receiver's poles make of powers so many bins away."""
+    return np.exp(np.minimum(tilt * bins, 50.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -107,7 +108,7 @@ def power_range_of(line, spread, extremes, tables, sizes):
     second = 0.5 * curvature * rms**2
     slant = min(slope, curvature * offset)
     least = on_axis - slant * mean - second - tilt * rms
-    uphill = np.exp(np.minimum(tilt * extreme, 50.0))
+    uphill = uphill_of(tilt, extreme)
     one_place = offset == offset_least and rms == 0
     most = on_axis if one_place else lobe_most(highest, offset_least) ** 2
     most = np.fmin(most + slope * mean + second, top)

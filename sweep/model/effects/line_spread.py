@@ -275,26 +275,54 @@ def velocity_to_bins(
     return np.asarray((2 / SPEED_OF_LIGHT) * (np.asarray(carrier) + beat) / np.asarray(bin_width))
 
 
-def range_moments_in_bins(bins: ArrayLike, ranges: Moments, tiles: int) -> Moments:
-    """Moments of relative ranges in bins, (3, tiles): none of the Doppler segment's.
+class Spreads(NamedTuple):
+    """What puts lines off the axis's [bins], (3, tiles) at the most."""
 
-    ``bins`` are those of a chirped segment for a relative difference of range of 1.
+    ranges: Moments
+    own_ranges: Moments
+    """Of beamlets on the axis's surface."""
+    velocities: Moments
+    both: Moments
+    """Ranges and velocities."""
+
+
+def spreads(
+    ends: np.ndarray, *, ranges: Moments, own_ranges: Moments, velocities: Moments
+) -> Spreads:
+    """Moments in bins, by :func:`range_to_bins` and :func:`velocity_to_bins` at the ends.
+
+    Parameters
+    ----------
+    ends : (9, 2, tiles) ndarray
+        :func:`axis_ends`.
+    ranges, own_ranges : Moments
+        Of (R_b - R_0) / R_0.
+    velocities : Moments
+        Of radial velocities [m/s].
     """
-    table = np.empty((4, tiles))
-    for row, value in zip(table, (bins, *ranges), strict=True):
-        row[:] = value
-    found = np.zeros((3, 3, tiles))
-    _put_moments(table, found)
-    return Moments(*found)
+    given = np.empty((9, ends.shape[2]))
+    for k, value in enumerate((*ranges, *own_ranges, *velocities)):
+        given[k] = value
+    found = np.empty((12, 3, ends.shape[2]))
+    _put_spreads(ends, given, found)
+    return Spreads(*(Moments(*found[k : k + 3]) for k in range(0, 12, 3)))
 
 
 @njit(cache=True, error_model="numpy")
-def _put_moments(table, out):
-    """Moments (3, 3, tiles); infinite ones as numbers that may be multiplied by 0."""
-    for t in range(table.shape[1]):
-        if table[0, t] > 0:
-            for k in range(3):
-                out[k, 0, t] = out[k, 2, t] = table[0, t] * np.minimum(table[1 + k, t], 1e200)
+def _put_spreads(ends, given, out):
+    """Moments (12, 3, tiles); infinite ones of ranges as numbers that may be multiplied by 0."""
+    for t in range(given.shape[1]):
+        beta, rate, far, width = ends[_BETA, :, t], ends[4, 1, t], ends[5, 1, t], ends[6, 0, t]
+        bins = rate * (1.0 + max(abs(beta[0]), abs(beta[1]))) * far / width
+        beat = 2.0 * rate * far
+        for k in range(3):
+            for s in range(3):
+                chirped = s != 1 and bins > 0.0
+                for row in (k, 3 + k):
+                    out[row, s, t] = bins * np.minimum(given[row, t], 1e200) if chirped else 0.0
+                factor = (2 / SPEED_OF_LIGHT) * (ends[s, 1, t] + beat) / width
+                out[6 + k, s, t] = given[6 + k, t] * factor
+                out[9 + k, s, t] = out[k, s, t] + out[6 + k, s, t]
 
 
 def power_range(line: Line, spread: Moments, beamlets: int) -> tuple[np.ndarray, np.ndarray]:
@@ -355,12 +383,7 @@ def moved_change(
     added, present, beamlets
         As for :func:`spread_change`.
     """
-    table, shape = columns(shift, *added, *present, *moved[:-1], *still[:-1], 0.0, 0.0)
-    ways, tilt = table[-2:], table[-3]
-    with np.errstate(invalid="ignore", over="ignore"):
-        ways[0] = table[6] + table[3] + table[0]
-        ways[1] = table[0]
-        np.exp(np.minimum(tilt * ways, 50.0), out=ways)
+    table, shape = columns(shift, *added, *present, *moved[:-1], *still[:-1])
     found = np.empty((2, *shape))
     put_moved_changes(table, beamlets, *sizes_of(still.lobe), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))

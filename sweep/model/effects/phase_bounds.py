@@ -41,17 +41,17 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
-from sweep.model.effects.line_spread import Moments, sizes_of
+from sweep.model.effects.line_spread import sizes_of
 from sweep.model.effects.phase_formulas import (
+    IMAGE,
     put_added,
+    put_error_changes,
     put_missed,
-    put_moved,
     put_over_record,
     put_peaks,
     put_phase_changes,
-    put_reaches,
 )
-from sweep.model.effects.span import Span, any_holds
+from sweep.model.effects.span import Span
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
@@ -64,8 +64,6 @@ _SHAPE_MARGIN = 1e-4
 _NODES = 256
 _MANY = 10**12
 """Lines of which none is strong enough to be looked at alone."""
-_IMAGE = 0.9
-"""What an image far away leaves at least of a line whose amplitude it adds to."""
 _WIDTH = "instrument.laser.line_width"
 
 
@@ -215,25 +213,23 @@ def phase_change(
     others : Error
         Phase errors that may be there besides: they lower the bin, and turn what changes.
     """
-    return _changed(error, others, peak or one_line(window), window)[0]
-
-
-def _changed(error: Error, others: Error, peak: Peak, window: Window) -> tuple[Change, np.ndarray]:
-    """What :func:`phase_change` tells, and the table of what it follows from, the error first."""
-    form, known = shape(window), means(window)
+    peak = peak or one_line(window)
     table, found_shape = columns(
         *error.powers, error.rest, *others.powers, others.rest, peak.least, peak.most
     )
-    reaches = np.empty((2, 2, table.shape[1]))
-    put_reaches(table, known.slope, reaches[0])
-    np.tanh(np.pi * reaches[0], out=reaches[1])
-    found = np.empty((2, *found_shape))
-    put_phase_changes(
-        table, reaches, (known.absolute, known.bent, known.square),
+    found, flags = np.empty((2, *found_shape)), (others is not NO_ERROR, bool(peak.single))
+    put_phase_changes(table, *_of_window(window), flags, found.reshape(2, -1))
+    return Change(signal=(found[0], found[1]))
+
+
+@lru_cache(maxsize=16)
+def _of_window(window: Window) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
+    """What compiled formulas take of a window."""
+    form, known = shape(window), means(window)
+    return (
+        (known.absolute, known.bent, known.square, known.slope),
         (form.absolute, form.edge, form.top, known.hann),
-        (others is not NO_ERROR, bool(peak.single)), found.reshape(2, -1),
-    )  # fmt: skip
-    return Change(signal=(found[0], found[1])), table
+    )
 
 
 def missed(error: Error, window: Window) -> np.ndarray:
@@ -269,23 +265,33 @@ def error_change(block: "Block", own: Own) -> Change | None:
     error = own(block)
     if error is None:
         return None
-    others, window = errors_of(block, own), block.window
-    peak, images = peak_of(block, error + others)
-    cancelling = may_cancel(block, images)
-    change, table = _changed(error, others, peak, window)
-    moved = np.empty(np.shape(change.signal[0]))
-    put_moved(table, means(window).steady, (block.fft_size, window.length), moved.reshape(-1))
-    if not any_holds(cancelling):
-        return change._replace(shift=moved)
-    low, high = (np.where(cancelling, 1.0, end) for end in change.signal)
-    lines_added = np.where(cancelling, added(block, error, images), 0.0)
+    others = errors_of(block, own)
+    width, number = _broadening(block)
+    table = np.empty((13, 3, block.size))
+    for k, value in enumerate((width, *_parts(error), *_parts(others))):
+        table[k] = value
+    found = np.empty((4, *table.shape[1:]))
+    put_error_changes(
+        block.axis, table.reshape(13, -1), number, sizes_of(block.lines.lobe), _record(block),
+        (*_of_window(block.window), means(block.window).steady),
+        (others is not NO_ERROR, block.number == 1, may_add(block)), found.reshape(4, -1),
+    )  # fmt: skip
+    low, high, lines_added, moved = found
     return Change(signal=(low, high), added=lines_added, shift=moved)
+
+
+def _parts(error: Error) -> tuple[Sizes, ...]:
+    return *error.powers, error.rest, error.constant
+
+
+def may_add(block: "Block") -> bool:
+    """Whether lines add as amplitudes, or may."""
+    return block.adds_amplitudes or block.has("target.roughness")
 
 
 def may_cancel(block: "Block", images: np.ndarray) -> np.ndarray:
     """Where amplitudes, or lines and images that make powers so much larger, may cancel."""
-    amplitudes = block.adds_amplitudes or block.has("target.roughness")
-    return amplitudes & ((images > 1.5) | (block.number > 1))
+    return may_add(block) & ((images > 1.5) | (block.number > 1))
 
 
 def added(block: "Block", error: Error, images: np.ndarray) -> np.ndarray:
@@ -315,21 +321,25 @@ def peak_of(block: "Block", error: Error, *, broadened: bool = True) -> tuple[Pe
     (3, tiles) ndarray
         By how much images make powers larger at the most.
     """
-    lines, spread, number = block.lines, block.spread, block.number
-    if broadened and block.word("instrument.laser.line_shape") == "gaussian" and block.has(_WIDTH):
-        width = block[_WIDTH].high * DEVIATION_OF_FWHM / block.bin_width.low
-        spread = Moments(spread.mean, np.hypot(spread.rms, width), spread.extreme + 6 * width)
-        number = _MANY
-    uphill = np.exp(np.minimum(lines.tilt * spread.extreme, 50.0))
-    table, found_shape = columns(
-        lines.edge, lines.tilt, *spread, uphill, block.spread.extreme, *error.powers
-    )
-    found = np.empty((3, *found_shape))
-    put_peaks(
-        table, number, sizes_of(lines.lobe), (block.fft_size, block.window.length),
-        (_IMAGE if block.adds_amplitudes else 1.0, _IMAGE), found.reshape(3, -1),
-    )  # fmt: skip
+    width, number = _broadening(block) if broadened else (0.0, block.number)
+    table = np.empty((5, 3, block.size))
+    for k, value in enumerate((width, *error.powers)):
+        table[k] = value
+    found, lobe = np.empty((3, *table.shape[1:])), sizes_of(block.lines.lobe)
+    put_peaks(block.axis, table.reshape(5, -1), number, lobe, _record(block), found.reshape(3, -1))
     return Peak(found[0], found[1], block.number == 1), found[2]
+
+
+def _broadening(block: "Block") -> tuple[Sizes, int]:
+    """Width of the laser's line [bins] where it may have one, and lines at the most."""
+    if block.word("instrument.laser.line_shape") != "gaussian" or not block.has(_WIDTH):
+        return 0.0, block.number
+    return block[_WIDTH].high * DEVIATION_OF_FWHM / block.bin_width.low, _MANY
+
+
+def _record(block: "Block") -> tuple[int, int, float]:
+    """Size of the FFT, length of the record, what images leave of the least magnitude."""
+    return block.fft_size, block.window.length, IMAGE if block.adds_amplitudes else 1.0
 
 
 def over_record(terms: Mapping[int, Span], *, start: Span, duration: Span) -> Error:

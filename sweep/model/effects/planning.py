@@ -16,7 +16,7 @@ from numba import njit
 
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.change import Bound, Change, Mean, within_changes
+from sweep.model.effects.change import Bound
 from sweep.model.effects.effect import MODES, Effect
 from sweep.model.effects.probability_bounds import probability_changes
 
@@ -80,41 +80,33 @@ def plan(
             list(bounds.values()),
             amplitude=rest.amplitude,
             threshold=block.threshold,
-            **_leaking(bounds, rules),
+            **_leaking(list(bounds), rules),
         )
     kept = _kept(change, [row for row in bounds if row not in rules.decided], rules, tolerance)
     return Plan(rules.names, kept, change, np.where(kept, 0.0, change).sum(axis=0))
 
 
-def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, Change | np.ndarray]:
+def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, Bound]:
     """Bounds of the effects that the scene has; all but Doppler's from lines as they are left."""
     asked: dict[int, Bound] = {}
     for row, effect in enumerate(effects):
         bound = effect.bound(block if effect.name == "doppler" else rest)
         if bound is not None:
             asked[row] = bound
-    told: dict[int, Change | np.ndarray] = {}
-    for row, bound in asked.items():
-        if isinstance(bound, Mean):
-            others = (b for k, b in asked.items() if k != row and isinstance(b, Change))
-            bound = bound.change(
-                *within_changes(others, amplitude=rest.amplitude, threshold=rest.threshold)
-            )
-        told[row] = bound
-    return told
+    return asked
 
 
-def _leaking(bounds: Mapping[int, Change | np.ndarray], rules: "_Rules") -> dict[str, Any]:
+def _leaking(rows: Sequence[int], rules: "_Rules") -> dict[str, Any]:
     """What of :func:`probability_changes` is told where a study asks for leakage.
 
     Bins that leak are so much smaller than the largest that next to nothing of that is much of
     them: it takes nearly all effects to tell leakage, and most studies look at detection.
     """
-    row = rules.leakage
-    if row not in rules.on or row not in bounds:
+    if rules.leakage not in rules.on or rules.leakage not in rows:
         return {}
-    leakage = np.atleast_2d(np.asarray(bounds[row], float)).sum(axis=0)
-    return {"spreads": [each in rules.spreading for each in bounds], "leakage": leakage}
+    return {
+        "leakage": rows.index(rules.leakage), "spreads": [row in rules.spreading for row in rows]
+    }  # fmt: skip
 
 
 class _Rules(NamedTuple):

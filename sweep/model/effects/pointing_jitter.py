@@ -243,7 +243,7 @@ def bound(block: "Block") -> Change | None:
         direct=block.architecture == "direct",
         speed_across=block["target.transverse_velocity"].magnitude,
         record=block.window.length / block.fft_size,
-        spread=2 * np.asarray(block.velocity_spread.extreme),
+        spread=2 * np.asarray(block.spreads.velocities.extreme),
         edge=block.lines.edge,
         tail=lambda bins: lobe.tail(bins) / lobe.worst,
     )

@@ -29,24 +29,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.change import NOTHING, Change
+from sweep.model.effects.change import NOTHING, Bound, Change, Mean
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1_pair
 
 _HUGE = 1e12
 _LN_10 = math.log(10.0)
 _WEAK, _STRONG, _DOWN, _UP, _ADDED, _SHARE, _FIELDS = range(7)
+_NO_NOISE = 1e-200
+"""Factor of noise that is as good as none, as of what saturates."""
 _NEGLIGIBLE = 1e-12
 """A change of a probability that needs no closer look."""
 
 
 def probability_changes(
-    bounds: Sequence[Change | np.ndarray],
+    bounds: Sequence[Bound],
     *,
     amplitude: Span,
     threshold: Span,
+    leakage: int = -1,
     spreads: Sequence[bool] = (),
-    leakage: ArrayLike = 0.0,
 ) -> np.ndarray:
     """Largest change of a probability or of a magnitude by each effect, (effects, tiles), 0..1.
 
@@ -57,37 +59,36 @@ def probability_changes(
 
     Parameters
     ----------
-    bounds : sequence of Change or array_like
+    bounds : sequence of Change, Mean or array_like
         Of scalars, (tiles,), or (3, tiles) by segment. An array is a bound on the change of a
-        probability itself, and is summed over the segments if it has them.
+        probability itself, and is summed over the segments if it has them; a :class:`Mean` makes
+        one from whatever the others leave.
     amplitude : Span
         Magnitude of the detecting bin without any of the effects over sigma, (3, tiles).
     threshold : Span
         Threshold over sigma, (tiles,) or a scalar.
+    leakage : int
+        Which of them is that of leakage, where it is asked for; none by default. Bins that leak
+        are then taken to be moved by effects that spread as far, in sigmas, as the largest; that
+        counts up to this bound.
     spreads : sequence of bool
-        Whether an effect moves light from bins to others; by default none does.
-    leakage : array_like
-        Probability of leakage at the most, (tiles,) or a scalar. Bins that leak are taken to be
-        moved by such effects as far, in sigmas, as the largest; that counts up to this.
+        Whether an effect moves light from bins to others.
     """
     tiles = np.shape(amplitude.low)[1]
     factors = [bound for bound in bounds if isinstance(bound, Change)]
-    table = np.empty((len(factors), _FIELDS, 3, tiles))
-    for entry, change in zip(table, factors, strict=True):
-        _fill(entry, change)
-    _finish(table.reshape(len(factors), _FIELDS, 3 * tiles))
-    ends = np.empty((2, 2, 3, tiles))
-    ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
-        amplitude.low, amplitude.high, threshold.low, threshold.high,
-    )  # fmt: skip
-    leaking = np.zeros((len(factors), tiles))
-    if spreads:
-        asked = zip(bounds, spreads, strict=True)
-        leaking[np.array([spread for bound, spread in asked if isinstance(bound, Change)])] = (
-            leakage
-        )
-    found = iter(_changes(table, ends, leaking))
+    table, ends = _table(factors, amplitude, threshold)
     out = np.empty((len(bounds), tiles))
+    for row, bound in zip(out, bounds, strict=True):
+        if not isinstance(bound, Change):
+            told = bound.change(*_within_all(table, ends)) if isinstance(bound, Mean) else bound
+            value = np.asarray(told, float)
+            row[:] = value.sum(axis=0) if value.ndim > 1 else value
+    leaking = np.zeros((len(factors), tiles))
+    if leakage >= 0:
+        asked = zip(bounds, spreads, strict=True)
+        moves = np.array([spread for bound, spread in asked if isinstance(bound, Change)])
+        leaking[moves] = out[leakage]
+    found = iter(_changes(table, ends, leaking))
     for row, bound in zip(out, bounds, strict=True):
         if isinstance(bound, Change):
             row[:] = next(found)
@@ -95,10 +96,36 @@ def probability_changes(
                 np.maximum(row, np.max(np.atleast_2d(bound.shift), axis=0), out=row)
             if bound.alarms is not NOTHING:
                 np.maximum(row, bound.alarms, out=row)
-        else:
-            value = np.asarray(bound, float)
-            row[:] = value.sum(axis=0) if value.ndim > 1 else value
     return np.minimum(out, 1.0)
+
+
+def within_changes(
+    changes: Sequence[Change], *, amplitude: Span, threshold: Span
+) -> tuple[Span, Span]:
+    """Magnitudes and thresholds over sigma that any of some changes may leave, (3, tiles)."""
+    return _within_all(*_table(changes, amplitude, threshold))
+
+
+def _within_all(table: np.ndarray, ends: np.ndarray) -> tuple[Span, Span]:
+    found = np.empty(ends.shape)
+    _put_all(table, ends, found)
+    return Span(found[0, 0], found[0, 1]), Span(found[1, 0], found[1, 1])
+
+
+def _table(
+    changes: Sequence[Change], amplitude: Span, threshold: Span
+) -> tuple[np.ndarray, np.ndarray]:
+    """Changes as compiled formulas take them; ends of what there is without, (2, 2, 3, tiles)."""
+    tiles = np.shape(amplitude.low)[1]
+    table = np.empty((len(changes), _FIELDS, 3, tiles))
+    for entry, change in zip(table, changes, strict=True):
+        _fill(entry, change)
+    _finish(table.reshape(len(changes), _FIELDS, 3 * tiles))
+    ends = np.empty((2, 2, 3, tiles))
+    ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
+        amplitude.low, amplitude.high, threshold.low, threshold.high,
+    )  # fmt: skip
+    return table, ends
 
 
 def pd_change_within(
@@ -138,7 +165,10 @@ def _finish(table):
         for t in range(table.shape[2]):
             own = table[i, :, t]
             weak, strong, follows = own[_WEAK], own[_STRONG], own[_SHARE] != 0.0
-            quiet, loud = 1.0 / math.sqrt(own[_DOWN]), 1.0 / math.sqrt(own[_UP])
+            quiet, loud = (
+                1.0 / math.sqrt(max(own[_DOWN], _NO_NOISE)),
+                1.0 / math.sqrt(max(own[_UP], _NO_NOISE)),
+            )
             own[_WEAK], own[_STRONG] = min(weak * loud, _HUGE), min(strong * quiet, _HUGE)
             own[_DOWN] = 1.0 if follows else min(loud, _HUGE)
             own[_UP] = 1.0 if follows else min(quiet, _HUGE)
@@ -177,6 +207,16 @@ def _changes(table, ends, leaking):
                     other = max(other, _alarm_change(own, upper))
             out[i, t] = min(max(total, other), 1.0)
     return out
+
+
+@njit(cache=True, error_model="numpy")
+def _put_all(table, ends, out):
+    """Ends of amplitude and threshold with any of the effects."""
+    for s in range(ends.shape[2]):
+        for t in range(ends.shape[3]):
+            out[0, 0, s, t], out[0, 1, s, t], out[1, 0, s, t], out[1, 1, s, t] = _with_others(
+                table, ends, -1, s, t
+            )
 
 
 @njit(cache=True, error_model="numpy")

@@ -37,7 +37,7 @@ def bound(block: "Block") -> Change | None:
         return None
     f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
     apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme
-    own, _ = power_range(line, block.own_range_spread, block.number)
+    own, _ = power_range(line, block.spreads.own_ranges, block.number)
     _, on_axis = power_range(line, NO_SPREAD, block.number)
     elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer_least**-2.0)
     table, shape = columns(f, apart, own, on_axis, elsewhere, line.edge, line.transfer_least)

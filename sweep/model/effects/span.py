@@ -98,6 +98,8 @@ class Span:
 
     def __truediv__(self, other: Operand) -> "Span":
         """Infinite to both sides where the divisor's span holds 0 and is not 0 itself."""
+        if isinstance(other, float | int) and 1 <= other < np.inf:
+            return Span(self.low / other, self.high / other)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # as by denormals
             return self._over(other)
 

@@ -6,7 +6,8 @@ from sweep.model.chain import prepare
 from sweep.model.effects import leakage
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
-from sweep.model.effects.change import Change, within_changes
+from sweep.model.effects.change import Change
+from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.span import Span
 from sweep.model.shot import find
 

@@ -151,7 +151,7 @@ def test_the_phase_reach_holds_the_phases_of_all_beamlets(table_4_1):
         parameters = scene(table_4_1, 40, seed, fft_size=4096, phases="coherent", beamlets=19)
         block, inner = tile_block(parameters, seed)
         ((_, shots),) = prepare(inner, ("footprint", "doppler_spread"))
-        reach = phase_reach(block, block.ranges, block.velocity_spread)
+        reach = phase_reach(block, block.ranges, block.spreads.velocities)
         away = abs(shots.offset[shots.row]).max(axis=1) * shots.range
         optical = 4 * np.pi * shots.carriers[0] / SPEED_OF_LIGHT * away
         assert (optical <= reach[1] * (1 + 1e-9)).all()

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.effects.change import Change, pd_change, within_changes
+from sweep.model.effects.change import Change, pd_change
+from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1
 
@@ -38,6 +39,10 @@ def test_no_change_is_none_and_no_signal_stays_none():
 def test_an_effect_that_leaves_no_noise_leaves_finite_magnitudes():
     """As where all is far beyond full scale."""
     nothing = Change(signal=(0.0, 0.0), noise=(0.0, 0.0))
-    found, threshold = within_changes([nothing], amplitude=Span(1.0, 2.0), threshold=Span(3.0, 4.0))
-    assert found.low == 0 and 2 <= found.high < np.inf and threshold.low <= 3
-    assert 4 <= threshold.high < np.inf
+    one = np.ones((3, 1))
+    found, threshold = within_changes(
+        [nothing], amplitude=Span(one, 2 * one), threshold=Span(3.0, 4.0)
+    )
+    assert (found.low == 0).all() and (found.high >= 2).all() and (found.high < np.inf).all()
+    assert (threshold.low <= 3).all() and (threshold.high >= 4).all()
+    assert (threshold.high < np.inf).all()

@@ -3,19 +3,23 @@
 import numpy as np
 import pytest
 
-from sweep.model.effects.change import Change, within_changes
+from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
 from sweep.model.effects.line_spread import (
     NO_SPREAD,
     Line,
     Moments,
+    axis_ends,
     image_factor,
     moved_change,
     power_range,
-    range_moments_in_bins,
+    range_to_bins,
+    spreads,
+    velocity_to_bins,
 )
 from sweep.model.effects.lobes import lobe
 from sweep.model.effects.phase_bounds import Error, Peak, phase_change
+from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.span import Span
 from sweep.model.window import window
 
@@ -86,12 +90,54 @@ def test_lines_that_nothing_moves_are_not_changed_and_boundless_spreads_are_boun
     assert not np.isnan(low).any() and (low < 1).all() and (high >= 1).all()
 
 
+def ends_of(rng, tiles):
+    """Ends of a line's spans, and by name those that spreads follow from."""
+
+    def span(scale):
+        low = rng.uniform(-1, 1, tiles) * scale if scale < 1 else rng.uniform(0.5, 1, tiles) * scale
+        return Span(low, low + rng.uniform(0, 0.2, tiles) * abs(scale))
+
+    given = {"range": span(1e3), "chirp_rate": span(1e13), "bin_width": span(1e5)}
+    carriers, beta = (span(2e14), span(2e14), span(2.1e14)), span(1e-6)
+    bandwidths = {"detector_bandwidth": span(1e9), "amplifier_bandwidth": span(2e9)}
+    return (
+        axis_ends(tiles, carriers=carriers, beta=beta, **given, **bandwidths),
+        given,
+        carriers,
+        beta,
+    )
+
+
+def test_spreads_are_what_ranges_and_velocities_make_at_the_ends():
+    rng = np.random.default_rng(5)
+    ends, given, carriers, beta = ends_of(rng, 40)
+    far, rate, width = given["range"].high, given["chirp_rate"].high, given["bin_width"].low
+    sizes = [Moments(*rng.uniform(0, 1e-3, (3, 40))) for _ in range(3)]
+    found = spreads(ends, ranges=sizes[0], own_ranges=sizes[1], velocities=sizes[2])
+    per_range = range_to_bins(range=far, beta=beta.magnitude, chirp_rate=rate, bin_width=width)
+    per_speed = [
+        velocity_to_bins(range=far, carrier=carrier.high, chirp_rate=rate, bin_width=width)
+        for carrier in carriers
+    ]
+    chirped = np.array([1.0, 0.0, 1.0])[:, None]
+    for k in range(3):
+        wide, own = (each[k] * per_range * chirped for each in sizes[:2])
+        np.testing.assert_allclose(found.ranges[k], wide, rtol=1e-15)
+        np.testing.assert_allclose(found.own_ranges[k], own, rtol=1e-15)
+        np.testing.assert_allclose(found.velocities[k], sizes[2][k] * per_speed, rtol=2e-15)
+        np.testing.assert_array_equal(found.both[k], found.ranges[k] + found.velocities[k])
+
+
 def test_boundless_ranges_make_no_line_of_the_doppler_segment_wide():
-    bins = np.array([0.0, 5.0, 2.0])
-    mean, _, extreme = range_moments_in_bins(bins, Moments(1.0, np.array([1.0, 2, 3]), np.inf), 3)
-    np.testing.assert_array_equal(mean, [bins, 0 * bins, bins])
+    ends, *_ = ends_of(np.random.default_rng(5), 3)
+    ends[4, :, 0] = 0.0  # no chirp
+    boundless = Moments(1e-3, np.array([1.0, 2, 3]), np.inf)
+    found = spreads(ends, ranges=boundless, own_ranges=boundless, velocities=NO_SPREAD)
+    np.testing.assert_array_equal(np.array(found.ranges), np.array(found.own_ranges))
+    extreme = found.ranges.extreme
     assert (extreme[:, 0] == 0).all() and (extreme[1] == 0).all()
     assert np.isfinite(extreme).all() and (extreme[[0, 2], 1:] > 1e199).all()
+    np.testing.assert_array_equal(found.both.extreme, extreme)
 
 
 def test_a_phase_error_of_unknown_size_may_do_anything_and_none_does_nothing():
@@ -129,9 +175,14 @@ def test_any_number_of_changes_leaves_what_they_leave_one_by_one():
         high *= change.signal[1]
     np.testing.assert_allclose(found.low, np.tile(low - high * 0.002, (3, 1)), rtol=1e-12)
     np.testing.assert_allclose(found.high, high * 1.002, rtol=1e-12)
-    assert same.low == same.high == 3
+    assert (same.low == 3).all() and (same.high == 3).all()
 
 
 def test_nothing_changes_magnitudes_and_thresholds_of_no_effects():
-    found, same = within_changes([Change()], amplitude=Span(1.0, 2.0), threshold=Span(3.0, 4.0))
-    assert (found.low, found.high, same.low, same.high) == (1, 2, 3, 4)
+    one = np.ones((3, 1))
+    for changes in ([Change()], []):
+        found, same = within_changes(
+            changes, amplitude=Span(one, 2 * one), threshold=Span(3.0, 4.0)
+        )
+        ends = np.array([found.low, found.high, same.low, same.high])
+        assert (ends == np.arange(1.0, 5.0)[:, None, None]).all()

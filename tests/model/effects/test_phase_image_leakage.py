@@ -57,7 +57,7 @@ def test_a_footprint_of_small_phases_adds_up_to_its_gain(table_4_1):
     )  # fmt: skip
     block = point_block(parameters)
     on, off = (magnitudes(parameters, e) for e in ((*POWERS, "footprint_phase"), POWERS))
-    phase = footprint_phase.phase_reach(block, block.ranges, block.velocity_spread)[2]
+    phase = footprint_phase.phase_reach(block, block.ranges, block.spreads.velocities)[2]
     change = footprint_phase.bound(block)
     low, high = change.signal[0][2], change.signal[1][2]
     tight = phase < 0.3

@@ -9,8 +9,9 @@ from scipy.integrate import quad
 from sweep.model import philox
 from sweep.model.effects.atmosphere import Path
 from sweep.model.effects.catalogue import CORE, EFFECTS
-from sweep.model.effects.change import Change, within_changes
+from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Realisation
+from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.scintillation import (
     bound,
     factors,
