@@ -86,10 +86,10 @@ costs depends on those that are computed beside it, as they share what is worked
 times are taken on stretches of the blocks that the study computes, some thousands of points each,
 around points of the sample. They are those that the processor spends on the work. The best round
 counts for them, and ratios are medians of those within each round, or of the best where there are
-but two. Planning is counted with what it plans; storing is not counted. Of a flight it takes about
-1 ms a block, however few shots that has: a tenth of the time of a thousand shots, which take some
-12 ms in all. So it is with a few points of a grid. In studies as short as these fixed settings are
-the faster ones, and `sweep accuracy` says so.
+but two. Planning is counted with what it plans; storing is not counted. Of a flight it takes some
+0.8 ms a block, however few shots that has: a twelfth of the time of a thousand shots, which take
+10 ms in all. Of fewer, or of a few points of a grid, fixed settings are the faster ones, and
+`sweep accuracy` says so.
 
 The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
 the differences from the reference in a probability of detection, of the segments and the shot, in

@@ -6,7 +6,7 @@ from small import small
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.effects.flags import flag_attributes, flags_of, names_of
-from sweep.tasks.calling import Called, Calling
+from sweep.tasks.calling import Called, Calling, _stretches
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.tiles import TILE_POINTS, Tiles, tile_shape
@@ -29,6 +29,15 @@ def whole(spec, name):
         out = np.empty(study.grid.shape, values.dtype) if out is None else out
         out[study.grid.block(block)] = values
     return out
+
+
+@pytest.mark.parametrize("tiles", [[7], [3, 3, 3], [0, 1, 2], [2, 2, 5, 5, 5, 9], [4, 9, 9]])
+def test_stretches_of_a_tile_lie_between_their_edges(tiles):
+    tiles = np.array(tiles)
+    edges, tile = _stretches(tiles)
+    starts = np.flatnonzero(np.diff(tiles, prepend=tiles[0] - 1))
+    assert edges.tolist() == [*starts, tiles.size]
+    assert (tiles[edges[:-1]][tile] == tiles).all()
 
 
 def test_tiles_are_alike_on_all_sides_and_hold_no_two_words():

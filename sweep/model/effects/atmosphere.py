@@ -230,10 +230,13 @@ def path_of(block: "Block") -> Path:
 
 def profile_over(block: "Block") -> Profile | None:
     """Extinction over height for a block; None without an atmosphere."""
+    name = block.word("atmosphere.profile")
+    if name == "none":
+        return None
     numbers = {
         path: np.ravel(block[path].low)[0] for path in ("atmosphere.extinction", "atmosphere.depth")
     }
-    return profile_of(numbers | {"atmosphere.profile": block.word("atmosphere.profile")})
+    return profile_of(numbers | {"atmosphere.profile": name})
 
 
 def depth_over(profile: Profile, path: Path) -> Span:

@@ -139,15 +139,7 @@ class Block(TileLink):
         return self._axis_ends(self.beta)
 
     def _axis_ends(self, beta: Span) -> np.ndarray:
-        return line_spread.axis_ends(
-            self.size,
-            range=self.range,
-            beta=beta,
-            chirp_rate=self.chirp_rate,
-            carriers=self.carriers,
-            bin_width=self.bin_width,
-            **self._receiver("detector_bandwidth", "amplifier_bandwidth"),
-        )
+        return line_spread.axis_ends(self.size, self.instrument_ends, range=self.range, beta=beta)
 
     def _lines(self, ends: np.ndarray) -> Line:
         return line_spread.axis_lines(ends, window=self.window, fft_size=self.fft_size)
@@ -158,7 +150,7 @@ class Block(TileLink):
         relative = monotone(
             lambda echo: relative_amplitude(self.architecture, np.asarray(echo)), echo=self.echo
         )
-        return 0.5 * self.beat_scale * relative * self.window.sum
+        return self.beat_scale.times(0.5, relative, self.window.sum)
 
     @cached_property
     def peak(self) -> Span:

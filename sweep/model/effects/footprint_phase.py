@@ -51,7 +51,13 @@ def phase_reach(block: "Block", ranges: Moments, velocities: Moments) -> np.ndar
 
 
 def sum_change(
-    line: Line, *, phase: np.ndarray, gain: Span, spread: Moments, most: ArrayLike
+    line: Line,
+    *,
+    phase: np.ndarray,
+    gain: Span,
+    spread: Moments,
+    most: ArrayLike = np.inf,
+    beamlets: float = np.inf,
 ) -> Change:
     """What phases can change in the largest bin of amplitudes that add.
 
@@ -67,6 +73,8 @@ def sum_change(
         Bins by which ranges and velocities put the lines off the axis's.
     most : array_like
         What no phases can exceed.
+    beamlets : float
+        As many as there are, whose powers without phases, with their images, the sum is told by.
     """
     f = line.lobe
     table, shape = columns(
@@ -74,12 +82,12 @@ def sum_change(
     )  # fmt: skip
     found = np.empty((2, *shape))
     sizes = f.curvature, f.margin, f.worst
-    _put_sum_changes(table, sizes, (f.reach, f.envelope), found.reshape(2, -1))
+    _put_sum_changes(table, sizes, (f.reach, f.envelope), float(beamlets), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))
 
 
 @njit(cache=True, error_model="numpy")
-def _put_sum_changes(table, sizes, lobe, out):
+def _put_sum_changes(table, sizes, lobe, beamlets, out):
     """Least and largest factor on magnitudes, (2, n)."""
     (curvature, margin, worst), (reach, envelope) = sizes, lobe
     for i in range(table.shape[1]):
@@ -87,8 +95,10 @@ def _put_sum_changes(table, sizes, lobe, out):
         apart = edge - extreme
         # by how much a bin may differ from line to line
         tilt = np.sqrt(curvature) * extreme / worst + poles * extreme
+        near = 2 * apart < 8 * margin
+        most = np.fmin(most, np.sqrt(beamlets * (2.0 if near else 1.01)))
         out[0, i], out[1, i] = 0.0, most
-        if tilt < 0.5 and not 2 * apart < 8 * margin:
+        if tilt < 0.5 and not near:
             image = lobe_tail(reach, envelope, 2 * apart - 1) / worst
             low = less * (1 - phase * phase / 2) * (1 - tilt) - more * image
             out[0, i] = low if low > 0 else 0.0
@@ -132,14 +142,12 @@ def bound(block: "Block") -> Change | None:
     """What phases can change in the largest bin."""
     if not block.coherent or block.architecture == "direct":
         return None
-    lines, spread = block.lines, block.spread
-    near = 2 * (lines.edge - np.asarray(spread.extreme)) < 8 * lines.lobe.margin
     return sum_change(
-        lines,
+        block.lines,
         phase=phase_reach(block, block.ranges, block.spreads.velocities),
         gain=block.gain,
-        spread=spread,
-        most=np.sqrt(block.number * np.where(near, 2.0, 1.01)),
+        spread=block.spread,
+        beamlets=block.number,
     )
 
 

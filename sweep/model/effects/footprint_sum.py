@@ -50,31 +50,32 @@ class Sum(NamedTuple):
 @lru_cache(maxsize=2)
 def footprint_sum(block: "Block") -> Sum:
     """Sums of the footprints of a block's tiles."""
-    ratio = np.maximum(block.echo_ratio.high, 1.0)
-    alone = np.zeros((3, block.size)) + (
-        ratio if block.architecture == "direct" else np.sqrt(ratio)
-    )
+    ratio, alone = np.maximum(block.echo_ratio.high, 1.0), np.empty((3, block.size))
+    alone[:] = ratio if block.architecture == "direct" else np.sqrt(ratio)
     if not block.adds_amplitudes:
         return Sum(alone, alone, np.zeros_like(alone))
     in_phase = alone * block.gain.high
-    most, lean = in_phase.copy(), in_phase * np.fmin(block.spread.extreme, block.fft_size)
-    points = _points(block)
-    if points.any():
-        known, apart = _at_points(block, points)
-        # without their phases, or a footprint, beamlets add as powers, or are one
-        known = np.maximum(known, alone[:, points])
-        most[:, points] = np.minimum(most[:, points], known)
-        lean[:, points] = np.minimum(lean[:, points], apart)
+    lean = in_phase * np.fmin(block.spread.extreme, block.fft_size)
+    if not _is_told(block) or not (points := _points(block)).any():
+        return Sum(in_phase, in_phase, lean)
+    most, (known, apart) = in_phase.copy(), _at_points(block, points)
+    # without their phases, or a footprint, beamlets add as powers, or are one
+    known = np.maximum(known, alone[:, points])
+    most[:, points] = np.minimum(most[:, points], known)
+    lean[:, points] = np.minimum(lean[:, points], apart)
     return Sum(in_phase, most, lean)
 
 
-def _points(block: "Block") -> np.ndarray:
-    """Tiles whose sum can be told, (tiles,) bool."""
-    none = np.zeros(block.size, bool)
+def _is_told(block: "Block") -> bool:
+    """Whether the sum of a tile that is one point can be told."""
     if not block.coherent or block.architecture == "direct" or not block.geometry.flat:
-        return none
-    if block.number == 1 or block.has(*_RANDOM):
-        return none
+        return False
+    return block.number > 1 and not block.has(*_RANDOM)
+
+
+def _points(block: "Block") -> np.ndarray:
+    """Tiles that are one point, (tiles,) bool."""
+    none = np.zeros(block.size, bool)
     spans = [block[path] for path in _SHAPE]
     spans += [block.range, block.chirp_rate, block.start, block.sample_rate, *block.carriers]
     return none | np.logical_and.reduce(

@@ -32,6 +32,7 @@ from sweep.model.preparation import PROCESSING, Shots
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
 
+_LN_10 = math.log(10)
 _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
 
@@ -79,9 +80,17 @@ def alarm_change(block: "Block") -> np.ndarray:
     """
     if block.word(PROCESSING + "bins_counted") == "all":
         return np.zeros(block.size)
-    bins, taken = moved_bins(block)
-    left = np.maximum(block.fft_size / 2 - taken, 1.0)
-    return np.where(bins > _SELDOM, np.maximum(bins, 1.0) / (math.log(10) * left), 0.0)
+    found = np.empty(block.size)
+    _put_alarms(*moved_bins(block), block.fft_size / 2, found)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _put_alarms(bins, taken, half, out):
+    """Changes of log10 pfa (tiles,)."""
+    for t in range(out.size):
+        left = np.maximum(half - taken[t], 1.0)
+        out[t] = np.maximum(bins[t], 1.0) / (_LN_10 * left) if bins[t] > _SELDOM else 0.0
 
 
 def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:

@@ -56,28 +56,29 @@ def put_moved_changes(table, beamlets, tables, sizes, out):
     """Least and largest factors on magnitudes (2, n).
 
     Rows of the table: shift; moments added and present, three each; offset, least offset, edge,
-    transfer, least transfer and tilt of the line that is moved, and of the one that is not.
+    transfer, least transfer and tilt of the line that is moved, and of the one that is not, but
+    for lines that only spread.
     """
     bounds = extremes_of(beamlets, tables)
     slope, curvature, margin, _ = sizes
     for i in range(table.shape[1]):
-        own = table[:, i]
+        own, line = table[:13, i], table[-6:, i]
         shift, mean, rms, extreme = own[0], own[1], own[2], own[3]
         if extreme == 0 and shift == 0:
             out[0, i], out[1, i] = 1.0, 1.0
             continue
-        wide, tilt = own[6] + extreme, own[18]
+        wide, tilt = own[6] + extreme, line[5]
         uphill, steepest = uphill_of(tilt, wide + shift), uphill_of(tilt, shift)
         together = own[4] + mean, own[5] + rms, wide
-        moved, still = (own[7], own[8], own[9], own[12]), (own[13], own[14], own[15], tilt)
+        moved, still = (own[7], own[8], own[9], own[12]), (line[0], line[1], line[2], tilt)
         with_least, with_most = power_range_of(moved, together, bounds, tables, sizes)
         least, most = power_range_of(still, (own[4], own[5], own[6]), bounds, tables, sizes)
-        double = max(image_factor_of(own[15], wide + shift, margin), 1.05)
+        double = max(image_factor_of(line[2], wide + shift, margin), 1.05)
         change = slope * (mean + shift) + curvature * (own[5] * rms + rms * rms / 2)
         change = double * uphill * (change + tilt * (rms + shift)) / least
         if np.isnan(change):
             change = np.inf
-        fall, rise = own[11] / own[16], own[10] / own[17]
+        fall, rise = own[11] / line[3], own[10] / line[4]
         less, more = np.maximum(fall * fall, 1 / steepest), np.minimum(rise * rise, steepest)
         out[0, i] = np.sqrt(np.fmax(1 - change, less * with_least / most))
         out[1, i] = np.sqrt(np.fmin(1 + change, more * with_most / least))

@@ -69,34 +69,39 @@ class Moments(NamedTuple):
 
 NO_SPREAD = Moments(0.0, 0.0, 0.0)
 
-_BETA = 3
+_BETA, _RANGE = 3, 5
 NOT_AWAY = 0.1
 """Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
 
-def axis_ends(
-    tiles: int,
+def instrument_ends(
     *,
-    range: Span,
-    beta: Span,
     chirp_rate: Span,
     carriers: Sequence[Span],
     bin_width: Span,
     detector_bandwidth: Span,
     amplifier_bandwidth: Span,
 ) -> np.ndarray:
+    """What :func:`axis_ends` takes of the instrument, (9, 2, tiles), or (9, 2, 1) for all tiles."""
+    none = Span.of(0.0)
+    spans = (
+        *carriers, none, chirp_rate * (2 / SPEED_OF_LIGHT), none, bin_width,
+        detector_bandwidth, amplifier_bandwidth,
+    )  # fmt: skip
+    table, _ = columns(*(end for span in spans for end in (span.low, span.high)))
+    return table.reshape(len(spans), 2, -1)
+
+
+def axis_ends(tiles: int, instrument: np.ndarray, *, range: Span, beta: Span) -> np.ndarray:
     """Ends of what the axis's line follows from, (9, 2, tiles): what the others here take.
 
     Carriers of the three segments, Doppler ratio, chirp rate times 2/c, range, bin width, and
     bandwidths of detector and amplifier.
     """
-    spans = (
-        *carriers, beta, chirp_rate * (2 / SPEED_OF_LIGHT), range, bin_width,
-        detector_bandwidth, amplifier_bandwidth,
-    )  # fmt: skip
-    ends = np.empty((len(spans), 2, tiles))
-    for row, span in zip(ends, spans, strict=True):
-        row[0], row[1] = span.low, span.high
+    ends = np.empty((9, 2, tiles))
+    ends[:] = instrument
+    for row, span in (_BETA, beta), (_RANGE, range):
+        ends[row, 0], ends[row, 1] = span.low, span.high
     return ends
 
 
@@ -383,7 +388,8 @@ def moved_change(
     added, present, beamlets
         As for :func:`spread_change`.
     """
-    table, shape = columns(shift, *added, *present, *moved[:-1], *still[:-1])
+    lines = moved[:-1] if moved is still else (*moved[:-1], *still[:-1])
+    table, shape = columns(shift, *added, *present, *lines)
     found = np.empty((2, *shape))
     put_moved_changes(table, beamlets, *sizes_of(still.lobe), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))

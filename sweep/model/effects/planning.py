@@ -83,7 +83,7 @@ def plan(
             **_leaking(list(bounds), rules),
         )
     kept = _kept(change, [row for row in bounds if row not in rules.decided], rules, tolerance)
-    return Plan(rules.names, kept, change, np.where(kept, 0.0, change).sum(axis=0))
+    return Plan(rules.names, kept, change, _left_out(kept, change))
 
 
 def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, Bound]:
@@ -192,7 +192,9 @@ def _kept(change: np.ndarray, chosen: Sequence[int], rules: _Rules, tolerance: f
     """
     kept = np.zeros(change.shape, np.bool_)
     if chosen:
-        room = np.maximum(tolerance - change[rules.off].sum(axis=0), 0.0)
+        room = np.full(change.shape[1], tolerance, float)
+        if rules.off:
+            room = np.maximum(tolerance - change[rules.off].sum(axis=0), 0.0)
         _keep(change, np.array(chosen[::-1]), rules.parents, rules.free, room, kept)
     if rules.on:
         kept[rules.on] = True
@@ -226,6 +228,16 @@ def _keep(change, rows, parents, free, room, kept):
                     continue
             total += change[row, t]
             kept[row, t] = not total <= room[t]
+
+
+@njit(cache=True, error_model="numpy")
+def _left_out(kept, change):
+    """Sum of the changes by what is not kept, (tiles,)."""
+    total = np.zeros(change.shape[1])
+    for i in range(change.shape[0]):
+        for t in range(total.size):
+            total[t] += 0.0 if kept[i, t] else change[i, t]
+    return total
 
 
 @njit(cache=True, error_model="numpy")

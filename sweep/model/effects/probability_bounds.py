@@ -29,13 +29,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.change import NOTHING, Bound, Change, Mean
+from sweep.model.effects.change import NONE, NOTHING, Bound, Change, Mean
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1_pair
 
 _HUGE = 1e12
 _LN_10 = math.log(10.0)
-_WEAK, _STRONG, _DOWN, _UP, _ADDED, _SHARE, _FIELDS = range(7)
+_WEAK, _STRONG, _DOWN, _UP, _ADDED, _SHARE, _SHIFT, _ALARMS, _FIELDS = range(9)
+_OF_NONE = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0])
+"""Fields of a change of nothing."""
 _NO_NOISE = 1e-200
 """Factor of noise that is as good as none, as of what saturates."""
 _NEGLIGIBLE = 1e-12
@@ -88,14 +90,7 @@ def probability_changes(
         asked = zip(bounds, spreads, strict=True)
         moves = np.array([spread for bound, spread in asked if isinstance(bound, Change)])
         leaking[moves] = out[leakage]
-    found = iter(_changes(table, ends, leaking))
-    for row, bound in zip(out, bounds, strict=True):
-        if isinstance(bound, Change):
-            row[:] = next(found)
-            if bound.shift is not NOTHING:
-                np.maximum(row, np.max(np.atleast_2d(bound.shift), axis=0), out=row)
-            if bound.alarms is not NOTHING:
-                np.maximum(row, bound.alarms, out=row)
+    out[[isinstance(bound, Change) for bound in bounds]] = _changes(table, ends, leaking)
     return np.minimum(out, 1.0)
 
 
@@ -118,6 +113,7 @@ def _table(
     """Changes as compiled formulas take them; ends of what there is without, (2, 2, 3, tiles)."""
     tiles = np.shape(amplitude.low)[1]
     table = np.empty((len(changes), _FIELDS, 3, tiles))
+    table[:] = _OF_NONE[:, None, None]
     for entry, change in zip(table, changes, strict=True):
         _fill(entry, change)
     _finish(table.reshape(len(changes), _FIELDS, 3 * tiles))
@@ -145,6 +141,7 @@ def pd_change_within(
     """
     ends = np.array(np.broadcast_arrays(*amplitude, *threshold), dtype=float)
     entry = np.empty((_FIELDS, *ends.shape[1:]))
+    entry.T[...] = _OF_NONE
     _fill(entry, change)
     _finish(entry.reshape(1, _FIELDS, -1))
     flat = _each_within(entry.reshape(_FIELDS, -1), ends.reshape(4, -1))
@@ -152,10 +149,15 @@ def pd_change_within(
 
 
 def _fill(entry: np.ndarray, change: Change) -> None:
-    """Ends of signal and noise, what is added, and whether the threshold follows."""
-    entry[_WEAK], entry[_STRONG] = change.signal
-    entry[_DOWN], entry[_UP] = change.noise
-    entry[_ADDED], entry[_SHARE] = change.added, change.threshold_follows
+    """Put in what differs from nothing: ends of signal and noise, what is added, and so on."""
+    if change.signal is not NONE:
+        entry[_WEAK], entry[_STRONG] = change.signal
+    if change.noise is not NONE:
+        entry[_DOWN], entry[_UP] = change.noise
+        entry[_SHARE] = change.threshold_follows
+    for row, value in (_ADDED, change.added), (_SHIFT, change.shift), (_ALARMS, change.alarms):
+        if value is not NOTHING:
+            entry[row] = value
 
 
 @njit(cache=True, error_model="numpy")
@@ -195,6 +197,8 @@ def _changes(table, ends, leaking):
             total, other = 0.0, 0.0
             for s in range(segments):
                 own = table[i, :, s, t]
+                besides = np.maximum(own[_SHIFT], own[_ALARMS])
+                other = max(other, besides if besides < 1.0 else 1.0)
                 if not _does_anything(own):
                     continue
                 low, high, lower, upper = _with_others(table, ends, i, s, t)
@@ -256,7 +260,7 @@ def _magnitude_change(own, low, high):
 @njit(cache=True, error_model="numpy")
 def _within(own, low, high, lower, upper):
     """Largest change of pd by one effect from anywhere within intervals."""
-    weak, strong, down, up, added, _ = own
+    weak, strong, down, up, added = own[:_SHARE]
     low, high = min(low, _HUGE), min(high, _HUGE)
     if low == high and lower == upper and added == 0.0:
         without = marcum_q1_pair(low, lower)[0]

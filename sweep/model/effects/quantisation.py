@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import Span, any_holds, monotone
+from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import Shots
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def truth_quantise(voltage: np.ndarray, *, full_scale: float, bits: int) -> np.n
 def bound(block: "Block") -> Change | None:
     """Change by rounding, without clipping; the threshold is set on it."""
     bits = block[_BITS]
-    if not any_holds(np.greater(bits.high, 0)):
+    if not block.has(_BITS):
         return None
     lsb = monotone(
         step, falling=("bits",), full_scale=block["instrument.processing.full_scale"], bits=bits

@@ -14,9 +14,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
+from sweep.model.effects.columns import columns, product_of
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.phase_bounds import (
     Error,
@@ -25,6 +27,7 @@ from sweep.model.effects.phase_bounds import (
     error_change,
     over_record,
 )
+from sweep.model.effects.span import Span
 from sweep.model.preparation import PhaseError, Shots
 
 if TYPE_CHECKING:
@@ -81,9 +84,22 @@ def error(block: "Block") -> Error | None:
     """The phase that range walk adds over a block's tiles."""
     if not block.has("target.radial_velocity"):
         return None
-    drift = block.chirp_rate * block.beta * (1 + 0.5 * block.beta)
-    walk = over_record({2: drift}, start=block.start, duration=block.record_duration)
+    rate, beta = block.chirp_rate, block.beta
+    table, shape = columns(rate.low, rate.high, beta.low, beta.high)
+    drift = np.empty((2, *shape))
+    _put_drifts(table, drift.reshape(2, -1))
+    terms = {2: Span(drift[0], drift[1])}
+    walk = over_record(terms, start=block.start, duration=block.record_duration)
     return by_segment(block, walk, None, walk)
+
+
+@njit(cache=True, error_model="numpy")
+def _put_drifts(table, out):
+    """Ends of S beta (1 + beta / 2), (2, n), from those of S and beta."""
+    for i in range(out.shape[1]):
+        beta = table[2, i], table[3, i]
+        moved = product_of((table[0, i], table[1, i]), beta)
+        out[0, i], out[1, i] = product_of(moved, (1.0 + 0.5 * beta[0], 1.0 + 0.5 * beta[1]))
 
 
 def bound(block: "Block") -> Change | None:

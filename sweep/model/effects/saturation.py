@@ -33,7 +33,7 @@ from sweep.model.effects import (
 )
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import Span, any_holds
+from sweep.model.effects.span import Span
 from sweep.model.preparation import Shots
 from sweep.model.unsupported import UnsupportedShot
 
@@ -225,7 +225,7 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
 
 def bound(block: "Block") -> Change | None:
     """What leaving clipping out can change, (tiles,), whatever else is noise or dims the echo."""
-    if not any_holds(np.greater(block[_FULL_SCALE].high, 0)):
+    if not block.has(_FULL_SCALE):
         return None
     limits = [np.asarray(v, float) for v in (block[_FULL_SCALE].low, block[_FULL_SCALE].high)]
     echo = block.echo * Span.hull(1.0, block.echo_ratio)

@@ -231,6 +231,8 @@ def turbulence_of(p: Mapping[str, np.ndarray]) -> Turbulence | None:
 
 def bound(block: "Block") -> Mean | None:
     """What leaving twinkling out can change of mean probabilities."""
+    if block.word(_TURBULENCE) == "none":
+        return None
     numbers = {_CONSTANT: np.ravel(block[_CONSTANT].low)[0]}
     air = turbulence_of(numbers | {_TURBULENCE: block.word(_TURBULENCE)})
     if air is None:

@@ -24,8 +24,8 @@ NAME = "signal_shot_noise"
 
 def bound(block: "Block") -> Change:
     """Change by the echo's shot noise, which the threshold does not follow."""
-    light = block.echo_scale * block.echo * Span.hull(1.0, block.echo_ratio)
-    variance = light * block.shot_noise_scale
+    more = Span.hull(1.0, block.echo_ratio)
+    variance = block.echo_scale.times(block.echo, more, block.shot_noise_scale)
     return added_noise.change(
         least=variance.low,
         largest=variance.high,

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 Operand = Union["Span", float, int, np.ndarray]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen: that takes three times as long to make
 class Span:
     """Least and largest value, scalars or arrays that broadcast against each other's shapes."""
 
@@ -95,6 +95,14 @@ class Span:
         return _extremes(self.low * o.low, self.low * o.high, self.high * o.low, self.high * o.high)
 
     __rmul__ = __mul__
+
+    def times(self, *others: Operand) -> "Span":
+        """Product with others, all of which are known never to be negative."""
+        low, high = self.low, self.high
+        for other in others:
+            o = Span.of(other)
+            low, high = low * o.low, high * o.high
+        return Span(low, high)
 
     def __truediv__(self, other: Operand) -> "Span":
         """Infinite to both sides where the divisor's span holds 0 and is not 0 itself."""
@@ -178,12 +186,15 @@ def monotone(
     **values
         The arguments.
     """
-    spans = {name: Span.of(value) for name, value in values.items()}
-    low = {name: s.high if name in falling else s.low for name, s in spans.items()}
-    if all(s.low is s.high for s in spans.values()):
+    low, high, is_one = {}, {}, True
+    for name, value in values.items():
+        span = Span.of(value)
+        is_one &= span.low is span.high
+        ends = (span.high, span.low) if name in falling else (span.low, span.high)
+        low[name], high[name] = ends
+    if is_one:
         one = function(**low)
         return Span(one, one)
-    high = {name: s.low if name in falling else s.high for name, s in spans.items()}
     return Span(function(**low), function(**high))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from sweep.model import detection, ground, link, noise, receiver, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.columns import columns
+from sweep.model.effects.line_spread import instrument_ends
 from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, TELESCOPE
 from sweep.model.window import Window, canonical_name, window
@@ -18,7 +19,7 @@ Parameters = Mapping[str, Span | str]
 _INSTRUMENT = (
     "architecture", "fft_size", "window", "carriers", "chirp_rate", "bin_width", "record_duration",
     "electrical_bandwidth", "noise_scale", "shot_noise_scale", "noise_variance", "deviation",
-    "threshold", "beamlets", "words", "most_turns", "turn_of_bin",
+    "threshold", "beamlets", "words", "most_turns", "instrument_ends", "turn_of_bin",
 )  # fmt: skip
 """What the instrument alone makes, whatever the beams meet."""
 
@@ -169,6 +170,16 @@ class TileLink:
         return self.sample_rate / self.fft_size
 
     @cached_property
+    def instrument_ends(self) -> np.ndarray:
+        """What lines on the axis follow from, but for their ranges and velocities."""
+        return instrument_ends(
+            chirp_rate=self.chirp_rate,
+            carriers=self.carriers,
+            bin_width=self.bin_width,
+            **self._receiver("detector_bandwidth", "amplifier_bandwidth"),
+        )
+
+    @cached_property
     def record_duration(self) -> Span:
         """Length of the record L/fs [s]."""
         return self.window.length / self.sample_rate
@@ -206,7 +217,7 @@ class TileLink:
             echo_power_scale=self.echo_scale,
             **self._receiver(*names),
         )
-        return current * self[RECEIVER + "transimpedance"]
+        return current.times(self[RECEIVER + "transimpedance"])
 
     @cached_property
     def noise_scale(self) -> Span:

@@ -11,6 +11,7 @@ from sweep.model.effects.line_spread import (
     Moments,
     axis_ends,
     image_factor,
+    instrument_ends,
     moved_change,
     power_range,
     range_to_bins,
@@ -97,15 +98,12 @@ def ends_of(rng, tiles):
         low = rng.uniform(-1, 1, tiles) * scale if scale < 1 else rng.uniform(0.5, 1, tiles) * scale
         return Span(low, low + rng.uniform(0, 0.2, tiles) * abs(scale))
 
-    given = {"range": span(1e3), "chirp_rate": span(1e13), "bin_width": span(1e5)}
-    carriers, beta = (span(2e14), span(2e14), span(2.1e14)), span(1e-6)
+    given = {"chirp_rate": span(1e13), "bin_width": span(1e5)}
+    carriers, beta, far = (span(2e14), span(2e14), span(2.1e14)), span(1e-6), span(1e3)
     bandwidths = {"detector_bandwidth": span(1e9), "amplifier_bandwidth": span(2e9)}
-    return (
-        axis_ends(tiles, carriers=carriers, beta=beta, **given, **bandwidths),
-        given,
-        carriers,
-        beta,
-    )
+    instrument = instrument_ends(carriers=carriers, **given, **bandwidths)
+    ends = axis_ends(tiles, instrument, range=far, beta=beta)
+    return ends, {"range": far, **given}, carriers, beta
 
 
 def test_spreads_are_what_ranges_and_velocities_make_at_the_ends():

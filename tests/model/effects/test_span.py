@@ -78,6 +78,14 @@ def test_arrays_leave_arithmetic_to_spans():
     assert not span.is_one and Span(np.ones(3), np.ones(3)).is_one
 
 
+@given(number, number, share, number, number, share)
+def test_products_of_what_is_never_negative_are_products(a, b, u, c, d, v):
+    (one, x), (two, y) = span_and_point(abs(a), abs(b), u), span_and_point(abs(c), abs(d), v)
+    found, usual = one.times(0.5, two, y), 0.5 * one * two * y
+    assert (found.low == usual.low).all() and (found.high == usual.high).all()
+    assert found.holds(x * 0.5 * y * y).all()
+
+
 def test_monotone_functions_are_taken_at_their_ends():
     found = monotone(lambda x, y: x / y, falling=("y",), x=Span(1.0, 2.0), y=Span(4.0, 8.0))
     assert (found.low, found.high) == (0.125, 0.5)
