@@ -62,10 +62,6 @@ class Moments(NamedTuple):
     rms: np.ndarray | float
     extreme: np.ndarray | float
 
-    def scaled(self, factor: ArrayLike) -> "Moments":
-        """Offsets in another unit."""
-        return Moments(*(np.multiply(value, factor) for value in self))
-
 
 NO_SPREAD = Moments(0.0, 0.0, 0.0)
 

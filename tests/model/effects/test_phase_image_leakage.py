@@ -15,10 +15,11 @@ from effect_points import (
 )  # fmt: skip
 from windows import marked
 
-from sweep.model.effects import footprint_phase, image
+from sweep.model.effects import footprint_phase, image, leakage
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.change import pd_change
 from sweep.model.effects.planning import plan
+from sweep.model.effects.span import Span
 from sweep.model.shot import find
 from sweep.model.spectra import segment_spectrum
 
@@ -257,3 +258,16 @@ def test_an_image_is_kept_where_a_bin_more_or_less_is_above_the_tolerance(table_
     one = 1 / np.log(10) / 2**12
     fine, coarse = (plan(block, {}, share * one, only).kept for share in (0.9, 1.2))
     assert fine.all() == (counted == "half") and not coarse.any()
+
+
+def test_thresholds_that_effects_raise_leak_more_and_drowned_ones_anything(table_4_1):
+    block = point_block(scene(table_4_1, 40, 3, fft_size=2**12, window="hann", beamlets=1))
+    level, magnitude = block.threshold.high, block.amplitude
+
+    def leaks(low, high):
+        return leakage.probability_bound(block, amplitude=magnitude, threshold=Span(low, high))
+
+    still, higher = leaks(level, level), leaks(level, 1.5 * level)
+    some = (still > 1e-9) & (higher < 1)
+    assert some.any() and (higher[some] >= 1.2 * still[some]).all()
+    assert (leaks(0.0 * level, level) == 1).all()
