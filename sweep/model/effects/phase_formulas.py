@@ -201,8 +201,8 @@ def _peak(axis, width, powers, beamlets, lobe, record):
     slopes = 0.0
     for k in range(4):
         slopes += (k + 1) * powers[k]
-    images = image_factor_of(edge, away + 2 * slopes * fft_size / length, sizes[2])
     extreme = away + 6 * width
+    images = image_factor_of(edge, extreme + 2 * slopes * fft_size / length, sizes[2])
     anywhere, spread = (0.5, 0.0, edge, tilt), (mean, np.hypot(rms, width), extreme)
     bounds = extremes_of(beamlets, tables)
     least, most = power_range_of(anywhere, spread, bounds, tables, sizes)
