@@ -86,10 +86,8 @@ costs depends on those that are computed beside it, as they share what is worked
 times are taken on stretches of the blocks that the study computes, some thousands of points each,
 around points of the sample. They are those that the processor spends on the work. The best round
 counts for them, and ratios are medians of those within each round, or of the best where there are
-but two. Planning is counted with what it plans; storing is not counted. Of a flight it takes some
-0.8 ms a block, however few shots that has: a twelfth of the time of a thousand shots, which take
-10 ms in all. Of fewer, or of a few points of a grid, fixed settings are the faster ones, and
-`sweep accuracy` says so.
+but two. Planning is counted with what it plans. Storing is not counted, as all settings share it,
+but told beside: the processor's time for making the store and writing its blocks.
 
 The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
 the differences from the reference in a probability of detection, of the segments and the shot, in
@@ -114,7 +112,12 @@ form stand beside them too.
 
 Two things are asked of the adaptive settings, and the answers below are computed: at equal error
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5
-times as fast as the thesis's way at the error that this has.
+times as fast as the thesis's way at the error that this has. Planning a block of a flight takes
+some 0.8 ms, however few shots that has: a twelfth of the time of a thousand shots, which take 10 ms
+in all. Of fewer, or of a few points of a grid, fixed settings are the faster ones by more than
+10 %, which is a millisecond: next to nothing of all that such a study takes, as the making of its
+store alone takes a hundred. `sweep accuracy` then says both: what is lost, and what that comes to
+with the store.
 """
 
 TAIL = """

@@ -36,7 +36,7 @@ class Called(NamedTuple):
     error: np.ndarray
     """Largest change of a probability that all that is left out may make."""
 
-    def some(self, index: np.ndarray) -> Called:
+    def some(self, index: slice | np.ndarray) -> Called:
         """What is simulated at some of the points."""
         return Called(self.flags[index], self.error[index])
 

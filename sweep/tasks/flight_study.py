@@ -171,15 +171,14 @@ class FlightStudy:
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
         stretches, part = self.part(block)
-        first, stop = stretches.shot_range(part)
-        reader = self._reader(part.scanner)
-        shots, eyepoints = reader.shots(first, stop)
-        results = shots | reader.cycles(*stretches.cycle_range(part))
-        called = self.called(block)
+        begin, own, shots, around = self._in_tiles(stretches, part)
+        called = self.call(part, around, first=begin).some(own)
+        shots = {name: values[own] for name, values in shots.items()}
+        results = shots | self._reader(part.scanner).cycles(*stretches.cycle_range(part))
         results |= {"effects": called.flags, "effects_error": called.error}
         known = self.earlier.known(block, called) if self.earlier else KnownCloud()
-        numbers = np.arange(first, stop)
-        results |= self.look(part, shots, eyepoints, called, numbers, known)
+        numbers = np.arange(begin + own.start, begin + own.stop)
+        results |= self.look(part, shots, around.some(own), called, numbers, known)
         depth = len(part.axes)
         return {
             f"{part.scanner}/{name}": values.reshape((1,) * depth + values.shape)
@@ -200,13 +199,17 @@ class FlightStudy:
     def called(self, block: int) -> Called:
         """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
         stretches, part = self.part(block)
+        begin, own, _, around = self._in_tiles(stretches, part)
+        return self.call(part, around, first=begin).some(own)
+
+    def _in_tiles(self, stretches: Stretches, part: Part) -> tuple[int, slice, Results, Eyepoints]:
+        """Number of the first shot of a block's tiles, its own among these, and what they see."""
         first, stop = stretches.shot_range(part)
         total = stretches.total_cycles * stretches.shots_a_cycle
         begin = first // TILE_SHOTS * TILE_SHOTS
         end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total)
-        _, around = self._reader(part.scanner).shots(begin, end)
-        called = self.call(part, around, first=begin)
-        return called.some(np.arange(first - begin, stop - begin))
+        shots, eyepoints = self._reader(part.scanner).shots(begin, end)
+        return begin, slice(first - begin, stop - begin), shots, eyepoints
 
     def call(self, part: Part, eyepoints: Eyepoints, *, first: int = 0) -> Called:
         """What is simulated of shots, the first of this number."""

@@ -10,8 +10,8 @@ from small import STUDY, small
 from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
-from sweep.tasks import progress
-from sweep.tasks.accuracy import flight_bench, measure, rungs
+from sweep.tasks import progress, store
+from sweep.tasks.accuracy import flight_bench, measure, rungs, storing
 from sweep.tasks.accuracy.bench import Seen
 from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
 from sweep.tasks.accuracy.grid_bench import GridBench
@@ -19,6 +19,7 @@ from sweep.tasks.accuracy.run import measure as measured
 from sweep.tasks.accuracy.sample import by_chance, neighbours, spread
 from sweep.tasks.errors import StoreError
 from sweep.tasks.stretches import Part
+from sweep.tasks.studies import study_of
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}
 
@@ -167,6 +168,7 @@ def test_the_store_has_errors_by_rung_and_point_and_seconds_by_rung_and_round(co
     assert (dataset.seconds > dataset.planning).all() and (dataset.planning >= 0).all()
     assert dataset.seconds.attrs["units"] == "s" and dataset.pd_error.attrs["long_name"]
     assert dataset.attrs["kind"] == "accuracy" and dataset.attrs["study_points"] == 72
+    assert 1e-4 < dataset.attrs["storing_seconds"] < 10
     assert json.loads(dataset.attrs["spec"])["title"] == spec.title
     assert {"processor", "numpy"} <= set(dataset.attrs["environment"])
     grazing = dataset.grazing_angle
@@ -366,6 +368,34 @@ def test_what_leaks_counts_as_a_probability_does():
 @pytest.mark.parametrize(("true", "found", "error"), [(2.0, 2.2, 0.1), (0.1, 0.2, 0.2)])
 def test_magnitudes_are_off_by_so_much_of_themselves_or_of_sigma(true, found, error):
     assert measure.apart(seen([1.0], found), seen([1.0], true))[2] == pytest.approx([error])
+
+
+@pytest.mark.parametrize(
+    "spec, name",
+    [
+        (small(storage={"block_points": 24}), "pd_shot"),
+        (small(draws={"number": 20, "batch": 8}, axes={}), "n_detected_shot"),
+        (small_scene(storage={"block_shots": 30}), "three/pd_shot"),
+    ],
+    ids=["blocks", "one point", "flight"],
+)
+def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
+    spec, name, monkeypatch, tmp_path
+):
+    study, ticks, written = study_of(spec, tmp_path / "a.zarr"), itertools.count(), []
+    write = store.Arrays.write
+
+    def noted(self, block, results):
+        written.append((block, results))
+        return write(self, block, results)
+
+    monkeypatch.setattr(store.Arrays, "write", noted)
+    monkeypatch.setattr(storing, "process_time", lambda: float(next(ticks)))
+    assert storing.storing(study) == 1.0 + study.n_blocks
+    assert {block for block, _ in written} == {study.n_blocks // 2}
+    # Whole chunks of all the block's arrays: anything else would have been refused.
+    assert written[0][1].keys() == study.chunks(study.n_blocks // 2).keys() >= {name}
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_store_in_the_way_is_refused_and_left_alone(tmp_path, undisturbed):

@@ -82,11 +82,14 @@ class Setting:
         """Error of pd that this share of the points stays below."""
         return float(np.nanquantile(self.pd_error, share))
 
-    def times_faster(self, other: Setting) -> float:
-        """Time of another over that of this, round by round, in the median; of few, at best."""
+    def times_faster(self, other: Setting, besides: float = 0.0) -> float:
+        """Time of another over that of this, round by round, in the median; of few, at best.
+
+        Both with what a point takes besides [s].
+        """
         if self.rounds.size < FEW_ROUNDS:
-            return other.seconds / self.seconds
-        return float(np.median(other.rounds / self.rounds))
+            return (other.seconds + besides) / (self.seconds + besides)
+        return float(np.median((other.rounds + besides) / (self.rounds + besides)))
 
 
 def settings_in(dataset: xr.Dataset) -> list[Setting]:
@@ -153,7 +156,11 @@ class Duel:
     @property
     def times_faster(self) -> float:
         """How many times faster the adaptive one is; inf against nothing."""
-        return self.adaptive.times_faster(self.other) if self.other else float("inf")
+        return self.with_besides(0.0)
+
+    def with_besides(self, seconds: float) -> float:
+        """The same, with what both take besides [s], a point."""
+        return self.adaptive.times_faster(self.other, seconds) if self.other else float("inf")
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:

@@ -70,7 +70,7 @@ def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
     """What it comes to, in words."""
     attributes = dataset.attrs
     found = [_written(dataset, settings)]
-    found += _fixed(of.against_fixed(settings), attributes["study_points"])
+    found += _fixed(of.against_fixed(settings), attributes)
     found += _thesis(settings, attributes["thesis_beamlets"]) + _like_for_like(settings)
     found.append(_reference(attributes))
     found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
@@ -93,31 +93,43 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     best = of.cheapest(of.candidates(settings), written.error)
     text = (
         f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
-        f"all {number:,} {unit} take {_time(number * written.seconds)} on one core"
+        f"all {number:,} {unit} take {_time(number * written.seconds)} on one core, and "
+        f"{_time(dataset.attrs['storing_seconds'])} to be stored, whatever the setting"
     )
     if best is None or best is written or best.times_faster(written) < 1.05:
         return text + ". Nothing tried is faster and as accurate."
     return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
 
 
-def _fixed(duels: Sequence[Duel], points: int) -> list[str]:
-    """Statement on adaptive against fixed settings, of a study of so many points."""
+def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
+    """Statement on adaptive against fixed settings."""
     if not duels:
         return []
     worst = min(duels, key=lambda duel: duel.times_faster)
     if worst.other is None:
         return ["At equal error: no fixed setting is as accurate as any adaptive one."]
-    kept = "kept"
-    if worst.times_faster < of.AS_FAST:
-        slower = worst.adaptive.seconds * (1 - worst.times_faster)
-        lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
-        kept = f"NOT kept, by {lost} in all; planning takes {planning}"
+    kept = "kept" if worst.times_faster >= of.AS_FAST else _lost(worst, duels, attributes)
     several = [duel.times_faster for duel in duels if duel.other]
     return [
         f"At equal error, adaptive against the best single fixed setting: {_span(several)} times "
         f"as fast; least {worst.adaptive.name} against {worst.other.name}. "
         f"Never slower by more than 10 %: {kept}."
     ]
+
+
+def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
+    """By how much an adaptive setting is slower, and whether that is much of all the study takes.
+
+    However few points a study has, its store is to be made, which is most of what it takes then.
+    """
+    points = attributes["study_points"]
+    slower = worst.adaptive.seconds * (1 - worst.times_faster)
+    lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
+    why = f"by {lost} in all; planning takes {planning}"
+    with_store = min(duel.with_besides(attributes["storing_seconds"] / points) for duel in duels)
+    if with_store < of.AS_FAST:
+        return f"NOT kept, {why}"
+    return f"kept with the study's store ({with_store:.2g}), NOT kept without, {why}"
 
 
 def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:

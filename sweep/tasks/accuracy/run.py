@@ -19,10 +19,11 @@ from sweep.tasks.accuracy.measure import (
     differences,
 )
 from sweep.tasks.accuracy.rungs import REFERENCE, THESIS, Rung
+from sweep.tasks.accuracy.storing import storing
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen
-from sweep.tasks.studies import ACCURACY
+from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout
 
 if TYPE_CHECKING:
@@ -92,9 +93,10 @@ def measure(
             ).run()
         except Nothing:
             return False
+    stored = storing(study_of(spec, store_path))  # type: ignore[arg-type]
     if store_path.exists():
         store.remove(store_path)
-    store.create(store_path, Content(spec, bench, measured))
+    store.create(store_path, Content(spec, bench, measured, stored))
     return True
 
 
@@ -114,10 +116,12 @@ class Content:
     ----------
     spec, bench, measured
         The study, the sample of its points, and what rungs came to on it.
+    stored
+        Time that storing all of it takes [s].
     """
 
-    def __init__(self, spec: Declared, bench: Bench, measured: Measured) -> None:
-        self._spec, self._bench, self._measured = spec, bench, measured
+    def __init__(self, spec: Declared, bench: Bench, measured: Measured, stored: float) -> None:
+        self._spec, self._bench, self._measured, self._stored = spec, bench, measured, stored
 
     @property
     def id(self) -> str:
@@ -137,6 +141,7 @@ class Content:
             "unit": self._bench.unit,
             "points": len(self._measured.done),
             "study_points": self._bench.whole,
+            "storing_seconds": self._stored,
             "notes": list(measured.ladder.notes),
             "thesis_beamlets": self._thesis_beamlets(),
             "stopped": measured.stopped,
