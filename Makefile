@@ -2,8 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+KERNELS := .venv/.kernels
 
-.PHONY: demo test test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: demo test test-fast test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -17,13 +18,16 @@ demo: $(READY)
 	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
 	$(BIN)/sweep figures results/quickstart.zarr
 
-# A compiled kernel's cache does not notice a change in a kernel that it calls: begin without it.
-test: $(READY) forget-kernels
-	$(MAKE) --jobs 3 --output-sync lint compile-grids compile-flights
+test: $(READY)
+	$(MAKE) --jobs 3 --output-sync lint $(KERNELS)
 	$(BIN)/pytest -n auto --dist worksteal --durations 12
 
-test-all: $(READY) forget-kernels
-	$(MAKE) --jobs 2 compile-grids compile-flights
+test-fast: $(READY)
+	$(MAKE) --jobs 2 --output-sync $(KERNELS)
+	$(BIN)/pytest -n auto --dist worksteal -m 'not slow and not long'
+
+test-all: $(READY)
+	$(MAKE) --jobs 2 --output-sync $(KERNELS)
 	$(BIN)/pytest -n auto --dist worksteal -m '' --hypothesis-profile anew
 
 lint: $(READY)
@@ -31,7 +35,13 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Once for all processes of tests, which would each compile the same.
+# Once for all processes of tests, which would each compile the same. A compiled kernel's cache does
+# not notice a change in a kernel that it calls: where any has changed it begins anew.
+$(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
+	$(MAKE) forget-kernels
+	$(MAKE) compile-grids compile-flights
+	touch $@
+
 compile-%: $(READY)
 	$(BIN)/python tests/compiling.py $*
 

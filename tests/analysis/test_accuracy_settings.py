@@ -238,6 +238,34 @@ def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dat
     assert "1e-1 … 1e-3" in words and "1e-4" in words and "1e-3" not in words
 
 
+def test_names_keep_off_marks_and_each_other(dataset):
+    """A ladder of beamlets right below one of tolerances, as in a landing."""
+    found = settings.settings_in(dataset)
+    adaptive, beamlets = found[2], found[4]
+    crowd = [
+        replace(like, name=name, tolerance=tolerance, rounds=1e-6 * np.array([us]), likely=1.0,
+                pd_error=np.full(3, error), log10_pfa_error=0.0, magnitude_error=0.0)
+        for like, name, tolerance, us, error in (
+            (adaptive, "auto at 0.01", 1e-2, 10.0, 3e-3), (adaptive, "", 1e-3, 13.5, 5e-4),
+            (beamlets, "61 beamlets", np.nan, 10.5, 3.2e-3),
+            (beamlets, "109 beamlets", np.nan, 13.6, 7e-4),
+            (beamlets, "223 beamlets", np.nan, 22.0, 9e-4),
+        )
+    ]  # fmt: skip
+    sheet = figure.draw(dataset, [*found, *crowd])
+    (axes,) = sheet.axes
+    names = [text.get_window_extent() for text in axes.texts]
+    assert len(names) >= 8
+    marks = [
+        axes.transData.transform((line.get_xdata()[0], line.get_ydata()[0]))
+        for line in axes.lines
+        if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
+    ]
+    for i, name in enumerate(names):
+        assert not name.count_overlaps(names[:i]), axes.texts[i].get_text()
+        assert not any(name.contains(*mark) for mark in marks), axes.texts[i].get_text()
+
+
 def test_a_store_of_another_kind_is_refused(tmp_path):
     with pytest.raises(NotAStoreError, match="there is no store"):
         report.opened(tmp_path / "none.zarr")

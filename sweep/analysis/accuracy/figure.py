@@ -9,10 +9,13 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.transforms import Bbox
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.accuracy import settings as of
+from sweep.analysis.accuracy import text
 from sweep.analysis.accuracy.settings import Setting
 
 FLOOR = of.EXACT
@@ -44,21 +47,31 @@ HALO = [withStroke(linewidth=2.5, foreground="white")]
 """What keeps a name readable upon lines; marks are drawn upon it."""
 
 
+PLACES = ((6, 5), (-6, -10), (6, -10), (-6, 5), (6, 15), (-6, -20), (6, -20), (-6, 15))
+"""Where a name may stand: right of its mark and above it, or left and below [points]."""
+
+MARK_SIZE = 7
+"""Width of most marks [points]."""
+
+
 def draw(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
     """The figure of a store that `sweep accuracy` made."""
     drawn = of.candidates(settings)
     sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
     _front(axes, of.front(drawn))
+    names: list[Annotation] = []
     for kind, (marker, colour, words) in MARKS.items():
         some = of.of_kinds(drawn, kind)
         for i, setting in enumerate(some):
             _mark(axes, setting, marker, colour, words if i == 0 else "")
         if kind in JOINED:
             _join(axes, some, colour)
-        _name(axes, some, above=kind not in BY_NUMBER)
+        names += _names(axes, some, above=kind not in BY_NUMBER)
     _finish(axes, min(_shown(setting.quantile(0.5)) for setting in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
+    sheet.draw_without_rendering()
+    _keep_apart(axes, names, drawn)
     return sheet
 
 
@@ -71,7 +84,7 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
         axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
     if half > FLOOR:
         axes.plot([time], [half], marker=".", color=colour, markersize=4, zorder=2)
-    size = 11 if marker == "*" else 7
+    size = 11 if marker == "*" else MARK_SIZE
     axes.plot(
         [time], [worst], marker=marker, color=colour, markersize=size, linestyle="",
         markeredgecolor="white", markeredgewidth=0.7, label=words or None, zorder=4,
@@ -89,20 +102,45 @@ def _place(setting: Setting) -> float:
     return _shown(setting.error)
 
 
-def _name(axes: Axes, settings: Sequence[Setting], above: bool) -> None:
+def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotation]:
     """Short names beside marks; settings whose marks are all but one have one name."""
+    found = []
     for together in _clusters(settings):
         ladder = [_short(setting) for setting in settings if setting in together]
         names = list(dict.fromkeys(filter(None, ladder)))
         if names:
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             beside = together[-1] if above else together[0]
-            axes.annotate(
-                text, (1e6 * beside.seconds, _place(beside)),
-                xytext=(6, 5) if above else (-6, -10), ha="left" if above else "right",
+            name = axes.annotate(
+                text, (1e6 * beside.seconds, _place(beside)), xytext=PLACES[0],
                 textcoords="offset points", fontsize=7.5, color=MARKS[beside.kind][1],
                 path_effects=HALO, zorder=3,
             )  # fmt: skip
+            _put(name, PLACES[0 if above else 1])
+            found.append(name)
+    return found
+
+
+def _put(name: Annotation, place: tuple[float, float]) -> None:
+    """A name so far to the right of its mark, and above it [points]."""
+    name.set_position(place)
+    name.set_horizontalalignment("left" if place[0] > 0 else "right")
+
+
+def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Setting]) -> None:
+    """Move names off marks and off each other, where another place beside their marks is free."""
+    marks = [axes.transData.transform((1e6 * s.seconds, _place(s))) for s in settings]
+    half = MARK_SIZE / 2 * canvas.DPI / 72
+    taken = [Bbox([mark - half, mark + half]) for mark in marks]
+    for name in names:
+        own = name.get_position()
+        for place in (own, *PLACES):
+            _put(name, place)
+            if not name.get_window_extent().count_overlaps(taken):
+                break
+        else:
+            _put(name, own)
+        taken.append(name.get_window_extent())
 
 
 def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
@@ -176,10 +214,10 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
         f"reference: {attributes['reference']}",
     ]
     if attributes["truth_points"]:
-        difference = attributes["truth_pd_difference"]
+        difference = text.error(attributes["truth_pd_difference"])
         parts.append(
             f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
-            f"{difference:.0e} of it"
+            f"{difference} of it"
         )
     parts.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")
     return labels.joined(parts)
