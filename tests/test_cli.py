@@ -213,6 +213,19 @@ def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
 
 
+def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
+    here, monkeypatch
+):
+    from sweep.model.unsupported import UnsupportedShot
+    from sweep.tasks import effects_table
+
+    def beyond(spec, **how):
+        raise UnsupportedShot("full scale is exceeded: raise it")
+
+    monkeypatch.setattr(effects_table, "effects_table", beyond)
+    refused(sweep("plan", "small.yaml"), "full scale is exceeded: raise it")
+
+
 DRAWN = """\
 draws: {limit: 60, batch: 20, method: noise}
 accuracy: {tolerance: 0.1}

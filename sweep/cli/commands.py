@@ -16,6 +16,7 @@ from sweep.cli.places import StorePath, shown
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
+    effects_of,
     grid_plan,
     scene_plan,
     tell_effects,
@@ -160,12 +161,14 @@ def plan(spec: Path, workers: int | None) -> None:
 
     study = load(spec)
     if isinstance(study, SceneSpec):
-        lines = scene_plan(study, _default_store(spec), workers)
+        lines = list(scene_plan(study, _default_store(spec), workers))
     else:
-        lines = grid_plan(study, workers)
+        lines = list(grid_plan(study, workers))
+    effects = effects_of(study, _default_store(spec))
+    # Nothing is printed before all is known: any of it may find a point that can't be simulated.
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
-    tell_effects(study, _default_store(spec))
+    tell_effects(effects)
 
 
 @main.command()

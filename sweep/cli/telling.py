@@ -216,9 +216,8 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
 
 
-def tell_effects(study: Spec | SceneSpec, store: Location) -> None:
+def tell_effects(table: EffectsTable) -> None:
     """Print which effects a study calls for, where, and what they cost; warn of what is off."""
-    table = _effects(study, store, costs=True)
     there = [row for row in table.rows if row.bound > 0 or row.share > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
     print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
@@ -235,10 +234,11 @@ def tell_effects(study: Spec | SceneSpec, store: Location) -> None:
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
     """Before a run: which effects are forced off though they matter."""
     if "off" in study.modes().values():
-        warn(_effects(study, store, costs=False))
+        warn(effects_of(study, store, costs=False))
 
 
-def _effects(study: Spec | SceneSpec, store: Location, *, costs: bool) -> EffectsTable:
+def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
+    """Which effects a study calls for, where, and what they cost if that is asked for."""
     from sweep.spec import SceneSpec
     from sweep.tasks.effects_table import effects_table, flight_effects_table
 
