@@ -116,6 +116,12 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
     assert told.endswith(": NOT kept, by 2e-05 s in all; planning takes 2e-05 s.")
 
 
+def test_a_store_of_an_earlier_version_does_not_say_what_storing_takes(dataset):
+    del dataset.attrs["storing_seconds"]
+    told = text.sentences(dataset, settings.settings_in(dataset))
+    assert "take 20 s on one core. Nothing tried" in told[0] and "NOT kept, by 2 s" in told[1]
+
+
 def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
     none = dataset.isel(rung=[0, 1, 2, 3, 10])
     duels = settings.against_fixed(settings.settings_in(none))

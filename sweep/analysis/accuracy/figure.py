@@ -109,10 +109,10 @@ def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotat
         ladder = [_short(setting) for setting in settings if setting in together]
         names = list(dict.fromkeys(filter(None, ladder)))
         if names:
-            text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            words = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             beside = together[-1] if above else together[0]
             name = axes.annotate(
-                text, (1e6 * beside.seconds, _place(beside)), xytext=PLACES[0],
+                words, (1e6 * beside.seconds, _place(beside)), xytext=PLACES[0],
                 textcoords="offset points", fontsize=7.5, color=MARKS[beside.kind][1],
                 path_effects=HALO, zorder=3,
             )  # fmt: skip

@@ -44,6 +44,9 @@ def cheapest_rows(settings: Sequence[Setting]) -> list[list[str]]:
     return found
 
 
+STORING = "storing_seconds"
+"""Attribute that stores of earlier versions lack."""
+
 SHORT = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
 
 
@@ -93,9 +96,10 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     best = of.cheapest(of.candidates(settings), written.error)
     text = (
         f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
-        f"all {number:,} {unit} take {_time(number * written.seconds)} on one core, and "
-        f"{_time(dataset.attrs['storing_seconds'])} to be stored, whatever the setting"
+        f"all {number:,} {unit} take {_time(number * written.seconds)} on one core"
     )
+    if (stored := dataset.attrs.get(STORING)) is not None:
+        text += f", and {_time(stored)} to be stored, whatever the setting"
     if best is None or best is written or best.times_faster(written) < 1.05:
         return text + ". Nothing tried is faster and as accurate."
     return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
@@ -126,7 +130,7 @@ def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
     slower = worst.adaptive.seconds * (1 - worst.times_faster)
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
     why = f"by {lost} in all; planning takes {planning}"
-    with_store = min(duel.with_besides(attributes["storing_seconds"] / points) for duel in duels)
+    with_store = min(duel.with_besides(attributes.get(STORING, 0.0) / points) for duel in duels)
     if with_store < of.AS_FAST:
         return f"NOT kept, {why}"
     return f"kept with the study's store ({with_store:.2g}), NOT kept without, {why}"
