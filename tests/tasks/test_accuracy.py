@@ -230,6 +230,28 @@ def test_what_is_timed_lies_in_the_points_own_block_at_other_powers_and_ranges_f
         assert len(set(map(tuple, places[:2, :left].T))) == left
 
 
+def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
+    """A study of one point has the cost of a call for it alone."""
+    rung, together = rungs.Rung(name="as written", kind=rungs.WRITTEN), []
+    ran = GridBench._run
+
+    def noted(self, rung, numbers):
+        together.append(len(numbers))
+        return ran(self, rung, numbers)
+
+    monkeypatch.setattr(GridBench, "_run", noted)
+    for spec, points, block in (
+        (small(footprint=COHERENT, axes={}), 1, 1),
+        (small(footprint=COHERENT, storage={"block_points": 24}), 8, 24),
+    ):
+        bench = GridBench(spec, points)
+        assert bench.most_times == block
+        together.clear()
+        bench.try_on(rung, np.arange(points), block)
+        assert together[0] == points and set(together[1:]) <= {block}
+        assert len(together) == 1 + points * (block > 1)
+
+
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))

@@ -94,9 +94,10 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     (written,) = of.of_kinds(settings, of.WRITTEN)
     number, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
     best = of.cheapest(of.candidates(settings), written.error)
+    whole = f"all {number:,} {unit} take" if number > 1 else "that is"
     text = (
         f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
-        f"all {number:,} {unit} take {_time(number * written.seconds)} on one core"
+        f"{whole} {_time(number * written.seconds)} on one core"
     )
     if (stored := dataset.attrs.get(STORING)) is not None:
         text += f", and {_time(stored)} to be stored, whatever the setting"

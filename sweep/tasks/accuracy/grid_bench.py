@@ -20,8 +20,9 @@ from sweep.tasks.grid import Grid
 if TYPE_CHECKING:
     from sweep.spec import Spec
 
-#: Places of a part at which stretches of a block are timed.
+#: Places of a part at which stretches of a block are timed, and points of a stretch at the most.
 PLACES = 12
+MOST_TIMES = 8192
 
 
 class GridBench:
@@ -38,7 +39,6 @@ class GridBench:
     """
 
     unit = "points"
-    most_times = 8192
     least_parts = 2
 
     def __init__(self, spec: Spec, points: int, seed: int | None = None) -> None:
@@ -71,6 +71,15 @@ class GridBench:
             self._names[rung.name] = frozenset(names)
         return self._names[rung.name]
 
+    @property
+    def most_times(self) -> int:
+        """Points of a block, as far as more of them cost no less each."""
+        return min(MOST_TIMES, self._block_points)
+
+    @property
+    def _block_points(self) -> int:
+        return math.prod(self._grid.block_shape)
+
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """A rung on a part of the sample; timed on stretches of so many points, or on the part.
 
@@ -82,8 +91,11 @@ class GridBench:
         timed = len(part)
         if times > 1:
             stretches = self._stretches(rung, numbers[:: -(-len(part) // PLACES)], times)
-            _, spent, planning = self._run(rung, stretches)
-            timed = stretches.size
+            # As many points together as a block has: what a call costs is shared by these alone.
+            together = np.array_split(stretches, -(-stretches.size // self._block_points))
+            runs = [self._run(rung, each)[1:] for each in together]
+            spent, planning = (sum(each) for each in zip(*runs, strict=True))
+            timed, planning = stretches.size, planning / len(runs)
         planning = planning if rung.plans else 0.0
         draws = int(self._calling_of(rung).tiles.grid.spec.draws.number)
         seen = seen_in(outputs, rung.estimate, draws)

@@ -178,7 +178,7 @@ class Measurement:
         """
         times, enough = 1, LONG_ENOUGH * self._limit
         while self._timed(0, parts[0]) < enough / 2 and times < self._bench.most_times:
-            times *= 2
+            times = min(2 * times, self._bench.most_times)
             self._times[0] = times
         shorter = max(1, times // FIRST_TRIED)
         self._times[:] = shorter
