@@ -43,6 +43,7 @@ def _thinned(spec):
     return Spec.from_mapping(mapping | {"axes": axes})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
 def test_experiment_runs_to_store_and_figures(path, tmp_path):
     spec = sweep.load(path)
@@ -81,6 +82,7 @@ def _lightened(path):
     return SceneSpec.from_mapping(mapping | few, base=path.parent)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
     spec = _lightened(path)

@@ -83,6 +83,7 @@ def workers(store) -> set[bytes]:
     return read_receipts(store, BLOCKS, since=0.0).workers
 
 
+@pytest.mark.long
 def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environment):
     store = here / "slow.zarr"
     asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
@@ -107,6 +108,7 @@ def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environm
     assert tree(store) == tree(here / "plain.zarr")
 
 
+@pytest.mark.long
 def test_jobs_that_the_batch_system_refuses_are_told_at_once(here, environment):
     cluster = yaml.safe_load((here / "slurm.yaml").read_text())
     cluster["job"]["queue"] = "absent"

@@ -63,6 +63,7 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
         assert language != "text" or before == "python"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "page",
     [

@@ -127,6 +127,7 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     assert tree(store) == undisturbed
 
 
+@pytest.mark.long
 def test_the_client_killed_with_its_workers(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:
@@ -187,6 +188,7 @@ def test_a_plain_loop_killed(tmp_path, undisturbed):
     finish(tmp_path, undisturbed)
 
 
+@pytest.mark.long
 def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:

@@ -29,6 +29,7 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
     assert sorted(receipts(undisturbed)) == list(range(12))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "place",
     [
@@ -221,6 +222,7 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     assert tree(path) == tree(undisturbed)
 
 
+@pytest.mark.long
 def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
     path = tmp_path / "small.zarr"
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):

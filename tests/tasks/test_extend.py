@@ -78,6 +78,7 @@ MORE = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axes, new", MORE.values(), ids=MORE)
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, axes, new
@@ -150,6 +151,7 @@ def test_many_grids_extended_to_larger_ones(tmp_path_factory, pair):
     see_that_it_extends(tmp_path_factory.mktemp("many"), pair)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("processes", [True, False], ids=["processes", "threads"])
 def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed, processes):
     store, spec = copied(undisturbed, tmp_path), small(axes=MORE["in between"][0])
@@ -221,6 +223,7 @@ MORE_DRAWS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("before, after, accuracy, tighter", MORE_DRAWS.values(), ids=MORE_DRAWS)
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 @pytest.mark.parametrize("scene", [{}, ROUGH], ids=["noise alone", "speckle"])
@@ -458,6 +461,7 @@ MOMENTS = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("again", ["extend", "resume"])
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(

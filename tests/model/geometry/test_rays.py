@@ -157,6 +157,7 @@ def closed():
     return vertices, faces, Caster(mesh), Caster(mesh, embree=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("embree", [True, False])
 @pytest.mark.parametrize("offset", [[0.0, 0.0, 0.0], [4e6, -3e6, 2e6]])
 def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale, offset, embree):
