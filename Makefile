@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 KERNELS := .venv/.kernels
 
-.PHONY: demo test test-fast test-all lint stability fuzz chaos bench effects accuracy stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: demo test test-fast test-all lint stability fuzz chaos bench effects accuracy blocks stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -85,6 +85,10 @@ promise: $(READY)
 
 detectors: $(READY)
 	$(BIN)/python benchmarks/detectors.py
+
+# Whole blocks of flights, effects on demand against fixed ones, three minutes.
+blocks: $(READY)
+	$(BIN)/python benchmarks/blocks.py
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py

@@ -100,7 +100,7 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
         f"{whole} {_time(number * written.seconds)} on one core"
     )
     if (stored := dataset.attrs.get(STORING)) is not None:
-        text += f", and {_time(stored)} to be stored, whatever the setting"
+        text += f", and at least {_time(stored)} to be stored, whatever the setting"
     if best is None or best is written or best.times_faster(written) < 1.05:
         return text + ". Nothing tried is faster and as accurate."
     return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
