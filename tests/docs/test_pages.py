@@ -102,6 +102,7 @@ def test_links_lead_to_files_that_are_there(page):
         assert re.match(r"https?:", link) or (page.parent / link).exists(), link
 
 
+@pytest.mark.long
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")

@@ -137,6 +137,7 @@ def test_the_client_killed_with_its_workers(tmp_path, undisturbed):
     finish(tmp_path, undisturbed)
 
 
+@pytest.mark.long
 def test_the_client_killed_while_its_cluster_lives_on(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with dask_cluster(tmp_path) as (scheduler, _, _):
@@ -147,6 +148,7 @@ def test_the_client_killed_while_its_cluster_lives_on(tmp_path, undisturbed):
         finish(tmp_path, undisturbed)
 
 
+@pytest.mark.long
 def test_a_worker_killed_its_blocks_go_to_the_other_one(tmp_path, undisturbed):
     store, log = tmp_path / "small.zarr", tmp_path / "log"
     with (
@@ -163,6 +165,7 @@ def test_a_worker_killed_its_blocks_go_to_the_other_one(tmp_path, undisturbed):
     assert all(Counter(evaluated(log))[block] == 1 for block in committed)
 
 
+@pytest.mark.long
 def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with (

@@ -121,7 +121,6 @@ def test_without_movement_up_and_down_chirp_are_alike(written):
     assert np.isnan(results["radial_velocity_error"]) or abs(results["radial_velocity_error"]) == 0
 
 
-@pytest.mark.long
 @settings(SOME)
 @given(written=studies())
 def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
@@ -137,7 +136,6 @@ def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
         assert np.array_equal(values, theirs[name], equal_nan=values.dtype.kind == "f"), name
 
 
-@pytest.mark.long
 @settings(SOME)
 @given(written=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
 def test_neither_seed_nor_blocks_change_what_is_not_random(written, seed, blocks):

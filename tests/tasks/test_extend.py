@@ -138,6 +138,7 @@ def see_that_it_extends(here, pair):
     shutil.rmtree(here)
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(pair=studies())
 def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):

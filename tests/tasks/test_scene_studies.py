@@ -96,6 +96,7 @@ def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monk
         assert tree(here) == tree(there)
 
 
+@pytest.mark.long
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
         "from small_flights import small_scene; from sweep.tasks.driver import run;"
