@@ -120,7 +120,7 @@ fewer, or of a few points of a grid, fixed settings that need no plan are the fa
 than 10 %, which is a millisecond. `sweep accuracy` then says both: what is lost, and what that
 comes to with the making of the study's store. A run plans fixed settings too, as its store tells
 what they leave out, and its blocks draw points and solve for velocities besides: `make blocks`
-times whole blocks of flights, in which fixed settings are no faster.
+times whole blocks of flights against both, planned and not.
 """
 
 TAIL = """

@@ -93,7 +93,7 @@ def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
     ]
     assert [d.times_faster for d in duels] == pytest.approx([1.2, 0.9, 5.0])
     (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
-    assert "0.9 to 5 times" in told and "NOT kept, by 2 s in all; planning takes 2 s." in told
+    assert "0.9 to 5 times" in told and "NOT kept, by 2 s in all; planning takes 2 s; with" in told
     dataset.seconds[5] *= 1.02  # 0.918 of its time: within the 10 %
     (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
     assert told.endswith(": kept.")
@@ -105,15 +105,11 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
     worst = settings.against_fixed(settings.settings_in(dataset))[1]
     # Rounds of 30, 20, 40 us against 27, 18, 36, and 3 us a point besides.
     assert worst.with_besides(3e-6) == pytest.approx(30 / 33)
-    dataset.attrs["storing_seconds"] *= 1.01
     (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
     assert "0.9 to 5 times" in told and told.endswith(
-        "kept with the study's store (0.91), NOT kept without, by 2e-05 s in all; planning takes "
-        "2e-05 s."
+        "NOT kept, by 2e-05 s in all; planning takes 2e-05 s; with the study's store it is 0.91 "
+        "times as fast."
     )
-    dataset.attrs["storing_seconds"] /= 1.03
-    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
-    assert told.endswith(": NOT kept, by 2e-05 s in all; planning takes 2e-05 s.")
 
 
 def test_a_store_of_an_earlier_version_does_not_say_what_storing_takes(dataset):

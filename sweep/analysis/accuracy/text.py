@@ -123,18 +123,18 @@ def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
 
 
 def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
-    """By how much an adaptive setting is slower, and whether that is much of all the study takes.
+    """By how much an adaptive setting is slower, and what that is of all that the study takes.
 
     However few points a study has, its store is to be made, which is most of what it takes then.
     """
     points = attributes["study_points"]
     slower = worst.adaptive.seconds * (1 - worst.times_faster)
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
-    why = f"by {lost} in all; planning takes {planning}"
-    with_store = min(duel.with_besides(attributes.get(STORING, 0.0) / points) for duel in duels)
-    if with_store < of.AS_FAST:
-        return f"NOT kept, {why}"
-    return f"kept with the study's store ({with_store:.2g}), NOT kept without, {why}"
+    told = f"NOT kept, by {lost} in all; planning takes {planning}"
+    if (stored := attributes.get(STORING)) is None:
+        return told
+    whole = min(duel.with_besides(stored / points) for duel in duels)
+    return f"{told}; with the study's store it is {whole:.2g} times as fast"
 
 
 def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
