@@ -12,6 +12,10 @@ from sweep.model.compiling import borrowing
 from sweep.model.effects import tile_geometry
 from sweep.model.effects.block import Block
 from sweep.model.effects.footprint_fields import FIELDS, ROOM, set_fields
+from sweep.model.effects.plain_changes import DISTANCE, VELOCITY
+from sweep.model.effects.plain_plan import plain_plan
+from sweep.model.effects.plain_scene import PlainScene
+from sweep.model.effects.planning import Plan, Rules
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
 from sweep.model.eyepoints import (
@@ -49,11 +53,8 @@ def block_of(
     values = np.empty((FIELDS + 1 + len(axes), len(eyepoints.time)))
     sun = instrument[SUNLIGHT]
     sent = np.empty(eyepoints.offset.size if not sun.is_zero else 0)
-    rays, materials = to_look_at(eyepoints, surfaces)
-    room = np.empty((ROOM + 5, materials[0].size))
-    beside = np.empty(materials[0].size, np.bool_)
     by_roots = instrument.architecture != "direct"
-    _look(rays, materials, by_roots, sent, room, beside, values[:FIELDS])
+    _put_fields(eyepoints, surfaces, by_roots, sent, values[:FIELDS])
     lit = sent.reshape(eyepoints.offset.shape).sum(axis=1) if sent.size else 0.0
     values[FIELDS] = sun.low * lit
     for row, value in zip(values[FIELDS + 1 :], axes.values(), strict=True):
@@ -64,6 +65,44 @@ def block_of(
     geometry = tile_geometry.of_fields(spans, rotating)
     parameters = {**instrument.parameters, "target.reflectance": Span.of(1.0), **seen}
     return Block(parameters, len(edges) - 1, geometry, instrument=instrument)
+
+
+def plain_plan_of(
+    eyepoints: Eyepoints,
+    scene: PlainScene,
+    surfaces: Sequence[Surface],
+    edges: np.ndarray,
+    rules: Rules,
+    tolerance: float,
+) -> Plan:
+    """The plan of some tiles of shots in a plain scene.
+
+    Parameters
+    ----------
+    eyepoints, surfaces, edges
+        As of :func:`block_of`.
+    scene : PlainScene
+        Of the instrument.
+    rules, tolerance
+        As of :meth:`sweep.model.effects.plain_plan.plain_plan`.
+    """
+    values = np.empty((FIELDS + 2, len(eyepoints.time)))
+    _put_fields(eyepoints, surfaces, True, np.empty(0), values[:FIELDS])
+    values[DISTANCE], values[VELOCITY] = eyepoints.range, eyepoints.radial_velocity
+    return plain_plan(scene, values, edges, rules, tolerance)
+
+
+def _put_fields(
+    eyepoints: Eyepoints,
+    surfaces: Sequence[Surface],
+    by_roots: bool,
+    sent: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Fields of footprints, and what beamlets send back where there is room for it."""
+    rays, materials = to_look_at(eyepoints, surfaces)
+    room = np.empty((ROOM + 5, materials[0].size))
+    _look(rays, materials, by_roots, sent, room, np.empty(materials[0].size, np.bool_), out)
 
 
 @borrowing(nogil=True)

@@ -156,31 +156,45 @@ class ShotsCalling:
         rays_by_tolerance: bool = False,
     ) -> None:
         from sweep.model.effects.catalogue import DEFAULTS
+        from sweep.model.effects.catalogue import EFFECTS as ALL
+        from sweep.model.effects.plain_scene import PlainScene, is_plain
+        from sweep.model.effects.planning import rules_of
         from sweep.model.effects.span import Span
         from sweep.model.effects.tile_link import TileLink
 
         self._parameters, self._surfaces, self._modes = parameters, surfaces, modes
         self._rotating, self._rays_by_tolerance = rotating, rays_by_tolerance
+        self._rules = rules_of(ALL, tuple(modes.items()))
         self._instrument = TileLink(
             {
                 path: value if isinstance(value, str) else Span.of(np.asarray(value)[()])
                 for path, value in (DEFAULTS | dict(parameters)).items()
             }
         )
+        plain = not self._rules.at_rest and is_plain(self._instrument, rotating)
+        self._plain = PlainScene.of(self._instrument) if plain else None
 
     def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""
-        from sweep.model.effects.planning import plan
-        from sweep.model.seen_tiles import block_of
-
         seen = eyepoints.seen.nonzero()[0]
         if not seen.size:
             return None
         some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
         edges, tile = _stretches(tiles[seen])
-        block = block_of(some, self._instrument, self._surfaces, edges, self._rotating)
-        planned = plan(block, modes=self._modes, tolerance=self._tolerance(some))
-        return ShotsPlan(seen, tile, planned)
+        return ShotsPlan(seen, tile, self._plan(some, edges))
+
+    def _plan(self, eyepoints: Eyepoints, edges: np.ndarray) -> Plan:
+        """The plan of tiles of shots that all see something: the same by either way."""
+        from sweep.model.effects.planning import plan
+        from sweep.model.seen_tiles import block_of, plain_plan_of
+
+        tolerance = self._tolerance(eyepoints)
+        if self._plain is not None:
+            return plain_plan_of(
+                eyepoints, self._plain, self._surfaces, edges, self._rules, tolerance
+            )
+        block = block_of(eyepoints, self._instrument, self._surfaces, edges, self._rotating)
+        return plan(block, modes=self._modes, tolerance=tolerance)
 
     def _tolerance(self, eyepoints: Eyepoints) -> float:
         """What of the tolerance is for effects."""

@@ -82,12 +82,12 @@ def sum_change(
     )  # fmt: skip
     found = np.empty((2, *shape))
     sizes = f.curvature, f.margin, f.worst
-    _put_sum_changes(table, sizes, (f.reach, f.envelope), float(beamlets), found.reshape(2, -1))
+    put_sum_changes(table, sizes, (f.reach, f.envelope), float(beamlets), found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))
 
 
 @njit(cache=True, error_model="numpy")
-def _put_sum_changes(table, sizes, lobe, beamlets, out):
+def put_sum_changes(table, sizes, lobe, beamlets, out):
     """Least and largest factor on magnitudes, (2, n)."""
     (curvature, margin, worst), (reach, envelope) = sizes, lobe
     for i in range(table.shape[1]):
@@ -122,12 +122,12 @@ def sum_added(block: "Block", lines: Line, bins: ArrayLike) -> np.ndarray:
     """
     table, shape = columns(lines.tilt, block.spread.extreme, bins, block.turn_of_bin)
     found, lobe = np.empty(shape), lines.lobe
-    _put_added(table, math.sqrt(lobe.curvature), lobe.worst, found.reshape(-1))
+    put_sums_added(table, math.sqrt(lobe.curvature), lobe.worst, found.reshape(-1))
     return found
 
 
 @njit(cache=True, error_model="numpy")
-def _put_added(table, steepest, worst, out):
+def put_sums_added(table, steepest, worst, out):
     """Largest changes of sums, (n,)."""
     for i in range(out.size):
         tilt, extreme, bins, turn = table[:, i]

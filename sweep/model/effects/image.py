@@ -44,7 +44,7 @@ def bound(block: "Block") -> Change:
     most E(e) of all lines in phase.
     """
     found, lobe = np.empty((2, 3, block.size)), block.lines.lobe
-    _put_bounds(
+    put_bounds(
         block.axis, block.number, *sizes_of(lobe), (lobe.reach, lobe.envelope),
         found.reshape(2, -1),
     )  # fmt: skip
@@ -57,7 +57,7 @@ def bound(block: "Block") -> Change:
 
 
 @njit(cache=True, error_model="numpy")
-def _put_bounds(axis, beamlets, tables, sizes, lobe, out):
+def put_bounds(axis, beamlets, tables, sizes, lobe, out):
     """Largest factor on the largest bin's magnitude, and what is added to a sum, (2, n)."""
     bounds, (reach, envelope) = extremes_of(beamlets, tables), lobe
     for i in range(axis.shape[1]):
@@ -81,12 +81,12 @@ def alarm_change(block: "Block") -> np.ndarray:
     if block.word(PROCESSING + "bins_counted") == "all":
         return np.zeros(block.size)
     found = np.empty(block.size)
-    _put_alarms(*moved_bins(block), block.fft_size / 2, found)
+    put_alarms(*moved_bins(block), block.fft_size / 2, found)
     return found
 
 
 @njit(cache=True, error_model="numpy")
-def _put_alarms(bins, taken, half, out):
+def put_alarms(bins, taken, half, out):
     """Changes of log10 pfa (tiles,)."""
     for t in range(out.size):
         left = np.maximum(half - taken[t], 1.0)
@@ -104,7 +104,7 @@ def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
     """
     lobe, found = block.lines.lobe, np.empty((2, block.size))
     table, shape = columns(footprint_sum(block).in_phase, block.peak.high, block.threshold.low)
-    _put_moved_bins(
+    put_moved_bins(
         block.axis.reshape(-1, *shape), table.reshape(-1, *shape), block.fft_size / 2,
         (lobe.reach, lobe.envelope), block.adds_amplitudes, found,
     )  # fmt: skip
@@ -112,7 +112,7 @@ def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, error_model="numpy")
-def _put_moved_bins(axis, table, half, lobe, amplitudes, out):
+def put_moved_bins(axis, table, half, lobe, amplitudes, out):
     """Expected bins that both chirps' images move, and most that a detection takes, (2, tiles)."""
     reach, envelope = lobe
     for t in range(out.shape[1]):

@@ -79,10 +79,10 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
     given, size = columns(
         *footprint_sum(block), block.peak.high, amplitude.low, threshold.low, threshold.high
     )
-    found = _union(
+    found = unions(
         block.axis, given, (main.reach, main.envelope),
         (table.highest, table.lowest, table.steepest),
-        _far(shape.name, shape.length, block.fft_size),
+        far_steps(shape.name, shape.length, block.fft_size),
         (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
         not block.adds_amplitudes,
     ).reshape(size)  # fmt: skip
@@ -92,7 +92,7 @@ def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np
 
 
 @lru_cache(maxsize=32)
-def _far(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def far_steps(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distances [bins] from the table's end on, between which sidelobes are taken to be even.
 
     Returns
@@ -108,7 +108,7 @@ def _far(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray,
 
 
 @njit(cache=True, error_model="numpy")
-def _union(axis, given, lobe, table, far, sizes, powers):
+def unions(axis, given, lobe, table, far, sizes, powers):
     """Largest sum of the chances of all bins that may leak, (n,)."""
     out, column = np.empty(given.shape[1]), np.empty(12)
     for i in range(out.size):

@@ -65,7 +65,7 @@ class Moments(NamedTuple):
 
 NO_SPREAD = Moments(0.0, 0.0, 0.0)
 
-_BETA, _RANGE = 3, 5
+BETA, RANGE = 3, 5
 NOT_AWAY = 0.1
 """Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
@@ -96,7 +96,7 @@ def axis_ends(tiles: int, instrument: np.ndarray, *, range: Span, beta: Span) ->
     """
     ends = np.empty((9, 2, tiles))
     ends[:] = instrument
-    for row, span in (_BETA, beta), (_RANGE, range):
+    for row, span in (BETA, beta), (RANGE, range):
         ends[row, 0], ends[row, 1] = span.low, span.high
     return ends
 
@@ -104,7 +104,7 @@ def axis_ends(tiles: int, instrument: np.ndarray, *, range: Span, beta: Span) ->
 def axis_lines(ends: np.ndarray, *, window: Window, fft_size: int) -> Line:
     """The axis's line in up, Doppler and down segment, (3, tiles), as :mod:`sweep.model.lines`."""
     found = np.empty((6, 3, ends.shape[2]))
-    _put_lines(ends, fft_size / 2, found)
+    put_lines(ends, fft_size / 2, found)
     offset, least, edge, transfer, transfer_least, tilt = found
     form = lobe(window.name, window.length, fft_size)
     return Line(offset, least, edge, transfer, transfer_least, tilt, form)
@@ -116,19 +116,20 @@ def doppler_shifts(ends: np.ndarray) -> np.ndarray:
     f beta, and the S tau beta by which it stretches the beat of the range.
     """
     found = np.empty((3, ends.shape[2]))
-    _put_shifts(ends, found)
+    put_shifts(ends, found)
     return found
 
 
 def with_and_without(ends: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     """Ends with Doppler ratios down to none where these move some line so little."""
     either = ends.copy()
-    _widen(either[_BETA], shifts)
+    widen(either[BETA], shifts)
     return either
 
 
 @njit(cache=True, error_model="numpy")
-def _widen(beta, shifts):
+def widen(beta, shifts):
+    """Extend ratios (2, tiles) to none in tiles of which some line moves so little."""
     for t in range(shifts.shape[1]):
         slow = np.any(shifts[:, t] <= NOT_AWAY)
         if slow and np.maximum(abs(beta[0, t]), abs(beta[1, t])) > 0.0:
@@ -136,10 +137,10 @@ def _widen(beta, shifts):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_shifts(ends, out):
+def put_shifts(ends, out):
     """Shifts (3, tiles)."""
     for t in range(out.shape[1]):
-        size = np.maximum(abs(ends[_BETA, 0, t]), abs(ends[_BETA, 1, t]))
+        size = np.maximum(abs(ends[BETA, 0, t]), abs(ends[BETA, 1, t]))
         beat = product_of((ends[4, 0, t], ends[4, 1, t]), (ends[5, 0, t], ends[5, 1, t]))
         width = ends[6, 0, t], ends[6, 1, t]
         for s in range(3):
@@ -148,7 +149,7 @@ def _put_shifts(ends, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_lines(given, half, out):
+def put_lines(given, half, out):
     """Fields of :class:`Line`, (6, 3, tiles), from the ends of nine spans, (9, 2, tiles)."""
     for t in range(given.shape[2]):
         ends = given[:, :, t]
@@ -305,15 +306,15 @@ def spreads(
     for k, value in enumerate((*ranges, *own_ranges, *velocities)):
         given[k] = value
     found = np.empty((12, 3, ends.shape[2]))
-    _put_spreads(ends, given, found)
+    put_spreads(ends, given, found)
     return Spreads(*(Moments(*found[k : k + 3]) for k in range(0, 12, 3)))
 
 
 @njit(cache=True, error_model="numpy")
-def _put_spreads(ends, given, out):
+def put_spreads(ends, given, out):
     """Moments (12, 3, tiles); infinite ones of ranges as numbers that may be multiplied by 0."""
     for t in range(given.shape[1]):
-        beta, rate, far, width = ends[_BETA, :, t], ends[4, 1, t], ends[5, 1, t], ends[6, 0, t]
+        beta, rate, far, width = ends[BETA, :, t], ends[4, 1, t], ends[5, 1, t], ends[6, 0, t]
         bins = rate * (1.0 + max(abs(beta[0]), abs(beta[1]))) * far / width
         beat = 2.0 * rate * far
         for k in range(3):

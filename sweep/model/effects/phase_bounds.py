@@ -218,12 +218,12 @@ def phase_change(
         *error.powers, error.rest, *others.powers, others.rest, peak.least, peak.most
     )
     found, flags = np.empty((2, *found_shape)), (others is not NO_ERROR, bool(peak.single))
-    put_phase_changes(table, *_of_window(window), flags, found.reshape(2, -1))
+    put_phase_changes(table, *of_window(window), flags, found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))
 
 
 @lru_cache(maxsize=16)
-def _of_window(window: Window) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
+def of_window(window: Window) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
     """What compiled formulas take of a window."""
     form, known = shape(window), means(window)
     return (
@@ -273,7 +273,7 @@ def error_change(block: "Block", own: Own) -> Change | None:
     found = np.empty((4, *table.shape[1:]))
     put_error_changes(
         block.axis, table.reshape(13, -1), number, sizes_of(block.lines.lobe), _record(block),
-        (*_of_window(block.window), means(block.window).steady),
+        (*of_window(block.window), means(block.window).steady),
         (others is not NO_ERROR, block.number == 1, may_add(block)), found.reshape(4, -1),
     )  # fmt: skip
     low, high, lines_added, moved = found
@@ -353,14 +353,14 @@ def over_record(terms: Mapping[int, Span], *, start: Span, duration: Span) -> Er
         Acquisition delay and length of the record [s].
     """
     ends = (end for c in terms.values() for end in (c.low, c.high))
-    table, found_shape = columns(*_powers(start, duration), *ends)
+    table, found_shape = columns(*record_powers(start, duration), *ends)
     found = np.empty((5, *found_shape))
     put_over_record(table, np.array(list(terms)), found.reshape(5, -1))
     return Error(tuple(found[1:]), constant=found[0])
 
 
 @lru_cache(maxsize=8)
-def _powers(start: Span, duration: Span) -> tuple[Sizes, ...]:
+def record_powers(start: Span, duration: Span) -> tuple[Sizes, ...]:
     """Powers 0..4 of half a record's length at the most, and ends of those of its middle."""
     half = 0.5 * duration
     middle = start + half

@@ -71,7 +71,7 @@ def plan(
         For a mode that is none of these, a name that is no effect's, or an effect that is on
         within one that is off.
     """
-    rules = _rules(tuple(effects), tuple((modes or {}).items()))
+    rules = rules_of(tuple(effects), tuple((modes or {}).items()))
     rest = block.at_rest() if rules.at_rest else block
     bounds = _bounds(effects, block, rest)
     change = np.zeros((len(effects), block.size))
@@ -82,8 +82,11 @@ def plan(
             threshold=block.threshold,
             **_leaking(list(bounds), rules),
         )
-    kept = _kept(change, [row for row in bounds if row not in rules.decided], rules, tolerance)
-    return Plan(rules.names, kept, change, _left_out(kept, change))
+    there = np.zeros(len(effects), np.bool_)
+    there[list(bounds)] = True
+    kept, error = np.zeros(change.shape, np.bool_), np.empty(block.size)
+    choose(change, there, rules.choice, tolerance, kept, error)
+    return Plan(rules.names, kept, change, error)
 
 
 def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, Bound]:
@@ -96,43 +99,50 @@ def _bounds(effects: Sequence[Effect], block: Block, rest: Block) -> dict[int, B
     return asked
 
 
-def _leaking(rows: Sequence[int], rules: "_Rules") -> dict[str, Any]:
+def _leaking(rows: Sequence[int], rules: "Rules") -> dict[str, Any]:
     """What of :func:`probability_changes` is told where a study asks for leakage.
 
     Bins that leak are so much smaller than the largest that next to nothing of that is much of
     them: it takes nearly all effects to tell leakage, and most studies look at detection.
     """
-    if rules.leakage not in rules.on or rules.leakage not in rows:
+    if not rules.asks_for_leakage or rules.leakage not in rows:
         return {}
-    return {
-        "leakage": rows.index(rules.leakage), "spreads": [row in rules.spreading for row in rows]
-    }  # fmt: skip
+    return {"leakage": rows.index(rules.leakage), "spreads": rules.spreading[list(rows)]}
 
 
-class _Rules(NamedTuple):
-    """What modes say of effects, by row, whatever the bounds do."""
+class Choice(NamedTuple):
+    """What modes say of effects as compiled code takes it, by row."""
 
-    names: tuple[str, ...]
+    open: np.ndarray
+    """Whether it is neither on nor off, (effects,) bool."""
     free: np.ndarray
     """Whether it costs nothing, (effects,) bool."""
-    spreading: frozenset[int]
-    """Those that move light from bins to others."""
-    leakage: int
-    """Row of the leakage; -1 for none."""
-    decided: frozenset[int]
-    """Those that are on or off."""
-    on: list[int]
-    off: list[int]
     parents: np.ndarray
     """Of each, what it is within; -1 for none."""
-    needs: tuple[tuple[int, int], ...]
-    """Effects, and what each is simulated with."""
+    on: np.ndarray
+    off: np.ndarray
+    """Those that are on, and off, int64."""
+    needs: np.ndarray
+    """(m, 2) int64: effects, and what each is simulated with."""
+
+
+class Rules(NamedTuple):
+    """What modes say of effects, whatever the bounds do."""
+
+    names: tuple[str, ...]
+    choice: Choice
+    spreading: np.ndarray
+    """Those that move light from bins to others, (effects,) bool."""
+    leakage: int
+    """Row of the leakage; -1 for none."""
+    asks_for_leakage: bool
+    """Whether it is on."""
     at_rest: bool
     """Whether the Doppler effect is off."""
 
 
 @lru_cache(maxsize=16)
-def _rules(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> _Rules:
+def rules_of(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> Rules:
     """What modes say, the same for all blocks of a study."""
     names = tuple(effect.name for effect in effects)
     within = {effect.name: effect.within for effect in effects if effect.within in names}
@@ -140,25 +150,28 @@ def _rules(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> _
     parents = np.full(len(names), -1)
     for child, parent in within.items():
         parents[names.index(child)] = names.index(parent)
-    return _Rules(
-        names=names,
-        free=np.array([effect.stage == "noise" for effect in effects]),
-        spreading=frozenset(
-            row
-            for row, effect in enumerate(effects)
-            if effect.stage in ("lines", "record", "spectrum")
-        ),
-        leakage=names.index("leakage") if "leakage" in names else -1,
-        decided=frozenset(map(names.index, decided)),
-        on=[names.index(name) for name, mode in decided.items() if mode == "on"],
-        off=[names.index(name) for name, mode in decided.items() if mode == "off"],
+    needs = [
+        (row, names.index(need))
+        for row, effect in enumerate(effects)
+        for need in effect.needs
+        if need in names and decided.get(need) != "off"
+    ]
+    rows = {mode: [names.index(n) for n, m in decided.items() if m == mode] for mode in MODES}
+    choice = Choice(
+        open=np.array([name not in decided for name in names], np.bool_),
+        free=np.array([effect.stage == "noise" for effect in effects], np.bool_),
         parents=parents,
-        needs=tuple(
-            (row, names.index(need))
-            for row, effect in enumerate(effects)
-            for need in effect.needs
-            if need in names and decided.get(need) != "off"
-        ),
+        on=np.array(rows["on"], np.int64),
+        off=np.array(rows["off"], np.int64),
+        needs=np.array(needs, np.int64).reshape(-1, 2),
+    )
+    moving = ("lines", "record", "spectrum")
+    return Rules(
+        names=names,
+        choice=choice,
+        spreading=np.array([effect.stage in moving for effect in effects], np.bool_),
+        leakage=names.index("leakage") if "leakage" in names else -1,
+        asks_for_leakage=decided.get("leakage") == "on",
         at_rest=decided.get("doppler") == "off",
     )
 
@@ -184,60 +197,63 @@ def _decided(
     return decided
 
 
-def _kept(change: np.ndarray, chosen: Sequence[int], rules: _Rules, tolerance: float) -> np.ndarray:
-    """Effects to keep, of those to choose from and of all that modes say, (effects, tiles) bool.
+@njit(cache=True, error_model="numpy")
+def choose(change, there, choice, tolerance, kept, error):
+    """Mark effects to keep, (effects, tiles) bool; sum what those that are not change, (tiles,).
 
     The smallest are left out first, as long as their sum is within what the tolerance leaves; an
-    effect never before those within it. Those that cost nothing have a share of it alone.
+    effect never before those within it, last ones first where they are alike. Those that cost
+    nothing have a share of it alone. ``there`` says of which effects the scene has anything.
     """
-    kept = np.zeros(change.shape, np.bool_)
-    if chosen:
-        room = np.full(change.shape[1], tolerance, float)
-        if rules.off:
-            room = np.maximum(tolerance - change[rules.off].sum(axis=0), 0.0)
-        _keep(change, np.array(chosen[::-1]), rules.parents, rules.free, room, kept)
-    if rules.on:
-        kept[rules.on] = True
-    for row, need in rules.needs:
-        kept[need] |= kept[row]
-    return kept
+    choosable, free, parents, on, off, needs = choice
+    key, order = np.empty(len(change)), np.empty(len(change), np.int64)
+    for t in range(change.shape[1]):
+        room = 0.0
+        for row in off:
+            room += change[row, t]
+        room = np.maximum(tolerance - room, 0.0)
+        number = _put_in_order(change[:, t], there & choosable, parents, key, order)
+        _keep(change[:, t], order[:number], free, room, kept[:, t])
+        for row in on:
+            kept[row, t] = True
+        for m in range(len(needs)):
+            kept[needs[m, 1], t] |= kept[needs[m, 0], t]
+        error[t] = 0.0
+        for row in range(len(change)):
+            error[t] += 0.0 if kept[row, t] else change[row, t]
 
 
 @njit(cache=True, error_model="numpy")
-def _keep(change, rows, parents, free, room, kept):
-    """Mark all but the smallest of some rows, last ones first where they are alike, that fit."""
-    key, order = np.empty(len(change)), np.empty(len(rows), np.int64)
-    for t in range(change.shape[1]):
-        key[:] = change[:, t]
-        for i in range(len(rows)):
-            parent = parents[rows[i]]
-            if parent >= 0:
-                key[parent] = np.maximum(key[parent], key[rows[i]])
-        for i in range(len(rows)):
-            place = i
-            while place > 0 and _is_less(key[rows[i]], key[order[place - 1]]):
+def _put_in_order(change, rows, parents, key, order):
+    """Sort rows that are marked by what they change with all within them; how many these are."""
+    key[:] = change
+    number = 0
+    for row in range(len(change) - 1, -1, -1):
+        if rows[row] and parents[row] >= 0:
+            key[parents[row]] = np.maximum(key[parents[row]], key[row])
+    for row in range(len(change) - 1, -1, -1):
+        if rows[row]:
+            place = number
+            while place > 0 and _is_less(key[row], key[order[place - 1]]):
                 order[place] = order[place - 1]
                 place -= 1
-            order[place] = rows[i]
-        total, unpaid = 0.0, 0.0
-        for row in order:
-            if free[row]:
-                unpaid += change[row, t]
-                if not unpaid <= FREE_SHARE * room[t]:
-                    kept[row, t] = True
-                    continue
-            total += change[row, t]
-            kept[row, t] = not total <= room[t]
+            order[place] = row
+            number += 1
+    return number
 
 
 @njit(cache=True, error_model="numpy")
-def _left_out(kept, change):
-    """Sum of the changes by what is not kept, (tiles,)."""
-    total = np.zeros(change.shape[1])
-    for i in range(change.shape[0]):
-        for t in range(total.size):
-            total[t] += 0.0 if kept[i, t] else change[i, t]
-    return total
+def _keep(change, order, free, room, kept):
+    """Mark all but the smallest of some rows that fit into the room."""
+    total, unpaid = 0.0, 0.0
+    for row in order:
+        if free[row]:
+            unpaid += change[row]
+            if not unpaid <= FREE_SHARE * room:
+                kept[row] = True
+                continue
+        total += change[row]
+        kept[row] = not total <= room
 
 
 @njit(cache=True, error_model="numpy")

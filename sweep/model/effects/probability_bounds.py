@@ -35,8 +35,8 @@ from sweep.model.marcum import marcum_q1_pair
 
 _HUGE = 1e12
 _LN_10 = math.log(10.0)
-_WEAK, _STRONG, _DOWN, _UP, _ADDED, _SHARE, _SHIFT, _ALARMS, _FIELDS = range(9)
-_OF_NONE = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0])
+WEAK, STRONG, DOWN, UP, ADDED, SHARE, SHIFT, ALARMS, CHANGE_FIELDS = range(9)
+OF_NONE = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0])
 """Fields of a change of nothing."""
 _NO_NOISE = 1e-200
 """Factor of noise that is as good as none, as of what saturates."""
@@ -90,7 +90,7 @@ def probability_changes(
         asked = zip(bounds, spreads, strict=True)
         moves = np.array([spread for bound, spread in asked if isinstance(bound, Change)])
         leaking[moves] = out[leakage]
-    out[[isinstance(bound, Change) for bound in bounds]] = _changes(table, ends, leaking)
+    out[[isinstance(bound, Change) for bound in bounds]] = changes_of(table, ends, leaking)
     return np.minimum(out, 1.0)
 
 
@@ -103,7 +103,7 @@ def within_changes(
 
 def _within_all(table: np.ndarray, ends: np.ndarray) -> tuple[Span, Span]:
     found = np.empty(ends.shape)
-    _put_all(table, ends, found)
+    put_all(table, ends, found)
     return Span(found[0, 0], found[0, 1]), Span(found[1, 0], found[1, 1])
 
 
@@ -112,11 +112,11 @@ def _table(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Changes as compiled formulas take them; ends of what there is without, (2, 2, 3, tiles)."""
     tiles = np.shape(amplitude.low)[1]
-    table = np.empty((len(changes), _FIELDS, 3, tiles))
-    table[:] = _OF_NONE[:, None, None]
+    table = np.empty((len(changes), CHANGE_FIELDS, 3, tiles))
+    table[:] = OF_NONE[:, None, None]
     for entry, change in zip(table, changes, strict=True):
         _fill(entry, change)
-    _finish(table.reshape(len(changes), _FIELDS, 3 * tiles))
+    finish(table.reshape(len(changes), CHANGE_FIELDS, 3 * tiles))
     ends = np.empty((2, 2, 3, tiles))
     ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = (
         amplitude.low, amplitude.high, threshold.low, threshold.high,
@@ -140,42 +140,42 @@ def pd_change_within(
         Least and largest magnitude and threshold, over sigma, without it.
     """
     ends = np.array(np.broadcast_arrays(*amplitude, *threshold), dtype=float)
-    entry = np.empty((_FIELDS, *ends.shape[1:]))
-    entry.T[...] = _OF_NONE
+    entry = np.empty((CHANGE_FIELDS, *ends.shape[1:]))
+    entry.T[...] = OF_NONE
     _fill(entry, change)
-    _finish(entry.reshape(1, _FIELDS, -1))
-    flat = _each_within(entry.reshape(_FIELDS, -1), ends.reshape(4, -1))
+    finish(entry.reshape(1, CHANGE_FIELDS, -1))
+    flat = _each_within(entry.reshape(CHANGE_FIELDS, -1), ends.reshape(4, -1))
     return np.asarray(flat.reshape(ends.shape[1:]))
 
 
 def _fill(entry: np.ndarray, change: Change) -> None:
     """Put in what differs from nothing: ends of signal and noise, what is added, and so on."""
     if change.signal is not NONE:
-        entry[_WEAK], entry[_STRONG] = change.signal
+        entry[WEAK], entry[STRONG] = change.signal
     if change.noise is not NONE:
-        entry[_DOWN], entry[_UP] = change.noise
-        entry[_SHARE] = change.threshold_follows
-    for row, value in (_ADDED, change.added), (_SHIFT, change.shift), (_ALARMS, change.alarms):
+        entry[DOWN], entry[UP] = change.noise
+        entry[SHARE] = change.threshold_follows
+    for row, value in (ADDED, change.added), (SHIFT, change.shift), (ALARMS, change.alarms):
         if value is not NOTHING:
             entry[row] = value
 
 
 @njit(cache=True, error_model="numpy")
-def _finish(table):
+def finish(table):
     """Factors on amplitude and threshold over sigma; what is added; change of |X| by its factor."""
     for i in range(table.shape[0]):
         for t in range(table.shape[2]):
             own = table[i, :, t]
-            weak, strong, follows = own[_WEAK], own[_STRONG], own[_SHARE] != 0.0
+            weak, strong, follows = own[WEAK], own[STRONG], own[SHARE] != 0.0
             quiet, loud = (
-                1.0 / math.sqrt(max(own[_DOWN], _NO_NOISE)),
-                1.0 / math.sqrt(max(own[_UP], _NO_NOISE)),
+                1.0 / math.sqrt(max(own[DOWN], _NO_NOISE)),
+                1.0 / math.sqrt(max(own[UP], _NO_NOISE)),
             )
-            own[_WEAK], own[_STRONG] = min(weak * loud, _HUGE), min(strong * quiet, _HUGE)
-            own[_DOWN] = 1.0 if follows else min(loud, _HUGE)
-            own[_UP] = 1.0 if follows else min(quiet, _HUGE)
-            own[_ADDED] = min(own[_ADDED], _HUGE)
-            own[_SHARE] = min(max(strong - 1.0, 1.0 - weak), _HUGE)
+            own[WEAK], own[STRONG] = min(weak * loud, _HUGE), min(strong * quiet, _HUGE)
+            own[DOWN] = 1.0 if follows else min(loud, _HUGE)
+            own[UP] = 1.0 if follows else min(quiet, _HUGE)
+            own[ADDED] = min(own[ADDED], _HUGE)
+            own[SHARE] = min(max(strong - 1.0, 1.0 - weak), _HUGE)
 
 
 @njit(cache=True, error_model="numpy")
@@ -188,7 +188,7 @@ def _each_within(entry, ends):
 
 
 @njit(cache=True, error_model="numpy")
-def _changes(table, ends, leaking):
+def changes_of(table, ends, leaking):
     """Changes of pd, summed over segments, of false alarms or of magnitudes, (effects, tiles)."""
     effects, _, segments, tiles = table.shape
     out = np.zeros((effects, tiles))
@@ -197,7 +197,7 @@ def _changes(table, ends, leaking):
             total, other = 0.0, 0.0
             for s in range(segments):
                 own = table[i, :, s, t]
-                besides = np.maximum(own[_SHIFT], own[_ALARMS])
+                besides = np.maximum(own[SHIFT], own[ALARMS])
                 other = max(other, besides if besides < 1.0 else 1.0)
                 if not _does_anything(own):
                     continue
@@ -205,16 +205,16 @@ def _changes(table, ends, leaking):
                 total += _within(own, low, high, lower, upper)
                 other = max(other, _magnitude_change(own, low, high))
                 if leaking[i, t] > 0.0:
-                    moved = (own[_SHARE] + own[_ADDED]) * min(high, _HUGE)
+                    moved = (own[SHARE] + own[ADDED]) * min(high, _HUGE)
                     other = max(other, min(moved, leaking[i, t]))
-                if own[_DOWN] != 1.0 or own[_UP] != 1.0:
+                if own[DOWN] != 1.0 or own[UP] != 1.0:
                     other = max(other, _alarm_change(own, upper))
             out[i, t] = min(max(total, other), 1.0)
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _put_all(table, ends, out):
+def put_all(table, ends, out):
     """Ends of amplitude and threshold with any of the effects."""
     for s in range(ends.shape[2]):
         for t in range(ends.shape[3]):
@@ -226,11 +226,11 @@ def _put_all(table, ends, out):
 @njit(cache=True, error_model="numpy")
 def _does_anything(own):
     return (
-        own[_WEAK] != 1.0
-        or own[_STRONG] != 1.0
-        or own[_DOWN] != 1.0
-        or own[_UP] != 1.0
-        or own[_ADDED] != 0.0
+        own[WEAK] != 1.0
+        or own[STRONG] != 1.0
+        or own[DOWN] != 1.0
+        or own[UP] != 1.0
+        or own[ADDED] != 0.0
     )
 
 
@@ -242,25 +242,25 @@ def _with_others(table, ends, i, s, t):
     added = 0.0
     for j in range(table.shape[0]):
         if j != i:
-            low *= min(table[j, _WEAK, s, t], 1.0)
-            high *= max(table[j, _STRONG, s, t], 1.0)
-            lower *= min(table[j, _DOWN, s, t], 1.0)
-            upper *= max(table[j, _UP, s, t], 1.0)
-            added += table[j, _ADDED, s, t]
+            low *= min(table[j, WEAK, s, t], 1.0)
+            high *= max(table[j, STRONG, s, t], 1.0)
+            lower *= min(table[j, DOWN, s, t], 1.0)
+            upper *= max(table[j, UP, s, t], 1.0)
+            added += table[j, ADDED, s, t]
     return max(low - high * added, 0.0), high * (1.0 + added), lower, upper
 
 
 @njit(cache=True, error_model="numpy")
 def _magnitude_change(own, low, high):
     """Largest change of a magnitude from within an interval, over it or 1, whichever is larger."""
-    more = own[_ADDED] * high / max(low, 1.0) if own[_ADDED] > 0.0 else 0.0
-    return min(own[_SHARE], _HUGE) * min(high, 1.0) + more
+    more = own[ADDED] * high / max(low, 1.0) if own[ADDED] > 0.0 else 0.0
+    return min(own[SHARE], _HUGE) * min(high, 1.0) + more
 
 
 @njit(cache=True, error_model="numpy")
 def _within(own, low, high, lower, upper):
     """Largest change of pd by one effect from anywhere within intervals."""
-    weak, strong, down, up, added = own[:_SHARE]
+    weak, strong, down, up, added = own[:SHARE]
     low, high = min(low, _HUGE), min(high, _HUGE)
     if low == high and lower == upper and added == 0.0:
         without = marcum_q1_pair(low, lower)[0]
@@ -331,5 +331,5 @@ def _steepest_threshold(low, high, smallest, biggest):
 @njit(cache=True, error_model="numpy")
 def _alarm_change(own, upper):
     """Largest change of log10 of a shot's chance of a false alarm from thresholds up to one."""
-    down, up = own[_DOWN], own[_UP]
+    down, up = own[DOWN], own[UP]
     return upper * upper * max(1.0 - down * down, up * up - 1.0) / _LN_10

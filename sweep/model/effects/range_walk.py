@@ -87,14 +87,14 @@ def error(block: "Block") -> Error | None:
     rate, beta = block.chirp_rate, block.beta
     table, shape = columns(rate.low, rate.high, beta.low, beta.high)
     drift = np.empty((2, *shape))
-    _put_drifts(table, drift.reshape(2, -1))
+    put_drifts(table, drift.reshape(2, -1))
     terms = {2: Span(drift[0], drift[1])}
     walk = over_record(terms, start=block.start, duration=block.record_duration)
     return by_segment(block, walk, None, walk)
 
 
 @njit(cache=True, error_model="numpy")
-def _put_drifts(table, out):
+def put_drifts(table, out):
     """Ends of S beta (1 + beta / 2), (2, n), from those of S and beta."""
     for i in range(out.shape[1]):
         beta = table[2, i], table[3, i]

@@ -13,7 +13,7 @@ from numba import njit
 from sweep.model.effects.change import Change
 from sweep.model.effects.columns import columns
 from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.line_powers import image_factor_of
+from sweep.model.effects.line_powers import image_factor_of, uphill_of
 from sweep.model.effects.line_spread import NO_SPREAD, Moments, power_range
 from sweep.model.effects.lobes import lobe_least
 from sweep.model.effects.span import any_holds
@@ -35,27 +35,33 @@ def bound(block: "Block") -> Change | None:
     """
     if not any_holds(np.greater(block.beside_share.high, 0)):
         return None
-    f, line = np.clip(block.beside_share.high, 0.0, 1.0), block.lines
+    line = block.lines
     apart = block.of_ranges(Moments(0.0, 0.0, block.beside_apart)).extreme
     own, _ = power_range(line, block.spreads.own_ranges, block.number)
     _, on_axis = power_range(line, NO_SPREAD, block.number)
-    elsewhere = np.fmin(np.exp(np.minimum(line.tilt * apart, 50.0)), line.transfer_least**-2.0)
-    table, shape = columns(f, apart, own, on_axis, elsewhere, line.edge, line.transfer_least)
-    found, lobe = np.empty((2, *shape)), line.lobe
-    _put_changes(
-        table, lobe.margin, lobe.lowest, block.adds_amplitudes, found.reshape(2, -1)
+    table, shape = columns(
+        block.beside_share.high, apart, own, on_axis, line.edge, line.transfer_least, line.tilt
     )  # fmt: skip
+    found, lobe = np.empty((2, *shape)), line.lobe
+    put_changes(table, lobe.margin, lobe.lowest, block.adds_amplitudes, found.reshape(2, -1))
     return Change(signal=(found[0], found[1]))
 
 
 @njit(cache=True, error_model="numpy")
-def _put_changes(table, margin, lowest, amplitudes, out):
-    """Least and largest factor on magnitudes, (2, n)."""
+def put_changes(table, margin, lowest, amplitudes, out):
+    """Least and largest factor on magnitudes, (2, n).
+
+    Rows of the table: share beside the axis's surface, and how far its lines lie apart; least power
+    of the largest bin of the axis's own lines, largest of one on the axis; edge, least transfer
+    and tilt of the axis's line.
+    """
     for i in range(table.shape[1]):
-        f, apart, least, on_axis, elsewhere, edge, transfer = table[:, i]
+        share, apart, least, on_axis, edge, transfer, tilt = table[:, i]
+        f = min(max(share, 0.0), 1.0)
         own = (1 - f) * least
         low, high = 1.0, 1.0
         if f > 0 and apart > 0:
+            elsewhere = np.fmin(uphill_of(tilt, apart), 1 / (transfer * transfer))
             more = elsewhere * image_factor_of(edge, apart, margin)
             low, high = np.sqrt(own / (own + f * on_axis)), np.sqrt(1 + f * more / own)
         if amplitudes and f > 0:

@@ -81,6 +81,9 @@ class Nothing(Exception):
 class Measurement:
     """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
 
+    Each round takes them in an order of its own: a short trial takes longer after a long one, which
+    leaves nothing of it at hand.
+
     Parameters
     ----------
     bench
@@ -101,6 +104,7 @@ class Measurement:
         self._rungs = self._ladder.rungs
         self._times = np.ones(len(self._rungs), np.int64)
         self._once = np.zeros(len(self._rungs), bool)
+        self._orders = np.random.default_rng(0)
 
     def run(self) -> Measured:
         """All rounds that the time allows, the first of them at least in part.
@@ -220,17 +224,17 @@ class Measurement:
         for part in parts:
             if done and time.monotonic() - self._begun > until * self._limit:
                 break
-            trials = []
-            for rung in range(len(self._rungs)):
+            trials = {}
+            for rung in self._orders.permutation(len(self._rungs)).tolist():
                 if self._interrupts.stopping:
                     return done
                 if first is not None and self._once[rung]:
-                    trials.append(first[len(done)][rung])
+                    trials[rung] = first[len(done)][rung]
                 else:
-                    trials.append(self._try(rung, part))
+                    trials[rung] = self._try(rung, part)
                 self._told.advance(points=1, failed=0)
             self._bench.forget()
-            done.append(trials)
+            done.append([trials[rung] for rung in range(len(self._rungs))])
         return done
 
     def _gathered(self, parts: list[np.ndarray], trials: list[list[Trial]]) -> Measured:
