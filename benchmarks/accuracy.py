@@ -77,17 +77,18 @@ on it is written by hand.
 
 A ladder of settings is put onto the spec. Each is computed by the machinery that computes the
 study, in one process, on one core: the spec as it is written; effects on demand (`auto`) at
-tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a
-tolerance calls for anywhere, with lines and leakage to three tolerances; fixed numbers of beamlets,
-where they add as powers; numbers of draws, where the study draws; and the way that the thesis
-describes. All take turns on parts of
-the sample, round after round, so that whatever slows the machine slows them alike. What a point
-costs depends on those that are computed beside it, as they share what is worked out for them: so
-times are taken on stretches of the blocks that the study computes, some thousands of points each,
-around points of the sample. They are those that the processor spends on the work. The best round
-counts for them, and ratios are medians of those within each round, or of the best where there are
-but two. Planning is counted with what it plans. Storing is not counted, as all settings share it,
-but told beside: the processor's time for making the store and writing its blocks.
+tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a tolerance
+calls for anywhere, with lines and leakage to three tolerances; fixed numbers of beamlets, where
+they add as powers; numbers of draws, where the study draws; and the way that the thesis describes.
+All take turns on parts of the sample, each round in an order of its own, so that whatever slows the
+machine slows them alike; a study that takes next to nothing is run up to fifteen times in a row, of
+which the best counts. What a point costs depends on those that are computed beside it, as they
+share what is worked out for them: so times are taken on stretches of the blocks that the study
+computes, some thousands of points each, around points of the sample. They are those that the
+processor spends on the work. The best round counts for them, and ratios are medians of those within
+each round, or of the best where there are but two. Planning is counted with what it plans. Storing
+is not counted, as all settings share it, but told beside: the processor's time for making the store
+and writing its blocks.
 
 The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
 the differences from the reference in a probability of detection, of the segments and the shot, in
@@ -114,13 +115,14 @@ Two things are asked of the adaptive settings, and the answers below are compute
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5
 times as fast as the thesis's way at the error that this has.
 
-Planning counts for adaptive settings alone. A block of a flight takes some 0.8 ms to be planned,
-however few shots it has: a twelfth of the time of a thousand shots, which take 10 ms in all. Of
-fewer, or of a few points of a grid, fixed settings that need no plan are the faster ones by more
-than 10 %, which is a millisecond. `sweep accuracy` then says both: what is lost, and what that
-comes to with the making of the study's store. A run plans fixed settings too, as its store tells
-what they leave out, and its blocks draw points and solve for velocities besides: `make blocks`
-times whole blocks of flights against both, planned and not.
+Planning counts for adaptive settings alone. In scenes of nothing but lines and their noise a block
+takes some 0.1 ms to be planned, and of a flight 0.2 us a shot besides: a twentieth of what a
+thousand shots take. Of studies of one or two points, which take less than a millisecond, that is a
+tenth or more; `sweep accuracy` then says what is lost, and what it comes to with the making of the
+study's store. Other effects than those of lines take a millisecond a block to be planned, and far
+longer to be computed. A run plans fixed settings too, as its store tells what they leave out, and
+its blocks draw points and solve for velocities besides: `make blocks` times whole blocks of flights
+against both, planned and not.
 """
 
 TAIL = """

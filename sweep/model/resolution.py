@@ -22,13 +22,9 @@ import numpy as np
 
 from sweep.model import detection, ground, quadrature
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.line_spread import (
-    plane_range_moments,
-    plane_velocity_moments,
-    range_to_bins,
-    velocity_to_bins,
-)
+from sweep.model.effects.line_spread import range_to_bins, velocity_to_bins
 from sweep.model.effects.lobes import lobe
+from sweep.model.effects.plane_geometry import plane_range_moments, plane_velocity_moments
 from sweep.model.preparation import (
     AUTOMATIC,
     BEAMLETS_ERROR,

@@ -12,9 +12,7 @@ from sweep.model.compiling import borrowing
 from sweep.model.effects import tile_geometry
 from sweep.model.effects.block import Block
 from sweep.model.effects.footprint_fields import FIELDS, ROOM, set_fields
-from sweep.model.effects.plain_changes import DISTANCE, VELOCITY
-from sweep.model.effects.plain_plan import plain_plan
-from sweep.model.effects.plain_scene import PlainScene
+from sweep.model.effects.plain_plan import DISTANCE, VELOCITY, PlainFlight
 from sweep.model.effects.planning import Plan, Rules
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
@@ -69,7 +67,7 @@ def block_of(
 
 def plain_plan_of(
     eyepoints: Eyepoints,
-    scene: PlainScene,
+    flight: PlainFlight,
     surfaces: Sequence[Surface],
     edges: np.ndarray,
     rules: Rules,
@@ -81,15 +79,15 @@ def plain_plan_of(
     ----------
     eyepoints, surfaces, edges
         As of :func:`block_of`.
-    scene : PlainScene
+    flight : PlainFlight
         Of the instrument.
     rules, tolerance
-        As of :meth:`sweep.model.effects.plain_plan.plain_plan`.
+        As of :meth:`sweep.model.effects.plain_plan.PlainFlight.plan`.
     """
     values = np.empty((FIELDS + 2, len(eyepoints.time)))
     _put_fields(eyepoints, surfaces, True, np.empty(0), values[:FIELDS])
     values[DISTANCE], values[VELOCITY] = eyepoints.range, eyepoints.radial_velocity
-    return plain_plan(scene, values, edges, rules, tolerance)
+    return flight.plan(values, edges, rules, tolerance)
 
 
 def _put_fields(

@@ -10,9 +10,10 @@ from numba import njit
 
 from sweep.model.effects.flags import flag_attributes, flags_apart, flags_of, names_of
 from sweep.tasks.study import ArrayLayout
-from sweep.tasks.tiles import Tiles
+from sweep.tasks.tiles import Alike, Tiles
 
 if TYPE_CHECKING:
+    from sweep.model.effects.plain_plan import PlainPlanes
     from sweep.model.effects.planning import Plan
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.surfaces import Surface
@@ -64,8 +65,13 @@ class Calling:
     """
 
     def __init__(self, spec: Spec, grid: Grid) -> None:
+        from sweep.model.effects.catalogue import EFFECTS as ALL
+        from sweep.model.effects.planning import rules_of
+
         self._modes, self.tiles = spec.modes(), Tiles(grid)
         self._known: dict[int, tuple[int, float]] = {}
+        self._alike: dict[int, tuple[PlainPlanes | None, float]] = {}
+        self._rules = rules_of(ALL, tuple(self._modes.items()))
 
     def of_block(self, block: int) -> Called:
         """What is simulated at the points of a block, in C order over it."""
@@ -101,16 +107,31 @@ class Calling:
 
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these."""
+        for alike in self.tiles.alike(tiles):
+            yield alike.tiles, self._plan(alike)
+
+    def _plan(self, alike: Alike) -> Plan:
+        """The plan of tiles that share words and sizes: the same by either way."""
         from sweep.model.effects.block import Block
         from sweep.model.effects.planning import plan
+
+        if alike.code not in self._alike:
+            self._alike[alike.code] = self._in_common(alike)
+        plain, tolerance = self._alike[alike.code]
+        if plain is not None and not self._rules.at_rest:
+            return plain.plan(alike.parameters, len(alike.tiles), self._rules, tolerance)
+        return plan(Block.of_plane(alike.parameters), modes=self._modes, tolerance=tolerance)
+
+    def _in_common(self, alike: Alike) -> tuple[PlainPlanes | None, float]:
+        """What makes plans of tiles in plain scenes, and what of the tolerance is for effects."""
+        from sweep.model.effects.plain_plan import PlainPlanes
+        from sweep.model.effects.tile_link import TileLink
         from sweep.model.resolution import BEAMLETS, effects_tolerance
 
-        for alike in self.tiles.alike(tiles):
-            block = Block.of_plane(alike.parameters)
-            tolerance = effects_tolerance(
-                block.words, block.whole(BEAMLETS), float(np.ravel(block[TOLERANCE].low)[0])
-            )
-            yield alike.tiles, plan(block, modes=self._modes, tolerance=tolerance)
+        shared = TileLink(alike.parameters)
+        number, tolerance = shared.whole(BEAMLETS), shared[TOLERANCE].low
+        share = effects_tolerance(shared.words, number, float(np.ravel(tolerance)[0]))
+        return PlainPlanes.of(alike.parameters), share
 
 
 class ShotsPlan(NamedTuple):
@@ -157,7 +178,8 @@ class ShotsCalling:
     ) -> None:
         from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.catalogue import EFFECTS as ALL
-        from sweep.model.effects.plain_scene import PlainScene, is_plain
+        from sweep.model.effects.plain_plan import PlainFlight
+        from sweep.model.effects.plain_scene import is_plain
         from sweep.model.effects.planning import rules_of
         from sweep.model.effects.span import Span
         from sweep.model.effects.tile_link import TileLink
@@ -172,7 +194,7 @@ class ShotsCalling:
             }
         )
         plain = not self._rules.at_rest and is_plain(self._instrument, rotating)
-        self._plain = PlainScene.of(self._instrument) if plain else None
+        self._plain = PlainFlight.of(self._instrument) if plain else None
 
     def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""

@@ -36,6 +36,8 @@ UNDIVIDED = (
 class Alike(NamedTuple):
     """Tiles that share every word and size."""
 
+    code: int
+    """The same for all tiles of the grid that share them."""
     tiles: np.ndarray
     """(m,): their numbers among those asked for."""
     parameters: dict[str, Span | str]
@@ -53,9 +55,8 @@ class Tiles:
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
-        self.shape = tile_shape(
-            grid.shape, tuple(self._undivided(k) for k in range(len(grid.dims)))
-        )
+        self._undivided = tuple(self._is_undivided(k) for k in range(len(grid.dims)))
+        self.shape = tile_shape(grid.shape, self._undivided)
         self.along = tuple(-(-n // s) for n, s in zip(grid.shape, self.shape, strict=True))
 
     @property
@@ -87,14 +88,14 @@ class Tiles:
         positions = np.unravel_index(tiles, self.along) if self.along else ()
         codes = np.zeros(len(tiles), np.int64)
         for k, position in enumerate(positions):
-            if self._undivided(k):
+            if self._undivided[k]:
                 codes = codes * self.along[k] + position
-        for code in np.unique(codes):
+        for code in np.unique(codes) if any(self._undivided) else codes[:1]:
             chosen = np.flatnonzero(codes == code)
-            parameters = {path: _span(value) for path, value in self.grid.fixed.items()}
+            parameters = dict(self._fixed)
             for k, position in enumerate(positions):
                 parameters |= self._along(k, position[chosen])
-            yield Alike(chosen, parameters)
+            yield Alike(int(code), chosen, parameters)
 
     def points(self, tile: int) -> tuple[slice, ...]:
         """Slices of a tile along each axis, cut at the edge of the grid."""
@@ -104,7 +105,7 @@ class Tiles:
             for p, side, size in zip(position, self.shape, self.grid.shape, strict=True)
         )
 
-    def _undivided(self, axis: int) -> bool:
+    def _is_undivided(self, axis: int) -> bool:
         from sweep.model.chain import SHARED
 
         return any(
@@ -115,13 +116,18 @@ class Tiles:
     def _along(self, axis: int, position: np.ndarray) -> dict[str, Span | str]:
         from sweep.model.effects.span import Span
 
-        if self._undivided(axis):
+        if self._undivided[axis]:
             first = int(position[0])
             return {path: _span(values[first]) for path, values in self.grid.values[axis].items()}
         return {
             path: Span(low[position], high[position])
             for path, (low, high) in self._extremes[axis].items()
         }
+
+    @cached_property
+    def _fixed(self) -> dict[str, Span | str]:
+        """Parameters that all points share."""
+        return {path: _span(value) for path, value in self.grid.fixed.items()}
 
     @cached_property
     def _extremes(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:

@@ -19,15 +19,24 @@ from sweep.model.effects.footprint_fields import (
     VELOCITIES,
     WHOLE,
 )
-from sweep.model.effects.plain_changes import DISTANCE, VELOCITY
-from sweep.model.effects.plain_plan import plain_plan
-from sweep.model.effects.plain_scene import PLAIN, PlainScene, is_plain
+from sweep.model.effects.plain_plan import (
+    DISTANCE,
+    VARYING,
+    VELOCITY,
+    PlainFlight,
+    PlainPlanes,
+)
+from sweep.model.effects.plain_scene import PLAIN, is_plain
 from sweep.model.effects.planning import plan, rules_of
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
 
 EDGES = np.array([0, 1, 4, 9, 10, 30, 31])
 """Of tiles of several sizes, some of one shot."""
+LARGEST = {
+    "target.grazing_angle": np.pi / 2, "target.reflectance": 1.0,
+    "instrument.telescope.optical_efficiency": 1.0,
+}  # fmt: skip
 ARCHITECTURE = "instrument.receiver.architecture"
 MODES = st.fixed_dictionaries(
     {}, optional={n: st.sampled_from(["on", "off"]) for n in NAMES if n != "doppler"}
@@ -100,11 +109,62 @@ def test_in_one_pass_a_plan_is_the_same_bit_for_bit(
         modes = {}
     found, rules = found_in(rng, number), rules_of(EFFECTS, tuple(modes.items()))
     slow = plan(block_of(scene, found), modes, tolerance)
-    fast = plain_plan(PlainScene.of(scene), found, EDGES, rules, tolerance)
+    fast = PlainFlight.of(scene).plan(found, EDGES, rules, tolerance)
     assert fast.names == slow.names
     np.testing.assert_array_equal(fast.change, slow.change)
     np.testing.assert_array_equal(fast.kept, slow.kept)
     np.testing.assert_array_equal(fast.error, slow.error)
+
+
+def planes(parameters, rng):
+    """Tiles of points on planes: as wide as chance has it, some of one point."""
+    number, found = 30, {}
+    wide = 10 ** rng.uniform(-9, 0, number) * rng.choice([0, 1], number)
+    varying = [path for path in sorted(VARYING) if rng.random() < 0.6]
+    for path, value in parameters.items():
+        if isinstance(value, str):
+            found[path] = value
+        elif path not in varying:
+            found[path] = Span.of(float(value))
+        else:
+            middle = float(value) * 10 ** rng.uniform(-1, 1, number)
+            top = LARGEST.get(path, np.inf)
+            low = np.minimum(middle, top)
+            found[path] = Span(low, np.minimum(low + wide * abs(low), top))
+    return found, max((span.low.size for path in varying for span in [found[path]]), default=1)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("law", ["thesis", "lambert", "lommel_seeliger"])
+@given(st.integers(0, 2**32), MODES, st.sampled_from([0.0, 1e-6, 1e-3, 0.1]))
+def test_on_planes_too(table_4_1, law, phases, seed, modes, tolerance):
+    rng = np.random.default_rng(seed)
+    parameters = DEFAULTS | table_4_1(
+        range=10 ** rng.uniform(0, 5), radial_velocity=float(rng.choice([0.0, -1e-4, 1.0, 3e3])),
+        grazing_angle=float(rng.choice([np.pi / 2, 1.0, 0.3, 1e-3])), reflectance_law=law,
+        beam_divergence=10 ** rng.uniform(-5, -2), phases=phases,
+        beamlets=int(rng.choice([1, 3, 19, 109])), duration=float(rng.choice([500e-6, 200e-6])),
+    ) | {"target.transverse_velocity": float(rng.choice([0.0, 30.0, -3e3]))}  # fmt: skip
+    tiles, size = planes(parameters, rng)
+    modes = modes | {e.name: "off" for e in EFFECTS if e.is_random}
+    if any(modes.get(e.name) == "on" and modes.get(e.within) == "off" for e in EFFECTS):
+        modes = {}
+    slow = plan(Block.of_plane(tiles), modes, tolerance)
+    rules = rules_of(EFFECTS, tuple(modes.items()))
+    fast = PlainPlanes.of(tiles).plan(tiles, size, rules, tolerance)
+    np.testing.assert_array_equal(fast.change, slow.change)
+    np.testing.assert_array_equal(fast.kept, slow.kept)
+    np.testing.assert_array_equal(fast.error, slow.error)
+
+
+def test_planes_are_planned_together_only_where_the_receiver_is_the_same(table_4_1):
+    tiles, _ = planes(DEFAULTS | table_4_1(), np.random.default_rng(1))
+    assert PlainPlanes.of(tiles) is not None
+    for path in ("instrument.processing.tnr", "instrument.receiver.responsivity"):
+        varied = Span(np.array([0.5, 6.0]), np.array([0.6, 7.0]))
+        assert PlainPlanes.of(tiles | {path: varied}) is None
+    assert PlainPlanes.of(tiles | {"target.acceleration": Span.of(1.0)}) is None
+    assert PlainPlanes.of(tiles | {ARCHITECTURE: "direct"}) is None
 
 
 def test_what_any_other_effect_brings_makes_a_scene_no_plain_one(table_4_1):

@@ -11,17 +11,19 @@ on the axis's, bins would have S |W|; as they lie X_b from it, by the mean value
 from that by no more than max |W'| sum_b a_b |X_b|.
 """
 
-from collections.abc import Iterator, Mapping
+import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numba import njit
 
-from sweep.model import reflectance, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.span import Span
-from sweep.model.footprint import plane_footprint, velocity_offsets
+from sweep.model.effects.columns import columns
+from sweep.model.elementary import sincos_cycles
+from sweep.model.footprint import beamlets
 from sweep.model.preparation import LASER
+from sweep.model.reflectance import LAWS, backscatter_of
 
 if TYPE_CHECKING:
     from sweep.model.effects.block import Block
@@ -85,63 +87,101 @@ def _points(block: "Block") -> np.ndarray:
 
 def _at_points(block: "Block", points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sums and leans of tiles of one point each, whatever the velocities make of them."""
-
-    def value(span: Span) -> np.ndarray:
-        return np.broadcast_to(span.low, points.shape)[points][:, None]
-
-    angle, divergence, along, across = (value(block[path])[:, 0] for path in _SHAPE)
-    shape: dict[str, Any] = {
-        "beam_divergence": divergence, "number": block.number, "pattern": block.pattern,
-    }  # fmt: skip
-    offset, cosine, weights = plane_footprint(grazing_angle=angle, **shape)
-    law = block.word("target.reflectance_law")
-    axis = reflectance.backscatter(law, np.sin(angle))[:, None]
-    echo = weights * reflectance.backscatter(law, cosine) / (1 + offset) ** 2 / axis
-    amplitude = np.sqrt(echo)
-    closing = velocity_offsets(radial=np.where(across == 0, 0.0, along), transverse=across, **shape)
-    spread = np.where(weights > 0, 2 * closing / SPEED_OF_LIGHT, 0.0)
-    scene = {name: value(span) for name, span in _motion(block)}
-    still = np.zeros_like(spread)
-    most, lean = np.zeros((2, 3, angle.size))
-    for doppler in (still, spread) if np.any(spread) else (still,):
-        for s, sign in enumerate(waveform.SIGNS):
-            carrier = value(block.carriers[s])
-            turns, beat, error = _phases(sign, carrier, offset, doppler, scene)
-            found = abs((amplitude * np.exp(2j * np.pi * turns)).sum(axis=1))
-            most[s] = np.maximum(most[s], found + (amplitude * error).sum(axis=1))
-            apart = (amplitude * abs(beat)).sum(axis=1) / scene["bin"][:, 0]
-            lean[s] = np.maximum(lean[s], apart * (1 + abs(scene["beta"][:, 0])))
-    # what the receiver's poles make of a beat's difference, in size and in phase
-    poles = 2 * np.broadcast_to(block.lines.tilt, (3, block.size))[:, points] * lean
-    return most + poles, lean
-
-
-def _motion(block: "Block") -> Iterator[tuple[str, Span]]:
-    """What the phases follow from, by name."""
-    yield "range", block.range
-    yield "rate", block.chirp_rate
-    yield "middle", block.start + 0.5 * block.record_duration
-    yield "bin", block.bin_width
-    yield "beta", block.beta
-
-
-def _phases(
-    sign: int,
-    carrier: np.ndarray,
-    offset: np.ndarray,
-    doppler: np.ndarray,
-    scene: Mapping[str, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phases [cycles] of beamlets at the record's middle, beats [Hz], errors of phases [rad]."""
-    delay = 2 / SPEED_OF_LIGHT * scene["range"]
-    slope = sign * scene["rate"]
-    beat = carrier * doppler - slope * delay * (offset + (1 + offset) * doppler)
-    parts = (
-        -carrier * delay * offset,
-        0.5 * slope * delay**2 * offset * (2 + offset),
-        beat * scene["middle"],
+    start, duration = block.start, block.record_duration
+    spans = [block[path] for path in _SHAPE]
+    spans += [block.range, block.chirp_rate, start + 0.5 * duration, block.bin_width, block.beta]
+    values = [span.low for span in (*spans, *block.carriers)]
+    table, _ = columns(
+        np.zeros(block.size), *values, *np.broadcast_to(block.lines.tilt, (3, block.size))
     )
-    # with the Doppler effect a range's beat is stretched
-    stretched = abs(scene["beta"] * slope * delay * offset * scene["middle"])
-    error = 2 * np.pi * (stretched + _ROUNDING * sum(map(abs, parts)))
-    return sum(parts), beat, error
+    found = np.empty((2, 3, int(points.sum())))
+    law = LAWS.index(block.word("target.reflectance_law"))
+    (across, along), share = beamlets(block.number, block.pattern)
+    put_at_points(table[1:, points], (across, along, share), law, found)
+    return found[0], found[1]
+
+
+@njit(cache=True, error_model="numpy")
+def put_at_points(table, beam, law, out):
+    """Sums of amplitudes and leans of points on smooth planes, (2, 3, n).
+
+    Each the larger of those with the beamlets' own velocities and without.
+
+    Parameters
+    ----------
+    table : (15, n) float64
+        Grazing angle, divergence [rad], radial and transverse velocity [m/s], range [m], chirp
+        rate [Hz/s], middle of the record [s], width of a bin [Hz], Doppler ratio; carriers [Hz]
+        and tilts of the three segments.
+    beam : tuple of (beamlets,) ndarray
+        Angles across the slope and along it in standard deviations, power fractions.
+    law : int
+        Place of the reflectance law in :data:`sweep.model.reflectance.LAWS`.
+    """
+    rays, terms = np.empty((3, beam[2].size)), np.empty((4, beam[2].size))
+    for i in range(table.shape[1]):
+        point = table[:, i]
+        out[:, :, i] = 0.0
+        for moving in range(2 if point[3] != 0.0 else 1):
+            _put_rays(point, beam, law, moving == 1, rays)
+            for s in range(3):
+                _put_terms(1.0 - s, point, point[9 + s], rays, terms)
+                real, imaginary, unsure, apart = _sums(terms)
+                out[0, s, i] = np.maximum(out[0, s, i], np.hypot(real, imaginary) + unsure)
+                lean = apart / point[7] * (1 + abs(point[8]))
+                out[1, s, i] = np.maximum(out[1, s, i], lean)
+        for s in range(3):
+            # what the receiver's poles make of a beat's difference, in size and in phase
+            out[0, s, i] += 2 * point[12 + s] * out[1, s, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _put_rays(point, beam, law, moving, out):
+    """Amplitudes, (R_b - R_0) / R_0 and Doppler ratios of beamlets, 0 over the horizon."""
+    angle, divergence, closing, sideways = point[0], point[1], point[2], point[3]
+    (across, along, share), sigma = beam, divergence / 4
+    sine, cosine = np.sin(angle), np.cos(angle)
+    axis = backscatter_of(law, sine)
+    for b in range(share.size):
+        x, y = across[b] * sigma, along[b] * sigma
+        square = x * x + y * y
+        stretch = square / (1 + np.sqrt(1 + square))  # |d| - 1
+        height = sine + y * cosine
+        hits = height > 0
+        over = height if hits else 1.0
+        offset = (stretch * sine - y * cosine) / over
+        echo = share[b] * backscatter_of(law, over / (1 + stretch)) / ((1 + offset) * (1 + offset))
+        speed = (sideways * y - closing * stretch) / (1 + stretch) if moving else 0.0
+        out[0, b] = np.sqrt(echo / axis) if hits else 0.0
+        out[1, b] = offset if hits else 0.0
+        out[2, b] = 2 * speed / SPEED_OF_LIGHT if hits else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _put_terms(sign, point, carrier, rays, out):
+    """Beamlets' parts of the sum, what they may be off by, and sizes of their beats [Hz].
+
+    By phases [cycles] at the record's middle.
+    """
+    delay, slope, middle = 2 / SPEED_OF_LIGHT * point[4], sign * point[5], point[6]
+    stretch = abs(point[8] * slope * delay * middle)
+    for b in range(rays.shape[1]):
+        amplitude, offset, doppler = rays[0, b], rays[1, b], rays[2, b]
+        beat = carrier * doppler - slope * delay * (offset + (1 + offset) * doppler)
+        far = -carrier * delay * offset
+        bent = 0.5 * slope * delay * delay * offset * (2 + offset)
+        turned = beat * middle
+        sine, cosine = sincos_cycles(far + bent + turned)
+        out[0, b], out[1, b] = amplitude * cosine, amplitude * sine
+        # with the Doppler effect a range's beat is stretched
+        unsure = stretch * abs(offset) + _ROUNDING * (abs(far) + abs(bent) + abs(turned))
+        out[2, b], out[3, b] = amplitude * (2 * math.pi * unsure), amplitude * abs(beat)
+
+
+@njit(cache=True, error_model="numpy")
+def _sums(terms):
+    """Sums of four rows, in order."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    for k in range(terms.shape[1]):
+        a, b, c, d = a + terms[0, k], b + terms[1, k], c + terms[2, k], d + terms[3, k]
+    return a, b, c, d

@@ -197,64 +197,6 @@ def _from_edge(position, half):
     return min(abs(low - np.rint(low)), abs(high - np.rint(high))) * half
 
 
-def plane_range_moments(
-    *, grazing_angle: ArrayLike, beam_divergence: ArrayLike, number: int, pattern: str
-) -> Moments:
-    """Bounds on (R_b - R_0)/R_0 of a beam on a plane, weighted by echo power.
-
-    With u the angle along the slope times cot(grazing), (1 + d)/(1 + u) is R_b/R_0, and the
-    echo's weight (1 + u)^m, m <= 3 (Lambert). The pattern has exactly the beam's covariance, so
-    that u has the rms q = (divergence/4) cot(grazing); the rest bounds Taylor's remainders.
-    Infinite where a beamlet may pass over the horizon.
-    """
-    if number == 1:
-        return NO_SPREAD
-    radius = reach_of(number, pattern)
-    sigma = np.asarray(beam_divergence, float) / 4
-    rms = sigma / np.tan(np.asarray(grazing_angle, float))
-    widest, bulge = radius * rms, (radius * sigma) ** 2 / 2
-    inside = np.where(widest < 1, 1 - widest, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        heavier = (1 + widest) ** 3 * np.exp(6 * bulge)
-        lean = 3 * rms**2 * (1 + widest) ** 2 * np.exp(6 * bulge) + 6 * rms * bulge
-        mean = lean + (rms**2 + sigma**2) * heavier / inside
-        far = (rms + sigma * np.sqrt(bulge)) * np.sqrt(heavier) / inside
-        extreme = (widest + bulge) / inside
-    bounds = (np.where(inside > 0, value, np.inf) for value in (mean, far, extreme))
-    return Moments(*(np.asarray(value) for value in bounds))
-
-
-def plane_velocity_moments(
-    *,
-    across: ArrayLike,
-    along: ArrayLike,
-    grazing_angle: ArrayLike,
-    beam_divergence: ArrayLike,
-    number: int,
-    pattern: str,
-) -> Moments:
-    """Bounds on the beamlets' radial velocities less the axis's [m/s], at a velocity off the beam.
-
-    A beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1), |d|^2 = 1 + x^2; its
-    weight is that of :func:`plane_range_moments`.
-    """
-    if number == 1:
-        return NO_SPREAD
-    radius = reach_of(number, pattern)
-    sigma = np.asarray(beam_divergence, float) / 4
-    slope = sigma / np.tan(np.asarray(grazing_angle, float))
-    widest = np.minimum(radius * slope, 1.0)
-    bulge = (radius * sigma) ** 2 / 2
-    across, along = np.abs(across), np.abs(along)
-    heavier = (1 + widest) ** 3 * np.exp(6 * bulge)
-    lean = sigma * (3 * slope * heavier + 8 * radius * bulge)
-    return Moments(
-        np.asarray(across * lean + along * sigma**2 * heavier),
-        np.asarray((across * sigma + along * sigma * np.sqrt(bulge)) * np.sqrt(heavier)),
-        np.asarray(across * radius * sigma + along * bulge),
-    )
-
-
 def reach_of(number: int, pattern: str) -> float:
     """Largest angle of a beamlet off the axis, in standard deviations."""
     points, _ = beamlets(number, pattern)

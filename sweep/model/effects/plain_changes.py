@@ -11,16 +11,6 @@ import numpy as np
 from numba import njit
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.footprint_fields import (
-    APART,
-    BESIDE,
-    FIELDS,
-    GAIN,
-    OWN_RANGES,
-    RANGES,
-    VELOCITIES,
-    WHOLE,
-)
 from sweep.model.effects.footprint_phase import put_sum_changes, put_sums_added
 from sweep.model.effects.image import put_alarms, put_bounds, put_moved_bins
 from sweep.model.effects.line_powers import put_moved_changes, put_power_ranges
@@ -51,8 +41,6 @@ from sweep.model.effects.several_returns import put_changes
 
 FOOTPRINT, PHASE, SEVERAL, DOPPLER, SPREAD, NOISE, WALK, IMAGE, LEAKAGE = range(9)
 """Effects, as of :data:`.plain_scene.PLAIN`."""
-DISTANCE, VELOCITY = FIELDS, FIELDS + 1
-"""Rows of what is found of shots: after the fields of their footprints."""
 SEGMENTS = 3
 
 _SQUARE = np.array([2])
@@ -60,12 +48,33 @@ _SQUARE = np.array([2])
 compiled = partial(njit, cache=True, error_model="numpy")
 
 
+class Found(NamedTuple):
+    """What beams meet, by tile: ends (2, tiles), or what is largest (tiles,)."""
+
+    range: np.ndarray
+    """[m]"""
+    velocity: np.ndarray
+    """On the axis [m/s]."""
+    light: np.ndarray
+    """Echo [W] of 1/sr at 1 m."""
+    echo: np.ndarray
+    """Of the bare line [1/sr]."""
+    ratio: np.ndarray
+    """All echo over the bare line's."""
+    gain: np.ndarray
+    """Of :class:`.tile_geometry.Geometry`."""
+    moments: np.ndarray
+    """(9, tiles): of ranges, of those on the axis's surface, of velocities [m/s]."""
+    beside: np.ndarray
+    """Share of the echo from other surfaces than the axis's."""
+    apart: np.ndarray
+    """How far off these are, over the range."""
+
+
 class Tiles(NamedTuple):
     """What the formulas look at, by cells: a segment's tiles, then the next one's."""
 
-    low: np.ndarray
-    high: np.ndarray
-    """(fields + 2, tiles): ends over the tiles of what was found."""
+    found: Found
     axis: np.ndarray
     """(9, cells): :attr:`.block.Block.axis`."""
     resting: np.ndarray
@@ -81,47 +90,49 @@ class Tiles(NamedTuple):
     noise: np.ndarray
     """(2, tiles): variance of the echo's shot noise over that of all other."""
     in_phase: np.ndarray
+    most: np.ndarray
     lean: np.ndarray
     """(cells,) each: of :func:`.footprint_sum.footprint_sum`."""
 
 
 @compiled
-def tiles_of(ends, scene):
+def tiles_of(found, scene):
     """All that the formulas look at."""
-    low, high = ends
-    number = low.shape[1]
+    number = found.beside.size
     cells = SEGMENTS * number
     axis, resting, shifts = np.empty((9, cells)), np.empty((6, cells)), np.empty(cells)
     spreads, apart = np.empty((12, cells)), np.empty((12, cells))
-    peak, noise = np.empty((2, number)), np.empty((2, number))
-    lines, moments = _given(low, high, scene)
+    lines, beside = _lines_of(found, scene), found.moments.copy()
     _put_axis(lines, scene.fft_size / 2, axis[:6], resting, shifts)
-    put_spreads(lines, moments, spreads.reshape(12, SEGMENTS, number))
+    put_spreads(lines, found.moments, spreads.reshape(12, SEGMENTS, number))
     axis[6:] = spreads[9:]
-    moments[5] = high[APART]
-    put_spreads(lines, moments, apart.reshape(12, SEGMENTS, number))
-    _put_light(low, high, scene.link, peak, noise)
-    in_phase, lean = np.ones(cells), np.zeros(cells)
-    for i in range(cells if scene.amplitudes else 0):
-        in_phase[i] = high[GAIN, i % number]
-        lean[i] = in_phase[i] * np.fmin(axis[8, i], scene.fft_size)
-    return Tiles(low, high, axis, resting, spreads, apart[5], shifts, peak, noise, in_phase, lean)
+    beside[5] = found.apart
+    put_spreads(lines, beside, apart.reshape(12, SEGMENTS, number))
+    peak, noise = _light(found, scene.link)
+    in_phase, lean = np.empty(cells), np.zeros(cells)
+    for i in range(cells):
+        t = i % number
+        in_phase[i] = np.sqrt(np.maximum(found.ratio[1, t], 1.0))
+        if scene.amplitudes:
+            in_phase[i] *= found.gain[1, t]
+            lean[i] = in_phase[i] * np.fmin(axis[8, i], scene.fft_size)
+    return Tiles(
+        found, axis, resting, spreads, apart[5], shifts, peak, noise, in_phase, in_phase.copy(),
+        lean,
+    )  # fmt: skip
 
 
 @compiled
-def _given(low, high, scene):
-    """What lines follow from, :func:`.line_spread.axis_ends`, and the moments of their spread."""
-    number = low.shape[1]
-    ends, moments = np.empty((9, 2, number)), np.empty((9, number))
+def _lines_of(found, scene):
+    """What lines follow from, :func:`.line_spread.axis_ends`."""
+    number = found.beside.size
+    ends = np.empty((9, 2, number))
     ends[:] = scene.ends
-    for t in range(number):
-        for end, value in (0, low), (1, high):
-            ends[BETA, end, t] = value[VELOCITY, t] * 2 / SPEED_OF_LIGHT
-            ends[RANGE, end, t] = value[DISTANCE, t]
-        for m in range(3):
-            moments[m, t], moments[3 + m, t] = high[RANGES + m, t], high[OWN_RANGES + m, t]
-            moments[6 + m, t] = high[VELOCITIES + m, t] * (SPEED_OF_LIGHT / 2)
-    return ends, moments
+    for end in range(2):
+        for t in range(number):
+            ends[BETA, end, t] = found.velocity[end, t] * 2 / SPEED_OF_LIGHT
+            ends[RANGE, end, t] = found.range[end, t]
+    return ends
 
 
 @compiled
@@ -140,17 +151,20 @@ def _put_axis(ends, half, lines, resting, shifts):
 
 
 @compiled
-def _put_light(low, high, link, peak, noise):
+def _light(found, link):
     """The bare line's peak over sigma, and the echo's shot noise over all other, (2, tiles)."""
-    light, oscillator, beat, transimpedance, window, deviation, shot, others = link
-    for t in range(low.shape[1]):
+    oscillator, beat, transimpedance, window, deviation, shot, others = link
+    peak, noise = np.empty(found.echo.shape), np.empty(found.echo.shape)
+    for t in range(peak.shape[1]):
         for end in range(2):
-            far = high[DISTANCE, t] if end == 0 else low[DISTANCE, t]
-            echo = low[WHOLE, t] if end == 0 else high[WHOLE, t]
-            power = light / (far * far)
+            far, echo = found.range[1 - end, t], found.echo[end, t]
+            power = found.light[end, t] / (far * far)
             voltage = beat * np.sqrt(oscillator * power) * transimpedance
             peak[end, t] = voltage * 0.5 * np.sqrt(echo) * window / deviation
-            noise[end, t] = power * echo * shot / others
+            ratio = found.ratio[end, t]
+            more = np.minimum(ratio, 1.0) if end == 0 else np.maximum(ratio, 1.0)
+            noise[end, t] = power * echo * more * shot / others
+    return peak, noise
 
 
 @compiled
@@ -161,9 +175,9 @@ def is_there(effect, tiles, scene):
     if effect == PHASE:
         return scene.amplitudes
     if effect == SEVERAL:
-        return np.any(tiles.high[BESIDE] > 0.0)
+        return np.any(tiles.found.beside > 0.0)
     if effect in (DOPPLER, WALK):
-        return np.any(tiles.low[VELOCITY] != 0.0) or np.any(tiles.high[VELOCITY] != 0.0)
+        return np.any(tiles.found.velocity != 0.0)
     if effect == SPREAD:
         return np.any(tiles.spreads[8] > 0.0)
     return True
@@ -214,21 +228,24 @@ def _put_sums(bins, tiles, scene, entry):
 @compiled
 def _put_footprint(tiles, scene, entry):
     """:func:`.footprint.bound`."""
-    none = np.zeros((3, tiles.axis.shape[1]))
+    none, number = np.zeros((3, tiles.axis.shape[1])), tiles.found.beside.size
     _put_moves(none[0], tiles.spreads[3:6], none, tiles.axis[:6], tiles, scene, entry)
+    for i in range(tiles.axis.shape[1]):
+        entry[WEAK, i] *= np.sqrt(tiles.found.ratio[0, i % number])
+        entry[STRONG, i] *= np.sqrt(tiles.found.ratio[1, i % number])
 
 
 @compiled
 def _put_phase(tiles, scene, entry):
     """:func:`.footprint_phase.bound`."""
-    low, high, axis, number = tiles.low, tiles.high, tiles.axis, tiles.low.shape[1]
+    found, axis, number = tiles.found, tiles.axis, tiles.found.beside.size
     table = np.empty((7, axis.shape[1]))
     for i in range(axis.shape[1]):
         t = i % number
-        further = scene.turns[i // number, 0] * (high[DISTANCE, t] * high[RANGES + 2, t])
+        further = scene.turns[i // number, 0] * (found.range[1, t] * found.moments[2, t])
         table[0, i], table[1, i], table[2, i] = axis[2, i], axis[5, i], axis[8, i]
         table[3, i] = further + tiles.spreads[8, i] * scene.turn_of_bin
-        table[4, i], table[5, i], table[6, i] = low[GAIN, t], high[GAIN, t], np.inf
+        table[4, i], table[5, i], table[6, i] = found.gain[0, t], found.gain[1, t], np.inf
     _, curvature, margin, _ = scene.lobe
     sizes = curvature, margin, scene.worst
     put_sum_changes(table, sizes, scene.tails, float(scene.beamlets), entry[: STRONG + 1])
@@ -237,7 +254,7 @@ def _put_phase(tiles, scene, entry):
 @compiled
 def _put_several(tiles, scene, entry):
     """:func:`.several_returns.bound`."""
-    axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.low.shape[1]
+    axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.found.beside.size
     given, found = np.zeros((7, cells)), np.empty((4, cells))
     given[0], given[1], given[2], given[3] = axis[0], axis[1], axis[2], axis[5]
     put_power_ranges(given, scene.beamlets, scene.tables, scene.lobe, found[:2])
@@ -245,7 +262,7 @@ def _put_several(tiles, scene, entry):
     put_power_ranges(given, scene.beamlets, scene.tables, scene.lobe, found[2:])
     table = np.empty((7, cells))
     for i in range(cells):
-        table[0, i], table[1, i] = tiles.high[BESIDE, i % number], tiles.apart[i]
+        table[0, i], table[1, i] = tiles.found.beside[i % number], tiles.apart[i]
         table[2, i], table[3, i] = found[2, i], found[1, i]
         table[4, i], table[5, i], table[6, i] = axis[2, i], axis[4, i], axis[5, i]
     _, lowest = scene.tables
@@ -255,7 +272,7 @@ def _put_several(tiles, scene, entry):
 @compiled
 def _put_doppler(tiles, scene, entry):
     """:func:`.doppler.bound`."""
-    shifts, cells, number = tiles.shifts, tiles.axis.shape[1], tiles.low.shape[1]
+    shifts, cells, number = tiles.shifts, tiles.axis.shape[1], tiles.found.beside.size
     none, moved = np.zeros((3, cells)), np.empty((2, cells))
     _put_moves(shifts, none, tiles.spreads[9:], tiles.resting, tiles, scene, moved)
     if scene.amplitudes:
@@ -284,7 +301,7 @@ def _put_doppler_spread(tiles, scene, entry):
 def _put_noise(tiles, entry):
     """:func:`.signal_shot_noise.bound`."""
     for i in range(tiles.axis.shape[1]):
-        t = i % tiles.low.shape[1]
+        t = i % tiles.found.beside.size
         entry[DOWN, i], entry[UP, i] = 1 + tiles.noise[0, t], 1 + tiles.noise[1, t]
         entry[SHARE, i] = 0.0
 
@@ -292,12 +309,12 @@ def _put_noise(tiles, entry):
 @compiled
 def _put_range_walk(tiles, scene, entry):
     """:func:`.range_walk.bound`."""
-    cells, number = tiles.axis.shape[1], tiles.low.shape[1]
+    cells, number = tiles.axis.shape[1], tiles.found.beside.size
     given, drifts, walk = np.empty((4, number)), np.empty((2, number)), np.empty((5, number))
     for t in range(number):
         given[0, t], given[1, t] = scene.rate, scene.rate
-        given[2, t] = tiles.low[VELOCITY, t] * 2 / SPEED_OF_LIGHT
-        given[3, t] = tiles.high[VELOCITY, t] * 2 / SPEED_OF_LIGHT
+        given[2, t] = tiles.found.velocity[0, t] * 2 / SPEED_OF_LIGHT
+        given[3, t] = tiles.found.velocity[1, t] * 2 / SPEED_OF_LIGHT
     put_drifts(given, drifts)
     over = np.empty((17, number))
     for k in range(15):
@@ -319,7 +336,7 @@ def _put_range_walk(tiles, scene, entry):
 @compiled
 def _put_image(tiles, scene, entry):
     """:func:`.image.bound`."""
-    axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.low.shape[1]
+    axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.found.beside.size
     found = np.empty((2, cells))
     put_bounds(axis, scene.beamlets, scene.tables, scene.lobe, scene.tails, found)
     entry[STRONG] = found[0]

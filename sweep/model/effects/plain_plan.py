@@ -1,57 +1,236 @@
-"""Plans of flights in plain scenes: those of :func:`.planning.plan`, in one compiled pass."""
+"""Plans in plain scenes: those of :func:`.planning.plan`, bit for bit, in one compiled pass.
+
+Once for shots, whose footprints rays have found, and once for points on planes; from what the beams
+meet on it is the same.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import tile_geometry
 from sweep.model.effects.catalogue import NAMES
+from sweep.model.effects.footprint_fields import (
+    APART,
+    BESIDE,
+    FIELDS,
+    GAIN,
+    OWN_RANGES,
+    RANGES,
+    VELOCITIES,
+    WHOLE,
+)
+from sweep.model.effects.footprint_sum import put_at_points
 from sweep.model.effects.leakage import unions
 from sweep.model.effects.line_powers import put_amplitudes
 from sweep.model.effects.plain_changes import (
     LEAKAGE,
     SEGMENTS,
+    Found,
     changes,
     compiled,
     is_there,
     tiles_of,
 )
-from sweep.model.effects.plain_scene import PLAIN, PlainScene
+from sweep.model.effects.plain_scene import PLAIN, PlainScene, is_plain, light_over
+from sweep.model.effects.plane_geometry import FIELDS as PLANE_FIELDS
+from sweep.model.effects.plane_geometry import Beam, beam_of, put_planes
 from sweep.model.effects.planning import Plan, Rules, choose
 from sweep.model.effects.probability_bounds import CHANGE_FIELDS, changes_of, finish, put_all
+from sweep.model.effects.span import Span
+from sweep.model.effects.tile_geometry import OF_PLANES
+from sweep.model.effects.tile_link import TileLink
+from sweep.model.footprint import beamlets
+from sweep.model.preparation import LASER, TELESCOPE
+from sweep.model.reflectance import LAWS
 
+VARYING = frozenset(
+    (
+        *OF_PLANES, "target.range", "target.reflectance", LASER + "power",
+        TELESCOPE + "aperture", TELESCOPE + "optical_efficiency",
+    )
+)  # fmt: skip
+"""Parameters that may differ within tiles of a plain scene's planes: all but the receiver's."""
+DISTANCE, VELOCITY = FIELDS, FIELDS + 1
+"""Rows of what is found of shots: after the fields of their footprints."""
 _ROWS = np.array([NAMES.index(name) for name in PLAIN])
 
 
-def plain_plan(
-    scene: PlainScene, found: np.ndarray, edges: np.ndarray, rules: Rules, tolerance: float
-) -> Plan:
-    """The plan of tiles of shots, as of :func:`.planning.plan`; Doppler must not be off.
+class PlainFlight(NamedTuple):
+    """Plans of shots in a plain scene."""
 
-    Parameters
-    ----------
-    scene : PlainScene
-        What the shots' instrument is.
-    found : (fields + 2, n) ndarray
-        Of the shots' footprints; their ranges [m] and radial velocities [m/s].
-    edges : (tiles + 1,) int ndarray
-        Tile i holds the shots from ``edges[i]`` up to ``edges[i + 1]``, one at least.
-    rules, tolerance
-        Of modes; on the sum of what is left out.
-    """
-    spans = tile_geometry.over(found, edges)
-    change = np.zeros((len(NAMES), edges.size - 1))
-    kept, error = np.zeros(change.shape, np.bool_), np.empty(edges.size - 1)
-    ends = np.asarray(spans.low), np.asarray(spans.high)
-    leaks = rules.asks_for_leakage, rules.spreading
-    # as a plain tuple, whose types are told at once
-    _plan(ends, tuple(scene), leaks, tuple(rules.choice), tolerance, (change, kept, error))
-    return Plan(rules.names, kept, change, error)
+    scene: PlainScene
+    light: float
+    """Echo [W] of 1/sr at 1 m."""
+
+    @classmethod
+    def of(cls, instrument: TileLink) -> "PlainFlight | None":
+        """Of an instrument whose parameters are the same for all shots; None as of scenes."""
+        scene = PlainScene.of(instrument)
+        white = {**instrument.parameters, "target.reflectance": Span.of(1.0)}
+        return None if scene is None else cls(scene, float(light_over(white).low))
+
+    def plan(self, found: np.ndarray, edges: np.ndarray, rules: Rules, tolerance: float) -> Plan:
+        """The plan of tiles of shots, as of :func:`.planning.plan`; Doppler must not be off.
+
+        Parameters
+        ----------
+        found : (fields + 2, n) ndarray
+            Of the shots' footprints; their ranges [m] and radial velocities [m/s].
+        edges : (tiles + 1,) int ndarray
+            Tile i holds the shots from ``edges[i]`` up to ``edges[i + 1]``, one at least.
+        rules, tolerance
+            Of modes; on the sum of what is left out.
+        """
+        spans = tile_geometry.over(found, edges)
+        ends, made = (np.asarray(spans.low), np.asarray(spans.high)), _room(edges.size - 1)
+        _plan_shots(ends, self.light, tuple(self.scene), _asked(rules, tolerance), made)
+        return Plan(rules.names, *made)
+
+
+class PlainPlanes(NamedTuple):
+    """Plans of points on planes of a plain scene, of which some parameters vary within tiles."""
+
+    scene: PlainScene
+    law: int
+    """Place of the reflectance law in :data:`sweep.model.reflectance.LAWS`."""
+    beam: Beam
+    pattern: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """Of :func:`.footprint_sum.put_at_points`."""
+    light: Span | None
+    """Echo [W] of 1/sr at 1 m, where it is the same in all tiles."""
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, Span | str]) -> "PlainPlanes | None":
+        """Of some tiles' parameters, for all whose others than :data:`VARYING` are the same.
+
+        None where there may be more than plain effects, or others vary.
+        """
+        for path, value in parameters.items():
+            if isinstance(value, Span) and path not in VARYING and not _is_number(value):
+                return None
+        instrument = TileLink(parameters)
+        if not is_plain(instrument, rotating=False):
+            return None
+        scene, light = PlainScene.of(instrument), light_over(parameters)
+        number, pattern = instrument.beamlets
+        (across, along), share = beamlets(number, pattern)
+        return scene and cls(
+            scene=scene,
+            law=LAWS.index(instrument.word("target.reflectance_law")),
+            beam=beam_of(number, pattern, instrument.architecture),
+            pattern=(across, along, share),
+            light=light if _is_number(light) else None,
+        )
+
+    def plan(
+        self, parameters: Mapping[str, Span | str], size: int, rules: Rules, tolerance: float
+    ) -> Plan:
+        """The plan of some tiles, as of :func:`.planning.plan`; Doppler must not be off.
+
+        Parameters
+        ----------
+        parameters : mapping
+            As of :meth:`.block.Block.of_plane`.
+        size : int
+            Tiles.
+        rules, tolerance
+            Of modes; on the sum of what is left out.
+        """
+        spans = [parameters[path] for path in (*OF_PLANES, "target.range")]
+        given, made = np.empty((12, size)), _room(size)
+        light = self.light or light_over(parameters)
+        for k, span in enumerate((*spans, light)):
+            given[2 * k], given[2 * k + 1] = span.low, span.high  # type: ignore[union-attr]
+        plane = self.law, self.beam, self.pattern
+        _plan_points(given, plane, tuple(self.scene), _asked(rules, tolerance), made)
+        return Plan(rules.names, *made)
+
+
+def _is_number(span: Span) -> bool:
+    return isinstance(span.low, float) and bool(span.low == span.high)
+
+
+def _room(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Room for what is kept, what it changes, and what is left out."""
+    change = np.zeros((len(NAMES), size))
+    return np.zeros(change.shape, np.bool_), change, np.empty(size)
+
+
+def _asked(rules: Rules, tolerance: float) -> tuple[Any, ...]:
+    """What is asked for, in plain tuples, whose types are told at once."""
+    return rules.asks_for_leakage, rules.spreading, tuple(rules.choice), tolerance
 
 
 @compiled(nogil=True)
-def _plan(ends, scene, leaks, choice, tolerance, out):
-    """Changes and what is kept, (effects, tiles), and errors, (tiles,)."""
-    (change, kept, error), scene = out, PlainScene(*scene)
-    tiles = tiles_of(ends, scene)
+def _plan_shots(ends, light, scene, asked, made):
+    """Plans of tiles of shots."""
+    (low, high), scene, moments = ends, PlainScene(*scene), np.empty((9, ends[0].shape[1]))
+    moments[:3], moments[3:6] = high[RANGES : RANGES + 3], high[OWN_RANGES : OWN_RANGES + 3]
+    moments[6:] = high[VELOCITIES : VELOCITIES + 3] * (SPEED_OF_LIGHT / 2)
+    shape = 2, low.shape[1]
+    found = Found(
+        _both(low[DISTANCE], high[DISTANCE]), _both(low[VELOCITY], high[VELOCITY]),
+        np.full(shape, light), _both(low[WHOLE], high[WHOLE]), np.ones(shape),
+        _both(low[GAIN], high[GAIN]), moments, high[BESIDE], high[APART],
+    )  # fmt: skip
+    _plan(tiles_of(found, scene), scene, asked, made)
+
+
+@compiled
+def _both(low, high):
+    ends = np.empty((2, low.size))
+    ends[0], ends[1] = low, high
+    return ends
+
+
+@compiled(nogil=True)
+def _plan_points(given, plane, scene, asked, made):
+    """Plans of tiles of points on planes.
+
+    ``given``: ends of what :func:`.plane_geometry.put_planes` takes, of ranges, and of the light.
+    """
+    (law, beam, pattern), scene = plane, PlainScene(*scene)
+    fields, moments = np.empty((PLANE_FIELDS, given.shape[1])), np.empty((9, given.shape[1]))
+    put_planes(given[:8], law, beam, fields)
+    moments[:3], moments[3:6], moments[6:] = fields[6:9], fields[6:9], fields[9:]
+    none = np.zeros(given.shape[1])
+    found = Found(
+        given[8:10], given[4:6], given[10:], fields[:2], fields[2:4], fields[4:6], moments, none,
+        none,
+    )  # fmt: skip
+    tiles = tiles_of(found, scene)
+    if scene.amplitudes and scene.beamlets > 1:
+        _tell_sums(given, law, pattern, tiles, scene)
+    _plan(tiles, scene, asked, made)
+
+
+@compiled
+def _tell_sums(given, law, pattern, tiles, scene):
+    """What amplitudes add up to in tiles of one point: :func:`.footprint_sum.footprint_sum`."""
+    number = given.shape[1]
+    point, sums = np.empty((15, 1)), np.empty((2, SEGMENTS, 1))
+    for t in range(number):
+        if not np.all(given[0:10:2, t] == given[1:10:2, t]):
+            continue
+        point[:5, 0], point[5], point[6] = given[0:10:2, t], scene.rate, scene.middle
+        point[7], point[8] = scene.ends[6, 0, 0], given[4, t] * 2 / SPEED_OF_LIGHT
+        for s in range(SEGMENTS):
+            point[9 + s], point[12 + s] = scene.ends[s, 0, 0], tiles.axis[5, s * number + t]
+        put_at_points(point, pattern, law, sums)
+        alone = np.sqrt(np.maximum(tiles.found.ratio[1, t], 1.0))
+        for s in range(SEGMENTS):
+            i = s * number + t
+            tiles.most[i] = np.minimum(tiles.most[i], np.maximum(sums[0, s, 0], alone))
+            tiles.lean[i] = np.minimum(tiles.lean[i], sums[1, s, 0])
+
+
+@compiled
+def _plan(tiles, scene, asked, made):
+    """Mark what is kept, say what it changes, (effects, tiles), and what is left out, (tiles,)."""
+    (kept, change, error), (wanted, spreading, choice, tolerance) = made, asked
     there, flat = np.zeros(len(change), np.bool_), changes(tiles, scene)
     number = len(error)
     table = flat.reshape(LEAKAGE, CHANGE_FIELDS, SEGMENTS, number)
@@ -62,9 +241,8 @@ def _plan(ends, scene, leaks, choice, tolerance, out):
     without = _without(tiles, scene)
     leaked = _leaked(table, without, tiles, scene)
     leaking = np.zeros((LEAKAGE, number))
-    asked, spreading = leaks
     for k in range(LEAKAGE):
-        if asked and spreading[_ROWS[k]]:
+        if wanted and spreading[_ROWS[k]]:
             leaking[k] = leaked
     told = changes_of(table, without, leaking)
     for k in range(LEAKAGE):
@@ -76,7 +254,7 @@ def _plan(ends, scene, leaks, choice, tolerance, out):
 @compiled
 def _without(tiles, scene):
     """Ends of amplitude and threshold over sigma, (2, 2, 3, tiles): :attr:`.Block.amplitude`."""
-    number, cells = tiles.low.shape[1], tiles.axis.shape[1]
+    number, cells = tiles.found.beside.size, tiles.axis.shape[1]
     given, found = np.empty((6, cells)), np.empty((2, cells))
     for i in range(cells):
         given[0, i], given[1, i] = tiles.peak[0, i % number], tiles.peak[1, i % number]
@@ -92,12 +270,12 @@ def _without(tiles, scene):
 @compiled
 def _leaked(changes, without, tiles, scene):
     """What leakage may change, (tiles,): :func:`.leakage.bound`."""
-    number, cells = tiles.low.shape[1], tiles.axis.shape[1]
+    number, cells = tiles.found.beside.size, tiles.axis.shape[1]
     left, given, found = np.empty(without.shape), np.empty((7, cells)), np.zeros(number)
     put_all(changes, without, left)
     for i in range(cells):
         s, t = i // number, i % number
-        given[0, i], given[1, i], given[2, i] = tiles.in_phase[i], tiles.in_phase[i], tiles.lean[i]
+        given[0, i], given[1, i], given[2, i] = tiles.in_phase[i], tiles.most[i], tiles.lean[i]
         given[3, i], given[4, i] = tiles.peak[1, t], left[0, 0, s, t]
         given[5, i], given[6, i] = left[1, 0, s, t], left[1, 1, s, t]
     cell = unions(

@@ -1,9 +1,11 @@
 """Plain scenes: those with nothing of any effect but of those that every scene may have.
 
-These are its lines, where they lie and how they add, their images, and the echo's own noise. Plans
-of flights in them are a few formulas, which :mod:`.plain_plan` takes one after the other.
+These are its lines, where they lie and how they add, their images, and the echo's own noise. A plan
+is a few formulas then, and to go from one to the next takes longer than they do: so
+:mod:`.plain_plan` takes them one after the other in compiled code.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +18,7 @@ from sweep.model.effects.lobes import lobe
 from sweep.model.effects.phase_bounds import means, of_window, record_powers
 from sweep.model.effects.phase_formulas import IMAGE
 from sweep.model.effects.sidelobes import sidelobes
-from sweep.model.effects.span import Span
+from sweep.model.effects.span import Span, monotone
 from sweep.model.effects.tile_link import TileLink
 from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE
 
@@ -60,8 +62,8 @@ class PlainScene(NamedTuple):
     """What plans take of an instrument whose parameters are the same for all shots."""
 
     link: tuple[float, ...]
-    """Echo [W] at 1 m; local oscillator [W]; beat [A] over the root of both; transimpedance; sum
-    of the window; sigma; noise of 1 W of light, and that of the receiver."""
+    """Local oscillator [W]; beat [A] over the root of it and the echo; transimpedance; sum of the
+    window; sigma; noise of 1 W of light, and that of the receiver."""
     ends: np.ndarray
     """:attr:`.tile_link.TileLink.instrument_ends`."""
     turns: np.ndarray
@@ -71,6 +73,8 @@ class PlainScene(NamedTuple):
     """Over sigma."""
     rate: float
     """Chirp rate [Hz/s]."""
+    middle: float
+    """Of the record [s]."""
     beamlets: int
     fft_size: int
     record: tuple[int, int, float]
@@ -114,6 +118,7 @@ class PlainScene(NamedTuple):
             turn_of_bin=float(np.ravel(instrument.turn_of_bin)[0]),
             threshold=_number(instrument.threshold),
             rate=_number(instrument.chirp_rate),
+            middle=_number(instrument.start + 0.5 * instrument.record_duration),
             beamlets=instrument.beamlets[0],
             fft_size=size,
             record=(size, window.length, IMAGE if amplitudes else 1.0),
@@ -131,16 +136,20 @@ class PlainScene(NamedTuple):
         )
 
 
+def light_over(parameters: Mapping[str, Span | str]) -> Span:
+    """Echo [W] of a backscatter of 1/sr at 1 m: all of the link budget but for the range."""
+    names = {
+        "power": LASER + "power", "aperture": TELESCOPE + "aperture",
+        "optical_efficiency": TELESCOPE + "optical_efficiency",
+        "reflectance": "target.reflectance",
+    }  # fmt: skip
+    spans = {name: parameters[path] for name, path in names.items()}
+    numbers = {name: span for name, span in spans.items() if isinstance(span, Span)}
+    return monotone(link.echo_power_scale, range=1.0, **numbers)
+
+
 def _budget(instrument: TileLink) -> tuple[float, ...]:
     """Numbers of :attr:`PlainScene.link`."""
-    one = np.asarray(1.0)
-    light = link.echo_power_scale(
-        power=np.asarray(instrument[LASER + "power"].low),
-        aperture=np.asarray(instrument[TELESCOPE + "aperture"].low),
-        optical_efficiency=np.asarray(instrument[TELESCOPE + "optical_efficiency"].low),
-        reflectance=one,
-        range=one,
-    )
     gain, responsivity, efficiency, oscillator, transimpedance = (
         _number(instrument[RECEIVER + name])
         for name in (
@@ -149,7 +158,7 @@ def _budget(instrument: TileLink) -> tuple[float, ...]:
         )
     )  # fmt: skip
     return (
-        float(light), oscillator, 2 * gain * responsivity * efficiency, transimpedance,
+        oscillator, 2 * gain * responsivity * efficiency, transimpedance,
         float(instrument.window.sum), _number(instrument.deviation),
         _number(instrument.shot_noise_scale), _number(instrument.noise_variance),
     )  # fmt: skip

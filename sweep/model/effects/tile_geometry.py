@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from sweep.model import reflectance
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import plane_geometry
+from sweep.model.effects.columns import columns
 from sweep.model.effects.footprint_fields import (
     APART,
     BESIDE,
@@ -18,18 +18,18 @@ from sweep.model.effects.footprint_fields import (
     WHOLE,
     fields_of,
 )
-from sweep.model.effects.line_spread import (
-    Moments,
-    plane_range_moments,
-    plane_velocity_moments,
-    reach_of,
-)
-from sweep.model.effects.span import Span, monotone
-from sweep.model.footprint import beamlets
+from sweep.model.effects.line_spread import Moments
+from sweep.model.effects.plane_geometry import put_planes
+from sweep.model.effects.span import Span
 from sweep.model.ground import Footprints
 from sweep.model.preparation import LASER, RECEIVER
+from sweep.model.reflectance import LAWS
 
-_ROUNDING = 1e-12
+OF_PLANES = (
+    "target.grazing_angle", LASER + "beam_divergence", "target.radial_velocity",
+    "target.transverse_velocity",
+)  # fmt: skip
+"""What :func:`.plane_geometry.put_planes` takes the ends of."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,89 +63,25 @@ class Geometry:
 
 def plane(p: Mapping[str, Span | str], number: int, pattern: str) -> Geometry:
     """Tiles of points on a flat plane: ``number`` beamlets in a pattern."""
-    law = str(p["target.reflectance_law"])
     architecture = str(p[RECEIVER + "architecture"])
-    angle, divergence, along, across = (
-        _number(p, path)
-        for path in (
-            "target.grazing_angle", LASER + "beam_divergence", "target.radial_velocity",
-            "target.transverse_velocity",
-        )
-    )  # fmt: skip
-    shape: dict[str, Any] = {
-        "grazing_angle": angle.low, "beam_divergence": divergence.high, "number": number,
-        "pattern": pattern,
-    }  # fmt: skip
-    ranges = plane_range_moments(**shape)
-    sideways = across.magnitude
-    reach = reach_of(number, pattern) if number > 1 else 0.0
-    each, whole = plane_echo(law, grazing_angle=angle, beam_divergence=divergence, reach=reach)
+    law = LAWS.index(str(p["target.reflectance_law"]))
+    spans = [_number(p, path) for path in OF_PLANES]
+    table, shape = columns(*(end for span in spans for end in (span.low, span.high)))
+    found = np.empty((plane_geometry.FIELDS, *shape))
+    beam = plane_geometry.beam_of(number, pattern, architecture)
+    put_planes(table, law, beam, found.reshape(plane_geometry.FIELDS, -1))
+    echo, ratio, gain = (Span(*found[k : k + 2]) for k in (0, 2, 4))
+    ranges, velocities = (Moments(*found[k : k + 3]) for k in (6, 9))
     return Geometry(
-        grazing_angle=angle,
-        echo=monotone(lambda angle: reflectance.backscatter(law, np.sin(angle)), angle=angle),
-        echo_ratio=whole,
-        gain=_plane_gain(architecture, number, pattern, each, whole),
+        grazing_angle=spans[0],
+        echo=echo,
+        echo_ratio=ratio,
+        gain=gain,
         ranges=ranges,
         own_ranges=ranges,
-        velocities=plane_velocity_moments(
-            across=sideways, along=np.where(sideways > 0, along.magnitude, 0.0), **shape
-        ),
+        velocities=velocities,
         beside_share=Span.of(0.0),
         flat=True,
-    )
-
-
-def plane_echo(
-    law: str, *, grazing_angle: Span, beam_divergence: Span, reach: float
-) -> tuple[Span, Span]:
-    """Echo of any beamlet, and of all of them, over what they would have on the axis.
-
-    With u = y cot(g) for a beamlet tilted by y towards the near side and d its direction, whose
-    length on the axis is 1, it is ((1 + u) / |d|)^m, m = 2 for laws that are even in all
-    directions and 3 for Lambert's. u has the mean 0 and the rms q = (divergence/4) cot(g), so that
-    the sum differs from 1 in the second order; where a beamlet may pass over the horizon only the
-    beamlets' own bounds are left.
-
-    Parameters
-    ----------
-    law : str
-        Reflectance law, see :func:`sweep.model.reflectance.backscatter`.
-    grazing_angle, beam_divergence : Span
-        Angle between axis and plane, full 1/e^2 angle [rad].
-    reach : float
-        Farthest beamlet from the axis in standard deviations; 0 for one beamlet.
-    """
-    sigma, cot = beam_divergence / 4, monotone(_cotangent, falling=("angle",), angle=grazing_angle)
-    rim, widest = reach * sigma.high, reach * sigma.high * cot.high
-    power = 2 + float(np.log2(reflectance.backscatter(law, np.asarray(1.0))
-                              / reflectance.backscatter(law, np.asarray(0.5))))  # fmt: skip
-    longest = np.sqrt(1 + rim**2)
-    near = np.minimum(1 + widest, 1 / np.sin(grazing_angle.low)) ** power
-    far = (np.maximum(1 - widest, 0.0) / longest) ** power
-    square = (sigma * cot) ** 2 if reach > 0 else Span.of(0.0)
-    lean = 0.0 if power == 2 else widest
-    inside = widest < 1
-    more = 1 + (power * (power - 1) / 2 + lean) * square.high
-    less = (1 + (power * (power - 1) / 2 - lean) * square.low) / longest**power
-    whole = Span(
-        np.maximum(np.where(inside, less, 0.0), far) * (1 - _ROUNDING),
-        np.minimum(np.where(inside, more, np.inf), near) * (1 + _ROUNDING),
-    )
-    return Span(far, near), whole
-
-
-def _cotangent(angle: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / np.tan(angle))
-
-
-def _plane_gain(architecture: str, number: int, pattern: str, each: Span, whole: Span) -> Span:
-    """Gain of beamlets whose echoes are the pattern's weights but for what the plane does."""
-    if architecture == "direct":
-        return Span.of(1.0)
-    level = np.sqrt(beamlets(number, pattern)[1]).sum()
-    found = (level * each.sqrt() / whole.sqrt()).minimum(np.sqrt(number))
-    return Span(
-        np.maximum(found.low * (1 - _ROUNDING), 1.0), np.maximum(found.high * (1 + _ROUNDING), 1.0)
     )
 
 

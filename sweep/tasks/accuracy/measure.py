@@ -29,6 +29,10 @@ LONG_ENOUGH = 0.003
 TOO_LONG = 2
 """Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
 
+MOST_RUNS, SHORT = 15, 4
+"""Runs of a trial of a study that takes next to nothing, of which the best counts: as many as make
+such a part of what is long enough."""
+
 FIRST_TRIED = 8
 """How much shorter the stretches are by which settings are known to be dear."""
 
@@ -104,6 +108,7 @@ class Measurement:
         self._rungs = self._ladder.rungs
         self._times = np.ones(len(self._rungs), np.int64)
         self._once = np.zeros(len(self._rungs), bool)
+        self._runs = np.ones(len(self._rungs), np.int64)
         self._orders = np.random.default_rng(0)
 
     def run(self) -> Measured:
@@ -178,7 +183,8 @@ class Measurement:
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
         """Rounds that fit in; before that, how long the stretches are to time rungs well.
 
-        As long for all of them, but for those that would take far longer.
+        As long for all of them, but for those that would take far longer. Where the study has no
+        more points, they are run so many times in a row.
         """
         times, enough = 1, LONG_ENOUGH * self._limit
         while self._timed(0, parts[0]) < enough / 2 and times < self._bench.most_times:
@@ -192,6 +198,9 @@ class Measurement:
         self._times[:] = cut
         spent = took * cut / shorter
         self._once = spent > LONG
+        runs = np.clip(enough / SHORT / np.median(spent), 1, MOST_RUNS)
+        self._runs[~self._once] = int(runs)
+        spent = spent * self._runs
         left = 0.75 * (self._limit - (time.monotonic() - self._begun)) / len(parts)
         after_truth = (1 - UNTIL_TRUTH) * self._limit / len(parts)
         again = max(float(spent[~self._once].sum()), 1e-9)
@@ -207,7 +216,10 @@ class Measurement:
         return time.monotonic() - begun
 
     def _try(self, rung: int, part: np.ndarray) -> Trial:
-        return self._bench.try_on(self._rungs[rung], part, int(self._times[rung]))
+        """A rung on a part, in the best of its runs."""
+        times = int(self._times[rung])
+        runs = [self._bench.try_on(self._rungs[rung], part, times) for _ in range(self._runs[rung])]
+        return min(runs, key=lambda trial: trial.seconds)
 
     def _round(
         self,
