@@ -4,12 +4,11 @@ Each is the bound of an effect's own module, of its own compiled formulas, and t
 bit: what is left out is the way from one to the next, which takes longer than they do.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.footprint_phase import put_sum_changes, put_sums_added
 from sweep.model.effects.image import put_alarms, put_bounds, put_moved_bins
@@ -45,7 +44,8 @@ SEGMENTS = 3
 
 _SQUARE = np.array([2])
 
-compiled = partial(njit, cache=True, error_model="numpy")
+ROOM = 28
+"""Rows of as many numbers as there are cells, to work in."""
 
 
 class Found(NamedTuple):
@@ -95,79 +95,90 @@ class Tiles(NamedTuple):
     """(cells,) each: of :func:`.footprint_sum.footprint_sum`."""
 
 
-@compiled
-def tiles_of(found, scene):
-    """All that the formulas look at."""
+@owning()
+def tiles_for(found):
+    """Room for what the formulas look at of what was found."""
     number = found.beside.size
     cells = SEGMENTS * number
-    axis, resting, shifts = np.empty((9, cells)), np.empty((6, cells)), np.empty(cells)
-    spreads, apart = np.empty((12, cells)), np.empty((12, cells))
-    lines, beside = _lines_of(found, scene), found.moments.copy()
-    _put_axis(lines, scene.fft_size / 2, axis[:6], resting, shifts)
-    put_spreads(lines, found.moments, spreads.reshape(12, SEGMENTS, number))
-    axis[6:] = spreads[9:]
-    beside[5] = found.apart
-    put_spreads(lines, beside, apart.reshape(12, SEGMENTS, number))
-    peak, noise = _light(found, scene.link)
-    in_phase, lean = np.empty(cells), np.zeros(cells)
-    for i in range(cells):
-        t = i % number
-        in_phase[i] = np.sqrt(np.maximum(found.ratio[1, t], 1.0))
-        if scene.amplitudes:
-            in_phase[i] *= found.gain[1, t]
-            lean[i] = in_phase[i] * np.fmin(axis[8, i], scene.fft_size)
     return Tiles(
-        found, axis, resting, spreads, apart[5], shifts, peak, noise, in_phase, in_phase.copy(),
-        lean,
+        found, np.empty((9, cells)), np.empty((6, cells)), np.empty((12, cells)), np.empty(cells),
+        np.empty(cells), np.empty((2, number)), np.empty((2, number)), np.empty(cells),
+        np.empty(cells), np.empty(cells),
     )  # fmt: skip
 
 
-@compiled
-def _lines_of(found, scene):
-    """What lines follow from, :func:`.line_spread.axis_ends`."""
+@borrowing()
+def put_tiles(tiles, scene, room):
+    """Fill in what the formulas look at."""
+    found, axis = tiles.found, tiles.axis
     number = found.beside.size
-    ends = np.empty((9, 2, number))
-    ends[:] = scene.ends
+    _put_lines(tiles, scene, room)
+    _put_light(tiles, scene.link)
+    for i in range(axis.shape[1]):
+        t = i % number
+        tiles.in_phase[i], tiles.lean[i] = np.sqrt(np.maximum(found.ratio[1, t], 1.0)), 0.0
+        if scene.amplitudes:
+            tiles.in_phase[i] *= found.gain[1, t]
+            tiles.lean[i] = tiles.in_phase[i] * np.fmin(axis[8, i], scene.fft_size)
+        tiles.most[i] = tiles.in_phase[i]
+
+
+@borrowing()
+def _put_lines(tiles, scene, room):
+    """Lines on the axis, with and without the Doppler effect, its shifts, and their spread."""
+    found, number = tiles.found, tiles.found.beside.size
+    ends = room[:6].reshape(9, 2, number)
+    for row in range(9):
+        for end in range(2):
+            for t in range(number):
+                ends[row, end, t] = scene.ends[row, end, 0]
     for end in range(2):
         for t in range(number):
             ends[BETA, end, t] = found.velocity[end, t] * 2 / SPEED_OF_LIGHT
             ends[RANGE, end, t] = found.range[end, t]
-    return ends
+    half, shifts = scene.fft_size / 2, tiles.shifts.reshape(SEGMENTS, number)
+    moments, spreads = room[6:9].reshape(9, number), room[9:21].reshape(12, SEGMENTS, number)
+    _copy(found.moments, moments)
+    for t in range(number):
+        moments[5, t] = found.apart[t]
+    put_spreads(ends, moments, spreads)
+    _copy(room[14:15], tiles.apart.reshape(1, -1))
+    put_spreads(ends, found.moments, tiles.spreads.reshape(12, SEGMENTS, number))
+    put_shifts(ends, shifts)
+    widen(ends[BETA], shifts)
+    put_lines(ends, half, tiles.axis[:6].reshape(6, SEGMENTS, number))
+    _copy(tiles.spreads[9:], tiles.axis[6:])
+    for end in range(2):
+        for t in range(number):
+            ends[BETA, end, t] = 0.0
+    put_lines(ends, half, tiles.resting.reshape(6, SEGMENTS, number))
 
 
-@compiled
-def _put_axis(ends, half, lines, resting, shifts):
-    """Lines on the axis, with and without the Doppler effect, and its shifts."""
-    number = ends.shape[2]
-    found, bins = np.empty((6, SEGMENTS, number)), np.empty((SEGMENTS, number))
-    put_shifts(ends, bins)
-    either = ends.copy()
-    widen(either[BETA], bins)
-    put_lines(either, half, found)
-    lines[:], shifts[:] = found.reshape(lines.shape), bins.reshape(shifts.shape)
-    either[BETA] = 0.0
-    put_lines(either, half, found)
-    resting[:] = found.reshape(lines.shape)
+@borrowing()
+def _copy(values, out):
+    """Put rows of numbers elsewhere: by itself in less code than wherever it is done."""
+    for k in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            out[k, i] = values[k, i]
 
 
-@compiled
-def _light(found, link):
-    """The bare line's peak over sigma, and the echo's shot noise over all other, (2, tiles)."""
+@borrowing()
+def _put_light(tiles, link):
+    """The bare line's peak over sigma, and the echo's shot noise over all other."""
     oscillator, beat, transimpedance, window, deviation, shot, others = link
-    peak, noise = np.empty(found.echo.shape), np.empty(found.echo.shape)
-    for t in range(peak.shape[1]):
+    found = tiles.found
+    for t in range(found.beside.size):
         for end in range(2):
             far, echo = found.range[1 - end, t], found.echo[end, t]
             power = found.light[end, t] / (far * far)
             voltage = beat * np.sqrt(oscillator * power) * transimpedance
-            peak[end, t] = voltage * 0.5 * np.sqrt(echo) * window / deviation
+            tiles.peak[end, t] = voltage * 0.5 * np.sqrt(echo) * window / deviation
             ratio = found.ratio[end, t]
             more = np.minimum(ratio, 1.0) if end == 0 else np.maximum(ratio, 1.0)
-            noise[end, t] = power * echo * more * shot / others
-    return peak, noise
+            tiles.noise[end, t] = power * echo * more * shot / others
 
 
-@compiled
+@borrowing()
 def is_there(effect, tiles, scene):
     """Whether a scene has anything of an effect."""
     if effect == FOOTPRINT:
@@ -175,109 +186,132 @@ def is_there(effect, tiles, scene):
     if effect == PHASE:
         return scene.amplitudes
     if effect == SEVERAL:
-        return np.any(tiles.found.beside > 0.0)
+        return _is_any(tiles.found.beside)
     if effect in (DOPPLER, WALK):
-        return np.any(tiles.found.velocity != 0.0)
+        return _is_any(tiles.found.velocity[0]) or _is_any(tiles.found.velocity[1])
     if effect == SPREAD:
-        return np.any(tiles.spreads[8] > 0.0)
+        return _is_any(tiles.spreads[8])
     return True
 
 
-@compiled
-def changes(tiles, scene):
+@borrowing()
+def _is_any(values):
+    """Whether any of some numbers is not 0."""
+    found = False
+    for value in values:
+        found |= value != 0.0
+    return found
+
+
+@borrowing()
+def put_all_changes(tiles, scene, room, table):
     """What effects may change of bins, (effects, fields, cells), leakage left out."""
-    table = np.empty((LEAKAGE, CHANGE_FIELDS, tiles.axis.shape[1]))
-    for k in range(CHANGE_FIELDS):
-        table[:, k] = OF_NONE[k]
+    for k in range(table.shape[0]):
+        for m in range(CHANGE_FIELDS):
+            for i in range(table.shape[2]):
+                table[k, m, i] = OF_NONE[m]
     if is_there(FOOTPRINT, tiles, scene):
-        _put_footprint(tiles, scene, table[FOOTPRINT])
+        _put_footprint(tiles, scene, room, table[FOOTPRINT])
     if is_there(PHASE, tiles, scene):
-        _put_phase(tiles, scene, table[PHASE])
+        _put_phase(tiles, scene, room, table[PHASE])
     if is_there(SEVERAL, tiles, scene):
-        _put_several(tiles, scene, table[SEVERAL])
+        _put_several(tiles, scene, room, table[SEVERAL])
     if is_there(DOPPLER, tiles, scene):
-        _put_doppler(tiles, scene, table[DOPPLER])
+        _put_doppler(tiles, scene, room, table[DOPPLER])
     if is_there(SPREAD, tiles, scene):
-        _put_doppler_spread(tiles, scene, table[SPREAD])
+        _put_doppler_spread(tiles, scene, room, table[SPREAD])
     _put_noise(tiles, table[NOISE])
     if is_there(WALK, tiles, scene):
-        _put_range_walk(tiles, scene, table[WALK])
-    _put_image(tiles, scene, table[IMAGE])
-    return table
+        _put_range_walk(tiles, scene, room, table[WALK])
+    _put_image(tiles, scene, room, table[IMAGE])
 
 
-@compiled
-def _put_moves(shift, added, present, still, tiles, scene, entry):
-    """Factors of :func:`.line_spread.moved_change`: moments of three rows that are added."""
-    table = np.empty((19, shift.size))
-    table[0], table[1:4], table[4:7] = shift, added, present
-    table[7:13], table[13:] = tiles.axis[:6], still
-    put_moved_changes(table, scene.beamlets, scene.tables, scene.lobe, entry[: STRONG + 1])
+@borrowing()
+def _put_moves(moves, still, tiles, scene, entry):
+    """Factors of :func:`.line_spread.moved_change`, of a table of its first seven rows.
+
+    Those are a shift, and moments that are added and that are there.
+    """
+    _copy(tiles.axis[:6], moves[7:13])
+    _copy(still, moves[13:])
+    put_moved_changes(moves, scene.beamlets, scene.tables, scene.lobe, entry)
 
 
-@compiled
-def _put_sums(bins, tiles, scene, entry):
+@borrowing()
+def _put_sums(bins, tiles, scene, room, entry):
     """What moving lines whose amplitudes add can change: :func:`.footprint_phase.sum_added`."""
-    table = np.empty((4, bins.size))
-    table[0], table[1], table[2], table[3] = (
-        tiles.axis[5], tiles.axis[8], bins, np.full(bins.size, scene.turn_of_bin),
-    )  # fmt: skip
+    table, axis = room[:4], tiles.axis
+    for i in range(bins.size):
+        table[0, i], table[1, i], table[2, i], table[3, i] = (
+            axis[5, i], axis[8, i], bins[i], scene.turn_of_bin,
+        )  # fmt: skip
     put_sums_added(table, np.sqrt(scene.lobe[1]), scene.worst, entry[ADDED])
 
 
-@compiled
-def _put_footprint(tiles, scene, entry):
+@borrowing()
+def _put_footprint(tiles, scene, room, entry):
     """:func:`.footprint.bound`."""
-    none, number = np.zeros((3, tiles.axis.shape[1])), tiles.found.beside.size
-    _put_moves(none[0], tiles.spreads[3:6], none, tiles.axis[:6], tiles, scene, entry)
-    for i in range(tiles.axis.shape[1]):
+    moves, number = room[:19], tiles.found.beside.size
+    for i in range(moves.shape[1]):
+        moves[0, i] = 0.0
+        for m in range(3):
+            moves[1 + m, i], moves[4 + m, i] = tiles.spreads[3 + m, i], 0.0
+    _put_moves(moves, tiles.axis[:6], tiles, scene, entry)
+    for i in range(moves.shape[1]):
         entry[WEAK, i] *= np.sqrt(tiles.found.ratio[0, i % number])
         entry[STRONG, i] *= np.sqrt(tiles.found.ratio[1, i % number])
 
 
-@compiled
-def _put_phase(tiles, scene, entry):
+@borrowing()
+def _put_phase(tiles, scene, room, entry):
     """:func:`.footprint_phase.bound`."""
-    found, axis, number = tiles.found, tiles.axis, tiles.found.beside.size
-    table = np.empty((7, axis.shape[1]))
+    found, axis, number, table = tiles.found, tiles.axis, tiles.found.beside.size, room[:7]
     for i in range(axis.shape[1]):
         t = i % number
         further = scene.turns[i // number, 0] * (found.range[1, t] * found.moments[2, t])
         table[0, i], table[1, i], table[2, i] = axis[2, i], axis[5, i], axis[8, i]
         table[3, i] = further + tiles.spreads[8, i] * scene.turn_of_bin
         table[4, i], table[5, i], table[6, i] = found.gain[0, t], found.gain[1, t], np.inf
-    _, curvature, margin, _ = scene.lobe
-    sizes = curvature, margin, scene.worst
-    put_sum_changes(table, sizes, scene.tails, float(scene.beamlets), entry[: STRONG + 1])
+    sizes = scene.lobe[1], scene.lobe[2], scene.worst
+    put_sum_changes(table, sizes, scene.tails, float(scene.beamlets), entry)
 
 
-@compiled
-def _put_several(tiles, scene, entry):
+@borrowing()
+def _put_several(tiles, scene, room, entry):
     """:func:`.several_returns.bound`."""
-    axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.found.beside.size
-    given, found = np.zeros((7, cells)), np.empty((4, cells))
-    given[0], given[1], given[2], given[3] = axis[0], axis[1], axis[2], axis[5]
+    axis, number, found = tiles.axis, tiles.found.beside.size, room[:4]
+    given, table = room[4:11], room[11:18]
+    for i in range(axis.shape[1]):
+        given[0, i], given[1, i], given[2, i], given[3, i] = (
+            axis[0, i], axis[1, i], axis[2, i], axis[5, i],
+        )  # fmt: skip
+        given[4, i], given[5, i], given[6, i] = 0.0, 0.0, 0.0
     put_power_ranges(given, scene.beamlets, scene.tables, scene.lobe, found[:2])
-    given[4:] = tiles.spreads[3:6]
+    _copy(tiles.spreads[3:6], given[4:])
     put_power_ranges(given, scene.beamlets, scene.tables, scene.lobe, found[2:])
-    table = np.empty((7, cells))
-    for i in range(cells):
+    for i in range(axis.shape[1]):
         table[0, i], table[1, i] = tiles.found.beside[i % number], tiles.apart[i]
         table[2, i], table[3, i] = found[2, i], found[1, i]
         table[4, i], table[5, i], table[6, i] = axis[2, i], axis[4, i], axis[5, i]
-    _, lowest = scene.tables
-    put_changes(table, scene.lobe[2], lowest, scene.amplitudes, entry[: STRONG + 1])
+    put_changes(table, scene.lobe[2], scene.tables[1], scene.amplitudes, entry)
 
 
-@compiled
-def _put_doppler(tiles, scene, entry):
+@borrowing()
+def _put_doppler(tiles, scene, room, entry):
     """:func:`.doppler.bound`."""
-    shifts, cells, number = tiles.shifts, tiles.axis.shape[1], tiles.found.beside.size
-    none, moved = np.zeros((3, cells)), np.empty((2, cells))
-    _put_moves(shifts, none, tiles.spreads[9:], tiles.resting, tiles, scene, moved)
+    shifts, number = tiles.shifts, tiles.found.beside.size
+    moves, moved = room[:19], room[19:21]
+    for i in range(shifts.size):
+        moves[0, i] = shifts[i]
+        for m in range(3):
+            moves[1 + m, i], moves[4 + m, i] = 0.0, tiles.spreads[9 + m, i]
+    _put_moves(moves, tiles.resting, tiles, scene, moved)
     if scene.amplitudes:
-        _put_sums(shifts * (1 + tiles.axis[8]), tiles, scene, entry)
-    for i in range(cells):
+        bins = room[4]
+        for i in range(shifts.size):
+            bins[i] = shifts[i] * (1 + tiles.axis[8, i])
+        _put_sums(bins, tiles, scene, room, entry)
+    for i in range(shifts.size):
         away = False
         for s in range(SEGMENTS):
             away |= shifts[s * number + i % number] > NOT_AWAY
@@ -288,71 +322,79 @@ def _put_doppler(tiles, scene, entry):
             entry[WEAK, i], entry[STRONG, i] = 1 / moved[1, i], 1 / moved[0, i]
 
 
-@compiled
-def _put_doppler_spread(tiles, scene, entry):
+@borrowing()
+def _put_doppler_spread(tiles, scene, room, entry):
     """:func:`.doppler_spread.bound`."""
-    none, ranges, velocities = np.zeros(tiles.axis.shape[1]), tiles.spreads[:3], tiles.spreads[6:9]
-    _put_moves(none, velocities, ranges, tiles.axis[:6], tiles, scene, entry)
+    moves = room[:19]
+    for i in range(moves.shape[1]):
+        moves[0, i] = 0.0
+        for m in range(3):
+            moves[1 + m, i], moves[4 + m, i] = tiles.spreads[6 + m, i], tiles.spreads[m, i]
+    _put_moves(moves, tiles.axis[:6], tiles, scene, entry)
     if scene.amplitudes:
-        _put_sums(velocities[2], tiles, scene, entry)
+        _put_sums(tiles.spreads[8], tiles, scene, room, entry)
 
 
-@compiled
+@borrowing()
 def _put_noise(tiles, entry):
     """:func:`.signal_shot_noise.bound`."""
-    for i in range(tiles.axis.shape[1]):
-        t = i % tiles.found.beside.size
+    number = tiles.found.beside.size
+    for i in range(entry.shape[1]):
+        t = i % number
         entry[DOWN, i], entry[UP, i] = 1 + tiles.noise[0, t], 1 + tiles.noise[1, t]
         entry[SHARE, i] = 0.0
 
 
-@compiled
-def _put_range_walk(tiles, scene, entry):
+@borrowing()
+def _put_range_walk(tiles, scene, room, entry):
     """:func:`.range_walk.bound`."""
     cells, number = tiles.axis.shape[1], tiles.found.beside.size
-    given, drifts, walk = np.empty((4, number)), np.empty((2, number)), np.empty((5, number))
+    given, drifts = room[0:2].reshape(6, number)[:4], room[2:3].reshape(3, number)[:2]
+    walk, over = room[3:5].reshape(6, number)[:5], room[5:11].reshape(18, number)[:17]
     for t in range(number):
         given[0, t], given[1, t] = scene.rate, scene.rate
         given[2, t] = tiles.found.velocity[0, t] * 2 / SPEED_OF_LIGHT
         given[3, t] = tiles.found.velocity[1, t] * 2 / SPEED_OF_LIGHT
     put_drifts(given, drifts)
-    over = np.empty((17, number))
-    for k in range(15):
-        over[k] = scene.times[k]
-    over[15:] = drifts
+    for t in range(number):
+        for k in range(15):
+            over[k, t] = scene.times[k]
+        over[15, t], over[16, t] = drifts[0, t], drifts[1, t]
     put_over_record(over, _SQUARE, walk)
-    table, found = np.zeros((13, cells)), np.empty((4, cells))
+    table, found = room[11:24], room[24:28]
     for i in range(cells):
+        for k in range(13):
+            table[k, i] = 0.0
         for k in range(5 if i // number != 1 else 0):
             table[k if k else 6, i] = walk[k, i % number]
-    flags = False, scene.beamlets == 1, scene.amplitudes
-    lobe = scene.tables, scene.lobe
+    flags, lobe = (False, scene.beamlets == 1, scene.amplitudes), (scene.tables, scene.lobe)
     put_error_changes(
         tiles.axis, table, scene.beamlets, lobe, scene.record, scene.window, flags, found
     )  # fmt: skip
-    entry[WEAK], entry[STRONG], entry[ADDED], entry[SHIFT] = found[0], found[1], found[2], found[3]
+    for i in range(cells):
+        entry[WEAK, i], entry[STRONG, i] = found[0, i], found[1, i]
+        entry[ADDED, i], entry[SHIFT, i] = found[2, i], found[3, i]
 
 
-@compiled
-def _put_image(tiles, scene, entry):
+@borrowing()
+def _put_image(tiles, scene, room, entry):
     """:func:`.image.bound`."""
     axis, cells, number = tiles.axis, tiles.axis.shape[1], tiles.found.beside.size
-    found = np.empty((2, cells))
+    found, half = room[:2], scene.fft_size / 2
     put_bounds(axis, scene.beamlets, scene.tables, scene.lobe, scene.tails, found)
-    entry[STRONG] = found[0]
-    if scene.amplitudes:
-        entry[ADDED] = found[1]
+    for i in range(cells):
+        entry[STRONG, i] = found[0, i]
+        if scene.amplitudes:
+            entry[ADDED, i] = found[1, i]
     if not scene.counts:
         return
-    half, table = scene.fft_size / 2, np.empty((3, SEGMENTS, number))
-    moved, alarms = np.empty((2, number)), np.empty(number)
+    table, moved = room[2:5], room[5:6].reshape(3, number)
     for i in range(cells):
-        s, t = i // number, i % number
-        table[0, s, t], table[1, s, t], table[2, s, t] = (
-            tiles.in_phase[i], tiles.peak[1, t], scene.threshold,
+        table[0, i], table[1, i], table[2, i] = (
+            tiles.in_phase[i], tiles.peak[1, i % number], scene.threshold,
         )  # fmt: skip
-    lines = axis.reshape(9, SEGMENTS, number)
-    put_moved_bins(lines, table, half, scene.tails, scene.amplitudes, moved)
-    put_alarms(moved[0], moved[1], half, alarms)
+    lines, sums = axis.reshape(9, SEGMENTS, number), table.reshape(3, SEGMENTS, number)
+    put_moved_bins(lines, sums, half, scene.tails, scene.amplitudes, moved[:2])
+    put_alarms(moved[0], moved[1], half, moved[2])
     for i in range(cells):
-        entry[ALARMS, i] = alarms[i % number]
+        entry[ALARMS, i] = moved[2, i % number]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model.compiling import borrowing, owning
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import tile_geometry
 from sweep.model.effects.catalogue import NAMES
@@ -27,12 +28,13 @@ from sweep.model.effects.leakage import unions
 from sweep.model.effects.line_powers import put_amplitudes
 from sweep.model.effects.plain_changes import (
     LEAKAGE,
+    ROOM,
     SEGMENTS,
     Found,
-    changes,
-    compiled,
     is_there,
-    tiles_of,
+    put_all_changes,
+    put_tiles,
+    tiles_for,
 )
 from sweep.model.effects.plain_scene import PLAIN, PlainScene, is_plain, light_over
 from sweep.model.effects.plane_geometry import FIELDS as PLANE_FIELDS
@@ -164,61 +166,70 @@ def _asked(rules: Rules, tolerance: float) -> tuple[Any, ...]:
     return rules.asks_for_leakage, rules.spreading, tuple(rules.choice), tolerance
 
 
-@compiled(nogil=True)
+@owning(nogil=True)
 def _plan_shots(ends, light, scene, asked, made):
     """Plans of tiles of shots."""
-    (low, high), scene, moments = ends, PlainScene(*scene), np.empty((9, ends[0].shape[1]))
-    moments[:3], moments[3:6] = high[RANGES : RANGES + 3], high[OWN_RANGES : OWN_RANGES + 3]
-    moments[6:] = high[VELOCITIES : VELOCITIES + 3] * (SPEED_OF_LIGHT / 2)
-    shape = 2, low.shape[1]
+    (low, high), scene, number = ends, PlainScene(*scene), ends[0].shape[1]
+    room = np.empty((ROOM, SEGMENTS * number))
+    moments, given, ratio = np.empty((9, number)), np.empty((10, number)), np.ones((2, number))
+    for t in range(number):
+        for k in range(3):
+            moments[k, t], moments[3 + k, t] = high[RANGES + k, t], high[OWN_RANGES + k, t]
+            moments[6 + k, t] = high[VELOCITIES + k, t] * (SPEED_OF_LIGHT / 2)
+        given[0, t], given[1, t] = low[DISTANCE, t], high[DISTANCE, t]
+        given[2, t], given[3, t] = low[VELOCITY, t], high[VELOCITY, t]
+        given[4, t], given[5, t] = light, light
+        given[6, t], given[7, t] = low[WHOLE, t], high[WHOLE, t]
+        given[8, t], given[9, t] = low[GAIN, t], high[GAIN, t]
     found = Found(
-        _both(low[DISTANCE], high[DISTANCE]), _both(low[VELOCITY], high[VELOCITY]),
-        np.full(shape, light), _both(low[WHOLE], high[WHOLE]), np.ones(shape),
-        _both(low[GAIN], high[GAIN]), moments, high[BESIDE], high[APART],
+        given[:2], given[2:4], given[4:6], given[6:8], ratio, given[8:], moments, high[BESIDE],
+        high[APART],
     )  # fmt: skip
-    _plan(tiles_of(found, scene), scene, asked, made)
+    tiles = tiles_for(found)
+    put_tiles(tiles, scene, room)
+    _plan(tiles, scene, room, asked, made)
 
 
-@compiled
-def _both(low, high):
-    ends = np.empty((2, low.size))
-    ends[0], ends[1] = low, high
-    return ends
-
-
-@compiled(nogil=True)
+@owning(nogil=True)
 def _plan_points(given, plane, scene, asked, made):
     """Plans of tiles of points on planes.
 
     ``given``: ends of what :func:`.plane_geometry.put_planes` takes, of ranges, and of the light.
     """
-    (law, beam, pattern), scene = plane, PlainScene(*scene)
-    fields, moments = np.empty((PLANE_FIELDS, given.shape[1])), np.empty((9, given.shape[1]))
+    (law, beam, pattern), scene, number = plane, PlainScene(*scene), given.shape[1]
+    room, none = np.empty((ROOM, SEGMENTS * number)), np.zeros(number)
+    fields, moments = np.empty((PLANE_FIELDS, number)), np.empty((9, number))
     put_planes(given[:8], law, beam, fields)
-    moments[:3], moments[3:6], moments[6:] = fields[6:9], fields[6:9], fields[9:]
-    none = np.zeros(given.shape[1])
+    for t in range(number):
+        for k in range(3):
+            moments[k, t], moments[3 + k, t] = fields[6 + k, t], fields[6 + k, t]
+            moments[6 + k, t] = fields[9 + k, t]
     found = Found(
         given[8:10], given[4:6], given[10:], fields[:2], fields[2:4], fields[4:6], moments, none,
         none,
     )  # fmt: skip
-    tiles = tiles_of(found, scene)
+    tiles = tiles_for(found)
+    put_tiles(tiles, scene, room)
     if scene.amplitudes and scene.beamlets > 1:
         _tell_sums(given, law, pattern, tiles, scene)
-    _plan(tiles, scene, asked, made)
+    _plan(tiles, scene, room, asked, made)
 
 
-@compiled
+@owning()
 def _tell_sums(given, law, pattern, tiles, scene):
     """What amplitudes add up to in tiles of one point: :func:`.footprint_sum.footprint_sum`."""
     number = given.shape[1]
     point, sums = np.empty((15, 1)), np.empty((2, SEGMENTS, 1))
     for t in range(number):
-        if not np.all(given[0:10:2, t] == given[1:10:2, t]):
+        if not _is_point(given[:, t]):
             continue
-        point[:5, 0], point[5], point[6] = given[0:10:2, t], scene.rate, scene.middle
-        point[7], point[8] = scene.ends[6, 0, 0], given[4, t] * 2 / SPEED_OF_LIGHT
+        for k in range(5):
+            point[k, 0] = given[2 * k, t]
+        point[5, 0], point[6, 0], point[7, 0] = scene.rate, scene.middle, scene.ends[6, 0, 0]
+        point[8, 0] = given[4, t] * 2 / SPEED_OF_LIGHT
         for s in range(SEGMENTS):
-            point[9 + s], point[12 + s] = scene.ends[s, 0, 0], tiles.axis[5, s * number + t]
+            point[9 + s, 0] = scene.ends[s, 0, 0]
+            point[12 + s, 0] = tiles.axis[5, s * number + t]
         put_at_points(point, pattern, law, sums)
         alone = np.sqrt(np.maximum(tiles.found.ratio[1, t], 1.0))
         for s in range(SEGMENTS):
@@ -227,47 +238,55 @@ def _tell_sums(given, law, pattern, tiles, scene):
             tiles.lean[i] = np.minimum(tiles.lean[i], sums[1, s, 0])
 
 
-@compiled
-def _plan(tiles, scene, asked, made):
+@borrowing()
+def _is_point(given):
+    """Whether a tile's points all lie at one place of a plane, and move alike."""
+    found = True
+    for k in range(0, 10, 2):
+        found &= given[k] == given[k + 1]
+    return found
+
+
+@owning()
+def _plan(tiles, scene, room, asked, made):
     """Mark what is kept, say what it changes, (effects, tiles), and what is left out, (tiles,)."""
     (kept, change, error), (wanted, spreading, choice, tolerance) = made, asked
-    there, flat = np.zeros(len(change), np.bool_), changes(tiles, scene)
-    number = len(error)
+    number, there = len(error), np.zeros(len(change), np.bool_)
+    flat = np.empty((LEAKAGE, CHANGE_FIELDS, SEGMENTS * number))
+    put_all_changes(tiles, scene, room, flat)
+    finish(flat)
     table = flat.reshape(LEAKAGE, CHANGE_FIELDS, SEGMENTS, number)
+    without, leaking = np.empty((2, 2, SEGMENTS, number)), np.zeros((LEAKAGE, number))
+    _put_without(tiles, scene, room, without)
+    leaked = _leaked(table, without, tiles, scene)
     for k in range(LEAKAGE):
         there[_ROWS[k]] = is_there(k, tiles, scene)
-    there[_ROWS[LEAKAGE]] = True
-    finish(flat)
-    without = _without(tiles, scene)
-    leaked = _leaked(table, without, tiles, scene)
-    leaking = np.zeros((LEAKAGE, number))
-    for k in range(LEAKAGE):
-        if wanted and spreading[_ROWS[k]]:
-            leaking[k] = leaked
+        for t in range(number):
+            leaking[k, t] = leaked[t] if wanted and spreading[_ROWS[k]] else 0.0
     told = changes_of(table, without, leaking)
-    for k in range(LEAKAGE):
-        change[_ROWS[k]] = np.minimum(told[k], 1.0)
-    change[_ROWS[LEAKAGE]] = np.minimum(leaked, 1.0)
+    there[_ROWS[LEAKAGE]] = True
+    for t in range(number):
+        for k in range(LEAKAGE):
+            change[_ROWS[k], t] = np.minimum(told[k, t], 1.0)
+        change[_ROWS[LEAKAGE], t] = np.minimum(leaked[t], 1.0)
     choose(change, there, choice, tolerance, kept, error)
 
 
-@compiled
-def _without(tiles, scene):
+@borrowing()
+def _put_without(tiles, scene, room, out):
     """Ends of amplitude and threshold over sigma, (2, 2, 3, tiles): :attr:`.Block.amplitude`."""
-    number, cells = tiles.found.beside.size, tiles.axis.shape[1]
-    given, found = np.empty((6, cells)), np.empty((2, cells))
+    number, cells, given = tiles.found.beside.size, tiles.axis.shape[1], room[:6]
     for i in range(cells):
         given[0, i], given[1, i] = tiles.peak[0, i % number], tiles.peak[1, i % number]
         given[2, i], given[3, i] = tiles.axis[0, i], tiles.axis[1, i]
         given[4, i], given[5, i] = tiles.axis[3, i], tiles.axis[4, i]
+        out[1, 0, i // number, i % number] = scene.threshold
+        out[1, 1, i // number, i % number] = scene.threshold
     highest, lowest = scene.tables
-    put_amplitudes(given, highest, lowest, found)
-    ends = np.full((2, 2, SEGMENTS, number), scene.threshold)
-    ends[0] = found.reshape(2, SEGMENTS, number)
-    return ends
+    put_amplitudes(given, highest, lowest, out[0].reshape(2, cells))
 
 
-@compiled
+@owning()
 def _leaked(changes, without, tiles, scene):
     """What leakage may change, (tiles,): :func:`.leakage.bound`."""
     number, cells = tiles.found.beside.size, tiles.axis.shape[1]

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
 
-MOST_ROUNDS = 9
+MOST_ROUNDS, MANY_ROUNDS = 9, 27
+"""Rounds at the most; of a study that takes next to nothing, as chance tells most there."""
 
 LONG_ENOUGH = 0.003
 """Share of the time limit that a trial takes: its calls then cost little beside its points."""
@@ -205,7 +206,8 @@ class Measurement:
         after_truth = (1 - UNTIL_TRUTH) * self._limit / len(parts)
         again = max(float(spent[~self._once].sum()), 1e-9)
         further = max(left - float(spent.sum()), after_truth) / again
-        return 1 + max(0, min(MOST_ROUNDS - 1, int(further)))
+        most = MANY_ROUNDS if runs > MOST_RUNS / 2 else MOST_ROUNDS
+        return 1 + max(0, min(most - 1, int(further)))
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
         begun = time.monotonic()
