@@ -131,7 +131,9 @@ def with_and_without(ends: np.ndarray, shifts: np.ndarray) -> np.ndarray:
 def widen(beta, shifts):
     """Extend ratios (2, tiles) to none in tiles of which some line moves so little."""
     for t in range(shifts.shape[1]):
-        slow = np.any(shifts[:, t] <= NOT_AWAY)
+        slow = False
+        for s in range(shifts.shape[0]):
+            slow |= shifts[s, t] <= NOT_AWAY
         if slow and np.maximum(abs(beta[0, t]), abs(beta[1, t])) > 0.0:
             beta[0, t], beta[1, t] = np.minimum(beta[0, t], 0.0), np.maximum(beta[1, t], 0.0)
 

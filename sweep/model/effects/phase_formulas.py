@@ -53,7 +53,9 @@ def put_error_changes(axis, table, beamlets, lobe, record, window, flags, out):
     beside, single, amplitudes = flags
     for i in range(axis.shape[1]):
         error, others = table[1:7, i], table[7:13, i]
-        both = table[1:5, i] + table[7:11, i]
+        both = (
+            error[0] + others[0], error[1] + others[1], error[2] + others[2], error[3] + others[3],
+        )  # fmt: skip
         least, most, images = _peak(axis[:, i], table[0, i], both, beamlets, lobe, record)
         low, high = _change(error, others, (least, most), known, sizes, (beside, single))
         more = 0.0
