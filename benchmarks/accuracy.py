@@ -117,12 +117,12 @@ times as fast as the thesis's way at the error that this has.
 
 Planning counts for adaptive settings alone. In scenes of nothing but lines and their noise a block
 takes some 0.1 ms to be planned, and of a flight 0.2 us a shot besides: a twentieth of what a
-thousand shots take. Of studies of one or two points, which take less than a millisecond, that is a
-tenth or more; `sweep accuracy` then says what is lost, and what it comes to with the making of the
-study's store. Other effects than those of lines take a millisecond a block to be planned, and far
-longer to be computed. A run plans fixed settings too, as its store tells what they leave out, and
-its blocks draw points and solve for velocities besides: `make blocks` times whole blocks of flights
-against both, planned and not.
+thousand shots take. Of studies of one or two points, which take less than a millisecond, it is
+nearly a tenth. Where adaptive settings are slower by more than that, `sweep accuracy` says what is
+lost, and what it comes to with the making of the study's store. Other effects than those of lines
+take a millisecond a block to be planned, and far longer to be computed. A run plans fixed settings
+too, as its store tells what they leave out, and its blocks draw points and solve for velocities
+besides: `make blocks` times whole blocks of flights against both, planned and not.
 """
 
 TAIL = """
