@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from effect_points import point_block, scene, shots_of, tile_block
 
-from sweep.model.effects.footprint_sum import footprint_sum
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.footprint_sum import footprint_sum, put_at_points
+from sweep.model.footprint import beamlets, plane_footprint
 from sweep.model.lines import segment_lines
 from sweep.model.segments import SIGNS
 
@@ -76,3 +78,27 @@ def test_phases_that_are_drawn_may_make_it_all_in_phase(table_4_1, jittered):
 def test_powers_add_up_whatever_their_phases(table_4_1):
     found = footprint_sum(point_block(scene(table_4_1, 5, 1)))
     assert (found.most == found.in_phase).all() and not found.lean.any()
+
+
+def test_the_phase_by_which_doppler_stretches_a_range_s_beat_counts_in_full():
+    (across, along), share = beamlets(19)
+    angle, divergence, far, rate, middle, beta = 0.4, 1e-3, 3000.0, 2e12, 3e-4, 2e-4
+    point = [angle, divergence, 0.0, 0.0, far, rate, middle, 1e4, beta, *[2e14] * 3, *[0.0] * 3]
+    moving, still = np.empty((2, 2, 3, 1))
+    for found, ratio in (moving, beta), (still, 0.0):
+        table = np.array(point)[:, None]
+        table[8] = ratio
+        put_at_points(table, (across, along, share), 0, found)
+    offset, _, weight = (
+        values[0]
+        for values in plane_footprint(
+            grazing_angle=np.array([angle]), beam_divergence=np.array([divergence]), number=19
+        )
+    )
+    amplitude = np.sqrt(weight) / (1 + offset)
+    beat = rate * 2 * far / SPEED_OF_LIGHT * abs(offset)
+    turned = 2 * np.pi * beta * middle * (amplitude * beat).sum()
+    assert turned > 0.01
+    np.testing.assert_allclose((moving - still)[0, :, 0], turned * np.array([1, 0, 1]), 1e-9)
+    lean = (amplitude * beat).sum() / 1e4
+    np.testing.assert_allclose(moving[1, :, 0], lean * (1 + beta) * np.array([1, 0, 1]), 1e-12)
