@@ -6,9 +6,6 @@ nearly a millisecond, which for a block of 26 arrays is 2 % of a second's work.
 
 from __future__ import annotations
 
-import os
-import uuid
-from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -20,9 +17,6 @@ if TYPE_CHECKING:
 
 #: How chunks of every array are compressed.
 ZSTD_LEVEL = 1
-
-#: What the name of a file ends in that is still being written.
-PARTIAL = ".partial"
 
 #: Kinds of numpy's types whose chunks are their values and nothing else.
 PLAIN = "biuf"
@@ -78,29 +72,3 @@ def _zstd() -> Zstd:
     from numcodecs.zstd import Zstd
 
     return Zstd(level=ZSTD_LEVEL)
-
-
-def put(file: str, content: bytes) -> None:
-    """Write a chunk in one step: whoever looks finds all of it, or nothing."""
-    draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
-    try:
-        try:
-            _write(draft, content)
-        except FileNotFoundError:
-            os.makedirs(os.path.dirname(file), exist_ok=True)
-            _write(draft, content)
-        os.replace(draft, file)
-    except BaseException:
-        with suppress(FileNotFoundError):
-            os.unlink(draft)
-        raise
-
-
-def _write(file: str, content: bytes) -> None:
-    opened = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    try:
-        left = memoryview(content)
-        while left:
-            left = left[os.write(opened, left) :]
-    finally:
-        os.close(opened)

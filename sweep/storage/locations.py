@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
+import uuid
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,6 +23,9 @@ Location = Path | ObjectPath
 
 #: Directory of the journal inside a store.
 JOURNAL = ".sweep"
+
+#: What the name of a file ends in that is still being written.
+PARTIAL = ".partial"
 
 #: Attribute of a copy of a store with many chunks to a file.
 PACKED = "packed"
@@ -102,11 +108,49 @@ def beside(location: Location) -> Path:
 
 
 def put_whole(location: Location, content: bytes) -> None:
-    """Write a small file in one step: what reads it finds the old one or the new one."""
+    """Write a small file in one step: readers, and power cuts, find the old one or the new one."""
     if isinstance(location, ObjectPath):
         location.write_bytes(content)
-        return
-    location.parent.mkdir(parents=True, exist_ok=True)
-    draft = location.with_name(f"{location.name}.{os.getpid()}")
-    draft.write_bytes(content)
-    os.replace(draft, location)
+    else:
+        put(str(location), content, durable=True)
+
+
+def put(file: str, content: bytes, *, durable: bool = False) -> None:
+    """Write a file on disk in one step, also where a directory has got into its place.
+
+    Parameters
+    ----------
+    file, content
+        Its path, and what it is to hold. Folders above it are made.
+    durable
+        Write the content to the disk before the file gets its name: else a power cut may leave
+        the name with nothing behind it.
+    """
+    draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
+    try:
+        try:
+            _write(draft, content, durable)
+        except FileNotFoundError:
+            os.makedirs(os.path.dirname(file), exist_ok=True)
+            _write(draft, content, durable)
+        try:
+            os.replace(draft, file)
+        except IsADirectoryError:
+            shutil.rmtree(file)
+            os.replace(draft, file)
+    except BaseException:
+        with suppress(FileNotFoundError):
+            os.unlink(draft)
+        raise
+
+
+def _write(file: str, content: bytes, durable: bool) -> None:
+    opened = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        left = memoryview(content)
+        while left:
+            left = left[os.write(opened, left) :]
+        if durable:
+            os.fsync(opened)
+    finally:
+        os.close(opened)

@@ -63,7 +63,7 @@ class FileLog:
 
     def keep(self, is_sound: Callable[[bytes], bool]) -> None:
         """Drop the lines that are not sound."""
-        if not all(map(is_sound, raw_lines(self._path))):
+        if self._path.is_dir() or not all(map(is_sound, raw_lines(self._path))):
             lines = raw_lines(self._path)
             put_whole(self._path, b"".join(line for line in lines if is_sound(line)))
 
@@ -176,6 +176,6 @@ def raw_lines(path: Location) -> Iterator[bytes]:
             yield from path.read_bytes().splitlines(keepends=True)
         for _, content in _contents(path, names):
             yield from content.splitlines(keepends=True)
-    elif path.exists():
+    elif path.is_file():
         with open(path, "rb") as log:
             yield from log

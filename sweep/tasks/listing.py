@@ -8,6 +8,7 @@ its memory is a few bytes a block.
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -96,8 +97,13 @@ def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
         _look(folder, there)
     else:
         with suppress(FileNotFoundError):
-            there[()] = folder.stat().st_size > 0
+            there[()] = _is_chunk(folder.stat())
     return there
+
+
+def _is_chunk(found: os.stat_result) -> bool:
+    """Whether what is in a chunk's place is a file with something in it."""
+    return stat.S_ISREG(found.st_mode) and found.st_size > 0
 
 
 def _keys(folder: ObjectPath, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], int]]:
@@ -137,6 +143,6 @@ def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> N
                 if there.ndim > 1:
                     _look(name, there[at], opened)
                 else:
-                    there[at] = entry.stat().st_size > 0
+                    there[at] = _is_chunk(entry.stat())
     finally:
         os.close(opened)

@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from sweep.storage import chunks
+from sweep.storage import chunks, locations
 from sweep.storage.locations import JOURNAL, Location, each, located, zarr_store
 from sweep.storage.objects import in_words
 from sweep.storage.sealing import sealed
@@ -244,7 +245,7 @@ class Arrays:
         stored = chunk_object(name, position)
         if isinstance(self.path, Path) and chunked.is_plain:
             content = chunked.encoded(values)
-            chunks.put(f"{self.path}/{stored}", content)
+            locations.put(f"{self.path}/{stored}", content)
         else:
             array[place or ...] = values
             content = (self.path / stored).read_bytes()
@@ -309,7 +310,7 @@ def _remove_partials(folder: str) -> None:
         for entry in entries:  # no look at a file: there may be millions
             if entry.is_dir(follow_symlinks=False):
                 _remove_partials(entry.path)
-            elif entry.name.endswith(chunks.PARTIAL):
+            elif entry.name.endswith(locations.PARTIAL):
                 with suppress(FileNotFoundError):
                     os.unlink(entry.path)
 
@@ -319,7 +320,8 @@ def is_whole(path: Location, objects: list[str]) -> bool:
     if not isinstance(path, Path):
         return all(size > 0 for size in each(path, lambda name: (path / name).size(), objects))
     try:
-        return all(os.stat(f"{path}/{name}").st_size > 0 for name in objects)
+        found = [os.stat(f"{path}/{name}") for name in objects]
+        return all(stat.S_ISREG(one.st_mode) and one.st_size > 0 for one in found)
     except (FileNotFoundError, NotADirectoryError):
         return False
 

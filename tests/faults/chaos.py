@@ -34,7 +34,7 @@ from rich.progress import track
 from rich.table import Table
 from small import receipts, small, tree
 
-from sweep.storage import chunks
+from sweep.storage import locations
 from sweep.tasks import journal, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
@@ -146,7 +146,7 @@ def set_traps(arena: Arena) -> None:
     """Have all that is written and committed from here on pass by the arena, here and in forks."""
     ARENA[:] = [arena]
     write, commit, put, append = (
-        store.Arrays.write, journal.Journal.commit, chunks.put, os.write,
+        store.Arrays.write, journal.Journal.commit, locations.put, os.write,
     )  # fmt: skip
     writing: list[int] = []  # the block, and how many of its files are written
 
@@ -157,7 +157,7 @@ def set_traps(arena: Arena) -> None:
         arena.reached(AFTER_WRITE, block)
         return digest
 
-    def trapped_put(file, content):
+    def trapped_put(file, content, **options):
         path = Path(file)
         if writing and "c" in path.parts:
             writing[1] += 1
@@ -169,7 +169,7 @@ def set_traps(arena: Arena) -> None:
                 half.write_bytes(content[: len(content) // 2])
                 arena.reached(IN_A_FILE, writing[0])
                 half.unlink()
-        return put(file, content)
+        return put(file, content, **options)
 
     def trapped_commit(self, *committed):
         blocks = [receipt.block for receipt in committed]
@@ -193,7 +193,7 @@ def set_traps(arena: Arena) -> None:
             arena.reached(moment, block)
 
     store.Arrays.write, journal.Journal.commit = trapped_write, trapped_commit
-    chunks.put = trapped_put
+    locations.put = trapped_put
 
 
 def forked(work: Callable[[], object]) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import zarr
 
-from sweep.storage import chunks
+from sweep.storage import chunks, locations
 from sweep.tasks.store import WRITTEN_WHOLE, codecs
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
@@ -34,7 +34,7 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
     for position in itertools.product(*map(range, counts)):
         at = tuple(slice(p * c, (p + 1) * c) for p, c in zip(position, chunk, strict=True))
         file = tmp_path / "hand" / "/".join(["c", *map(str, position)])
-        chunks.put(str(file), chunks.Chunked.of(by_hand).encoded(values[at]))
+        locations.put(str(file), chunks.Chunked.of(by_hand).encoded(values[at]))
         assert (
             file.read_bytes()
             == (tmp_path / "zarr" / file.relative_to(tmp_path / "hand")).read_bytes()
@@ -54,14 +54,14 @@ def test_chunks_equal_to_the_fill_and_values_of_the_other_byte_order(tmp_path):
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     file = tmp_path / "c" / "0"
-    chunks.put(str(file), b"old")
+    locations.put(str(file), b"old")
 
     def full(*_):
         raise OSError(28, "no space left")
 
     monkeypatch.setattr("os.replace", full)
     with pytest.raises(OSError, match="no space"):
-        chunks.put(str(file), b"new")
+        locations.put(str(file), b"new")
     assert file.read_bytes() == b"old"
     assert [each.name for each in file.parent.iterdir()] == ["0"]
 

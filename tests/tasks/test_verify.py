@@ -154,6 +154,31 @@ def flip(file: Path) -> None:
     file.write_bytes(content)
 
 
+def put_directory(file: Path) -> None:
+    """Have a directory, and something in it, where a file was."""
+    file.unlink(missing_ok=True)
+    (file / "some").mkdir(parents=True)
+    (file / "some" / "notes").write_text("what got here")
+
+
+def test_a_directory_in_the_place_of_a_chunk_or_a_log_is_healed(undisturbed, tmp_path):
+    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    put_directory(store / "pd_up" / "c" / "0" / "5" / "0")
+    put_directory(store / ".sweep" / "failures.jsonl")
+    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
+    assert evaluated(log) == [5] and damages(store) == []
+    assert tree(store) == tree(undisturbed)
+
+
+def test_a_directory_in_the_place_of_an_eyepoint_is_healed(flight, tmp_path):
+    directory = shutil.copytree(flight.parent, tmp_path / "copy")
+    store = directory / flight.name
+    eyepoints = eyepoints_path(store, small_scene().geometry_id("line"))
+    put_directory(next(file for file in files(eyepoints) if file.parent.parent.name == "c"))
+    assert resume(store, progress=False, scheduler="none").complete
+    assert damages(store) == [] and tree(directory) == tree(flight.parent)
+
+
 def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path):
     store = copied(undisturbed, tmp_path)
     chunks = store / "pd_shot" / "c" / "0"
@@ -177,11 +202,13 @@ def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp
     "name",
     ["zarr.json", "pd_shot/zarr.json", "range/zarr.json", "range/c/0", ".sweep/template.jsonl"],
 )
-@pytest.mark.parametrize("damage", ["flipped", "missing"])
+@pytest.mark.parametrize("damage", ["flipped", "missing", "a directory"])
 def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, damage):
     store = copied(undisturbed, tmp_path)
     before = everything(store)
     flip(store / name) if damage == "flipped" else (store / name).unlink()
+    if damage == "a directory":
+        put_directory(store / name)
     with pytest.raises(StoreError, match=r"sweep verify .* --repair"):
         resume(store, progress=False, scheduler="none")
     (report,) = verify(store, progress=False, repair=True)
