@@ -115,14 +115,12 @@ Two things are asked of the adaptive settings, and the answers below are compute
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5
 times as fast as the thesis's way at the error that this has.
 
-Planning counts for adaptive settings alone. In scenes of nothing but lines and their noise a block
-takes some 0.1 ms to be planned, and of a flight 0.2 us a shot besides: a twentieth of what a
-thousand shots take. Of studies of one or two points, which take less than a millisecond, it is
-nearly a tenth. Where adaptive settings are slower by more than that, `sweep accuracy` says what is
-lost, and what it comes to with the making of the study's store. Other effects than those of lines
-take a millisecond a block to be planned, and far longer to be computed. A run plans fixed settings
-too, as its store tells what they leave out, and its blocks draw points and solve for velocities
-besides: `make blocks` times whole blocks of flights against both, planned and not.
+Planning counts for adaptive settings alone. A block takes some 1 ms to be planned, which is next to
+nothing of what a thousand points take, and most of the time of a study of one or two points. Where
+adaptive settings are slower by more than 10 %, `sweep accuracy` says what is lost, and what it
+comes to with the making of the study's store. A run plans fixed settings too, as its store tells
+what they leave out, and its blocks draw points and solve for velocities besides: `make blocks`
+times whole blocks of flights against both, planned and not.
 """
 
 TAIL = """

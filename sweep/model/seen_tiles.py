@@ -12,8 +12,6 @@ from sweep.model.compiling import borrowing
 from sweep.model.effects import tile_geometry
 from sweep.model.effects.block import Block
 from sweep.model.effects.footprint_fields import FIELDS, ROOM, set_fields
-from sweep.model.effects.plain_plan import DISTANCE, VELOCITY, PlainFlight
-from sweep.model.effects.planning import Plan, Rules
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
 from sweep.model.eyepoints import (
@@ -63,31 +61,6 @@ def block_of(
     geometry = tile_geometry.of_fields(spans, rotating)
     parameters = {**instrument.parameters, "target.reflectance": Span.of(1.0), **seen}
     return Block(parameters, len(edges) - 1, geometry, instrument=instrument)
-
-
-def plain_plan_of(
-    eyepoints: Eyepoints,
-    flight: PlainFlight,
-    surfaces: Sequence[Surface],
-    edges: np.ndarray,
-    rules: Rules,
-    tolerance: float,
-) -> Plan:
-    """The plan of some tiles of shots in a plain scene.
-
-    Parameters
-    ----------
-    eyepoints, surfaces, edges
-        As of :func:`block_of`.
-    flight : PlainFlight
-        Of the instrument.
-    rules, tolerance
-        As of :meth:`sweep.model.effects.plain_plan.PlainFlight.plan`.
-    """
-    values = np.empty((FIELDS + 2, len(eyepoints.time)))
-    _put_fields(eyepoints, surfaces, True, np.empty(0), values[:FIELDS])
-    values[DISTANCE], values[VELOCITY] = eyepoints.range, eyepoints.radial_velocity
-    return flight.plan(values, edges, rules, tolerance)
 
 
 def _put_fields(

@@ -13,7 +13,6 @@ from sweep.tasks.study import ArrayLayout
 from sweep.tasks.tiles import Alike, Tiles
 
 if TYPE_CHECKING:
-    from sweep.model.effects.plain_plan import PlainPlanes
     from sweep.model.effects.planning import Plan
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.surfaces import Surface
@@ -65,13 +64,9 @@ class Calling:
     """
 
     def __init__(self, spec: Spec, grid: Grid) -> None:
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-        from sweep.model.effects.planning import rules_of
-
         self._modes, self.tiles = spec.modes(), Tiles(grid)
         self._known: dict[int, tuple[int, float]] = {}
-        self._alike: dict[int, tuple[PlainPlanes | None, float]] = {}
-        self._rules = rules_of(ALL, tuple(self._modes.items()))
+        self._tolerances: dict[int, float] = {}
 
     def of_block(self, block: int) -> Called:
         """What is simulated at the points of a block, in C order over it."""
@@ -111,27 +106,23 @@ class Calling:
             yield alike.tiles, self._plan(alike)
 
     def _plan(self, alike: Alike) -> Plan:
-        """The plan of tiles that share words and sizes: the same by either way."""
+        """The plan of tiles that share words and sizes."""
         from sweep.model.effects.block import Block
         from sweep.model.effects.planning import plan
 
-        if alike.code not in self._alike:
-            self._alike[alike.code] = self._in_common(alike)
-        plain, tolerance = self._alike[alike.code]
-        if plain is not None and not self._rules.at_rest:
-            return plain.plan(alike.parameters, len(alike.tiles), self._rules, tolerance)
+        if alike.code not in self._tolerances:
+            self._tolerances[alike.code] = self._tolerance(alike)
+        tolerance = self._tolerances[alike.code]
         return plan(Block.of_plane(alike.parameters), modes=self._modes, tolerance=tolerance)
 
-    def _in_common(self, alike: Alike) -> tuple[PlainPlanes | None, float]:
-        """What makes plans of tiles in plain scenes, and what of the tolerance is for effects."""
-        from sweep.model.effects.plain_plan import PlainPlanes
+    def _tolerance(self, alike: Alike) -> float:
+        """Share of the tolerance that is for effects."""
         from sweep.model.effects.tile_link import TileLink
         from sweep.model.resolution import BEAMLETS, effects_tolerance
 
         shared = TileLink(alike.parameters)
         number, tolerance = shared.whole(BEAMLETS), shared[TOLERANCE].low
-        share = effects_tolerance(shared.words, number, float(np.ravel(tolerance)[0]))
-        return PlainPlanes.of(alike.parameters), share
+        return effects_tolerance(shared.words, number, float(np.ravel(tolerance)[0]))
 
 
 class ShotsPlan(NamedTuple):
@@ -177,24 +168,17 @@ class ShotsCalling:
         rays_by_tolerance: bool = False,
     ) -> None:
         from sweep.model.effects.catalogue import DEFAULTS
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-        from sweep.model.effects.plain_plan import PlainFlight
-        from sweep.model.effects.plain_scene import is_plain
-        from sweep.model.effects.planning import rules_of
         from sweep.model.effects.span import Span
         from sweep.model.effects.tile_link import TileLink
 
         self._parameters, self._surfaces, self._modes = parameters, surfaces, modes
         self._rotating, self._rays_by_tolerance = rotating, rays_by_tolerance
-        self._rules = rules_of(ALL, tuple(modes.items()))
         self._instrument = TileLink(
             {
                 path: value if isinstance(value, str) else Span.of(np.asarray(value)[()])
                 for path, value in (DEFAULTS | dict(parameters)).items()
             }
         )
-        plain = not self._rules.at_rest and is_plain(self._instrument, rotating)
-        self._plain = PlainFlight.of(self._instrument) if plain else None
 
     def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""
@@ -206,17 +190,12 @@ class ShotsCalling:
         return ShotsPlan(seen, tile, self._plan(some, edges))
 
     def _plan(self, eyepoints: Eyepoints, edges: np.ndarray) -> Plan:
-        """The plan of tiles of shots that all see something: the same by either way."""
+        """The plan of tiles of shots that all see something."""
         from sweep.model.effects.planning import plan
-        from sweep.model.seen_tiles import block_of, plain_plan_of
+        from sweep.model.seen_tiles import block_of
 
-        tolerance = self._tolerance(eyepoints)
-        if self._plain is not None:
-            return plain_plan_of(
-                eyepoints, self._plain, self._surfaces, edges, self._rules, tolerance
-            )
         block = block_of(eyepoints, self._instrument, self._surfaces, edges, self._rotating)
-        return plan(block, modes=self._modes, tolerance=tolerance)
+        return plan(block, modes=self._modes, tolerance=self._tolerance(eyepoints))
 
     def _tolerance(self, eyepoints: Eyepoints) -> float:
         """What of the tolerance is for effects."""
