@@ -84,7 +84,7 @@ def build(scene: Scene, files: Files, span: Span) -> World:
         first += len(materials(name, thing))
     meshes = [merge(resting)] if resting else []
     return World(
-        Caster([*meshes, *(mesh for mesh, _ in moving)], embree=False),
+        Caster([*meshes, *(mesh for mesh, _ in moving)]),
         surfaces_of(scene),
         (*(None for _ in meshes), *(flight for _, flight in moving)),
         tuple(reports),

@@ -39,7 +39,7 @@ def observed(path, *, bodies=None, beams=DOWN, scanner=None, index=(0,), **keywo
         np.asarray(index),
         flight=path,
         scanner=scanner or fixed(beams, rate=1.0),
-        caster=Caster(meshes, embree=False),
+        caster=Caster(meshes),
         beam_divergence=keywords.pop("beam_divergence", 50e-6),
         number=keywords.pop("number", 19),
         bodies=motion,

@@ -37,7 +37,7 @@ def _observed(flight, *, beams=None, caster=None, index=(0,), number=19, **keywo
         np.asarray(index),
         flight=flight,
         scanner=scanner,
-        caster=caster or Caster(_plane(), embree=False),
+        caster=caster or Caster(_plane()),
         beam_divergence=keywords.pop("beam_divergence", 50e-6),
         number=number,
         **keywords,
@@ -101,7 +101,7 @@ def test_a_spinning_target_closes_on_one_side_and_recedes_on_the_other():
     omega = 0.7
     path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
     body = Flight(path, Spin((0.0, omega, 0.0)))
-    caster = Caster(_plane(size=50.0), embree=False)
+    caster = Caster(_plane(size=50.0))
     for x in (-20.0, 5.0, 20.0):
         seen = _observed(_flight(position=(x, 0.0, 300.0)), caster=caster, bodies=[body])
         # a point at (x, 0, 0) moves up with (omega x r)_z = -omega_y x: up is closing
@@ -123,7 +123,7 @@ def test_velocity_across_the_footprint_of_a_spinning_target_is_that_of_its_point
     omega, place, own = np.array([0.05, 0.3, 0.1]), np.array([8.0, -3.0, 300.0]), (2.0, 1.0, -9.0)
     path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
     seen = _observed(
-        _flight(position=place, velocity=own), caster=Caster(_plane(size=400.0), embree=False),
+        _flight(position=place, velocity=own), caster=Caster(_plane(size=400.0)),
         bodies=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
     )  # fmt: skip
     here = place + when * np.array(own)
@@ -183,7 +183,7 @@ def test_a_tumbling_instrument_sees_the_velocity_of_its_lever_arm():
 
 
 def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(table_4_1):
-    edge = Caster(_plane(size=5.0), embree=False)
+    edge = Caster(_plane(size=5.0))
     seen = _observed(
         _flight(position=(5.0, 0.0, 100.0)), caster=edge, beam_divergence=2e-3, number=109
     )

@@ -24,7 +24,7 @@ def eyepoints():
         np.arange(24),
         flight=Flight(path, Nadir()),
         scanner=fixed(cone(3, half_angle=0.2), rate=2.0),
-        caster=Caster(ground, embree=False),
+        caster=Caster(ground),
         beam_divergence=0.03,
         number=7,
     )

@@ -14,9 +14,7 @@ from sweep.model.geometry.rays import Caster
 FAMILY = Family(
     "Meshes",
     "The range of the first hit, against exact fractions, in units of the last place of the range: "
-    "half of one is its own rounding; a miss, or a hit where there is none, counts as infinite. "
-    "Each by the float64 hierarchy alone and from Embree's guess, which is blind to what float32 "
-    "cannot tell apart: surfaces nearer to each other than 1e-7 of the range, and facets as thin.",
+    "half of one is its own rounding; a miss, or a hit where there is none, counts as infinite.",
 )
 IN_PLACES = {
     "reference": "nearest triangle in exact fractions",
@@ -33,12 +31,10 @@ def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def worst_of(scene: Scene, embree: bool) -> float:
+def worst_of(scene: Scene) -> float:
     """Worst error of the ranges of a scene's rays [last places]."""
     vertices, faces, origins, directions = scene
-    hits = Caster(clean(vertices, faces, np.zeros(len(faces)))[0], embree=embree).cast(
-        origins, directions
-    )
+    hits = Caster(clean(vertices, faces, np.zeros(len(faces)))[0]).cast(origins, directions)
     worst = 0.0
     for found, o, d in zip(hits.range, origins, directions, strict=True):
         exact = nearest(np.asarray(vertices, float), np.asarray(faces), o, d)
@@ -49,16 +45,11 @@ def worst_of(scene: Scene, embree: bool) -> float:
     return worst
 
 
-def both_ways(
-    hard: str, allowed: float = 1.0
-) -> Callable[[Callable[[], Scene]], Callable[[], Scene]]:
-    """Registers a scene for either way to find the nearest triangle."""
+def scene(hard: str) -> Callable[[Callable[[], Scene]], Callable[[], Scene]]:
+    """Registers a scene."""
 
     def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
-        for embree, way in ((False, "float64"), (True, "Embree")):
-            FAMILY.case(f"{hard} ({way})", allowed=allowed, **IN_PLACES)(
-                lambda embree=embree: worst_of(make(), embree)
-            )
+        FAMILY.case(hard, allowed=1.0, **IN_PLACES)(lambda: worst_of(make()))
         return make
 
     return register
@@ -87,7 +78,7 @@ def random_targets(vertices: np.ndarray, faces: np.ndarray, number: int) -> np.n
     return np.einsum("ij,ijk->ik", part, vertices[faces[rng.integers(0, len(faces), number)]])
 
 
-@both_ways("terrain 4e6 m from the origin, from 2 km")
+@scene("terrain 4e6 m from the origin, from 2 km")
 def far_from_the_origin() -> Scene:
     vertices, faces = terrain()
     vertices = vertices + np.array([4e6, -3e6, 2e6])
@@ -95,19 +86,19 @@ def far_from_the_origin() -> Scene:
     return vertices, faces, *aimed(random_targets(vertices, faces, 60), away, 2000.0)
 
 
-@both_ways("terrain of 1e-6 m cells, from 1 mm")
+@scene("terrain of 1e-6 m cells, from 1 mm")
 def microscopic() -> Scene:
     vertices, faces = terrain(spacing=1e-6)
     return vertices, faces, *aimed(random_targets(vertices, faces, 40), [0.1, 0.2, 1], 1e-3)
 
 
-@both_ways("terrain of 1e5 m cells, from 1e7 m")
+@scene("terrain of 1e5 m cells, from 1e7 m")
 def planetary() -> Scene:
     vertices, faces = terrain(spacing=1e5)
     return vertices, faces, *aimed(random_targets(vertices, faces, 40), [0.1, 0.2, 1], 1e7)
 
 
-@both_ways("needles 1 km long and 1 um wide, side by side")
+@scene("needles 1 km long and 1 um wide, side by side")
 def needles() -> Scene:
     y = np.arange(41) * 1e-6
     near, far = (
@@ -120,11 +111,12 @@ def needles() -> Scene:
     return vertices, faces, *aimed(random_targets(vertices, faces, 60), [-0.2, 0.1, 1], 500.0)
 
 
-def slivers(width: float) -> Scene:
+@scene("slivers of 1e-10 m, before a wall 100 m off")
+def slivers() -> Scene:
     """Corners about a line, before a wall, seen face on: each is as wide as it is."""
     rng = np.random.default_rng(5)
     start, along = rng.uniform(-1, 1, (30, 3)), unit(rng.normal(size=(30, 3)))
-    middle = start + 0.4 * along + width * rng.normal(size=(30, 3))
+    middle = start + 0.4 * along + 1e-10 * rng.normal(size=(30, 3))
     wall = np.array([[-50, -50, -9], [50, -50, -9.5], [0, 90, -8.7]])
     vertices = np.concatenate([start, middle, start + along, wall])
     k = np.arange(30)
@@ -135,17 +127,7 @@ def slivers(width: float) -> Scene:
     return vertices, faces, *aimed(targets, away, 100.0)
 
 
-@FAMILY.case("slivers of 1e-10 m, before a wall 100 m off (float64)", allowed=1.0, **IN_PLACES)
-def slivers_in_doubles() -> float:
-    return worst_of(slivers(1e-10), False)
-
-
-@FAMILY.case("slivers of 1 mm, before a wall 100 m off (Embree)", allowed=1.0, **IN_PLACES)
-def slivers_by_embree() -> float:
-    return worst_of(slivers(1e-3), True)
-
-
-@both_ways("facets that coincide and overlap in one plane")
+@scene("facets that coincide and overlap in one plane")
 def coplanar() -> Scene:
     square = np.array([[-9, -9], [9, -9], [9, 9], [-9, 9], [-3, -7], [8, 0.5], [-1, 8]])
     vertices = np.concatenate([square, (0.25 * square[:, :1] - 0.5 * square[:, 1:])], axis=1)
@@ -155,7 +137,7 @@ def coplanar() -> Scene:
     return vertices, faces, *aimed(targets, [0.1, -0.2, 1], 300.0)
 
 
-@both_ways("rays exactly in the planes of facets, a wall behind")
+@scene("rays exactly in the planes of facets, a wall behind")
 def edge_on() -> Scene:
     """The planes z = 0, z = x and x = y, along directions of equal components."""
     flat = [[-9, -9, 0], [9, -9, 0], [9, 9, 0]]
@@ -174,7 +156,7 @@ def edge_on() -> Scene:
     return np.array([*flat, *tilted, *upright, *wall], float), faces, origins, directions
 
 
-@both_ways("rays through vertices, exactly")
+@scene("rays through vertices, exactly")
 def through_vertices() -> Scene:
     """Ground of dyadic numbers, and directions that reach its vertices without rounding."""
     vertices, faces = terrain(9)
@@ -185,7 +167,7 @@ def through_vertices() -> Scene:
     return vertices, faces, inner - 1024.0 * d, d
 
 
-@both_ways("rays through edges, exactly")
+@scene("rays through edges, exactly")
 def through_edges() -> Scene:
     vertices, faces = terrain(9)
     vertices[:, 2] = np.round(vertices[:, 2] * 8) / 8
@@ -201,7 +183,7 @@ def through_edges() -> Scene:
     return vertices, faces, targets - 512.0 * d, d
 
 
-@both_ways("rays within the last places of vertices and edges, 4e6 m from the origin")
+@scene("rays within the last places of vertices and edges, 4e6 m from the origin")
 def beside_edges() -> Scene:
     vertices, faces = terrain(9)
     vertices = vertices + 4e6
@@ -212,7 +194,7 @@ def beside_edges() -> Scene:
     return vertices, faces, *aimed(targets[keep], [0.2, -0.1, 1], 3000.0)
 
 
-@both_ways("a plane at 0.01 deg of grazing angle, from 2 km")
+@scene("a plane at 0.01 deg of grazing angle, from 2 km")
 def grazing() -> Scene:
     corners = np.array([[-1e5, -1e5, 3.1], [1.1e5, -1e5, -2.7], [0, 1.2e5, 0.4]])
     targets = np.random.default_rng(8).dirichlet([3, 3, 3], 40) @ corners
@@ -222,26 +204,17 @@ def grazing() -> Scene:
     return corners, np.array([[0, 1, 2]]), *aimed(targets, away, 2000.0)
 
 
-def layers(apart: float) -> Scene:
-    """Two parallel facets so far apart, the far one first, seen from 2 km before a third."""
+@scene("two surfaces 1e-11 m apart, from 2 km")
+def layers() -> Scene:
+    """Two parallel facets, the far one first, seen from 2 km before a third."""
     ground = np.array([[-50.0, -50, 0], [50, -50, 0], [0, 90, 0]])
-    vertices = np.concatenate([ground - np.array([0, 0, depth]) for depth in (0, apart, 5)])
+    vertices = np.concatenate([ground - np.array([0, 0, depth]) for depth in (0, 1e-11, 5)])
     targets = np.random.default_rng(9).uniform(-15, 15, (60, 3)) * [1, 1, 0]
     return (
         vertices,
         np.array([[3, 4, 5], [0, 1, 2], [6, 7, 8]]),
         *aimed(targets, [0.3, 0.1, 1], 2e3),
     )
-
-
-@FAMILY.case("two surfaces 1e-11 m apart, from 2 km (float64)", allowed=1.0, **IN_PLACES)
-def close_layers() -> float:
-    return worst_of(layers(1e-11), False)
-
-
-@FAMILY.case("two surfaces 1 mm apart, from 2 km (Embree)", allowed=1.0, **IN_PLACES)
-def layers_by_embree() -> float:
-    return worst_of(layers(1e-3), True)
 
 
 @FAMILY.case(

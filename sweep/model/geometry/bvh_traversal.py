@@ -174,7 +174,7 @@ def _walk_ray(tree, ray, distance, face, stack, entry, entered):
                 ax, ay, az = moved(vertices, faces[j, 0], o, kx, ky, kz)
                 bx, by, bz = moved(vertices, faces[j, 1], o, kx, ky, kz)
                 cx, cy, cz = moved(vertices, faces[j, 2], o, kx, ky, kz)
-                t, _ = sheared_hit(ax, ay, az, bx, by, bz, cx, cy, cz, sx, sy, inverse)
+                t = sheared_hit(ax, ay, az, bx, by, bz, cx, cy, cz, sx, sy, inverse)
                 if t < distance or (t == distance and order[j] < face):
                     distance, face = t, np.int64(order[j])
     return distance, face
@@ -260,7 +260,7 @@ def _test_bundle(a, b, c, index, shears, distance, face):
     bx, by, bz = b
     cx, cy, cz = c
     for i in range(distance.size):
-        t, _ = sheared_hit(
+        t = sheared_hit(
             ax, ay, az, bx, by, bz, cx, cy, cz, shears[0, i], shears[1, i], shears[2, i]
         )
         closer = (t < distance[i]) | ((t == distance[i]) & (index < face[i]))

@@ -43,7 +43,7 @@ def moved(vertices, v, o, kx, ky, kz):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def sheared_hit(ax, ay, az, bx, by, bz, cx, cy, cz, sx, sy, inverse):
-    """Distance of the hit, inf where there is none; and whether it is off all edges.
+    """Distance of the hit, inf where there is none.
 
     A weighted mean of the corners' depths: between them, however flat the ray lies.
     """
@@ -57,45 +57,4 @@ def sheared_hit(ax, ay, az, bx, by, bz, cx, cy, cz, sx, sy, inverse):
     most = larger(u, larger(v, w))
     t = (u * az + v * bz + w * cz) / (u + v + w) * inverse
     inside = (least >= 0.0) | (most <= 0.0)
-    return t if inside & (t > 0.0) else np.inf, (least > 0.0) | (most < 0.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def check_guesses(vertices, faces, guess, origins, directions, distance, face):
-    """Accept guessed triangles (n,) that the ray hits off all edges; the rays left to walk.
-
-    Parameters
-    ----------
-    vertices, faces
-        The mesh's.
-    guess : (n,) int
-        Triangle that each ray may hit nearest, -1 for none.
-    origins, directions, distance, face
-        As in :func:`sweep.model.geometry.bvh_traversal.nearest_of_rays`.
-
-    Returns
-    -------
-    (k,) int64
-        Rays without a guess, or for which it is not hit or hit on an edge, where another may tie.
-    """
-    pending = np.empty(guess.size, dtype=np.int64)
-    number = 0
-    for i in range(guess.size):
-        j = guess[i]
-        t, is_off_edges = np.inf, False
-        if j >= 0:
-            o, d = origins[i], directions[i]
-            kx, ky, kz = axes(d)
-            ax, ay, az = moved(vertices, faces[j, 0], o, kx, ky, kz)
-            bx, by, bz = moved(vertices, faces[j, 1], o, kx, ky, kz)
-            cx, cy, cz = moved(vertices, faces[j, 2], o, kx, ky, kz)
-            inverse = 1.0 / d[kz]
-            t, is_off_edges = sheared_hit(
-                ax, ay, az, bx, by, bz, cx, cy, cz, d[kx] * inverse, d[ky] * inverse, inverse
-            )
-        if not (is_off_edges and t < np.inf):
-            pending[number] = i
-            number += 1
-        elif t < distance[i]:
-            distance[i], face[i] = t, j
-    return pending[:number]
+    return t if inside & (t > 0.0) else np.inf

@@ -5,9 +5,6 @@ tests that leave no crack between neighbours (:mod:`sweep.model.geometry.ray_tri
 plane is met in twice float64's precision (:mod:`sweep.model.geometry.ray_plane`): a range is the
 exact one of the numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body
 that moves is met in its own frame, so its mesh is never rebuilt.
-
-Single rays may start from Embree's float32 guess, checked in float64; bundles, which share one
-walk through the hierarchy, are faster without.
 """
 
 from collections.abc import Sequence
@@ -20,10 +17,8 @@ from sweep.model.geometry import quaternion
 from sweep.model.geometry.bvh import build
 from sweep.model.geometry.bvh_traversal import nearest_of_bundles, nearest_of_rays
 from sweep.model.geometry.mesh import Mesh
-from sweep.model.geometry.ray_embree import Guesser
 from sweep.model.geometry.ray_hits import are_units, first_hits, put_surfaces, take_nearer
 from sweep.model.geometry.ray_ranges import finish_bundles, finish_rays, to_body, turn_to_body
-from sweep.model.geometry.ray_triangle import check_guesses
 
 _UNIT_TOLERANCE = 1e-9
 _STILL = (np.eye(3)[None], np.zeros((1, 3)))
@@ -85,11 +80,6 @@ class Caster:
     ----------
     bodies : Mesh or sequence of Mesh
         The bodies, numbered from 0; coordinates in each body's frame.
-    embree : bool
-        Start single rays from Embree's guess. Without it (the reference) every ray walks the
-        float64 hierarchy, and results are the same bit for bit on any machine; with it, rays
-        that pass a silhouette within float32's resolution may see the surface behind, and so may
-        all where two surfaces are nearer to each other than that, 1e-7 of the range.
 
     Raises
     ------
@@ -97,12 +87,11 @@ class Caster:
         There is no body.
     """
 
-    def __init__(self, bodies: Mesh | Sequence[Mesh], *, embree: bool = True):
+    def __init__(self, bodies: Mesh | Sequence[Mesh]):
         self.meshes = (bodies,) if isinstance(bodies, Mesh) else tuple(bodies)
         if not self.meshes:
             raise ValueError("there is no body to cast rays at")
         self._trees = [build(mesh.vertices, mesh.faces) for mesh in self.meshes]
-        self._guessers = [Guesser(mesh) for mesh in self.meshes] if embree else None
 
     def cast(
         self,
@@ -137,7 +126,7 @@ class Caster:
         for number, frame in enumerate(frames):
             o, d = _in_frame(frame, start, along[:, None])
             found = np.full(n, -1)
-            self._nearest(number, o, d[:, 0], distance, found)
+            nearest_of_rays(self._trees[number], o, np.ascontiguousarray(d[:, 0]), distance, found)
             take_nearer(found, number, face, body)
         result = np.full(n, np.inf), np.zeros(n), np.full(n, np.nan), np.full((n, 3), np.nan)
         self._finish(frames, start, along[:, None], np.zeros_like(face), face, body, result)
@@ -189,19 +178,6 @@ class Caster:
             (shift, *(_STILL if pose is None else _turned(pose, n)), mesh.origin, pose is None)
             for mesh, pose in zip(self.meshes, poses, strict=True)
         ]
-
-    def _nearest(self, number, origins, directions, distance, face):
-        """Nearest triangles of one body; what is known in `distance` and `face` stays if nearer."""
-        tree, directions = self._trees[number], np.ascontiguousarray(directions)
-        if self._guessers is None:
-            nearest_of_rays(tree, origins, directions, distance, face)
-            return
-        mesh, guess = self.meshes[number], self._guessers[number].guess(origins, directions)
-        left = check_guesses(mesh.vertices, mesh.faces, guess, origins, directions, distance, face)
-        if left.size:
-            nearer, found = distance[left], face[left]
-            nearest_of_rays(tree, origins[left], directions[left], nearer, found)
-            distance[left], face[left] = nearer, found
 
     def _finish(self, frames, origins, directions, beamlet, face, body, result):
         """Fill ranges, cosines and normals of one beamlet of each bundle in, body by body."""
