@@ -204,7 +204,7 @@ def _roc_traces(track: Track, name: str, number: int, point: xr.Dataset) -> list
         traces += [
             go.Scatter(
                 x=of(IN_A_BIN, bins).astype(np.float32), y=curve["pd"].values.astype(np.float32),
-                text=[f"TNR {t:.3g}" for t in curve["tnr"].values],
+                text=[f"TNR {t:.3g}" for t in curve["curve_tnr"].values],
                 name=name, legendgroup=name, showlegend=bool(name), meta=meta, line=line,
                 mode="lines",
             ),

@@ -3,10 +3,12 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from click.testing import CliRunner
 from drawn_studies import POWERS, SURFACE, stored, study
 from made_datasets import made
 
 import sweep
+from sweep.cli import main
 from sweep.model import cramer_rao
 from sweep.model.shot import evaluate
 
@@ -103,10 +105,26 @@ def test_a_roc_curve_is_the_model_at_each_threshold(surface):
     for segment in ("up", "doppler", "shot"):
         curve = part.sweep.roc(expected["pfa_bin"], segment=segment)
         assert not curve.simulated
-        assert curve.tnr.values == pytest.approx(tnr, rel=1e-6)
+        assert curve.curve_tnr.values == pytest.approx(tnr, rel=1e-6)
         # lines are as exact as each threshold asks for, to a tolerance of 1e-3
         assert curve.pd.values == pytest.approx(expected[f"pd_{segment}"], abs=1e-5)
     assert 0.01 < expected["pd_shot"][-1] < 0.99
+
+
+def test_a_study_of_thresholds_has_the_curve_of_its_point_at_each_of_them(tmp_path, surface):
+    axes = {"instrument.processing.tnr": [8, 10], "target.range": ["7 km", "9 km"]}
+    store = stored(tmp_path, axes)
+    dataset = sweep.open(store)
+    curves = dataset.sweep.roc([1e-9, 1e-6, 1e-3])
+    assert curves.pd.dims == ("pfa_bin", "tnr", "range") and curves.tnr.values.tolist() == [8, 10]
+    alone = surface.sweep.sel(range="9 km", grazing_angle="60 deg").sweep.roc([1e-9, 1e-6, 1e-3])
+    for threshold in (8, 10):
+        point = dataset.sweep.sel(tnr=threshold, range="9 km").sweep.roc([1e-9, 1e-6, 1e-3])
+        assert point.curve_tnr.values == pytest.approx(alone.curve_tnr.values, rel=1e-6)
+        assert curves.pd.sel(tnr=threshold, range=9).values == pytest.approx(alone.pd, abs=1e-5)
+        assert point.pd.values == pytest.approx(alone.pd, abs=1e-5)
+    page = CliRunner().invoke(main, ["report", str(store)], catch_exceptions=False)
+    assert page.exit_code == 0
 
 
 def test_the_roc_of_a_speckled_target_is_swerlings(speckled):

@@ -164,7 +164,7 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     for line in by_alarm.values():
         np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
     parameters = detector.parameters_at(study.spec, track.position(place))
-    of_model = evaluate(parameters | {detector.TNR: curve["tnr"].values}, [])
+    of_model = evaluate(parameters | {detector.TNR: curve["curve_tnr"].values}, [])
     for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
                         ("in both chirps", "pfa_shot")):  # fmt: skip
         # the model leaves out the few bins in which the target lies

@@ -39,6 +39,9 @@ SAME = 1e-9
 """Difference of pd up to which the closed form gives back what is stored."""
 
 TNR = "instrument.processing.tnr"
+CURVE_TNR = "curve_tnr"
+"""Not `tnr`, which is the study's own where that is on an axis."""
+
 DOMAIN = "sweep.analysis.roc"
 _SEGMENTS = {"up": ("up",), "doppler": ("doppler",), "down": ("down",), "shot": ("up", "down")}
 
@@ -66,9 +69,9 @@ def roc(
     Returns
     -------
     xarray.Dataset
-        `pd`, with a further dimension `pfa_bin`; `tnr`, the threshold to noise ratio that makes
-        each pfa_bin at each point; `simulated`, whether the point was simulated anew. Where draws
-        are made, `half_width` with the study's confidence; 0 where pd is exact.
+        `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold to noise ratio that
+        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. Where
+        draws are made, `half_width` with the study's confidence; 0 where pd is exact.
 
     Raises
     ------
@@ -93,7 +96,7 @@ def roc(
     pd, exact = _closed(dataset, segment, level)
     tnr = level * parameter(dataset, TNR) / _own_level(dataset)
     result = xr.Dataset(
-        {"pd": pd, "tnr": tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
+        {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
         {"pfa_bin": ("pfa_bin", chances)},
     )
     result = result.transpose("pfa_bin", *dataset[named("pd", segment)].dims)
@@ -159,7 +162,7 @@ def _simulate(dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int)
     for place in places:
         at = dict(zip(dims, map(int, place), strict=True))
         point = dataset.isel(at)
-        tnr = result["tnr"].isel(at).values
+        tnr = result[CURVE_TNR].isel(at).values
         index = (slice(None), *place)
         pd[index], width[index] = _curve(spec, point, tnr, segment, draws)
     result["pd"] = result["pd"].copy(data=pd)
@@ -197,7 +200,7 @@ def _described(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Data
     """Units and words."""
     words = {
         "pd": f"probability of detection, {segment}",
-        "tnr": "threshold to noise ratio",
+        CURVE_TNR: "threshold to noise ratio",
         "simulated": "whether the point was simulated anew at every threshold",
         "half_width": f"half-width of the interval of the probability of detection, {segment}",
         "pfa_bin": "probability of false alarm in one bin, from noise alone",
