@@ -249,6 +249,23 @@ def test_the_summary_counts_what_the_arrays_hold(undisturbed):
     assert rows["line, power 1 W"].cycles == 0
 
 
+def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undisturbed, tmp_path):
+    """One block is committed; another has its points written, and no velocity yet."""
+    store = shutil.copytree(undisturbed.store, tmp_path / "copy.zarr")
+    log = store / ".sweep" / "receipts.jsonl"
+    first = next(line for line in log.read_text().splitlines(True) if '"block":0,' in line)
+    log.write_text(first)
+    for chunk in (store / "three" / "velocity_status" / "c").rglob("*"):
+        if chunk.is_file() and chunk.parts[-3:] != ("0", "0", "0"):
+            chunk.unlink()
+    rows = {row.part: row for row in scene_summary(store)}
+    weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
+    assert (weak.shots, weak.cycles) == (60 * 2, 20 * 2)
+    status = opened(undisturbed.store)["three"].velocity_status.values[0, :20, :2]
+    assert weak.solved == (status <= 1).sum()
+    assert strong.shots == strong.cycles == strong.solved == rows["line, power 1 W"].shots == 0
+
+
 def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
     """A plane of 200 m under beams at 22.5 deg, that leave it behind from 240 m on."""
     objects = {"ground": {"kind": "plane", "size": "200 m", "reflectance": 0.1}}
