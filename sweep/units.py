@@ -113,7 +113,8 @@ def read_number(written: object) -> tuple[Fraction, Unit]:
     """
     value, unit = _split(written)
     if unit not in ("", "%"):
-        raise QuantityError("is a pure number and takes no unit", f"write e.g. '{_show(value)}'")
+        ratio = f"; {_show(value)} dB is {_show(_ratio(value))}" if unit == DECIBEL else ""
+        raise QuantityError(f"is a pure number and takes no unit{ratio}")
     return value, Unit(unit, Fraction(1, 100)) if unit else Unit("")
 
 
@@ -205,7 +206,7 @@ def _spelled(text: str) -> str:
 def _show(value: Fraction) -> str:
     """A number as a user would write it."""
     try:
-        return f"{float(value):.12g}"
+        return f"{float(value):.4g}"
     except OverflowError:
         return "1e300"
 

@@ -132,6 +132,8 @@ def test_a_changed_spec_is_refused_with_what_changed(here):
         (["run", "small.yaml", "--store", "notes"], "is not a Zarr store"),
         (["run", "small.yaml", "--store", "notes", "--overwrite"], "is not a Zarr store"),
         (["run", "small.yaml", "--store", "notes/text/small.zarr"], "can't be made"),
+        (["run", "small.yaml", "--store", "ftp://x/y.zarr"], "ftp://x/y.zarr: is no place for a"),
+        (["status", "S3://x/y.zarr"], "write a path, or s3://, gs://, az://"),
         (["runn", "small.yaml"], "runn"),
     ],
 )
@@ -172,6 +174,15 @@ def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch
     assert sweep(*again).exit_code == 3  # what failed is left out until it is asked for
     assert sweep(*again, "--retry-failed").exit_code == 0
     assert "complete" in sweep("status", "results/small.zarr").stdout
+
+
+def test_a_path_after_an_equals_sign_may_begin_at_home(here, monkeypatch):
+    monkeypatch.setenv("HOME", str(here / "home"))
+    store = "--store=~/small.zarr"
+    assert sweep("run", "small.yaml", store, "--scheduler", "none").exit_code == 0
+    assert (here / "home" / "small.zarr").is_dir() and not (here / "~").exists()
+    drawn = sweep("shot", "small.yaml", "--output=~/drawn")
+    assert drawn.exit_code == 0 and (here / "home" / "drawn").is_dir()
 
 
 def test_status_tells_who_is_at_work(here):

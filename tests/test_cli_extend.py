@@ -58,6 +58,8 @@ def test_elsewhere_it_leaves_the_store(store):
         (["--set", f"{POWER}=[1 W"], "--set:2: is no valid YAML"),
         (["--set", f"{POWER}=[1 W, 2 parsecs]"], "parsecs"),
         (["--set", f"{POWER}=[1 W, 2 W]"], "instrument.laser.power: 3 W: lost, and must stay"),
+        (["--set", "target.range.x=5"], "target.range.x: is no field: target.range holds none"),
+        (["--set", "title.x.y=5"], "title.x.y: is no field: title.x holds none"),
         (["--set", "seed=4"], "seed: 3 -> 4, and must stay as it is"),
         (["--set", "seed=4"], "sweep run SPEC --store NEW"),
     ],

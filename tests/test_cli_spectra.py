@@ -36,9 +36,11 @@ def command(*arguments):
 
 def test_spectra_are_those_that_the_study_looks_at(here):
     """Detections of the fixed threshold counted by hand, one by one, as the store has them."""
-    assert sweep.run(sweep.load("small.yaml"), store="a.zarr", scheduler="none", progress=False)
+    stores = "a.zarr", "memory://spectra/a.zarr"
+    for place in stores:
+        assert sweep.run(sweep.load("small.yaml"), store=place, scheduler="none", progress=False)
     store = sweep.open("a.zarr")
-    for source in ("small.yaml", "a.zarr"):
+    for source in ("small.yaml", *stores):
         done = command("spectra", source, "--at", "range=3km", "--draws", DRAWS, "-o", "s.zarr",
                        "--overwrite")  # fmt: skip
         assert done.exit_code == 0, done.output
@@ -74,6 +76,7 @@ def test_a_file_says_what_is_true(here):
 
 def test_mistakes_are_told(here):
     assert command("spectra", "small.yaml", "-o", "s.npz").exit_code == 0
+    assert "does not exist" in command("spectra", "absent.yaml", "-o", "t.npz").stderr
     for arguments, words in (
         (("-o", "s.npz"), "--overwrite"),
         (("-o", "s.csv"), ".zarr nor .npz"),

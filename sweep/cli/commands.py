@@ -12,7 +12,7 @@ import click
 from sweep.cli.accuracy import conclude_accuracy
 from sweep.cli.assignments import assignments
 from sweep.cli.options import ALLOW_CODE, FORMAT, WORKERS, computing
-from sweep.cli.places import StorePath, shown
+from sweep.cli.places import LocalPath, StorePath, shown
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
@@ -26,7 +26,7 @@ from sweep.storage.locations import Location
 
 MISTAKE = 2
 
-SPEC = click.argument("spec", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+SPEC = click.argument("spec", type=LocalPath(exists=True, dir_okay=False))
 STORE = click.argument("store", type=StorePath())
 
 
@@ -124,7 +124,7 @@ def _default_store(spec: Path) -> Path:
 @STORE
 @click.option(
     "--spec",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=LocalPath(exists=True, dir_okay=False),
     help="Go on only if the store holds this study.",
 )
 @click.option("--retry-failed", is_flag=True, help="Also try again what failed before.")
@@ -184,7 +184,7 @@ def plan(spec: Path, workers: int | None) -> None:
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of that noise [the spec's].")
 @click.option(
     "--output",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=LocalPath(file_okay=False),
     help="Directory of the figure [results/<name of the spec>].",
 )
 @FORMAT
@@ -278,7 +278,7 @@ def accuracy(
 @STORE
 @click.option(
     "--output",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=LocalPath(file_okay=False),
     help="Directory of the figures [NAME-figures beside NAME.zarr].",
 )
 @FORMAT
@@ -294,7 +294,7 @@ def figures(store: Location, output: Path | None, form: str) -> None:
 
 @main.command()
 @STORE
-@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("file", type=LocalPath(dir_okay=False))
 @click.option("--scanner", help="Which scanner's points, where the study has several.")
 @click.option("--draw", type=click.IntRange(min=0), default=0, help="Number of the draw [0].")
 @click.option(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sweep.cli.places import StorePath
+from sweep.cli.places import LocalPath, StorePath
 from sweep.cli.telling import INCOMPLETE, print_table
 from sweep.storage.locations import Location
 
@@ -23,7 +23,7 @@ DIFFERENT = 4
 @click.argument("b", type=StorePath())
 @click.option(
     "--figure",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     help="Draw the differences of pd into this file: .png, .pdf or .svg.",
 )
 def compare(a: Location, b: Location, figure: Path | None) -> None:

@@ -9,16 +9,14 @@ import click
 
 from sweep.cli.assignments import assignments
 from sweep.cli.options import computing
-from sweep.cli.places import StorePath, shown
+from sweep.cli.places import LocalPath, StorePath, shown
 from sweep.cli.telling import conclude
 from sweep.storage.locations import Location
 
 
 @click.command()
 @click.argument("store", type=StorePath())
-@click.argument(
-    "spec", type=click.Path(exists=True, dir_okay=False, path_type=Path), required=False
-)
+@click.argument("spec", type=LocalPath(exists=True, dir_okay=False), required=False)
 @click.option(
     "--set",
     "fields",

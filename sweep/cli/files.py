@@ -6,9 +6,11 @@ from pathlib import Path
 
 import click
 
+from sweep.cli.places import LocalPath
+
 
 @click.command()
-@click.argument("directory", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("directory", type=LocalPath(file_okay=False))
 @click.option("--days", type=click.IntRange(min=1), default=365, help="How long they hold [365].")
 def certificates(directory: Path, days: int) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.

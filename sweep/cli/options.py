@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import click
+
+from sweep.cli.places import LocalPath
 
 WORKERS = click.option(
     "--workers",
@@ -18,7 +19,7 @@ SCHEDULER = click.option(
 )
 CLUSTER = click.option(
     "--cluster",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=LocalPath(exists=True, dir_okay=False),
     help="A file that describes a cluster: deploy/ has one of each kind.",
 )
 BLOCK_TIMEOUT = click.option(
@@ -29,7 +30,7 @@ BLOCK_TIMEOUT = click.option(
 )
 PERFORMANCE_REPORT = click.option(
     "--performance-report",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     metavar="FILE.html",
     help="Write Dask's own account of the run.",
 )

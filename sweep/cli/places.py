@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from sweep.storage.locations import Location, located
+
+
+class LocalPath(click.Path):
+    """A path here, in which ~ stands for the user's own folder, after `--output=` too."""
+
+    def __init__(self, **rules: Any) -> None:
+        super().__init__(path_type=Path, **rules)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path, as click checks it."""
+        return super().convert(os.path.expanduser(value), param, ctx)
 
 
 class StorePath(click.ParamType):

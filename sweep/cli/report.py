@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sweep.cli.places import StorePath, shown
+from sweep.cli.places import LocalPath, StorePath, shown
 from sweep.storage.locations import Location, beside
 
 
@@ -15,7 +15,7 @@ from sweep.storage.locations import Location, beside
 @click.option(
     "--output",
     "-o",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     help="The page [NAME-report.html beside NAME.zarr, here for a store in an object store].",
 )
 def report(store: Location, output: Path | None) -> None:

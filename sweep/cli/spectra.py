@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sweep.cli.places import LocalPath, StorePath
+from sweep.storage.locations import Location
+
 if TYPE_CHECKING:
     from sweep.spec import Spec
 
 
-def declared(path: Path) -> Spec:
+def declared(place: Location) -> Spec:
     """The study of a flat target in a spec's file or in a store.
 
     Raises
@@ -21,19 +24,19 @@ def declared(path: Path) -> Spec:
     """
     from sweep.spec import SceneSpec, Spec, load
 
-    if path.is_dir():
+    if isinstance(place, Path) and not place.is_dir():
+        study: object = load(place)
+    else:
         from sweep.tasks.studies import read
 
-        study: object = read(path)[1].spec
-    else:
-        study = load(path)
+        study = read(place)[1].spec
     if isinstance(study, SceneSpec) or not isinstance(study, Spec):
-        raise click.UsageError(f"{path} is a study of a scene: spectra are those of a flat target")
+        raise click.UsageError(f"{place} is a study of a scene: spectra are those of a flat target")
     return study
 
 
 @click.command()
-@click.argument("study", type=click.Path(exists=True, path_type=Path))
+@click.argument("study", type=StorePath())
 @click.option(
     "--at",
     "at",
@@ -46,13 +49,13 @@ def declared(path: Path) -> Spec:
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     required=True,
     help="File to write: .zarr (opens with xarray) or .npz (with numpy).",
 )
 @click.option("--overwrite", is_flag=True, help="Put the new file in the place of an old one.")
 def spectra(
-    study: Path, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
+    study: Location, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
 ) -> None:
     """Write spectra of a shot of STUDY, a spec or a store, with noise in every bin.
 
@@ -63,6 +66,7 @@ def spectra(
     \b
       sweep spectra experiments/cfar.yaml --at range=2km --draws 100 -o spectra.npz
       sweep spectra results/cfar.zarr --at range=2km --at window=hann -o spectra.zarr
+      sweep spectra s3://bucket/cfar.zarr --at range=2km -o spectra.npz
     """  # noqa: D301
     from sweep.analysis.shot_figure import chosen
     from sweep.cli.assignments import assignments

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +22,7 @@ class Files:
     Parameters
     ----------
     base : Path
-        Folder that their paths are relative to.
+        Folder that their paths are relative to; ~ is the user's own.
     digests : mapping
         Digest of each file by its path as written.
     """
@@ -37,7 +38,7 @@ class Files:
         SceneError
             Where it is missing, or has another content than when the spec was loaded.
         """
-        path = self.base / written
+        path = self.base / os.path.expanduser(written)
         known = self.digests.get(written)
         if known is not None and file_digest(path) != known:
             raise SceneError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -253,7 +254,7 @@ def resolve_instrument(document: Document, base: Path) -> bool:
         )
         return False
     try:
-        read = read_document(base / reference)
+        read = read_document(base / os.path.expanduser(reference))
     except SpecError as error:
         rule = f"names a file that {error.mistakes[0].rule}"
         document.findings.append(Finding(location, rule, error.mistakes[0].suggestion, reference))

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 import sweep.spec.quantities as of
-from sweep.spec.files import named_files
+from sweep.spec.files import Files, named_files
 from sweep.spec.flight_check import flight_findings
 from sweep.spec.grounds import Ground
 from sweep.spec.mistakes import ABSENT, Finding, Location, near_miss
@@ -174,7 +174,7 @@ def _file_findings(parts: Parts, base: Path) -> Iterator[Finding]:
     for location, thing in things:
         for key, file in named_files(thing):
             try:
-                file_digest(base / file)
+                file_digest(Files(base).path(file))
             except SceneError as error:
                 rule = f"names a file that {error.rule}"
                 yield Finding((*location, *key), rule, error.remedy, file)

@@ -281,4 +281,4 @@ def _digests(spec: SceneSpec, base: Path) -> dict[str, str]:
     """Digest of every file that a spec names, by its path as written."""
     from sweep.scenes.digests import file_digest
 
-    return {written: file_digest(base / written) for _, written in named_files(spec)}
+    return {written: file_digest(Files(base).path(written)) for _, written in named_files(spec)}

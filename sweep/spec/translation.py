@@ -21,6 +21,13 @@ _PLAIN = {
     "tuple_type": ("must be a list", ""),
     "invalid_key": ("must be a word", ""),
 }
+_FLIES = "it is for studies with a scene, in place of a target"
+_OTHER_STUDYS = {
+    **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
+    **dict.fromkeys(("platform", "scanners", "navigation"), _FLIES),
+}
+"""Remedy for a section that only the other kind of study has."""
+
 _DRAWN_BY = dict.fromkeys(FIGURE_KINDS, "a target") | dict.fromkeys(SCENE_FIGURE_KINDS, "a scene")
 
 
@@ -35,7 +42,10 @@ def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
     place = place_of(detail["loc"], root)
     location = place.location
     if kind == BROKEN_RULE:
-        context = detail["ctx"]
+        context, path = detail["ctx"], dotted(location)
+        if isinstance(written, list) and path in parameter_rules():
+            remedy = f"put several under axes: '{path}: [...]'"
+            return Finding(location, "takes one value", remedy, written)
         return Finding(location, context["rule"], context["suggestion"], written)
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place), ABSENT)
@@ -83,6 +93,8 @@ def _sibling(place: Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
     beside = [field for model in place.parents for field in fields_of(model)]
+    if name in _OTHER_STUDYS and place.parents == (root,):
+        return _OTHER_STUDYS[name]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion

@@ -48,13 +48,16 @@ def located(where: str | Location) -> Location:
     Raises
     ------
     ObjectStoreError
-        For an address without a bucket or a key.
+        For an address of another kind, or one without a bucket or a key.
     """
     if isinstance(where, ObjectPath):
         return where
     text = str(where)
     if not is_url(text):
-        return Path(text.removeprefix("file://"))
+        if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", text):
+            kinds = ", ".join(f"{scheme}://" for scheme in SCHEMES if scheme != "memory")
+            raise ObjectStoreError(22, f"is no place for a store: write a path, or {kinds}", text)
+        return Path(os.path.expanduser(text.removeprefix("file://")))
     scheme, _, rest = text.partition(":")
     bucket, _, key = rest.strip("/").partition("/")
     if not bucket or not key.strip("/"):

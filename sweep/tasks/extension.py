@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.spec import difference
+from sweep.spec import SpecError, difference
 from sweep.spec.fields import parameter_rules
+from sweep.spec.mistakes import Mistake
 from sweep.storage.locations import Location
 from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import FlightStudy
@@ -43,7 +44,7 @@ def changed(spec: Spec | SceneSpec, changes: Mapping[str, Any]) -> Spec | SceneS
     Raises
     ------
     SpecError
-        With every mistake in what comes out.
+        With every mistake in what comes out; where a path goes through a single value.
     """
     written = spec.to_yaml_mapping()
     for path, value in changes.items():
@@ -52,9 +53,12 @@ def changed(spec: Spec | SceneSpec, changes: Mapping[str, Any]) -> Spec | SceneS
             written[first] = {**written.get(first, {}), rest: value}
             continue
         *sections, last = path.split(".")
-        section = written
+        section: Any = written
         for name in sections:
-            section = section.setdefault(name, {})
+            section = section.setdefault(name, {}) if isinstance(section, dict) else None
+        if not isinstance(section, dict):
+            parent = ".".join(sections)
+            raise SpecError([Mistake(path, f"is no field: {parent} holds none", str(value))])
         section[last] = value
     return type(spec).from_mapping(written, base=getattr(spec, "base", "."))
 

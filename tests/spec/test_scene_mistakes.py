@@ -24,6 +24,7 @@ GROUND, PATH, THREE = "scene.objects.ground", "platform.path", "scanners.three"
 
 FIELDS = [
     ("scene", ..., "is missing; write 'scene:' with origin, objects"),
+    ("target", {}, "is no field; a study has a scene or a target, not both"),
     ("scene", "hilly", "must be a mapping of fields to values"),
     ("scene.objects", ..., "is missing"),
     ("scene.objects", {}, "holds nothing; name at least one"),

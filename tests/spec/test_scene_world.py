@@ -115,15 +115,23 @@ def test_a_hole_in_the_middle_is_no_origin(tmp_path):
         built(mapping, tmp_path)
 
 
-def test_arrays_and_images_lie_about_their_position(tmp_path):
+def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
     from PIL import Image
+
+    monkeypatch.setenv("HOME", str(tmp_path))
 
     np.save(tmp_path / "grid.npy", ramp(base=0.0))
     levels = np.zeros((5, 5), np.uint8)
     levels[0] = 255  # the northern row
     Image.fromarray(levels).save(tmp_path / "grid.png")
     array = {"kind": "array", "file": "grid.npy", "spacing": ["2 m", "-2 m"], "reflectance": 1}
-    image = {"kind": "image", "file": "grid.png", "pixel": "1 m", "white": "8 m", "reflectance": 1}
+    image = {
+        "kind": "image",
+        "file": "~/grid.png",
+        "pixel": "1 m",
+        "white": "8 m",
+        "reflectance": 1,
+    }
     _, world = built(
         written(
             {

@@ -87,11 +87,14 @@ def instrument_file(tmp_path):
     return write(folder / "lidar.yaml", BASE["instrument"])
 
 
-def test_an_instrument_kept_in_a_file_is_the_same_study_as_one_written_out(tmp_path):
+def test_an_instrument_kept_in_a_file_is_the_same_study_as_one_written_out(tmp_path, monkeypatch):
     instrument_file(tmp_path)
     inline = write(tmp_path / "inline.yaml", BASE)
     named = write(tmp_path / "named.yaml", BASE | {"instrument": "instruments/lidar.yaml"})
     assert load(named).id == load(inline).id
+    monkeypatch.setenv("HOME", str(tmp_path))
+    at_home = BASE | {"instrument": {"file": "~/instruments/lidar.yaml"}}
+    assert load(write(tmp_path / "home.yaml", at_home)).id == load(inline).id
     assert load(named).to_yaml_mapping() == load(inline).to_yaml_mapping()
 
 
