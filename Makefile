@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 KERNELS := .venv/.kernels
 
-.PHONY: demo test test-fast test-all lint stability fuzz chaos bench effects accuracy blocks stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: demo test test-fast test-all lint size stability fuzz chaos bench effects accuracy blocks stopping promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -44,6 +44,10 @@ $(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
 
 compile-%: $(READY)
 	$(BIN)/python tests/compiling.py $*
+
+# Lines, modules and compiled functions; tests/test_layers.py holds what they may come to.
+size:
+	$(PYTHON) tests/house_size.py
 
 stability: $(READY)
 	PYTHONPATH=tests $(BIN)/python tests/stability/stability_table.py

@@ -1,0 +1,49 @@
+"""Size of the house: lines, modules, and functions that numba compiles. `make size` prints it."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+COMPILING = ("numba", "sweep.model.compiling")
+"""Modules whose names, as decorators, make compiled functions."""
+
+
+def modules(folder: str) -> list[Path]:
+    """Modules in a folder of the repository."""
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def lines(folder: str) -> int:
+    """Lines of all modules in a folder."""
+    return sum(path.read_text().count("\n") for path in modules(folder))
+
+
+def compiled(folder: str) -> int:
+    """Functions with a decorator of numba's, by whatever name the module knows it."""
+    return sum(compiled_in(ast.parse(path.read_text())) for path in modules(folder))
+
+
+def compiled_in(tree: ast.Module) -> int:
+    """Functions of a module, likewise."""
+    names: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            of = node.module or "" if isinstance(node, ast.ImportFrom) else ""
+            names |= {
+                alias.asname or alias.name for alias in node.names
+                if f"{of}.{alias.name}".strip(".").startswith(COMPILING)
+            }  # fmt: skip
+        elif isinstance(node, ast.Assign) and _names(node.value) & names:
+            names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return sum(any(_names(d) & names for d in function.decorator_list) for function in functions)
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+if __name__ == "__main__":
+    for folder in ("sweep", "sweep/model", "tests"):
+        print(f"{folder:12}{lines(folder):8,} lines {len(modules(folder)):5} modules")
+    print(f"compiled    {compiled('sweep'):8,} functions of sweep, by numba")
