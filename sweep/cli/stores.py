@@ -71,23 +71,34 @@ def status(store: Location) -> None:
     is_flag=True,
     help="Put back metadata, coordinates and spec; blocks are resume's to compute.",
 )
-def verify(store: Location, repair: bool) -> None:
+@click.option(
+    "--spec",
+    "spec_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="With --repair: the study's spec, for a store that no longer holds it undamaged.",
+)
+def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
     """Check every byte of STORE against the digests taken as it was written.
 
     Names every object that has a flipped, missing or surplus byte: results block by block,
-    metadata, coordinates, the spec, the journal; of a flight the eyepoints, too. Damaged blocks
-    are marked, so that sweep resume computes just them, to the same bytes as before.
+    metadata, coordinates, the spec, the journal; of a flight the eyepoints, too; and files and
+    arrays that are no part of it. Damaged blocks are marked, so that sweep resume computes just
+    them, to the same bytes as before.
 
     \b
       sweep verify results/range_angle.zarr
       sweep verify results/range_angle.zarr --repair
+      sweep verify results/range_angle.zarr --repair --spec range_angle.yaml
 
     Exit codes: 0 all there and undamaged, 1 damage was found, 2 a mistake in what was asked or
     nothing of sweep's there, 3 undamaged but incomplete (resume goes on).
     """  # noqa: D301
+    from sweep.spec import load
     from sweep.tasks.verify import verify as check
 
-    reports = check(store, repair=repair)
+    if spec_file and not repair:
+        raise click.UsageError("--spec is for --repair: what is whole says itself what it holds")
+    reports = check(store, repair=repair, spec=load(spec_file) if spec_file else None)
     for report in reports:
         _tell(report)
     if not all(report.sound for report in reports):
@@ -142,8 +153,10 @@ def _say_what_to_do(store: Location, reports: list[Report]) -> None:
                 "Verify again when that is settled.",
                 err=True,
             )
-    damages = [damage for report in reports for damage in report.damages]
-    if any(damage.of_template for damage in damages):
+    found = {damage.mended_by for report in reports for damage in report.damages}
+    if "repair" in found:
         click.echo(f"sweep verify {store} --repair  puts back what is not results.", err=True)
-    if any(not damage.of_template for damage in damages):
+    if "resume" in found:
         click.echo(f"sweep resume {store}  computes what is lost and mends the journal.", err=True)
+    if "hand" in found:
+        click.echo("What is no part of a store is not sweep's to remove: remove it.", err=True)

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
@@ -95,6 +95,16 @@ def each(
 @cache
 def _requests() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(REQUESTS, thread_name_prefix="object-store")
+
+
+def names_below(location: Location) -> Iterator[str]:
+    """Names of all files below a place, relative to it, however many."""
+    if isinstance(location, ObjectPath):
+        yield from (name for name, _ in location.below())
+        return
+    for folder, _, names in os.walk(location):
+        inside = os.path.relpath(folder, location)
+        yield from (os.path.normpath(f"{inside}/{name}") for name in names)
 
 
 def files_below(location: Location) -> dict[str, int]:

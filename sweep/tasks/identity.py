@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from sweep.storage.locations import JOURNAL, Location
 from sweep.storage.objects import ObjectStoreError
+from sweep.storage.sealing import read_lines
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
+from sweep.tasks.journal import LOGS
 from sweep.tasks.store import LAYOUT, MANIFEST
 
 if TYPE_CHECKING:
@@ -65,15 +67,22 @@ def recognised(path: Location, attributes: Any) -> dict[str, Any]:
     return ours
 
 
+def listed_attributes(path: Location) -> dict[str, Any]:
+    """Attributes of a store by the list of what it was made of; empty where that is damaged."""
+    found: dict[str, Any] = next(read_lines(path / JOURNAL / MANIFEST), {}).get("attributes", {})
+    return found
+
+
 def refuse_foreign(path: Location) -> None:
-    """Refuse what no version of this program has made.
+    """Refuse what no version of this program has made; a damaged store of ours passes.
 
     Raises
     ------
     StoreError
-        Where that is so.
+        Where neither the group says that it is ours nor any line of the journal is whole.
     """
-    _ours(path, _written(path))
+    if not any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
+        _ours(path, _written(path))
 
 
 def _written(path: Location) -> Any:
@@ -85,10 +94,16 @@ def _written(path: Location) -> Any:
         if not path.exists():
             raise StoreError(f"there is no store at {path}") from None
         if (path / JOURNAL / MANIFEST).exists():
-            raise StoreError(
-                f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair` puts it back"
-            ) from None
+            raise damaged(path) from None
         raise StoreError(f"{path} is not a Zarr store of sweep's") from None
+
+
+def damaged(path: Location) -> StoreError:
+    """What to say of a store whose group is not as it was made."""
+    remedy = "` puts" if listed_attributes(path) else " --spec FILE`, with the study's spec, puts"
+    return StoreError(
+        f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair{remedy} it back"
+    )
 
 
 def _ours(path: Location, attributes: Any) -> dict[str, Any]:

@@ -10,11 +10,11 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sweep.storage.locations import Location, put_whole
-from sweep.storage.sealing import read_sealed
-from sweep.tasks import identity, store
+from sweep.storage.locations import Location, names_below, put_whole
+from sweep.storage.sealing import read_lines, read_sealed
+from sweep.tasks import identity, journal, store
 from sweep.tasks.errors import StoreError
-from sweep.tasks.study import Content
+from sweep.tasks.study import Study
 
 LIST = f"{store.JOURNAL}/{store.MANIFEST}"
 
@@ -25,7 +25,7 @@ class Damage(NamedTuple):
     object: str  # path inside the store; a line of a log by its number
     what: str  # what is wrong with it
     block: int = -1  # that it belongs to
-    of_template: bool = False  # whether it was there before there were results
+    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
 
 
 def attributes(path: Location) -> dict[str, Any]:
@@ -34,31 +34,38 @@ def attributes(path: Location) -> dict[str, Any]:
     Raises
     ------
     StoreError
-        Where there is no store, or not one of this program's.
+        Where there is no store, or not one of this program's; where both are damaged.
     """
-    for _, record in read_sealed(path / LIST):
-        if record and "attributes" in record:
-            return identity.recognised(path, record["attributes"])
-    return identity.read_attributes(path)
+    if listed := identity.listed_attributes(path):
+        return identity.recognised(path, listed)
+    found = identity.read_attributes(path)
+    if any(_wrong(path, o, digest) for o, digest in digests(path).items() if o == "zarr.json"):
+        raise identity.damaged(path)
+    return found
+
+
+def digests(path: Location) -> dict[str, str]:
+    """Digests of what a store was made of, by object, as far as its list is undamaged."""
+    return {r["object"]: r["digest"] for r in read_lines(path / LIST) if "object" in r}
 
 
 def damages(path: Location) -> list[Damage]:
     """What of a template, or of its list, is not as it was made."""
     lines = [record for _, record in read_sealed(path / LIST)]
     if not lines:
-        return [Damage(LIST, "is missing or empty", of_template=True)]
+        return [Damage(LIST, "is missing or empty", mended_by="repair")]
     found = [
-        Damage(f"{LIST} line {n}", "is damaged", of_template=True)
+        Damage(f"{LIST} line {n}", "is damaged", mended_by="repair")
         for n, each in enumerate(lines, 1)
         if each is None
     ]
     whole = [record for record in lines if record]
     if not found and whole[0].get("objects") != len(whole) - 1:
-        found.append(Damage(LIST, "lacks lines", of_template=True))
+        found.append(Damage(LIST, "lacks lines", mended_by="repair"))
     return found + [
-        Damage(record["object"], what, of_template=True)
-        for record in whole
-        if "object" in record and (what := _wrong(path, record["object"], record["digest"]))
+        Damage(name, what, mended_by="repair")
+        for name, digest in digests(path).items()
+        if (what := _wrong(path, name, digest))
     ]
 
 
@@ -87,15 +94,15 @@ def refuse_damaged(path: Location) -> None:
         )
 
 
-def restore(path: Location, study: Content) -> list[str]:
-    """Put a template back as it was made.
+def restore(path: Location, study: Study) -> list[str]:
+    """Put a template back as it was made, each object in one step.
 
     Parameters
     ----------
     path
         The store, whose lock the caller holds.
     study
-        What its attributes say that it holds.
+        What it holds, by its attributes or by a spec that is said to be its own.
 
     Returns
     -------
@@ -108,12 +115,22 @@ def restore(path: Location, study: Content) -> list[str]:
         Where this machine can't make the same again. Nothing is touched.
     """
     try:
+        written = attributes(path)
+    except StoreError:
+        written = {}
+    if written:
+        identity.refuse_other_versions(path, written, where="this machine")
+    if written.get("study_id", study.id) != study.id:
+        raise identity.damaged(path)
+    try:
         with tempfile.TemporaryDirectory() as directory:
             aside = Path(directory) / path.name
-            store.build(aside, study, attributes(path))
+            store.build(aside, study, written or store.new_attributes(study))
             _refuse_different(path, aside)
-            names = [str(file.relative_to(aside)) for file in aside.rglob("*") if file.is_file()]
-            wrong = [name for name in sorted(names) if not _same(path / name, aside / name)]
+            names = sorted(names_below(aside))
+            wrong = [name for name in names if not _same(path / name, aside / name)]
+            if not (written or "zarr.json" in digests(path)):
+                _refuse_unproven(path, study, aside, wrong)
             for name in wrong:
                 put_whole(path / name, (aside / name).read_bytes())
     except OSError as error:
@@ -123,12 +140,27 @@ def restore(path: Location, study: Content) -> list[str]:
 
 def _refuse_different(path: Location, aside: Path) -> None:
     """Refuse to put back what an undamaged line of the list says is not what was there."""
-    for _, record in read_sealed(path / LIST):
-        if record and "object" in record and _wrong(aside, record["object"], record["digest"]):
+    for name, digest in digests(path).items():
+        if _wrong(aside, name, digest):
             raise StoreError(
-                f"{record['object']} of {path} can't be made again as it was on this machine: "
-                "put it back from a copy, or run the study anew into another store"
+                f"{name} of {path} can't be made again as it was on this machine, or from this "
+                "spec: put it back from a copy, or run the study anew into another store"
             )
+
+
+def _refuse_unproven(path: Location, study: Study, aside: Path, wrong: list[str]) -> None:
+    """Refuse a spec that makes other arrays or results, where all else that could tell is lost."""
+    if others := set(wrong) - {"zarr.json", LIST}:
+        raise StoreError(
+            f"{path} holds another study, or too little is left: {min(others)} differs"
+        )
+    committed = journal.digests(path, study.n_blocks)
+    for block in (committed != b"").nonzero()[0][:1].tolist():
+        written = store.Arrays(aside, study).write(block, study.evaluate(block))
+        for name in store.block_objects(study, block):
+            (aside / name).unlink()
+        if written.digest.encode() != committed[block]:
+            raise StoreError(f"{path} holds another study: its block {block} has other results")
 
 
 def _same(one: Location, other: Path) -> bool:

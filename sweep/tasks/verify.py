@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import google_crc32c
 import numpy as np
 
-from sweep.storage.locations import PACKED, Location, located
+from sweep.storage.locations import JOURNAL, PACKED, PARTIAL, Location, located, names_below
 from sweep.storage.sealing import damaged_lines, read_sealed
 from sweep.tasks import identity, journal, lock, store, studies, template
 from sweep.tasks.errors import StoreError
@@ -23,9 +24,15 @@ from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
 from sweep.tasks.template import Damage
 
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
+
 #: Blocks that are read at a time, and by how many threads: reading is waiting.
 BATCH = 256
 THREADS = 4
+
+#: Name of a chunk: its array, and its place in it.
+CHUNK = re.compile(r"(.+)/c((?:/\d+)*)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +58,11 @@ class Report:
 
 
 def verify(
-    path: str | Location, *, repair: bool = False, progress: bool | Progress = True
+    path: str | Location,
+    *,
+    repair: bool = False,
+    spec: Spec | SceneSpec | None = None,
+    progress: bool | Progress = True,
 ) -> list[Report]:
     """Check every byte of a store, and of the eyepoints that its study looks with.
 
@@ -66,6 +77,8 @@ def verify(
     repair
         Whether to put back what was in the store before there were results: metadata,
         coordinates, the spec.
+    spec
+        The study that the store holds, to repair one that no longer says so itself.
     progress
         As in `run`; shown after two seconds.
 
@@ -77,25 +90,34 @@ def verify(
     Raises
     ------
     StoreError
-        Where there is no store, or not one of this program's; where it can't be repaired.
+        Where there is no store, or not one of this program's, or one of another study than
+        `spec`; where it can't be repaired.
     """
     path, told = located(path).absolute(), Late(chosen(progress))
-    study = _study(path, template.attributes(path))
+    study = _study(path, spec if repair else None)
     stores: dict[Location, AnyStudy | None] = {path: study}
     if isinstance(study, FlightStudy):
         stores |= {eyepoints_path(path, each.id): each for each in study.eyepoint_studies()}
     return [_verify(each, held, repair, told) for each, held in stores.items() if each.exists()]
 
 
-def _study(path: Location, attributes: dict[str, Any]) -> AnyStudy | None:
+def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
     """The study in a store; None where it holds none, or only who made it could tell."""
+    try:
+        attributes = template.attributes(path)
+    except StoreError:
+        if spec is None or not path.exists():
+            raise
+        return studies.study_of(spec, path)
+    if spec and attributes["study_id"] != spec.id:
+        raise StoreError(f"{path} holds another study than the spec: `sweep status` names it")
     if (
         attributes["kind"] == studies.ACCURACY
         or (attributes["kind"] == "eyepoints" and not read_recipe(path))
         or PACKED in attributes
     ):
         return None
-    return studies.described(path, attributes)
+    return studies.study_of(spec, path) if spec else studies.described(path, attributes)
 
 
 def _verify(path: Location, study: AnyStudy | None, repair: bool, told: Progress) -> Report:
@@ -104,11 +126,12 @@ def _verify(path: Location, study: AnyStudy | None, repair: bool, told: Progress
         found, restored = [], _restore(path, study)
     logs = _of_logs(path)
     blocks = list(_of_blocks(path, study, told)) if study else []
+    surplus = [] if template.damages(path) else _surplus(path, study)
     return Report(
         store=path,
         blocks=study.n_blocks if study else 0,
         whole=_whole(path, study, blocks) if study else 0,
-        damages=(*found, *logs, *blocks),
+        damages=(*found, *logs, *blocks, *surplus),
         restored=tuple(restored),
         unmarked=_mark(path, blocks) if logs or blocks else "",
     )
@@ -121,8 +144,7 @@ def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
 
 
 def _restore(path: Location, study: AnyStudy) -> list[str]:
-    attributes = template.attributes(path)
-    identity.refuse_other_versions(path, attributes, where="this machine")
+    identity.refuse_foreign(path)  # a lock would be the first thing of ours in it
     held = lock.Lock(path)
     try:
         return template.restore(path, study)
@@ -153,6 +175,22 @@ def _unfinished(log: Location) -> int:
         if not line.endswith(b"\n"):
             return number
     return 0
+
+
+def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
+    """Files of a store that are no part of it; drafts of writers that were killed are not told."""
+    listed = template.digests(path)
+    grids = {name: owner.shape for name, owner in study.owners().items()} if study else {}
+    for name in names_below(path):
+        if name in listed or name.startswith(f"{JOURNAL}/") or name.endswith(PARTIAL):
+            continue
+        chunk = CHUNK.fullmatch(name)
+        array, place = (chunk[1], chunk[2].split("/")[1:]) if chunk else ("", [])
+        if chunk and not study and f"{array}/zarr.json" in listed:
+            continue  # only who made it could tell which chunks it has
+        grid = grids.get(array, (0,))
+        if len(place) != len(grid) or any(int(i) >= n for i, n in zip(place, grid, strict=True)):
+            yield Damage(name, "is no part of the store", mended_by="hand")
 
 
 def _of_blocks(path: Location, study: Study, told: Progress) -> Iterator[Damage]:

@@ -4,13 +4,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from click.testing import CliRunner
-from small import copied, evaluated, everything, failing, logged, quiet, small, tree
+from small import STUDY, copied, evaluated, everything, failing, logged, quiet, small, tree
 from small_flights import small_scene
 
 from sweep.cli import main
 from sweep.tasks import journal, studies
-from sweep.tasks.driver import resume
+from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.lock import Lock
@@ -68,7 +69,7 @@ def found_where(store: Path, file: Path) -> bool:
 def look_only(store: Path, monkeypatch) -> None:
     """Have the one store verified quickly, without withdrawing anything."""
     _, study = studies.read(store)
-    monkeypatch.setattr("sweep.tasks.verify._study", lambda path, attributes: study)
+    monkeypatch.setattr("sweep.tasks.verify._study", lambda path, spec: study)
     monkeypatch.setattr("sweep.tasks.verify._mark", lambda path, blocks: "only looking")
 
 
@@ -217,6 +218,88 @@ def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, dama
     assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
 
 
+def flip_at(file: Path, place: int) -> None:
+    """Flip a bit that leaves a letter a letter, and a digit one."""
+    content = bytearray(file.read_bytes())
+    content[place] ^= 1
+    file.write_bytes(content)
+
+
+def lose_what_it_holds(store: Path, how: str) -> None:
+    """Have neither the group nor the list of a store say undamaged what is in it."""
+    root, listed = store / "zarr.json", store / ".sweep" / "template.jsonl"
+    if how == "gone":
+        root.unlink()
+        listed.write_bytes(b"")
+        return
+    flip_at(listed, 40)
+    flip_at(root, 0 if how == "no JSON" else root.read_bytes().index(b"0.02") + 3)  # 0.03
+
+
+@pytest.mark.parametrize("how", ["no JSON", "JSON", "gone"])
+def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
+    undisturbed, tmp_path, how
+):
+    store = copied(undisturbed, tmp_path)
+    before = everything(store)
+    lose_what_it_holds(store, how)
+    after = everything(store)
+    with pytest.raises(StoreError, match=r"--repair --spec FILE"):
+        verify(store, progress=False, repair=True)
+    power = ["1 W", "3 W", "4 W"]  # as larger studies have it: the first blocks are the same
+    axes = {**STUDY["axes"], "instrument.laser.power": power}
+    for other in ({"footprint": {"beamlets": 11}}, {"axes": axes}):
+        with pytest.raises(StoreError, match=r"from this spec|holds another study"):
+            verify(store, progress=False, repair=True, spec=small(**other))
+    assert everything(store) == after
+    (report,) = verify(store, progress=False, repair=True, spec=small())
+    assert report.sound and report.complete
+    assert everything(store) == before
+
+
+@pytest.mark.parametrize("how", ["no JSON", "JSON", "gone"])
+def test_a_damaged_store_is_known_for_ours_and_written_over(undisturbed, tmp_path, how):
+    store = copied(undisturbed, tmp_path)
+    lose_what_it_holds(store, how)
+    assert run(small(), store=store, overwrite=True, progress=False, scheduler="none").complete
+    assert tree(store) == tree(undisturbed) and damages(store) == []
+
+
+@pytest.mark.parametrize("content", ['{"attributes": {}}', "no JSON"])
+def test_a_directory_that_sweep_did_not_make_is_not_written_over(tmp_path, content):
+    store = tmp_path / "other.zarr"
+    (store / ".sweep").mkdir(parents=True)
+    (store / "zarr.json").write_text(content)
+    (store / ".sweep" / "sessions.jsonl").write_text('{"event":"begun"}\n')
+    before = everything(store)
+    with pytest.raises(StoreError, match=r"not a Zarr store of sweep's|not one that sweep made"):
+        run(small(), store=store, overwrite=True, progress=False, scheduler="none")
+    assert everything(store) == before
+
+
+def test_eyepoints_that_no_longer_say_what_they_are_are_mended_by_the_flight(flight, tmp_path):
+    directory = shutil.copytree(flight.parent, tmp_path / "copy")
+    store = directory / flight.name
+    lose_what_it_holds(eyepoints_path(store, small_scene().geometry_id("line")), "gone")
+    assert all(report.sound for report in verify(store, progress=False, repair=True))
+    assert tree(directory) == tree(flight.parent)
+
+
+def test_files_and_arrays_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
+    store = copied(undisturbed, tmp_path)
+    surplus = ["pd_down2/zarr.json", "notes", "pd_up/c/0/12/0", "range/c/1"]
+    for name in surplus:
+        (store / name).parent.mkdir(parents=True, exist_ok=True)
+        (store / name).write_text("{}")
+    (store / "pd_up/c/0/5/0.1234.partial").write_bytes(b"of a writer that was killed")
+    (store / ".sweep" / "receipts.jsonl").write_bytes(b"")  # blocks are no surplus without them
+    (report,) = verify(store, progress=False)
+    assert sorted(damage.object for damage in report.damages) == sorted(surplus)
+    told = CliRunner().invoke(main, ["verify", str(store), "--repair"])
+    assert told.exit_code == 1 and "notes is no part of the store" in told.output
+    assert "sweep resume" not in told.output and (store / "notes").exists()
+
+
 def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
     undisturbed, tmp_path, monkeypatch
 ):
@@ -294,6 +377,13 @@ def test_the_command_tells_what_is_wrong_and_what_to_do(undisturbed, tmp_path, m
     assert command.invoke(main, ["resume", "copy.zarr", "--scheduler", "none"]).exit_code == 0
     assert command.invoke(main, ["verify", "copy.zarr"]).exit_code == 0
     assert command.invoke(main, ["verify", "nowhere.zarr"]).exit_code == 2
+    Path("small.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
+    assert command.invoke(main, ["verify", "copy.zarr", "--spec", "small.yaml"]).exit_code == 2
+    lose_what_it_holds(Path("copy.zarr"), "no JSON")
+    asked = command.invoke(main, ["status", "copy.zarr"]).output
+    assert "sweep verify" in asked and "--repair --spec FILE" in asked
+    mended = command.invoke(main, ["verify", "copy.zarr", "--repair", "--spec", "small.yaml"])
+    assert mended.exit_code == 0, mended.output
 
 
 def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
