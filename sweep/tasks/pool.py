@@ -15,7 +15,7 @@ from sweep.tasks.cluster import Reached
 from sweep.tasks.errors import ClusterError
 from sweep.tasks.performance import reported
 from sweep.tasks.todo import Todo
-from sweep.tasks.window import Job, Window, plain
+from sweep.tasks.window import Job, Seen, Window, plain
 from sweep.tasks.worker import Answer, Terms
 
 if TYPE_CHECKING:
@@ -93,8 +93,10 @@ class Pool:
         """How blocks are computed."""
         return self._place.terms
 
-    def answers(self, job: Job, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Answer]:
-        """Answers of a study's blocks as they arrive.
+    def answers(
+        self, job: Job, todo: Todo, stopping: Callable[[], bool], seen: Seen
+    ) -> Iterator[Answer]:
+        """Answers of a study's blocks as they arrive; `seen` tells what is in the store here.
 
         Raises
         ------
@@ -104,8 +106,8 @@ class Pool:
         if self._place.client is None and self._place.scheduler == cluster.NONE:
             if self._place.performance_report is not None:
                 self._say("no performance report: a plain loop has no scheduler to tell of it")
-            return plain(job, todo, stopping)
-        return Window(*self._connected(), job, todo).answers(stopping)
+            return plain(job, todo, stopping, seen)
+        return Window(*self._connected(), job, todo, seen=seen, say=self._say).answers(stopping)
 
     def _connected(self) -> Reached:
         if self._reached is None:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -254,7 +253,9 @@ class Session:
                 compiling = threading.Thread(target=self._compile, daemon=True)
                 compiling.start()  # beside the workers' start, which is mostly waiting
                 job = Job(str(self._path), self._study.id, versions.model(), self._pool.terms)
-                answers = self._pool.answers(job, todo, lambda: self._interrupts.stopping)
+                answers = self._pool.answers(
+                    job, todo, lambda: self._interrupts.stopping, self._is_seen
+                )
                 self._await(compiling)
                 self._progress.begin(
                     points=self._study.points, done=points_before, unit=self._study.unit
@@ -307,15 +308,8 @@ class Session:
 
     def _commit(self, answer: Answer, todo: Todo) -> None:
         before = self._tally.points, len(self._tally.failures)
-        seen = [
-            store.is_seen(self._path, store.block_objects(self._study, receipt.block))
-            for receipt in answer.receipts
-        ]
-        self._journal.commit(*compress(answer.receipts, seen))
-        self._gathered += compress(answer.receipts, seen)
-        for receipt, is_seen in zip(answer.receipts, seen, strict=True):
-            if not is_seen:
-                self._fail(_unseen(receipt), todo)
+        self._journal.commit(*answer.receipts)
+        self._gathered += answer.receipts
         for failure in answer.failures:
             self._fail(failure, todo)
         self._count()
@@ -323,6 +317,11 @@ class Session:
         self._progress.advance(
             points=self._tally.points - before[0], failed=len(self._tally.failures) - before[1]
         )
+
+    def _is_seen(self, receipt: Receipt, read: bool) -> bool:
+        objects = store.block_objects(self._study, receipt.block)
+        wanted = store.Written(receipt.digest, receipt.bytes)
+        return store.is_seen(self._path, objects, wanted, read=read)
 
     def _count(self, *, now: bool = False) -> None:
         """Count the blocks whose receipts are written."""
@@ -350,14 +349,3 @@ def unwritable(path: Location, error: OSError) -> str:
 def _is_there(path: Location) -> bool:
     """Whether a store is in its place: of one that went away, writers may leave folders anew."""
     return (path / "zarr.json").exists()
-
-
-def _unseen(receipt: Receipt) -> Failure:
-    return Failure(
-        block=receipt.block,
-        error="its chunks were written on the worker but are not in the store here: "
-        "does the worker see the same file system?",
-        traceback="",
-        host=receipt.host,
-        pid=receipt.pid,
-    )

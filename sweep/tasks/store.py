@@ -326,12 +326,20 @@ def is_whole(path: Location, objects: list[str]) -> bool:
         return False
 
 
-def is_seen(path: Location, objects: list[str]) -> bool:
+def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
     """Whether a block that a worker has written is here, too: it is, but in another place.
 
-    An object store shows what is written, whole, to everyone at once: one object tells.
+    It is known by its size, or by its digest where it is `read`. An object store shows what is
+    written, whole, to everyone at once: one object tells.
     """
-    return is_whole(path, objects if isinstance(path, Path) else objects[-1:])
+    try:
+        if read:
+            return digest(path, objects) == wanted.digest
+        if isinstance(path, Path):
+            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == wanted.bytes
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return is_whole(path, objects[-1:])
 
 
 def digest(path: Location, objects: list[str]) -> str:

@@ -10,15 +10,19 @@ from __future__ import annotations
 import hashlib
 import queue
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from sweep.tasks.errors import SchedulerLost, StoreError
+from sweep.tasks.journal import Receipt
+from sweep.tasks.progress import duration
 from sweep.tasks.todo import Todo
-from sweep.tasks.worker import STORAGE_ERRORS, Answer, Terms, failure, work
+from sweep.tasks.worker import Answer, Terms, failure, work
 
 if TYPE_CHECKING:
     from dask.typing import Key
@@ -36,7 +40,18 @@ TASKS_A_SECOND = 100.0
 #: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
 TICK = 0.5
 SLOTS_AGE = 2.0
-GATHER_TIMEOUT = 60.0
+
+#: Seconds after which a worker that does not answer is silent; longer where its blocks are.
+LEASE = 30.0
+
+#: Seconds in which a file server shows here what a worker has written: Linux's NFS keeps what it
+#: knows of a folder for as long.
+LATENCY = 60.0
+
+NOT_HERE = "what was written is not in the store here: does the worker see the same file system?"
+
+Seen = Callable[[Receipt, bool], bool]
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -49,10 +64,15 @@ class Job:
     terms: Terms = field(default_factory=Terms)
 
 
-def plain(job: Job, todo: Todo, stopping: Callable[[], bool]) -> Iterator[Answer]:
+def plain(job: Job, todo: Todo, stopping: Callable[[], bool], seen: Seen) -> Iterator[Answer]:
     """Answers of a study computed here, one block after the other: what defines its bytes."""
     while not stopping() and (blocks := todo.take(1)):
-        yield work(job.path, job.study_id, blocks, job.terms)
+        answer = work(job.path, job.study_id, blocks, job.terms)
+        if not all(seen(receipt, False) for receipt in answer.receipts):
+            answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in blocks])
+        yield answer
+        if answer.unfit is not None:
+            raise answer.unfit
 
 
 @dataclass
@@ -86,21 +106,33 @@ class Slots:
     client: Client
     hoped: int = 0
     count: int = 1
-    addresses: tuple[str, ...] = ()  # of the workers
+    threads: dict[str, int] = field(default_factory=dict)  # by address of the worker
     asked: float = field(default=-1e9)
 
     def now(self) -> int:
         """Worker threads, at least 1."""
         if time.monotonic() - self.asked > SLOTS_AGE:
-            threads = self.client.nthreads()
-            self.count = max(1, self.hoped, sum(threads.values()))
-            self.addresses = tuple(threads)
+            self.threads = dict(self.client.nthreads())
+            self.count = max(1, self.hoped, sum(self.threads.values()))
             self.asked = time.monotonic()
         return self.count
 
 
+@dataclass(eq=False)
+class _Task:
+    """Blocks that are out: at one worker, and again at others where that one is silent."""
+
+    blocks: list[int]
+    futures: dict[Key, Future] = field(default_factory=dict)
+    sent: float = 0.0  # last
+
+
 class Window:
     """Tasks in flight on a cluster.
+
+    A worker that can't open the store, can't write to it, or writes to another one is left out,
+    and its blocks go to the others. Blocks of a worker that is silent for long are computed by
+    others too, once these have nothing else to do; the first answer counts.
 
     Parameters
     ----------
@@ -112,14 +144,29 @@ class Window:
         The study.
     todo
         Its blocks.
+    seen
+        Tells whether what a receipt is for is in the store here: by its size, or read and held to
+        its digest, as is done with the first block of each worker.
+    say
+        Takes what befalls workers, in words.
     """
 
-    def __init__(self, client: Client, hoped: int, job: Job, todo: Todo) -> None:
+    def __init__(
+        self, client: Client, hoped: int, job: Job, todo: Todo, *, seen: Seen, say: Say
+    ) -> None:
         self._client, self._job, self._todo = client, job, todo
-        self._flying: dict[Key, tuple[Future, list[int]]] = {}
+        self._seen, self._say = seen, say
+        self._flying: dict[Key, _Task] = {}
+        self._outrun: dict[Key, Future] = {}  # out still, though another worker has answered
         self._arrived: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._pace, self._slots = Pace(), Slots(client, hoped)
+        self._copies: Counter[int] = Counter()  # how often a task's first block was sent again
         self._failed_at: dict[int, str] = {}  # address of the worker by block
+        self._heard: dict[str, float] = {}  # when a worker last answered
+        self._relieved = self._looked = time.monotonic()
+        self._unseen: list[tuple[Receipt, str, float]] = []  # of which worker, looked for till when
+        self._trusted: set[str] = set()  # workers that have written to the store that is here
+        self._unfit: dict[str, int] = {}  # workers that are left out, and their threads
 
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers as they arrive; an empty one every `TICK` while none does.
@@ -132,36 +179,80 @@ class Window:
         SchedulerLost
             Where the scheduler, and with it what was out, is gone.
         StoreError, OSError
-            Where a worker can't write to the store.
+            Where no worker can write to the store.
         """
         try:
             while True:
-                if not stopping():
-                    self._fill()
-                elif not self._workers():
+                self._fill(sending=not stopping())
+                if stopping() and not (self._flying and self._fit()):
                     return  # nothing that is out will ever come
-                if not self._flying:
+                if not (self._flying or self._unseen or self._waits):
                     return
                 answer = self._next()
-                answer.workers = len(self._slots.addresses)
+                answer.workers = len(self._fit())
                 yield answer
         finally:
             self._flying.clear()  # a task without a future is cancelled
+            self._outrun.clear()
 
-    def _fill(self) -> None:
+    def _fit(self) -> list[str]:
+        """Workers that there are, but for those that are left out."""
+        return [worker for worker in self._slots.threads if worker not in self._unfit]
+
+    @property
+    def _waits(self) -> bool:
+        """Whether all workers so far are left out, and others are still to come."""
+        return bool(self._unfit) and not self._fit()
+
+    def _fill(self, *, sending: bool) -> None:
         with self._connected():
             slots = self._slots.now()
-            while len(self._flying) < 2 * slots:
+            if time.monotonic() - self._relieved > SLOTS_AGE:
+                self._relieved = time.monotonic()
+                self._relieve()
+            while sending and not self._waits and len(self._flying) < 2 * slots:
                 count = self._pace.blocks_a_task(self._todo.left, slots)
                 if not (blocks := self._todo.take(count, suspects=not self._suspect_flies())):
                     return
-                self._send(blocks)
+                self._send(_Task(blocks), **self._elsewhere(blocks[0]))
 
-    def _workers(self) -> int:
-        """Workers that there are."""
-        with self._connected():
-            self._slots.now()
-        return len(self._slots.addresses)
+    def _relieve(self) -> None:
+        """Send what silent workers hold to others as well, where these have nothing to do."""
+        now = time.monotonic()
+        late = [task for task in set(self._flying.values()) if now - task.sent > self._lease(task)]
+        if not late:
+            return
+        held = {worker: set(keys) for worker, keys in self._client.processing().items()}
+        silent = {
+            worker: tasks
+            for worker, keys in held.items()
+            if now - self._heard.get(worker, -1e9) > LEASE
+            and (tasks := [task for task in late if keys & task.futures.keys()])
+        }
+        free = [
+            worker
+            for worker in self._fit()
+            if worker not in silent and len(held.get(worker, ())) < self._slots.threads[worker]
+        ]
+        if not free:
+            return
+        for worker, tasks in silent.items():
+            number = sum(len(task.blocks) for task in tasks)
+            since = now - max(self._heard.get(worker, -1e9), min(task.sent for task in tasks))
+            self._say(
+                f"worker {worker} is silent ({duration(since)}): {number} "
+                f"block{'s' if number > 1 else ''} of its go to others as well"
+            )
+        waiting = [task for task in late if not any(task.futures.keys() & k for k in held.values())]
+        for task in {*waiting, *chain.from_iterable(silent.values())}:
+            self._copies[task.blocks[0]] += 1
+            self._send(task, workers=free)
+
+    def _lease(self, task: _Task) -> float:
+        """Seconds after which a task may be sent again; longer each time."""
+        pace = self._pace
+        expected = len(task.blocks) * pace.seconds / pace.blocks if pace.blocks else LEASE
+        return max(LEASE, 5 * expected) * 2.0 ** (len(task.futures) - 1)
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
@@ -178,46 +269,67 @@ class Window:
         Tasks on a worker that one of them kills all count as failed; a second failure is final.
         """
         return self._todo.any_failed and any(
-            self._todo.attempt(blocks[0]) for _, blocks in self._flying.values()
+            self._todo.attempt(task.blocks[0]) for task in self._flying.values()
         )
 
-    def _send(self, blocks: list[int]) -> None:
-        job = self._job
+    def _send(self, task: _Task, **where: Any) -> None:
+        job, blocks = self._job, task.blocks
+        tries = self._todo.attempt(blocks[0]), self._copies[blocks[0]]
         future = self._client.submit(
             work,
             job.path,
             job.study_id,
             blocks,
             job.terms,
-            key=task_key(job, blocks, self._todo.attempt(blocks[0])),
+            key=task_key(job, blocks, *tries),
             retries=0,
-            **self._elsewhere(blocks[0]),
+            **where,
         )
-        self._flying[future.key] = (future, blocks)
+        task.sent = time.monotonic()
+        task.futures[future.key] = future
+        self._flying[future.key] = task
         future.add_done_callback(self._arrived.put)
 
     def _elsewhere(self, block: int) -> dict[str, Any]:
         """Where to send a block: not where it failed before, if there is anywhere else."""
         before = self._failed_at.get(block)
-        others = [address for address in self._slots.addresses if address != before]
-        return {"workers": others, "allow_other_workers": True} if before and others else {}
+        others = [worker for worker in self._fit() if worker != before]
+        if before and others:
+            return {"workers": others, "allow_other_workers": not self._unfit}
+        return {"workers": self._fit()} if self._unfit else {}
 
     def _next(self) -> Answer:
+        answer = Answer()
         try:
             future = self._arrived.get(timeout=TICK)
         except queue.Empty:
             self._check()
-            return Answer()
-        _, blocks = self._flying.pop(future.key)
-        answer = self._answer(future, blocks)
+        else:
+            if self._outrun.pop(future.key, None) is None:
+                answer = self._arrival(future)
+        self._verify(answer)
+        return answer
+
+    def _arrival(self, future: Future) -> Answer:
+        task = self._flying[future.key]
+        for key in task.futures:
+            del self._flying[key]
+        del task.futures[future.key]
+        self._outrun |= task.futures
+        answer = self._answer(future, task.blocks)
+        self._heard[answer.worker] = time.monotonic()
         self._pace.learn(answer)
         self._failed_at.update((failure.block, answer.worker) for failure in answer.failures)
+        if answer.unfit is not None:
+            done = {r.block for r in answer.receipts} | {f.block for f in answer.failures}
+            self._put_back([block for block in task.blocks if block not in done])
+            self._leave_out(answer.worker, answer.host, answer.unfit)
         return answer
 
     def _answer(self, future: Future, blocks: list[int]) -> Answer:
         if future.status == "finished":
             try:
-                return future.result(timeout=GATHER_TIMEOUT)
+                return future.result(timeout=LEASE)
             except TimeoutError:
                 pass  # lost, as below, and not computed again in that time
             except (CancelledError, OSError) as error:
@@ -228,8 +340,44 @@ class Window:
             return _failed(future.exception(), blocks)
         if future.status == "cancelled":
             raise SchedulerLost("its tasks were cancelled")
-        self._todo.put_back(blocks)  # the worker died between its answer and our asking for it
+        self._put_back(blocks)  # the worker died between its answer and our asking for it
         return Answer()
+
+    def _put_back(self, blocks: list[int]) -> None:
+        """Put blocks back that are to be sent again, by no fault of theirs."""
+        self._todo.put_back(blocks)
+        self._copies.update(blocks)
+
+    def _verify(self, answer: Answer) -> None:
+        """Leave the receipts in an answer of what is in the store here, held-back ones too.
+
+        A file server may show what others write some seconds late. A worker whose writing never
+        shows sees another store.
+        """
+        now = time.monotonic()
+        looked_for = [(receipt, answer.worker, now + LATENCY) for receipt in answer.receipts]
+        if now - self._looked > TICK:
+            self._looked = now
+            looked_for, self._unseen = self._unseen + looked_for, []
+        answer.receipts = []
+        for receipt, worker, until in looked_for:
+            if self._seen(receipt, worker not in self._trusted):
+                self._trusted.add(worker)
+                answer.receipts.append(receipt)
+            elif now < until and worker not in self._unfit:
+                self._unseen.append((receipt, worker, until))
+            else:
+                self._put_back([receipt.block])
+                self._leave_out(worker, receipt.host, StoreError(NOT_HERE))
+
+    def _leave_out(self, worker: str, host: str, why: Exception) -> None:
+        """Send nothing more to a worker; raise why where no other is left, or may come."""
+        if worker in self._unfit:
+            return
+        self._unfit[worker] = self._slots.threads.get(worker, 1)
+        if self._waits and sum(self._unfit.values()) >= self._slots.hoped:
+            raise why
+        self._say(f"worker {worker} on {host} is left out: {why}")
 
     def _check(self) -> None:
         if self._client.status != "running":
@@ -240,10 +388,6 @@ def _failed(error: BaseException, blocks: list[int]) -> Answer:
     """Answer of a task that raised or killed its workers: any of its blocks may be to blame."""
     from distributed.scheduler import KilledWorker
 
-    if isinstance(error, StoreError):
-        raise error
-    if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
-        raise error
     failures = [failure(block, error) for block in blocks]
     if isinstance(error, KilledWorker):
         failures = [replace(each, error=_killed(error)) for each in failures]
@@ -255,8 +399,8 @@ def _killed(error: KilledWorker) -> str:
     return f"KilledWorker: {died}: out of memory, stuck beyond --block-timeout, or killed"
 
 
-def task_key(job: Job, blocks: list[int], attempt: int) -> str:
+def task_key(job: Job, blocks: list[int], attempt: int, copy: int = 0) -> str:
     """Key of a task: the same work for the same store is the same task, whoever asks."""
-    said = repr((job.path, job.study_id, job.code_version, blocks, attempt)).encode()
+    said = repr((job.path, job.study_id, job.code_version, blocks, attempt, copy)).encode()
     digest = hashlib.blake2b(said, digest_size=12).hexdigest()
     return f"blocks-{job.study_id[:8]}-{blocks[0]}-{digest}"

@@ -36,6 +36,8 @@ class Answer:
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     worker: str = ""  # address of the one that computed them, where there is one
+    host: str = ""  # its machine
+    unfit: Exception | None = None  # why that worker can't compute any
     workers: int = 1  # that there were as it arrived
 
 
@@ -135,25 +137,33 @@ def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
     terms
         How.
 
-    Raises
-    ------
-    StoreError, OSError
-        Where the store can't be written at all.
+    Returns
+    -------
+    Answer
+        Of what was done before the store could not be read or written here, where that is so.
     """
-    answer = Answer(worker=worker_address())
-    opened = study(path, study_id)
+    answer = Answer(worker=worker_address(), host=socket.gethostname())
+    try:
+        _work(answer, study(path, study_id), blocks, terms)
+    except (StoreError, OSError) as error:
+        answer.unfit = error
+    return answer
+
+
+def _work(answer: Answer, opened: Opened, blocks: list[int], terms: Terms) -> None:
+    written = []
     for block in blocks:
         try:
-            answer.receipts.append(_one(opened, block, terms))
+            written.append(_one(opened, block, terms))
         except StoreError:
             raise
         except Exception as error:
             if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
                 raise
             answer.failures.append(failure(block, error))
-    if terms.durable and answer.receipts:
+    if terms.durable and written:
         store.sync(opened.arrays.path)
-    return answer
+    answer.receipts = written
 
 
 def _one(opened: Opened, block: int, terms: Terms) -> Receipt:

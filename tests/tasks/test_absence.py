@@ -1,16 +1,22 @@
-"""What a run says, and does, whose cluster has no worker."""
+"""What a run says, and does, whose cluster has no worker, a silent one or an unfit one."""
 
+import errno
 import os
+import shutil
 import signal
+import threading
 import time
 
 import pytest
 from distributed import Client, LocalCluster
-from small import small, tree
+from small import copied, receipts, small, tree
 
-from sweep.tasks import session, window
-from sweep.tasks.driver import run
+from sweep.tasks import session, store, window, worker
+from sweep.tasks.driver import resume, run
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import Silent
+from sweep.tasks.time_limit import worker_address
 
 
 class Told(Silent):
@@ -92,3 +98,123 @@ def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(
     assert absence.told(0) == absence.told(0, worked=True) == ""
     clock[0] = session.ABSENT + 1
     assert absence.told(0).startswith("no worker is left (")
+
+
+@pytest.fixture
+def two_workers(monkeypatch):
+    """A client of a cluster with two workers, whose silence is soon noticed."""
+    monkeypatch.setattr(window, "SLOTS_AGE", 0.1)
+    monkeypatch.setattr(window, "TICK", 0.1)
+    monkeypatch.setattr(window, "LEASE", 1.0)
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+SILENT: list[str] = []
+FROZEN, THAWED = threading.Event(), threading.Event()
+
+
+def silent_from_block_3(study, block):
+    """The model, on a worker that stands still as it comes to a block, and on the other ones."""
+    if block == 3 and not SILENT:
+        SILENT.append(worker_address())
+        FROZEN.set()
+    if worker_address() in SILENT:
+        assert THAWED.wait(300)
+    return study.evaluate(block)
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
+    undisturbed, tmp_path, two_workers, interrupted
+):
+    SILENT.clear(), FROZEN.clear(), THAWED.clear()
+    told = Told(lambda: None)
+    if interrupted:
+        told = Told(lambda: None, lambda: FROZEN.wait(60) and os.kill(os.getpid(), signal.SIGINT))
+    try:
+        outcome = run(
+            small(), store=tmp_path / "s.zarr", client=two_workers, progress=told,
+            evaluate=silent_from_block_3,
+        )  # fmt: skip
+    finally:
+        THAWED.set()
+    assert any(line.startswith(f"worker {SILENT[0]} is silent (") for line in told.lines)
+    assert len(receipts(outcome.store)) == len(set(receipts(outcome.store)))
+    assert 3 in receipts(outcome.store)  # it ran as the run was interrupted
+    if interrupted:
+        assert outcome.stopped == "interrupted"
+        assert resume(outcome.store, scheduler="none", progress=False).complete
+    else:
+        assert outcome.complete and outcome.blocks_computed == 12
+    assert tree(outcome.store) == tree(undisturbed)
+
+
+def versions_differ(path, opened):
+    raise StoreError(f"{path} was begun with other versions than worker on here has")
+
+
+def disk_is_read_only(path, opened):
+    def write(block, results):
+        raise OSError(errno.EROFS, "Read-only file system", path)
+
+    opened.arrays.write = write
+    return opened
+
+
+def another_store(path, opened):
+    return worker.Opened(opened.study, store.Arrays(f"{path}-copy", opened.study))
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (versions_differ, "was begun with other versions than worker on here has"),
+        (disk_is_read_only, "Read-only file system"),
+        (another_store, "does the worker see the same file system?"),
+    ],
+)
+@pytest.mark.parametrize("all_unfit", [False, True])
+def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
+    undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
+):
+    monkeypatch.setattr(window, "LATENCY", 0.5)
+    path = copied(undisturbed, tmp_path)
+    (path / ".sweep" / "receipts.jsonl").unlink()
+    held = GridStudy(small())
+    for block in range(12):
+        for name in store.block_objects(held, block):  # of the right size, and of another study
+            (path / name).write_bytes(bytes((path / name).stat().st_size))
+    shutil.copytree(undisturbed, f"{path}-copy")
+    unfit = sorted(two_workers.nthreads())[: 1 + all_unfit]
+
+    def study(path, study_id):
+        opened = worker._open(path, study_id)
+        return fault(path, opened) if worker_address() in unfit else opened
+
+    def evaluate(study, block):
+        time.sleep(0.02)  # so that both get some
+        return study.evaluate(block)
+
+    monkeypatch.setattr(worker, "study", study)
+    told, outcome = Told(lambda: None), None
+    options = {"client": two_workers, "progress": told, "evaluate": evaluate}
+    try:
+        outcome = resume(path, **options)
+    except StoreError as error:
+        assert all_unfit and said in str(error)
+    lines = [line for line in told.lines if "is left out" in line]
+    assert lines[0].startswith(
+        tuple(f"worker {w} on {os.uname().nodename} is left out" for w in unfit)
+    )
+    assert said in lines[0] and len(lines) == 1
+    if all_unfit:
+        assert outcome is None or (not outcome.blocks_done and said in outcome.stopped)
+    else:
+        assert outcome.complete and not outcome.failures
+        assert tree(path) == tree(undisturbed)

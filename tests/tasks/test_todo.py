@@ -3,7 +3,7 @@ import tracemalloc
 import numpy as np
 
 from sweep.tasks.todo import Todo
-from sweep.tasks.window import Job, Pace, Window, task_key
+from sweep.tasks.window import Job, Pace, Window, _Task, task_key
 from sweep.tasks.worker import Answer
 
 
@@ -64,11 +64,12 @@ def test_the_same_work_has_the_same_key_and_other_work_another():
     others = [
         task_key(job, [1, 3], 0),
         task_key(job, [1, 2], 1),
+        task_key(job, [1, 2], 0, copy=1),
         task_key(Job("/other", "id", "1"), [1, 2], 0),
         task_key(Job("/store", "other", "1"), [1, 2], 0),
         task_key(Job("/store", "id", "2"), [1, 2], 0),
     ]
-    assert len({task_key(job, [1, 2], 0), *others}) == 6
+    assert len({task_key(job, [1, 2], 0), *others}) == 7
 
 
 def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_its_blocks():
@@ -80,8 +81,9 @@ def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_i
         def result(self, timeout):
             raise RuntimeError("killed")
 
-    window = Window(None, 0, Job("x.zarr", "0", "0"), Todo(np.zeros(8, dtype=bool)))
-    window._flying["lost"] = (Lost(), [3, 4])
+    todo = Todo(np.zeros(8, dtype=bool))
+    window = Window(None, 0, Job("x.zarr", "0", "0"), todo, seen=None, say=None)
+    window._flying["lost"] = _Task([3, 4], {"lost": Lost()})
     window._arrived.put(Lost())
     answer = window._next()
     assert [failure.block for failure in answer.failures] == [3, 4] and not answer.receipts
