@@ -239,6 +239,9 @@ class Execution(Part):
     scheduler: Annotated[
         str,
         Text(
-            about="Address of a running Dask scheduler, 'none' for a plain loop; empty starts one"
+            about="'none' for a plain loop without Dask; empty for workers on this machine",
+            pattern="(none)?",
+            remedy="an address is no part of a spec, which a stranger may have written: "
+            "say --scheduler ADDRESS, or --cluster FILE",
         ),
     ] = ""

@@ -94,7 +94,7 @@ def test_the_order_of_axes_is_part_of_the_id_as_it_lays_out_the_arrays():
     [
         {"title": "Another"},
         {"question": "Why?"},
-        {"execution": {"workers": 7, "threads": 2, "scheduler": "tcp://somewhere:8786"}},
+        {"execution": {"workers": 7, "threads": 2, "scheduler": "none"}},
         {"figures": [{"kind": "slices", "variable": "pd_shot", "x": "range"}]},
         {"target.range": "77 m"},  # an axis overrides it
     ],

@@ -91,6 +91,8 @@ FIELDS = [
     ("draws.interval", "wald", "must be one of clopper_pearson, wilson"),
     ("draws.method", "luck", "must be one of probabilities, noise"),
     ("storage.block_points", -1, "must be at least 0"),
+    ("execution.scheduler", "tcp://10.0.0.5:8786", "say --scheduler ADDRESS, or --cluster FILE"),
+    ("execution.scheduler", "none ", "say --scheduler ADDRESS, or --cluster FILE"),
     ("seed", 1.5, "must be a whole number"),
     ("seed", -1, "must be at least 0"),
     ("platform", {}, "is no field; it is for studies with a scene, in place of a target"),
