@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from drawn_files import shows
 
 from sweep.cli import main
 from sweep.spec import Spec
@@ -306,7 +307,7 @@ def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(here):
     assert "2000.0000" in result.stdout and "45" in result.stdout
     files = [Path(line) for line in result.stdout.split("\n") if line.startswith("results/")]
     assert {file.suffix for file in files} == {".png", ".txt"}
-    assert all((here / file).stat().st_size > 0 for file in files)
+    assert all(shows(here / file) for file in files)
     refused(sweep("shot", "small.yaml", "--at", "range"), "is not NAME=VALUE")
     refused(sweep("shot", "small.yaml", "--at", "rnge=2km"), "rnge: is no parameter")
 
@@ -317,7 +318,10 @@ def test_figures_go_beside_the_store_or_where_asked(here):
     assert beside and all(name.startswith("results/small-figures/") for name in beside)
     asked = sweep("figures", "results/small.zarr", "--output", "elsewhere").stdout.split()
     assert [Path(name).name for name in asked] == [Path(name).name for name in beside]
-    assert all((here / name).stat().st_size > 0 for name in beside + asked)
+    assert all(shows(here / name) for name in beside)
+    assert [(here / name).read_bytes() for name in asked] == [
+        (here / name).read_bytes() for name in beside
+    ]
 
 
 def test_schema_prints_a_json_schema_that_names_the_sections():

@@ -51,7 +51,10 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
 
 def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path):
     put(tmp_path, replace(Holder.myself(), started=Holder.myself().started - 3600))
-    Lock(tmp_path).release()
+    assert not is_live(tmp_path, holder(tmp_path))
+    mine = Lock(tmp_path)
+    assert mine.is_mine()
+    mine.release()
 
 
 @pytest.mark.parametrize(("age", "live"), [(0.0, True), (60.0, True), (600.0, False)])
