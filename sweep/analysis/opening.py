@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,6 +12,7 @@ import xarray as xr
 
 import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
 from sweep.model.outputs import RUNNING
+from sweep.storage import sealing
 from sweep.storage.locations import JOURNAL, Location, located, zarr_store
 from sweep.storage.objects import ObjectStoreError
 from sweep.storage.receipts import read_receipts
@@ -60,10 +62,11 @@ def open(path: str | Location) -> xr.Dataset:
     Raises
     ------
     NotAStoreError
-        Where there is no store of a study.
+        Where there is no store of a study, or one whose coordinates are lost or damaged.
     """
     path = located(path)
     attributes = read_attributes(path, GRID)
+    refuse_lost(path)
     consolidated = "consolidated_metadata" in _document(path)
     dataset = xr.open_zarr(zarr_store(path), chunks=None, consolidated=consolidated)
     dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))
@@ -73,6 +76,34 @@ def open(path: str | Location) -> xr.Dataset:
     shape = _points(dataset, attributes)
     blocks = (math.ceil(n / cut) for n, cut in zip(shape, attributes["block_shape"], strict=True))
     return dataset.assign_attrs(progress(path, math.prod(shape), math.prod(blocks)))
+
+
+def refuse_lost(path: Location) -> None:
+    """Refuse a store with other coordinates than it was made with; of a lost one Zarr reads zeros.
+
+    Raises
+    ------
+    NotAStoreError
+        With what is lost.
+    """
+    document = _document(path)
+    nodes = {"": document, **document.get("consolidated_metadata", {}).get("metadata", {})}
+    names = set()
+    for name, node in nodes.items():
+        inside, own = name, node["attributes"].get("coordinates", "").split()
+        if "dimension_names" in node:
+            inside, own = name.rpartition("/")[0], node["dimension_names"]
+        names |= {f"{inside}/{each}".lstrip("/") for each in own}
+    for record in read_lines(path / JOURNAL / "template.jsonl"):
+        name = record.get("object", "")
+        if f"{name}/".partition("/c/")[0] in names:
+            with suppress(OSError):
+                if sealing.digest(path, [name]) == record["digest"]:
+                    continue
+            raise NotAStoreError(
+                f"{path} has lost {name}, of a coordinate: `sweep verify {path} --repair` puts "
+                "it back"
+            )
 
 
 def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:

@@ -47,7 +47,7 @@ class FileClaim:
             return probe.stat().st_mtime - self._path.stat().st_mtime
         except FileNotFoundError:
             return float("inf")
-        except PermissionError:  # a reader of a store that it can't write to
+        except OSError:  # a reader of a store that it can't write to
             return time.time() - self._path.stat().st_mtime
         finally:
             with suppress(OSError):

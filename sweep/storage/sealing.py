@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, each
 from sweep.storage.logs import raw_lines
 
 _SUM = b',"sum":"'
@@ -60,3 +60,18 @@ def read_lines(path: Location) -> Iterator[dict[str, Any]]:
 def damaged_lines(path: Location) -> list[int]:
     """Numbers, from 1, of the lines of a log that are damaged or cut short."""
     return [n for n, (_, record) in enumerate(read_sealed(path), start=1) if record is None]
+
+
+def digest(path: Location, objects: list[str]) -> str:
+    """blake2b-128 of names and bytes of stored objects, in hex."""
+    contents = each(path, lambda name: (path / name).read_bytes(), objects)
+    return digest_of(zip(objects, contents, strict=True))
+
+
+def digest_of(contents: Iterable[tuple[str, bytes]]) -> str:
+    """As :func:`digest`, of names and bytes at hand."""
+    sum_ = hashlib.blake2b(digest_size=16)
+    for name, content in contents:
+        sum_.update(f"{name}\0{len(content)}\0".encode())
+        sum_.update(content)
+    return sum_.hexdigest()

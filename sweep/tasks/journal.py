@@ -35,7 +35,7 @@ class Receipt:
     block: int
     points: int
     bytes: int  # as stored
-    digest: str  # of the bytes stored, `store.digest`
+    digest: str  # of the bytes stored, `sealing.digest`
     seconds: float  # evaluating and writing
     write_seconds: float
     host: str

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sweep.storage import sealing
 from sweep.storage.locations import Location, read_array
 from sweep.tasks import store
 from sweep.tasks.journal import digests
@@ -49,7 +50,7 @@ class OlderBlocks:
         """Results by name, each with its chunk's shape; None where a block is damaged or lost."""
         try:
             objects = store.block_objects(self._study, block)
-            if store.digest(self._path, objects).encode() != self._digests[block]:
+            if sealing.digest(self._path, objects).encode() != self._digests[block]:
                 return None
             return {name: self.chunk(name, block) for name in self._study.chunks(block)}
         except DAMAGED:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage import sealing
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
@@ -29,9 +30,8 @@ from sweep.storage.locations import (
     read_array,
     zarr_store,
 )
-from sweep.storage.logs import raw_lines
 from sweep.storage.objects import in_words
-from sweep.storage.sealing import sealed
+from sweep.storage.sealing import read_lines, sealed
 from sweep.tasks import remote, store, studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import LOGS, committed
@@ -117,18 +117,25 @@ def _pack(path: Location, output: Location, study: Study, told: Progress) -> Non
     finally:
         told.end()
     for name in (*LOGS, RECIPE):
-        if content := b"".join(raw_lines(path / JOURNAL / name)):
+        if content := b"".join(map(_without_host, read_lines(path / JOURNAL / name))):
             put_whole(output / JOURNAL / name, content)
     _list(output, attributes, root)
     put_whole(output / "zarr.json", root)
+
+
+def _without_host(record: dict[str, Any]) -> bytes:
+    """A line of a log without the machine that it was written on: copies are given away."""
+    return sealed({name: value for name, value in record.items() if name not in ("host", "pid")})
 
 
 def _list(output: Location, attributes: dict[str, Any], root: bytes) -> None:
     """Put down what the copy is made of, with digests, for `sweep verify`."""
     names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
     lines = [sealed({"attributes": attributes, "objects": len(names) + 1})]
-    lines += [sealed({"object": n, "digest": store.digest(output, [n])}) for n in sorted(names)]
-    lines.append(sealed({"object": "zarr.json", "digest": store.digest_of([("zarr.json", root)])}))
+    lines += [sealed({"object": n, "digest": sealing.digest(output, [n])}) for n in sorted(names)]
+    lines.append(
+        sealed({"object": "zarr.json", "digest": sealing.digest_of([("zarr.json", root)])})
+    )
     put_whole(output / JOURNAL / store.MANIFEST, b"".join(lines))
 
 

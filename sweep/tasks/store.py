@@ -8,14 +8,12 @@ follows from the study.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import json
 import os
 import shutil
-import stat
 import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +24,7 @@ import numpy as np
 from sweep.storage import chunks, locations
 from sweep.storage.locations import JOURNAL, Location, each, located, zarr_store
 from sweep.storage.objects import in_words
-from sweep.storage.sealing import sealed
+from sweep.storage.sealing import digest, digest_of, sealed
 from sweep.tasks import remote, versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.study import ArrayLayout, Content, Study
@@ -315,17 +313,6 @@ def _remove_partials(folder: str) -> None:
                     os.unlink(entry.path)
 
 
-def is_whole(path: Location, objects: list[str]) -> bool:
-    """Whether every object of a block is there and has bytes."""
-    if not isinstance(path, Path):
-        return all(size > 0 for size in each(path, lambda name: (path / name).size(), objects))
-    try:
-        found = [os.stat(f"{path}/{name}") for name in objects]
-        return all(stat.S_ISREG(one.st_mode) and one.st_size > 0 for one in found)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
 def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
     """Whether a block that a worker has written is here, too: it is, but in another place.
 
@@ -339,19 +326,4 @@ def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) 
             return sum(os.stat(f"{path}/{name}").st_size for name in objects) == wanted.bytes
     except (FileNotFoundError, NotADirectoryError):
         return False
-    return is_whole(path, objects[-1:])
-
-
-def digest(path: Location, objects: list[str]) -> str:
-    """blake2b-128 of names and bytes of stored objects, in hex."""
-    contents = each(path, lambda name: (path / name).read_bytes(), objects)
-    return digest_of(zip(objects, contents, strict=True))
-
-
-def digest_of(contents: Iterable[tuple[str, bytes]]) -> str:
-    """As :func:`digest`, of names and bytes at hand."""
-    sum_ = hashlib.blake2b(digest_size=16)
-    for name, content in contents:
-        sum_.update(f"{name}\0{len(content)}\0".encode())
-        sum_.update(content)
-    return sum_.hexdigest()
+    return (path / objects[-1]).size() > 0

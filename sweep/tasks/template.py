@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sweep.storage import sealing
 from sweep.storage.locations import Location, names_below, put_whole
 from sweep.storage.sealing import read_lines, read_sealed
 from sweep.tasks import identity, journal, store
@@ -71,7 +72,7 @@ def damages(path: Location) -> list[Damage]:
 
 def _wrong(path: Location, name: str, digest: str) -> str:
     try:
-        return "" if store.digest(path, [name]) == digest else "is not as it was made"
+        return "" if sealing.digest(path, [name]) == digest else "is not as it was made"
     except (FileNotFoundError, NotADirectoryError):
         return "is missing"
     except OSError as error:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import google_crc32c
 import numpy as np
 
+from sweep.storage import sealing
 from sweep.storage.locations import JOURNAL, PACKED, PARTIAL, Location, located, names_below
 from sweep.storage.sealing import damaged_lines, read_sealed
 from sweep.tasks import identity, journal, lock, store, studies, template
@@ -214,7 +215,7 @@ def _of_blocks(path: Location, study: Study, told: Progress) -> Iterator[Damage]
 def _of_block(path: Location, study: Study, block: int, digest: bytes) -> list[Damage]:
     objects = store.block_objects(study, block)
     try:
-        if store.digest(path, objects) == digest.decode():
+        if sealing.digest(path, objects) == digest.decode():
             return []
     except OSError:
         pass  # told below, object by object

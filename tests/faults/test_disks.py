@@ -9,6 +9,7 @@ from small import receipts, small, tree
 
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
+from sweep.tasks.status import status
 from sweep.tasks.verify import verify
 
 
@@ -89,6 +90,7 @@ def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, un
     assert outcome.blocks_done == 5
     assert "Read-only file system" in outcome.stopped and "for writing" in outcome.stopped
     committed_is_whole(store)
+    assert not status(store).complete  # with the lock that could not be given up
     with pytest.raises(StoreError, match="can't be locked: Read-only file system"):
         resume(store, progress=False, scheduler="none")
     assert mount("-o", "remount,rw", str(disk))

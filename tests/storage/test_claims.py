@@ -1,5 +1,8 @@
 """Claims that nobody holds, and heartbeats that can be told apart."""
 
+import errno
+import os
+
 import pytest
 
 from sweep.storage.claims import claim
@@ -14,6 +17,17 @@ def test_a_claim_that_nobody_holds_never_beat(kind, tmp_path, memory):
     assert free.read() == "me" and free.age() < 60
     free.leave()
     assert free.read() is None
+
+
+def test_a_claim_on_a_read_only_disk_has_an_age(tmp_path, monkeypatch):
+    held = claim(tmp_path / "lock")
+    held.take("me", lambda: None)
+
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("pathlib.Path.touch", refuse)
+    assert held.age() < 60
 
 
 def test_no_two_heartbeats_of_an_object_are_alike(memory):

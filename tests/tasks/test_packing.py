@@ -42,6 +42,15 @@ def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(undist
     assert sweep.open(packed).attrs["finished"] == sweep.open(undisturbed).attrs["finished"] != ""
 
 
+def test_a_copy_does_not_name_the_machine_that_made_it(undisturbed, packed):
+    import socket
+
+    host = socket.gethostname().encode()
+    assert any(host in content for content in everything(undisturbed).values())
+    assert not any(host in content for content in everything(packed).values())
+    assert status(packed).points_done == status(undisturbed).points_done == 72
+
+
 def test_what_reads_stores_reads_the_copy_and_what_writes_them_refuses_it(packed):
     found = status(packed)
     assert found.complete and found.bytes == sum(files_below(packed).values())

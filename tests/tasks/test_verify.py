@@ -9,6 +9,8 @@ from click.testing import CliRunner
 from small import STUDY, copied, evaluated, everything, failing, logged, quiet, small, tree
 from small_flights import small_scene
 
+import sweep
+from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
 from sweep.tasks import journal, studies
 from sweep.tasks.driver import resume, run
@@ -178,6 +180,26 @@ def test_a_directory_in_the_place_of_an_eyepoint_is_healed(flight, tmp_path):
     put_directory(next(file for file in files(eyepoints) if file.parent.parent.name == "c"))
     assert resume(store, progress=False, scheduler="none").complete
     assert damages(store) == [] and tree(directory) == tree(flight.parent)
+
+
+@pytest.mark.parametrize("how", ["missing", "a directory", "flipped"])
+def test_a_store_without_a_coordinate_is_not_opened(undisturbed, tmp_path, how):
+    store = copied(undisturbed, tmp_path)
+    chunk = store / "range" / "c" / "0"
+    flip(chunk) if how == "flipped" else chunk.unlink()
+    if how == "a directory":
+        put_directory(chunk)
+    with pytest.raises(NotAStoreError, match=r"coordinate.* `sweep verify .* --repair` puts it"):
+        sweep.open(store)
+    verify(store, progress=False, repair=True)
+    assert (sweep.open(store)["range"] > 0).all()
+
+
+def test_a_flight_without_a_coordinate_is_not_opened(flight, tmp_path):
+    store = shutil.copytree(flight.parent, tmp_path / "copy") / flight.name
+    (store / "line" / "power" / "c" / "0").unlink()
+    with pytest.raises(NotAStoreError, match="has lost line/power/c/0, of a coordinate"):
+        sweep.open_scene(store)
 
 
 def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path):

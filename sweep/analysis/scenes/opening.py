@@ -7,7 +7,7 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.opening import SCENE, progress, read_attributes
+from sweep.analysis.opening import SCENE, progress, read_attributes, refuse_lost
 from sweep.storage.locations import Location, located, zarr_store
 
 STRETCH = 8192
@@ -43,6 +43,7 @@ def open_scene(path: str | Location) -> xr.DataTree:
 def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
     """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
     attributes = read_attributes(path, SCENE)
+    refuse_lost(path)
     tree = xr.open_datatree(zarr_store(path), engine="zarr", chunks=chunks)
     tree.encoding["source"] = str(path)
     tree.attrs |= progress(path, *_extent(tree, attributes))
