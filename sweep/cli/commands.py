@@ -158,13 +158,15 @@ def plan(spec: Path, workers: int | None) -> None:
     pfa or |X| (a bound), and the time that it takes a point there.
     """
     from sweep.spec import SceneSpec, load
+    from sweep.tasks.progress import working
 
     study = load(spec)
-    if isinstance(study, SceneSpec):
-        lines = list(scene_plan(study, _default_store(spec), workers))
-    else:
-        lines = list(grid_plan(study, workers))
-    effects = effects_of(study, _default_store(spec))
+    with working("planning"):
+        if isinstance(study, SceneSpec):
+            lines = list(scene_plan(study, _default_store(spec), workers))
+        else:
+            lines = list(grid_plan(study, workers))
+        effects = effects_of(study, _default_store(spec))
     # Nothing is printed before all is known: any of it may find a point that can't be simulated.
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
@@ -199,20 +201,22 @@ def shot(
     """  # noqa: D301
     from sweep.analysis.shot_figure import report
     from sweep.spec import SceneSpec, load
+    from sweep.tasks.progress import working
 
     study = load(spec)
     if isinstance(study, SceneSpec):
         raise click.UsageError(
             f"{spec} is a study of a scene: run it, and ask for a figure of the kind shot_spectra"
         )
-    text, files = report(
-        study,
-        at=assignments(at),
-        directory=output or Path("results") / spec.stem,
-        noise=noise,
-        seed=study.seed if seed is None else seed,
-        form=form,
-    )
+    with working("simulating and drawing"):
+        text, files = report(
+            study,
+            at=assignments(at),
+            directory=output or Path("results") / spec.stem,
+            noise=noise,
+            seed=study.seed if seed is None else seed,
+            form=form,
+        )
     click.echo(text)
     _list(files)
 
@@ -288,8 +292,11 @@ def figures(store: Location, output: Path | None, form: str) -> None:
 
     check(store)
     from sweep.analysis.figures import draw
+    from sweep.tasks.progress import working
 
-    _list(draw(store, output, form))
+    with working("drawing"):
+        files = draw(store, output, form)
+    _list(files)
 
 
 @main.command()
@@ -320,6 +327,9 @@ def export(
           --scanner four --at optical_efficiency=1
     """  # noqa: D301
     from sweep.analysis.export import export as write
+    from sweep.tasks.progress import working
 
-    points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=assignments(at))
+    where = assignments(at)
+    with working("writing points"):
+        points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=where)
     click.echo(f"{shown(file.absolute())}: {points:,} points")

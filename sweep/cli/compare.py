@@ -49,10 +49,12 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
         )
     from sweep.analysis.answers import comparison_table
     from sweep.spec import difference
+    from sweep.tasks.progress import working
 
     left, right = _opened(a), _opened(b)
     try:
-        compared = comparison_table.compared(left, right)
+        with working("comparing"):
+            compared = comparison_table.compared(left, right)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:

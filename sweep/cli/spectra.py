@@ -70,12 +70,14 @@ def spectra(
     """  # noqa: D301
     from sweep.analysis.shot_figure import chosen
     from sweep.cli.assignments import assignments
+    from sweep.tasks.progress import working
     from sweep.tasks.spectra_export import spectra as drawn
     from sweep.tasks.spectra_export import write
 
     spec = declared(study)
     _, parameters = chosen(spec, assignments(at))[0]
-    dataset = drawn(spec, parameters, draws=draws, first=first)
-    write(dataset, output, overwrite=overwrite)
+    with working("drawing spectra"):
+        dataset = drawn(spec, parameters, draws=draws, first=first)
+        write(dataset, output, overwrite=overwrite)
     sizes = ", ".join(f"{size:,} {name}" for name, size in dataset.spectrum.sizes.items())
     click.echo(f"{output}: {sizes}")

@@ -23,7 +23,7 @@ from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
-from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.progress import Progress, chosen, working
 from sweep.tasks.recipe import EXTENDS, read_recipe, refuse_damaged_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
@@ -326,8 +326,9 @@ def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told:
             f"`sweep resume {path}` goes on with it, --overwrite begins anew"
         )
     if isinstance(study, FlightStudy):
-        told.say("building the scene")
-        for line in study.reports:
+        with working("building the scene", told):
+            reports = study.reports
+        for line in reports:
             told.say(line)
     create(path, study)
     _note(path, study.spec)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -15,7 +18,7 @@ LINE_EVERY = 30.0
 #: Times a second that a bar is drawn, each some ms of the driver's time.
 REFRESHES = 4.0
 
-#: Seconds before anything is shown of what is most often over by then.
+#: Seconds before anything is shown of what is mostly over by then.
 LATE = 2.0
 
 
@@ -43,6 +46,48 @@ def chosen(progress: bool | Progress) -> Progress:
     if progress is True:
         return Bar() if sys.stderr.isatty() else Lines()
     return Silent() if progress is False else progress
+
+
+@contextmanager
+def working(what: str, told: Progress | None = None) -> Iterator[None]:
+    """Say that something goes on while a block runs, from its third second on.
+
+    Parameters
+    ----------
+    what
+        In words. While kernels are compiled that is said in its place, with their number.
+    told
+        Whom to tell; by default what standard error can show.
+    """
+    from numba.core.event import install_recorder
+
+    shown, begun, over = told or chosen(True), time.monotonic(), threading.Event()
+
+    def text() -> str:
+        done = sum(event.is_end for _, event in compiled.buffer)
+        is_compiling = len(compiled.buffer) > 2 * done
+        compiling = f"compiling the model, once; functions so far: {done}"
+        return f"{compiling if is_compiling else what}, {duration(time.monotonic() - begun)}"
+
+    def tell() -> None:
+        pause = LATE
+        while not over.wait(pause):
+            if isinstance(shown, Bar):
+                with shown.console.status(text()) as status:
+                    while not over.wait(1 / REFRESHES):
+                        status.update(text())
+            else:
+                shown.say(text())
+                pause = min(2 * pause, LINE_EVERY)
+
+    with install_recorder("numba:compile") as compiled:
+        telling = threading.Thread(target=tell, daemon=True)
+        telling.start()
+        try:
+            yield
+        finally:
+            over.set()
+            telling.join()
 
 
 class Silent:
@@ -170,6 +215,7 @@ class Bar:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+        self.console = Console(stderr=True)
         self._bar = Progress(
             BarColumn(),
             TextColumn("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
@@ -177,7 +223,7 @@ class Bar:
             TimeRemainingColumn(compact=True),
             TextColumn("{task.fields[work]}"),
             TextColumn("[red]{task.fields[failures]}"),
-            console=Console(stderr=True),
+            console=self.console,
             refresh_per_second=REFRESHES,
         )
         self._task: TaskID | None = None
@@ -213,7 +259,7 @@ class Bar:
 
     def say(self, text: str) -> None:
         """A line above the bar."""
-        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def end(self) -> None:
         """The bar stays as it is."""

@@ -24,7 +24,7 @@ from sweep.tasks.journal import Failure, Journal, Receipt, given_up
 from sweep.tasks.listing import Look
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Pool
-from sweep.tasks.progress import Progress, duration
+from sweep.tasks.progress import Progress, duration, working
 from sweep.tasks.study import Study
 from sweep.tasks.todo import Todo
 from sweep.tasks.window import Job
@@ -48,9 +48,6 @@ LOOKING = 2.0
 
 #: Seconds without any worker after which that is said.
 ABSENT = 20.0
-
-#: Seconds after which the kernels are being compiled and not read.
-COMPILING = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,12 +248,13 @@ class Session:
         with ExitStack() as stack:
             try:
                 compiling = threading.Thread(target=self._compile, daemon=True)
-                compiling.start()  # beside the workers' start, which is mostly waiting
                 job = Job(str(self._path), self._study.id, versions.model(), self._pool.terms)
-                answers = self._pool.answers(
-                    job, todo, lambda: self._interrupts.stopping, self._is_seen
-                )
-                self._await(compiling)
+                with working("loading the model", self._progress):
+                    compiling.start()  # beside the workers' start, which is mostly waiting
+                    answers = self._pool.answers(
+                        job, todo, lambda: self._interrupts.stopping, self._is_seen
+                    )
+                    compiling.join()
                 self._progress.begin(
                     points=self._study.points, done=points_before, unit=self._study.unit
                 )
@@ -278,13 +276,6 @@ class Session:
             return
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
-
-    def _await(self, compiling: threading.Thread) -> None:
-        """Wait for the kernels, and say so where that is not a matter of reading them from disk."""
-        compiling.join(COMPILING)
-        if compiling.is_alive():
-            self._progress.say("compiling the model's kernels, once: about a minute")
-            compiling.join()
 
     def _take(self, answers: Iterator[Answer], todo: Todo) -> str:
         told, interrupts, absence = False, self._interrupts, Absence()

@@ -12,6 +12,7 @@ import numpy as np
 from sweep.tasks.accuracy.bench import Bench, Seen, Trial
 from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, DRAWN, Ladder, Rung, ladder
 from sweep.tasks.accuracy.sample import spread
+from sweep.tasks.progress import working
 
 if TYPE_CHECKING:
     from sweep.tasks.accuracy.rungs import Declared
@@ -123,9 +124,10 @@ class Measurement:
         self._told.say(
             f"trying {len(self._rungs)} settings on {self._bench.size:,} {self._bench.unit}"
         )
-        self._compile()
-        parts = self._bench.parts(self._part_points())
-        rounds = self._planned_rounds(parts)
+        with working("looking how long settings take", self._told):
+            self._compile()
+            parts = self._bench.parts(self._part_points())
+            rounds = self._planned_rounds(parts)
         self._told.begin(points=len(self._rungs) * len(parts) * rounds, done=0, unit="trials")
         try:
             return self._rounds(parts, rounds)

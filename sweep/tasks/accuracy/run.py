@@ -22,7 +22,7 @@ from sweep.tasks.accuracy.rungs import REFERENCE, THESIS, Rung
 from sweep.tasks.accuracy.storing import storing
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.progress import Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout
 
@@ -86,7 +86,8 @@ def measure(
     _refuse_in_the_way(store_path, overwrite)
     told = chosen(progress)
     with Interrupts() as interrupts:
-        bench = bench_of(spec, points)
+        with working("choosing points", told):
+            bench = bench_of(spec, points)
         try:
             measured = Measurement(
                 bench, time_limit=time_limit, told=told, interrupts=interrupts

@@ -1,0 +1,108 @@
+"""What is said while nothing else is to be seen: nobody waits in silence, and it is true."""
+
+import time
+
+import pytest
+from click.testing import CliRunner
+from numba.core.event import trigger_event
+from small import STUDY, small
+
+from sweep.cli import main
+from sweep.model.unsupported import UnsupportedShot
+from sweep.tasks import progress
+from sweep.tasks.driver import run
+from sweep.tasks.grid_study import GridStudy
+
+
+class Told(progress.Silent):
+    """Progress that keeps what is said."""
+
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+    def until(self, words):
+        """Wait until a line begins with these words."""
+        end = time.monotonic() + 60
+        while not any(line.startswith(words) for line in self.lines):
+            assert time.monotonic() < end, self.lines
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """No time that passes before something is said, and little between lines."""
+    monkeypatch.setattr(progress, "LATE", 0.01)
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.01)
+
+
+def compiling():
+    """As numba tells of a function that it compiles."""
+    return trigger_event("numba:compile", data={})
+
+
+@pytest.mark.usefixtures("at_once")
+def test_functions_are_counted_while_they_are_compiled_and_not_told_of_otherwise():
+    told = Told()
+    with progress.working("planning", told):
+        told.until("planning, 0 s")
+        assert not any("compiling" in line for line in told.lines)
+        with compiling():
+            told.until("compiling the model, once; functions so far: 0")
+            with compiling():
+                pass
+            told.until("compiling the model, once; functions so far: 1")
+        told.lines.clear()
+        told.until("planning")
+    after = len(told.lines)
+    time.sleep(0.05)
+    assert len(told.lines) == after and "compiling" not in told.lines[-1]
+
+
+def test_what_is_over_soon_is_not_told_of():
+    told = Told()
+    with progress.working("planning", told), compiling():
+        pass
+    assert told.lines == []
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, monkeypatch):
+    told = Told()
+    monkeypatch.setattr(GridStudy, "compile", lambda study: told.until("loading the model"))
+    run(small(axes={}), store=tmp_path / "small.zarr", scheduler="none", progress=told)
+    assert not any("compiling" in line for line in told.lines)
+
+
+@pytest.mark.usefixtures("at_once")
+@pytest.mark.parametrize(
+    "arguments, inner",
+    [
+        (("plan", "small.yaml"), "sweep.tasks.effects_table.effects_table"),
+        (("shot", "small.yaml"), "sweep.analysis.shot_figure.report"),
+        (("spectra", "small.yaml", "-o", "s.npz"), "sweep.tasks.spectra_export.spectra"),
+        (("figures", "small.zarr"), "sweep.analysis.figures.draw"),
+        (("export", "small.zarr", "s.csv"), "sweep.analysis.export.export"),
+        (("compare", "small.zarr", "small.zarr"),
+         "sweep.analysis.answers.comparison_table.compared"),
+    ],
+)  # fmt: skip
+def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, arguments, inner):
+    import yaml
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(STUDY))
+    (tmp_path / "small.zarr").symlink_to(undisturbed)
+    told = Told()
+    monkeypatch.setattr(progress.Lines, "say", lambda self, text: told.say(text))
+
+    def compiled(*_, **__):
+        with compiling():
+            told.until("compiling the model, once; functions so far: 0")
+        raise UnsupportedShot("enough")
+
+    monkeypatch.setattr(inner, compiled)
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 2 and "enough" in result.stderr
