@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -223,6 +224,36 @@ def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
     assert lines["time"].endswith("on 2 workers")
     assert all(name.replace("_", " ") in " ".join(table.split()) for name in NAMES)
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
+
+
+def words_of(text):
+    """Words that were printed, without colours."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", text).split()
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 120])
+def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_without_one(
+    here, monkeypatch, columns
+):
+    from sweep.cli.telling import print_table
+
+    cells = ["12,345 of 678,901", "0.000123", "1.2e+03 us", "123,456,789"]
+    where = "range 10..5000 m, grazing_angle 20..90 deg, laser power 1..3 W"
+    monkeypatch.setenv("COLUMNS", str(columns))
+
+    def printed():
+        with CliRunner().isolation() as (out, _, _):
+            headings = ["", "points met", "worst", "costs", "draws needed", "called for"]
+            print_table("Half-widths", headings, [["pd_doppler", *cells, where]], "called for")
+            return out.getvalue().decode()
+
+    lines = printed().splitlines()
+    assert any(all(cell in line for cell in (*cells, where)) for line in lines)
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    shown = words_of(printed())
+    assert "…" not in "".join(shown)
+    assert not {*" ".join([*cells, where, "pd_doppler"]).split()} - {*shown}
+    assert all(cell in " ".join(shown) for cell in cells)
 
 
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(

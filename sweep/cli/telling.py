@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 INCOMPLETE = 3
 
+LEAST_WORDS, BETWEEN = 14, 3
+"""Characters of a table: a column of sentences at the least, and between columns."""
+
 LOOKED_AT = 1024
 """Shots of each scanner whose effects are planned before a run."""
 
@@ -156,21 +159,53 @@ def _scene_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
 
 
 def print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
-    """Print a table; `words` names a column that may be broken into lines."""
+    """Print a table, folded to the terminal's width; nothing is folded where there is none.
+
+    `words` names a column of sentences. No number is ever broken or cut: where a terminal is too
+    narrow for a table, a row is a list.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
-    for heading in headings:
-        if heading == words:
-            table.add_column(escape(heading), justify="left", overflow="fold")
-        else:
-            table.add_column(escape(heading), justify="right", no_wrap=True)
+    table, console = Table(title=title, title_justify="left", box=SIMPLE_HEAD), Console()
+    columns = [[heading, *cells] for heading, *cells in zip(headings, *rows, strict=True)]
+    whole = [max(map(len, column)) for column in columns]
+    least = [_least(column, is_words=column[0] == words) for column in columns]
+    spare = console.width - sum(least) - BETWEEN * len(columns) - 1
+    if not console.is_terminal:
+        spare = sum(whole)
+    elif spare < 0:
+        _print_lists(title, headings, rows)
+        return
+    for heading, most, width in zip(headings, whole, least, strict=True):  # words come last
+        spare, width = spare - min(most - width, spare), width + min(most - width, spare)
+        table.add_column(
+            escape(heading), justify="left" if heading == words else "right", width=width
+        )
     for row in rows:
         table.add_row(*map(escape, row))
-    Console().print(table)
+    console.width = max(console.width, sum(whole) + BETWEEN * len(columns) + 1)
+    console.print(table)
+
+
+def _print_lists(title: str, headings: list[str], rows: list[list[str]]) -> None:
+    """Print each row of a table as a list of its cells."""
+    click.echo(title)
+    for row in rows:
+        click.echo(f"\n{row[0]}")
+        for heading, cell in zip(headings[1:], row[1:], strict=True):
+            click.echo(f"  {heading}: {cell}")
+    click.echo()
+
+
+def _least(column: list[str], *, is_words: bool) -> int:
+    """Width of a column whose words, and where they are no sentences whose numbers, stay whole."""
+    heading, *cells = column
+    numbers = [] if is_words else [c for c in cells if any(map(str.isdigit, c))]
+    longest = max(map(len, [*heading.split(), *" ".join(cells).split(), *numbers]), default=0)
+    return max(longest, min(LEAST_WORDS, max(map(len, column)))) if is_words else longest
 
 
 def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:

@@ -18,6 +18,9 @@ LINE_EVERY = 30.0
 #: Times a second that a bar is drawn, each some ms of the driver's time.
 REFRESHES = 4.0
 
+#: Columns of a terminal that has room for workers and bytes beside a bar.
+BROAD = 100
+
 #: Seconds before anything is shown of what is mostly over by then.
 LATE = 2.0
 
@@ -214,15 +217,21 @@ class Bar:
     def __init__(self) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.table import Column
 
         self.console = Console(stderr=True)
+
+        def words(text: str) -> TextColumn:
+            return TextColumn(text, table_column=Column())  # folded where others would be cut
+
+        work = [words("{task.fields[work]}")] if self.console.width >= BROAD else []
         self._bar = Progress(
-            BarColumn(),
-            TextColumn("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
-            TextColumn("{task.fields[rate]}"),
+            BarColumn(bar_width=min(40, max(self.console.width - BROAD, 8))),
+            words("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
+            words("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[work]}"),
-            TextColumn("[red]{task.fields[failures]}"),
+            *work,
+            words("[red]{task.fields[failures]}"),
             console=self.console,
             refresh_per_second=REFRESHES,
         )

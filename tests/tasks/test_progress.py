@@ -68,6 +68,21 @@ def test_what_is_over_soon_is_not_told_of():
     assert told.lines == []
 
 
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    bar = progress.Bar()
+    bar.begin(points=12_345_678, done=1_234_567, unit="points")
+    bar.at_work(workers=12, stored=3_100_000)
+    bar.advance(points=1_000, failed=3)
+    bar.end()
+    shown = capsys.readouterr().err
+    for number in ("1,235,567", "12,345,678", "3"):
+        assert number in shown
+    assert "…" not in shown and ("12 workers, 3.1 MB" in shown) == (width == 120)
+
+
 @pytest.mark.usefixtures("at_once")
 def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, monkeypatch):
     told = Told()
