@@ -36,6 +36,7 @@ class Reached(NamedTuple):
 
     client: Client
     slots: int  # worker threads that it may come to have; 0 where that is unknown
+    revive: Callable[[], object] = lambda: None  # starts workers in the place of lost ones
 
 
 def cores() -> int:
@@ -111,12 +112,17 @@ def connected(
             yield Reached(client, bounds.most * cluster.worker.threads)
         return
     with (
+        local.spawning(),
         _started(cluster, bounds, processes) as started,
         Client(started, set_as_default=False) as client,
     ):
         _keep(started, cluster, bounds)
         say(f"{_described(cluster, bounds)}: dashboard {started.dashboard_link}")
-        yield Reached(client, bounds.most * cluster.worker.threads)
+        slots = bounds.most * cluster.worker.threads
+        if isinstance(cluster, Local):
+            yield Reached(client, slots, lambda: started.scale(bounds.least))
+        else:  # what is lost comes again by itself, or not at all
+            yield Reached(client, slots)
 
 
 def _bounds(cluster: Any, most: int) -> Bounds:

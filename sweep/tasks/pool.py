@@ -107,7 +107,13 @@ class Pool:
             if self._place.performance_report is not None:
                 self._say("no performance report: a plain loop has no scheduler to tell of it")
             return plain(job, todo, stopping, seen)
-        return Window(*self._connected(), job, todo, seen=seen, say=self._say).answers(stopping)
+        client, slots, _ = self._connected()
+        return Window(client, slots, job, todo, seen=seen, say=self._say).answers(stopping)
+
+    def revive(self) -> None:
+        """Start workers of this machine again that are gone."""
+        if self._reached is not None:
+            self._reached.revive()
 
     def _connected(self) -> Reached:
         if self._reached is None:
@@ -119,6 +125,8 @@ class Pool:
     def _reach(self) -> Reached:
         place = self._place
         if place.client is not None:
+            if place.client.asynchronous:
+                raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             return Reached(place.client, 0)
         assert place.cluster is not None  # for_spec saw to it
         return self._stack.enter_context(

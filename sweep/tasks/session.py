@@ -27,7 +27,7 @@ from sweep.tasks.pool import Pool
 from sweep.tasks.progress import Progress, duration, working
 from sweep.tasks.study import Study
 from sweep.tasks.todo import Todo
-from sweep.tasks.window import Job
+from sweep.tasks.window import TICK, Job
 from sweep.tasks.worker import Answer
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
@@ -254,7 +254,8 @@ class Session:
                     answers = self._pool.answers(
                         job, todo, lambda: self._interrupts.stopping, self._is_seen
                     )
-                    compiling.join()
+                    while compiling.is_alive() and not self._interrupts.stopping:
+                        compiling.join(TICK)
                 self._progress.begin(
                     points=self._study.points, done=points_before, unit=self._study.unit
                 )
@@ -286,6 +287,7 @@ class Session:
                 return "another process took the store's lock"
             if missing := absence.told(answer.workers, worked=bool(answer.receipts)):
                 self._progress.say(missing)
+                self._pool.revive()
             self._commit(answer, todo)
             if interrupts.stopping and not told:
                 self._progress.say("stopping when what runs is written; again to stop at once")

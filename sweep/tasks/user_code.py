@@ -44,9 +44,13 @@ def allow(modules: Iterable[str]) -> None:
     allowed = {*_allowed(), *modules}
     if allowed:
         os.environ[ALLOWED] = ",".join(sorted(allowed))
-        here = os.getcwd()
-        if here not in sys.path:
-            sys.path.insert(0, here)  # handed on to workers that are spawned
+        _reach_here()  # handed on to workers that are spawned
+
+
+def _reach_here() -> None:
+    """Import from the working directory too, and what is found nowhere else: it may be anyone's."""
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.append(here)
 
 
 def _allowed() -> set[str]:
@@ -124,6 +128,7 @@ def _imported(name: str) -> Callable[..., Any]:
             f"{name} is code that this study would run, and its module is not allowed: look at it, "
             f"then say --allow-code {module} (or put it into {ALLOWED} where workers start)"
         )
+    _reach_here()
     try:
         function = getattr(import_module(module), attribute)
     except ImportError as error:

@@ -111,16 +111,26 @@ def address_of(address: str, security: dict[str, str]) -> dict:
     return {"kind": "scheduler", "address": address, "security": security}
 
 
-def test_without_certificates_nothing_listens_beyond_this_machine():
+@pytest.mark.parametrize("processes", [True, False])
+def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
     import psutil
+    from distributed import Client, Security
 
     own = psutil.Process()
     before = listening([own])
     described = local(scheduler={"dashboard": "127.0.0.1:0"})
-    with cluster.connected(described, most=9, processes=True, say=lambda _: None) as reached:
+    with cluster.connected(described, most=9, processes=processes, say=lambda _: None) as reached:
         reached.client.wait_for_workers(1)
         found = listening([own, *own.children(recursive=True)]) - before
-    assert len(found) >= 3  # scheduler, dashboard, nanny, worker
+        address = reached.client.scheduler.address
+        if processes:
+            assert address.startswith("tls://127.0.0.1:")
+            for security in (None, Security.temporary()):
+                with pytest.raises((OSError, TypeError)):
+                    Client(address, timeout=2, security=security, set_as_default=False)
+            with pytest.raises(OSError):
+                Client(address.replace("tls", "tcp"), timeout=2, set_as_default=False)
+    assert len(found) >= 3 if processes else len(found) == 2  # pages, of scheduler and worker
     assert {host for host, _ in found} == {"127.0.0.1"}
 
 

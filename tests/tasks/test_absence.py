@@ -1,5 +1,6 @@
 """What a run says, and does, whose cluster has no worker, a silent one or an unfit one."""
 
+import asyncio
 import errno
 import os
 import shutil
@@ -11,9 +12,9 @@ import pytest
 from distributed import Client, LocalCluster
 from small import copied, receipts, small, tree
 
-from sweep.tasks import session, store, window, worker
+from sweep.tasks import progress, session, store, window, worker
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import StoreError
+from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import Silent
 from sweep.tasks.time_limit import worker_address
@@ -218,3 +219,28 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
     else:
         assert outcome.complete and not outcome.failures
         assert tree(path) == tree(undisturbed)
+
+
+def test_an_asynchronous_client_is_refused_in_words(tmp_path):
+    async def ask():
+        async with Client(processes=False, asynchronous=True, dashboard_address=None) as client:
+            run(small(), store=tmp_path / "s.zarr", client=client, progress=False)
+
+    with pytest.raises(ClusterError, match="the client is asynchronous"):
+        asyncio.run(ask())
+    assert not (tmp_path / "s.zarr").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
+    compiled = threading.Event()
+    monkeypatch.setattr(progress, "LATE", 0.1)
+    monkeypatch.setattr(GridStudy, "compile", lambda self: compiled.wait(60))
+    told = Told(lambda: os.kill(os.getpid(), number) if len(told.lines) == 1 else None)
+    begun = time.monotonic()
+    try:
+        outcome = run(small(), store=tmp_path / "s.zarr", scheduler="none", progress=told)
+    finally:
+        compiled.set()
+    assert told.lines[0].startswith("loading the model") and time.monotonic() - begun < 50
+    assert outcome.stopped == "interrupted" and outcome.blocks_done == 0

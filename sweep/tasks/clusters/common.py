@@ -22,6 +22,10 @@ ONE_THREAD = {
     "NUMBA_NUM_THREADS": "1",
 }
 
+#: Variable that keeps the working directory out of the places that modules are imported from: a
+#: file `socket.py` there would be run by every worker.
+SAFE_PATH = "PYTHONSAFEPATH"
+
 #: How often Dask looks at itself. By default it does so some 150 times a second in each worker,
 #: which takes a tenth of the processor's time from whatever else the worker does. And no pause near
 #: the memory's limit: tasks leave nothing behind that could be waited for, so a worker that paused
@@ -40,12 +44,12 @@ WORK_AHEAD = "1s"
 
 
 def environment(given: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables of workers: one thread a slot, calm, and those given."""
+    """Environment variables of workers: one thread a slot, calm, wary, and those given."""
     calm = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in CALM.items()
     }
-    return {**ONE_THREAD, **calm, **given}
+    return {**ONE_THREAD, SAFE_PATH: "1", **calm, **given}
 
 
 def security_of(cluster: Cluster) -> Security | None:

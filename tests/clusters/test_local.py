@@ -1,0 +1,117 @@
+"""Workers of this machine: how they start, what ends them, and that they are started again."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import dask
+import psutil
+import pytest
+from small import receipts, small, tree
+
+from sweep.tasks import session, window
+from sweep.tasks.clusters import local
+from sweep.tasks.driver import run
+from sweep.tasks.progress import Silent
+
+SCRIPT = """
+import sys
+import sweep
+from small import small
+
+def evaluate(study, block):
+    return study.evaluate(block)
+
+spec = small()
+outcome = sweep.run(spec, store=sys.argv[1], workers=2, evaluate=evaluate, progress=False)
+print(outcome.complete)
+"""
+
+
+@pytest.mark.long
+def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_is_run(
+    undisturbed, tmp_path
+):
+    folder = tmp_path / "downloads"
+    folder.mkdir()
+    (folder / "socket.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w').close()\n")
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    path = os.pathsep.join(
+        map(str, [Path(__file__).parents[1] / "tasks", Path(__file__).parents[2]])
+    )
+    ended = subprocess.run(
+        [sys.executable, str(script), str(tmp_path / "s.zarr")], cwd=folder, timeout=300,
+        env={**os.environ, "PYTHONPATH": str(path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ended.stdout == "True\n" and ended.returncode == 0, ended.stderr
+    assert tree(tmp_path / "s.zarr") == tree(undisturbed)
+    assert not (tmp_path / "imported").exists()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
+    undisturbed, tmp_path, monkeypatch, workers
+):
+    monkeypatch.setattr(local, "FROZEN", "1 s")  # ten heartbeats at least
+    monkeypatch.setattr(window, "LEASE", 1.0)
+    pid = tmp_path / "pid"
+
+    def evaluate(study, block):
+        if block == 3 and not pid.exists():
+            pid.write_text(str(os.getpid()))
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return study.evaluate(block)
+
+    outcome = run(
+        small(), store=tmp_path / "s.zarr", workers=workers, evaluate=evaluate, progress=False
+    )
+    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
+    assert sorted(receipts(outcome.store)) == list(range(12))
+    assert not psutil.pid_exists(int(pid.read_text()))
+
+
+class Ending(Silent):
+    """Progress that has all workers end as the first points arrive, and gives up in the end."""
+
+    def __init__(self, workers) -> None:
+        self._workers, self.lines = workers, []
+
+    def advance(self, *, points, failed):
+        while points and self._workers:
+            started = self._workers.pop()
+            for worker in list(started.workers.values()):
+                started.sync(worker.close)
+
+    def say(self, text):
+        self.lines.append(text)
+        if len(self.lines) == 8:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "ABSENT", 1.0)
+    monkeypatch.setattr(window, "SLOTS_AGE", 0.1)
+    clusters, start = [], local.start
+
+    def started(*given, **options):
+        clusters.append(start(*given, **options))
+        return clusters[-1]
+
+    def evaluate(study, block):
+        time.sleep(0.05)  # so that some are left
+        return study.evaluate(block)
+
+    monkeypatch.setattr(local, "start", started)
+    told = Ending(clusters)
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}):
+        outcome = run(
+            small(), store=tmp_path / "s.zarr", workers=2, processes=False, progress=told,
+            evaluate=evaluate,
+        )  # fmt: skip
+    assert any(line.startswith("no worker is left (") for line in told.lines)
+    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
