@@ -10,7 +10,7 @@ import xarray as xr
 
 from sweep.analysis import canvas, labels, mean_table, slices, surface_figure, tables
 from sweep.analysis.defaults import default_figures
-from sweep.analysis.opening import ACCURACY, SCENE, kind_of, read_attributes
+from sweep.analysis.opening import ACCURACY, SCENE, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points, confined
 from sweep.analysis.tabular import Page
@@ -84,13 +84,13 @@ def draw(
 
 def _drawn(store_path: Location, directory: str | Path | None, form: str) -> list[Path]:
     """All of it, whichever kind of store."""
-    if kind_of(read_attributes(store_path)) == ACCURACY:
+    if read_attributes(store_path)["kind"] == ACCURACY:
         from sweep.analysis.accuracy import report
 
         return report.draw(store_path, None if directory is None else Path(directory), form)
     stem = store_path.name.removesuffix(".zarr")
     directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
-    if kind_of(read_attributes(store_path)) == SCENE:
+    if read_attributes(store_path)["kind"] == SCENE:
         from sweep.analysis.scenes import figures as of_scenes
 
         return of_scenes.draw(store_path, directory, form)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
 from sweep.model.outputs import RUNNING
-from sweep.storage import sealing
+from sweep.storage import opening, sealing
 from sweep.storage.locations import JOURNAL, Location, located, zarr_store
-from sweep.storage.objects import ObjectStoreError
+from sweep.storage.opening import CHECKED, NotAStoreError
 from sweep.storage.receipts import read_receipts
 from sweep.storage.sealing import read_lines
 
@@ -34,10 +34,6 @@ _HOLDS = {
     "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
 }
 """What the kinds of stores hold, and what to do with them."""
-
-
-class NotAStoreError(ValueError):
-    """A path at which there is no store of a study."""
 
 
 def open(path: str | Location) -> xr.Dataset:
@@ -65,17 +61,16 @@ def open(path: str | Location) -> xr.Dataset:
         Where there is no store of a study, or one whose coordinates are lost or damaged.
     """
     path = located(path)
-    attributes = read_attributes(path, GRID)
+    read_attributes(path, GRID)
     refuse_lost(path)
-    consolidated = "consolidated_metadata" in _document(path)
-    dataset = xr.open_zarr(zarr_store(path), chunks=None, consolidated=consolidated)
+    dataset = xr.open_zarr(zarr_store(path), chunks=None, **CHECKED)
+    points = dataset["effects"]
+    blocks = map(math.ceil, np.divide(points.shape, points.encoding["chunks"]))
     dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
-    shape = _points(dataset, attributes)
-    blocks = (math.ceil(n / cut) for n, cut in zip(shape, attributes["block_shape"], strict=True))
-    return dataset.assign_attrs(progress(path, math.prod(shape), math.prod(blocks)))
+    return dataset.assign_attrs(progress(path, points.size, math.prod(blocks)))
 
 
 def refuse_lost(path: Location) -> None:
@@ -86,15 +81,15 @@ def refuse_lost(path: Location) -> None:
     NotAStoreError
         With what is lost.
     """
-    document = _document(path)
-    nodes = {"": document, **document.get("consolidated_metadata", {}).get("metadata", {})}
+    document = opening.read_document(path)
+    nodes = {"": document, **document["consolidated_metadata"]["metadata"]}
     names = set()
     for name, node in nodes.items():
         inside, own = name, node["attributes"].get("coordinates", "").split()
         if "dimension_names" in node:
             inside, own = name.rpartition("/")[0], node["dimension_names"]
         names |= {f"{inside}/{each}".lstrip("/") for each in own}
-    for record in read_lines(path / JOURNAL / "template.jsonl"):
+    for record in read_lines(path / JOURNAL / opening.MANIFEST):
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in names:
             with suppress(OSError):
@@ -107,7 +102,7 @@ def refuse_lost(path: Location) -> None:
 
 
 def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:
-    """Attributes of a store, from its group's metadata.
+    """Attributes of a store that is as this program writes stores.
 
     Parameters
     ----------
@@ -121,37 +116,10 @@ def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:
     NotAStoreError
         Where there is none, with the stores that are near, or one of another kind.
     """
-    try:
-        attributes = _document(path)["attributes"]
-    except ObjectStoreError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError):
-        if not path.exists():
-            raise NotAStoreError(f"there is no store at {path}{_near(path)}") from None
-        raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}") from None
-    if not isinstance(attributes, dict) or not {"study_id", "model_version"} <= set(attributes):
-        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
-    found = kind_of(attributes)
-    if kind and found != kind:
-        raise NotAStoreError(f"{path} holds {_HOLDS.get(found, found)}")
+    attributes = opening.read_attributes(path)
+    if kind and attributes["kind"] != kind:
+        raise NotAStoreError(f"{path} holds {_HOLDS[attributes['kind']]}")
     return attributes
-
-
-def kind_of(attributes: dict[str, Any]) -> str:
-    """Kind of study in a store: ``grid``, ``scene`` or ``eyepoints``."""
-    return str(attributes.get("kind", GRID))
-
-
-def _document(path: Location) -> dict[str, Any]:
-    return json.loads((path / "zarr.json").read_text())
-
-
-def _near(path: Location) -> str:
-    """Remark on the stores in a directory or beside a path; empty where there are none."""
-    directory = path if path.is_dir() else path.parent
-    names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
-    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    return f"; stores near it: {shown}" if names else ""
 
 
 def in_pieces(dataset: xr.Dataset) -> xr.Dataset:
@@ -202,12 +170,6 @@ def progress(path: Location, points: int, blocks: int) -> dict[str, Any]:
         "blocks": blocks,
         "blocks_committed": receipts.blocks,
     }
-
-
-def _points(dataset: xr.Dataset, attributes: dict[str, Any]) -> tuple[int, ...]:
-    """Shape of the grid, as long as the shape of a block."""
-    rank = len(attributes["block_shape"])
-    return next(array.shape for name, array in dataset.data_vars.items() if len(array.dims) == rank)
 
 
 def _utc(time: float) -> str:

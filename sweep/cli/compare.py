@@ -80,8 +80,8 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 def _opened(path: Location) -> Store:
     """A store of a grid as a dataset, of a flight as a tree."""
-    from sweep.analysis.opening import SCENE, kind_of, read_attributes
+    from sweep.analysis.opening import SCENE, read_attributes
     from sweep.analysis.opening import open as open_grid
     from sweep.analysis.scenes.opening import open_scene
 
-    return open_scene(path) if kind_of(read_attributes(path)) == SCENE else open_grid(path)
+    return open_scene(path) if read_attributes(path)["kind"] == SCENE else open_grid(path)

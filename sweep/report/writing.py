@@ -13,7 +13,7 @@ from sweep.analysis import labels
 from sweep.analysis.defaults import default_figures
 from sweep.analysis.figures import Study, made_page
 from sweep.analysis.mean_table import outputs_page
-from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, kind_of, read_attributes
+from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.tabular import Page as TablePage
 from sweep.report import asked, clouds, detector, flights, heat_maps, lines, reach, samples
@@ -48,7 +48,7 @@ def write(store: str | Location, file: str | Path, say: Say = lambda text: None)
         Where the file can't be written.
     """
     store, file = located(store), Path(file)
-    kind = kind_of(read_attributes(store))
+    kind = read_attributes(store)["kind"]
     if kind == ACCURACY:
         raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
     if kind not in (GRID, SCENE):

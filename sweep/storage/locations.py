@@ -11,12 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from sweep.storage.objects import SCHEMES, ObjectPath, ObjectStoreError
-
-if TYPE_CHECKING:
-    import zarr
 
 Location = Path | ObjectPath
 """What stands for a place; both know `/`, `name`, `parent`, `exists()` and `read_bytes()`."""
@@ -74,13 +71,6 @@ def zarr_store(location: Location) -> Any:
     from zarr.storage import ObjectStore, StorePath
 
     return StorePath(ObjectStore(location.client), location.key)
-
-
-def read_array(location: Location) -> zarr.Array[Any]:
-    """A Zarr array for reading."""
-    import zarr
-
-    return zarr.open_array(zarr_store(location), mode="r")
 
 
 def each(

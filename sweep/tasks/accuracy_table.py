@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.storage.locations import Location, located, read_array
+from sweep.storage.locations import Location, located
+from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -116,7 +117,8 @@ def rays_table(store: str | Location) -> list[RaysRow]:
 
 def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
     names = "beamlets_error", "beamlets", "time"
-    errors, numbers, times = (read_array(path / scanner / name) for name in names)
+    arrays: Any = open_group(path)[scanner]
+    errors, numbers, times = (arrays[name] for name in names)
     stretches, worst = study.scanners[scanner], _Worst()
     tolerance, rays, most = float(study.spec.accuracy.tolerance), 0, 0
     for block in np.flatnonzero(receipted(path, study)).tolist():

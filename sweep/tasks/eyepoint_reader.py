@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS
-from sweep.storage.locations import Location, read_array
+from sweep.storage.locations import Location
+from sweep.storage.opening import open_group
 from sweep.tasks.study import Results
 
 if TYPE_CHECKING:
@@ -25,11 +26,11 @@ class EyepointReader:
     """
 
     def __init__(self, path: Location) -> None:
-        def opened(names: Iterable[str]) -> dict[str, Any]:
-            return {name: read_array(path / name) for name in names}
-
-        self._shots, self._beamlets, self._cycles = map(opened, (SHOTS, BEAMLETS, CYCLES))
-        self._weight = np.asarray(read_array(path / "weight")[...])
+        group: Any = open_group(path)
+        self._shots, self._beamlets, self._cycles = (
+            {name: group[name] for name in names} for names in (SHOTS, BEAMLETS, CYCLES)
+        )
+        self._weight = np.asarray(group["weight"][...])
 
     def shots(self, first: int, stop: int) -> tuple[Results, Eyepoints]:
         """Arrays of the shots from `first` to before `stop`, and their eyepoints."""

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.storage import opening
 from sweep.storage.locations import JOURNAL, Location
-from sweep.storage.objects import ObjectStoreError
+from sweep.storage.opening import MANIFEST, NotAStoreError
 from sweep.storage.sealing import read_lines
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import LOGS
-from sweep.tasks.store import LAYOUT, MANIFEST
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-
-REQUIRED = ("kind", "study_id", "model_version", "software", "layout")
 
 
 def read_spec(path: Location, text: str, base: Path | None = None) -> Spec | SceneSpec:
@@ -46,7 +43,10 @@ def read_attributes(path: Location) -> dict[str, Any]:
     StoreError
         Where there is no store, or not one that this version of the program can read.
     """
-    return recognised(path, _written(path))
+    try:
+        return opening.read_attributes(path)
+    except NotAStoreError as error:
+        raise StoreError(str(error)) from None
 
 
 def recognised(path: Location, attributes: Any) -> dict[str, Any]:
@@ -57,20 +57,10 @@ def recognised(path: Location, attributes: Any) -> dict[str, Any]:
     StoreError
         Where it can't.
     """
-    ours = _ours(path, attributes)
-    if ours.get("layout") != LAYOUT:
-        raise StoreError(
-            f"{path} is laid out as version {ours.get('layout')}; this sweep writes {LAYOUT}"
-        )
-    if any(key not in ours for key in REQUIRED):
-        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
-    return ours
-
-
-def listed_attributes(path: Location) -> dict[str, Any]:
-    """Attributes of a store by the list of what it was made of; empty where that is damaged."""
-    found: dict[str, Any] = next(read_lines(path / JOURNAL / MANIFEST), {}).get("attributes", {})
-    return found
+    try:
+        return opening.recognised(path, attributes)
+    except NotAStoreError as error:
+        raise StoreError(str(error)) from None
 
 
 def refuse_foreign(path: Location) -> None:
@@ -81,35 +71,12 @@ def refuse_foreign(path: Location) -> None:
     StoreError
         Where neither the group says that it is ours nor any line of the journal is whole.
     """
-    if not any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
-        _ours(path, _written(path))
-
-
-def _written(path: Location) -> Any:
+    if any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
+        return
     try:
-        return json.loads((path / "zarr.json").read_text())["attributes"]
-    except ObjectStoreError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError):
-        if not path.exists():
-            raise StoreError(f"there is no store at {path}") from None
-        if (path / JOURNAL / MANIFEST).exists():
-            raise damaged(path) from None
-        raise StoreError(f"{path} is not a Zarr store of sweep's") from None
-
-
-def damaged(path: Location) -> StoreError:
-    """What to say of a store whose group is not as it was made."""
-    remedy = "` puts" if listed_attributes(path) else " --spec FILE`, with the study's spec, puts"
-    return StoreError(
-        f"{path / 'zarr.json'} is damaged: `sweep verify {path} --repair{remedy} it back"
-    )
-
-
-def _ours(path: Location, attributes: Any) -> dict[str, Any]:
-    if not isinstance(attributes, dict) or "study_id" not in attributes:
-        raise StoreError(f"{path} is a Zarr store, but not one that sweep made")
-    return attributes
+        opening.refuse_foreign(path)
+    except NotAStoreError as error:
+        raise StoreError(str(error)) from None
 
 
 def refuse_other_study(

@@ -6,13 +6,14 @@ is damaged counts as absent.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from sweep.storage import sealing
-from sweep.storage.locations import Location, read_array
+from sweep.storage.locations import Location
+from sweep.storage.opening import open_group
 from sweep.tasks import store
 from sweep.tasks.journal import digests
 from sweep.tasks.study import Results, Study
@@ -39,7 +40,6 @@ class OlderBlocks:
     def __init__(self, path: Location, study: Study) -> None:
         self._path, self._study = path, study
         self._digests = digests(path, study.n_blocks)
-        self._arrays: dict[str, zarr.Array] = {}
         self.read = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
 
     def has(self, block: int) -> bool:
@@ -58,6 +58,9 @@ class OlderBlocks:
 
     def chunk(self, name: str, block: int) -> np.ndarray:
         """A block's chunk of an array, as it is."""
-        if name not in self._arrays:
-            self._arrays[name] = read_array(self._path / name)
-        return np.asarray(self._arrays[name].blocks[self._study.chunks(block)[name]])
+        array = cast("zarr.Array[Any]", self._group[name])
+        return np.asarray(array.blocks[self._study.chunks(block)[name]])
+
+    @cached_property
+    def _group(self) -> zarr.Group:
+        return open_group(self._path)

@@ -27,7 +27,6 @@ from sweep.storage.locations import (
     files_below,
     located,
     put_whole,
-    read_array,
     zarr_store,
 )
 from sweep.storage.objects import in_words
@@ -107,12 +106,12 @@ def _pack(path: Location, output: Location, study: Study, told: Progress) -> Non
         root = (template / "zarr.json").read_bytes()
         for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{store.MANIFEST}"}:
             put_whole(output / name, (template / name).read_bytes())
-    names = sorted(study.owners())
+    names, arrays = sorted(study.owners()), store.open_group(path)
     told.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:
             with in_words(path), in_words(output):
-                _pack_array(path / name, output / name)
+                _pack_array(arrays[name], output / name)
             told.advance(points=1, failed=0)
     finally:
         told.end()
@@ -139,11 +138,10 @@ def _list(output: Location, attributes: dict[str, Any], root: bytes) -> None:
     put_whole(output / JOURNAL / store.MANIFEST, b"".join(lines))
 
 
-def _pack_array(path: Location, output: Location) -> None:
+def _pack_array(source: Any, output: Location) -> None:
     """Copy an array, shard by shard, and read each back."""
     import zarr
 
-    source = read_array(path)
     target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
     with ThreadPoolExecutor(THREADS) as pool:
         for _ in pool.map(lambda part: _copy(source, target, part), _parts(target)):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from sweep.storage.locations import Location, read_array
+from sweep.storage.locations import Location
+from sweep.storage.opening import open_group
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import receipted
 
@@ -20,7 +22,8 @@ def pieces(
     store: Location, study: GridStudy, names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
     """Where in the grid each block is, and its values in some arrays."""
-    arrays = [read_array(store / name) for name in names]
+    group = open_group(store)
+    arrays: list[Any] = [group[name] for name in names]
     for block in blocks:
         place = study.grid.block(int(block))
         yield place, [np.asarray(array[place or ...]) for array in arrays]

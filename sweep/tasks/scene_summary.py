@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.storage.locations import Location, located, read_array
+from sweep.storage.locations import Location, located
+from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import FlightStudy
@@ -88,10 +89,9 @@ def _row(path: Location, stretches: Stretches, part: str, done: list[Part]) -> S
     from sweep.model.navigation_screening import EXCLUDED
     from sweep.model.pairing import TRUE
 
-    group = path / stretches.scanner
-    arrays: list[Any] = [read_array(group / name) for name in ("flags", "pd_shot")]
-    flags, pd = arrays
-    status: Any = read_array(group / "velocity_status") if stretches.navigates else None
+    arrays: Any = open_group(path)[stretches.scanner]
+    flags, pd = arrays["flags"], arrays["pd_shot"]
+    status = arrays["velocity_status"] if stretches.navigates else None
     row = SceneRow(part)
     for block in done:
         shots, cycles, draws = (

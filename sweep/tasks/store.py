@@ -13,7 +13,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from sweep.storage import chunks, locations
-from sweep.storage.locations import JOURNAL, Location, each, located, zarr_store
+from sweep.storage.locations import JOURNAL, Location, each, located
 from sweep.storage.objects import in_words
+from sweep.storage.opening import LAYOUT, MANIFEST, open_group
 from sweep.storage.sealing import digest, digest_of, sealed
 from sweep.tasks import remote, versions
 from sweep.tasks.errors import StoreError
@@ -32,12 +33,6 @@ from sweep.tasks.study import ArrayLayout, Content, Study
 if TYPE_CHECKING:
     import zarr
     from zarr.core.array_spec import ArrayConfigLike
-
-#: What a store is made of before there are results, and the digest of each object, in the journal.
-MANIFEST = "template.jsonl"
-
-#: Version of the layout of stores.
-LAYOUT = 5
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -258,9 +253,7 @@ class Arrays:
     @cached_property
     def _group(self) -> zarr.Group:
         """The store, its metadata read once for all arrays."""
-        import zarr
-
-        return zarr.open_group(zarr_store(self.path), mode="r+")
+        return open_group(self.path, mode="r+")
 
 
 def block_objects(study: Study, block: int) -> list[str]:
@@ -300,17 +293,34 @@ def sync(path: Location) -> None:
 def remove_partials(path: Location) -> None:
     """Remove what writers that were killed in the midst of a file have left."""
     if isinstance(path, Path):
-        _remove_partials(str(path))
+        for entry in _entries(str(path)):
+            if entry.name.endswith(locations.PARTIAL):
+                with suppress(FileNotFoundError):
+                    os.unlink(entry.path)
 
 
-def _remove_partials(folder: str) -> None:
+def refuse_links(path: Location) -> None:
+    """Refuse a store through whose links something would be written elsewhere.
+
+    Raises
+    ------
+    StoreError
+        With a link, or what else is neither a file nor a folder.
+    """
+    if isinstance(path, Path):
+        for entry in _entries(str(path)):
+            if not entry.is_file(follow_symlinks=False):
+                raise StoreError(f"{entry.path} is no plain file: sweep made none such, remove it")
+
+
+def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
+    """Everything below a folder but folders."""
     with os.scandir(folder) as entries:
         for entry in entries:  # no look at a file: there may be millions
             if entry.is_dir(follow_symlinks=False):
-                _remove_partials(entry.path)
-            elif entry.name.endswith(locations.PARTIAL):
-                with suppress(FileNotFoundError):
-                    os.unlink(entry.path)
+                yield from _entries(entry.path)
+            else:
+                yield entry
 
 
 def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sweep.storage import sealing
+from sweep.storage import opening, sealing
 from sweep.storage.locations import Location, names_below, put_whole
 from sweep.storage.sealing import read_lines, read_sealed
 from sweep.tasks import identity, journal, store
@@ -37,11 +37,11 @@ def attributes(path: Location) -> dict[str, Any]:
     StoreError
         Where there is no store, or not one of this program's; where both are damaged.
     """
-    if listed := identity.listed_attributes(path):
+    if listed := opening.listed_attributes(path):
         return identity.recognised(path, listed)
     found = identity.read_attributes(path)
     if any(_wrong(path, o, digest) for o, digest in digests(path).items() if o == "zarr.json"):
-        raise identity.damaged(path)
+        raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     return found
 
 
@@ -87,6 +87,7 @@ def refuse_damaged(path: Location) -> None:
     StoreError
         With the objects, and what to do.
     """
+    store.refuse_links(path)
     if found := damages(path):
         listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
         raise StoreError(
@@ -115,6 +116,7 @@ def restore(path: Location, study: Study) -> list[str]:
     StoreError
         Where this machine can't make the same again. Nothing is touched.
     """
+    store.refuse_links(path)
     try:
         written = attributes(path)
     except StoreError:
@@ -122,7 +124,7 @@ def restore(path: Location, study: Study) -> list[str]:
     if written:
         identity.refuse_other_versions(path, written, where="this machine")
     if written.get("study_id", study.id) != study.id:
-        raise identity.damaged(path)
+        raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     try:
         with tempfile.TemporaryDirectory() as directory:
             aside = Path(directory) / path.name

@@ -11,6 +11,7 @@ from sweep.analysis.accuracy import figure, text
 from sweep.analysis.accuracy.settings import Setting, settings_in
 from sweep.analysis.opening import ACCURACY, read_attributes
 from sweep.storage.locations import Location, beside, zarr_store
+from sweep.storage.opening import CHECKED
 
 
 def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
@@ -22,7 +23,7 @@ def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
         Where there is no such store.
     """
     read_attributes(store, ACCURACY)
-    with xr.open_zarr(zarr_store(store)) as dataset:
+    with xr.open_zarr(zarr_store(store), **CHECKED) as dataset:
         whole = dataset.load()
     return whole, settings_in(whole)
 

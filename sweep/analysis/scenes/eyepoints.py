@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.opening import read_attributes
 from sweep.model.eyepoints import Eyepoints
 from sweep.model.scene_outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.storage.locations import Location, zarr_store
+from sweep.storage.opening import CHECKED, NotAStoreError
 
 FOLDER = "eyepoints"
 """Folder of the eyepoints of all studies whose stores lie beside it."""
@@ -40,7 +41,8 @@ def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
             "running the study again casts them anew"
         )
-    dataset = xr.open_dataset(zarr_store(path), engine="zarr", chunks=None)
+    read_attributes(path, "eyepoints")
+    dataset = xr.open_zarr(zarr_store(path), chunks=None, **CHECKED)
     chosen = dataset.isel(shot=np.asarray(index))
     arrays = {name: np.asarray(chosen[name].values) for name in (*SHOTS, *BEAMLETS)}
     return from_arrays(arrays, np.asarray(dataset["weight"].values))

@@ -9,6 +9,7 @@ import xarray as xr
 
 from sweep.analysis.opening import SCENE, progress, read_attributes, refuse_lost
 from sweep.storage.locations import Location, located, zarr_store
+from sweep.storage.opening import CHECKED
 
 STRETCH = 8192
 """Shots, times draws, that are read at a time."""
@@ -44,7 +45,7 @@ def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
     """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
     attributes = read_attributes(path, SCENE)
     refuse_lost(path)
-    tree = xr.open_datatree(zarr_store(path), engine="zarr", chunks=chunks)
+    tree = xr.open_datatree(zarr_store(path), engine="zarr", chunks=chunks, **CHECKED)
     tree.encoding["source"] = str(path)
     tree.attrs |= progress(path, *_extent(tree, attributes))
     return tree

@@ -1,0 +1,300 @@
+"""Stores opened only as this program writes them.
+
+Zarr decodes whatever the metadata of arrays declare: older formats, objects to unpickle, codecs of
+plug-ins. A store has the metadata of all its arrays in one document, that of its root. It is
+checked first, and arrays are opened by it alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.storage.chunks import ZSTD_LEVEL
+from sweep.storage.locations import JOURNAL, Location, zarr_store
+from sweep.storage.objects import ObjectStoreError
+from sweep.storage.sealing import read_lines
+
+if TYPE_CHECKING:
+    import zarr
+
+#: What a store is made of before there are results, and the digest of each object, in the journal.
+MANIFEST = "template.jsonl"
+
+#: Version of the layout of stores.
+LAYOUT = 5
+
+#: For xarray's functions: so they read the document that was checked, and no other.
+CHECKED: dict[str, Any] = {"consolidated": True, "zarr_format": 3}
+
+#: Bytes of a file of an array at most, before compression, and chunks of an array.
+MOST_BYTES = MOST_CHUNKS = 2**31
+
+_KINDS = {
+    "grid": ("title", "spec", "coordinates"),
+    "scene": ("title", "spec", "scanners", "surfaces"),
+    "eyepoints": ("geometry", "shots_a_cycle"),
+    "accuracy": ("title", "spec", "coordinates"),
+}
+"""Attributes of each kind of store, besides those of all."""
+
+_REQUIRED = ("study_id", "model_version", "software")
+
+_NOT_TEXT = {
+    "software": dict, "shots_a_cycle": int, "scanners": list, "surfaces": list,
+}  # fmt: skip
+
+_ARRAY_ATTRIBUTES = {
+    "units": str, "long_name": str, "comment": str, "path": str, "flag_meanings": str,
+    "flag_masks": list, "tolerance": float, "confidence": float,
+}  # fmt: skip
+"""Attributes of arrays. xarray acts on others, such as `scale_factor`."""
+
+_FILLS: dict[str, tuple[Any, ...]] = {
+    "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
+    "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
+}  # fmt: skip
+"""Types of arrays, and what stands where nothing is written."""
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+
+_CHECKSUM = {"name": "crc32c"}
+_PACKED = [{"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": False}}, _CHECKSUM]
+_TEXT = {"name": "vlen-utf8", "configuration": {}}
+_BYTES = {"name": "bytes"}
+_WORDS = {"name": "bytes", "configuration": {"endian": "little"}}
+_SHARDS = {"index_codecs": [_WORDS, _CHECKSUM], "index_location": "end"}
+
+
+class NotAStoreError(ValueError):
+    """A path at which there is no store of a study, or none that this program can read."""
+
+
+def open_group(path: Location, mode: Any = "r") -> zarr.Group:
+    """The arrays of a store, by its checked document.
+
+    Raises
+    ------
+    NotAStoreError
+        As of :func:`read_document`.
+    """
+    import zarr
+
+    read_document(path)
+    return zarr.open_group(zarr_store(path), mode=mode, zarr_format=3, use_consolidated=True)
+
+
+def read_attributes(path: Location) -> dict[str, Any]:
+    """Attributes of a store.
+
+    Raises
+    ------
+    NotAStoreError
+        As of :func:`read_document`.
+    """
+    attributes: dict[str, Any] = read_document(path)["attributes"]
+    return attributes
+
+
+def read_document(path: Location) -> dict[str, Any]:
+    """The document of a store's root, with the metadata of all its arrays, checked.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store, or one that this version of the program does not write.
+    """
+    document = _document(path)
+    attributes = recognised(path, document["attributes"])
+    try:
+        nodes = document["consolidated_metadata"]["metadata"]
+        if (document["zarr_format"], document["node_type"]) != (3, "group"):
+            raise ValueError("its root is another")
+        for name, node in nodes.items():
+            _check_node(name, node)
+        _check_dimensions(nodes)
+        of_scanners = [f"{name}/flags" for name in attributes.get("scanners", ())]
+        needed = ["effects"] if attributes["kind"] == "grid" else of_scanners
+        if lost := [name for name in needed if name not in nodes]:
+            raise ValueError(f"it lacks {lost[0]}")
+        _check_files(path)
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        why = error if type(error) is ValueError else "its metadata are incomplete"
+        raise NotAStoreError(f"{path} is not as sweep writes stores: {why}{remedy(path)}") from None
+    return document
+
+
+def recognised(path: Location, attributes: Any) -> dict[str, Any]:
+    """Attributes of a store, where this version of the program writes such.
+
+    Raises
+    ------
+    NotAStoreError
+        Where it does not.
+    """
+    ours = _ours(path, attributes)
+    if (layout := ours.get("layout")) != LAYOUT:
+        raise NotAStoreError(
+            f"{path} is laid out as version {layout!r:.20}; this sweep writes {LAYOUT}"
+        )
+    needed = (*_REQUIRED, *_KINDS.get(str(ours.get("kind")), ("no known kind",)))
+    if any(type(ours.get(name)) is not _NOT_TEXT.get(name, str) for name in needed):
+        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    return ours
+
+
+def refuse_foreign(path: Location) -> None:
+    """Refuse what no version of this program has made.
+
+    Raises
+    ------
+    NotAStoreError
+        Where that is so.
+    """
+    _ours(path, _document(path)["attributes"])
+
+
+def _ours(path: Location, attributes: Any) -> dict[str, Any]:
+    if not isinstance(attributes, dict) or "study_id" not in attributes:
+        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    return attributes
+
+
+def _document(path: Location) -> dict[str, Any]:
+    """The document of a store's root, a group."""
+    try:
+        if isinstance(path, Path) and not (path / "zarr.json").is_file():
+            raise FileNotFoundError
+        document = json.loads((path / "zarr.json").read_bytes())
+        if "attributes" in document:
+            return dict(document)
+    except ObjectStoreError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    if not path.exists():
+        raise NotAStoreError(f"there is no store at {path}{_near(path)}")
+    if how := remedy(path):
+        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{how}")
+    raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}")
+
+
+def listed_attributes(path: Location) -> dict[str, Any]:
+    """Attributes of a store by the list of what it was made of; empty where that is damaged."""
+    found: dict[str, Any] = next(read_lines(path / JOURNAL / MANIFEST), {}).get("attributes", {})
+    return found
+
+
+def remedy(path: Location) -> str:
+    """How to put back what a store was made of, where it says what that was."""
+    if not (path / JOURNAL / MANIFEST).exists():
+        return ""
+    how = "`" if listed_attributes(path) else " --spec FILE`, with the study's spec,"
+    return f": `sweep verify {path} --repair{how} puts it back"
+
+
+def _near(path: Location) -> str:
+    """Remark on the stores in a directory or beside a path; empty where there are none."""
+    directory = path if path.is_dir() else path.parent
+    names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return f"; stores near it: {shown}" if names else ""
+
+
+def _check_node(path: str, node: dict[str, Any]) -> None:
+    """Refuse a group or an array that is declared otherwise than this program declares them."""
+    if not all(map(_NAME.fullmatch, path.split("/"))):
+        raise ValueError(f"an array has the name {path!r:.60}")
+    if node["zarr_format"] != 3:
+        raise ValueError(f"{path} is of the Zarr format {node['zarr_format']!r:.20}")
+    if node["node_type"] == "group":
+        own = node["attributes"]
+        if not re.fullmatch("[0-9a-f]{32}", own["geometry_id"]):  # part of a path
+            raise ValueError(f"the group {path} has no eyepoints")
+        own["coordinates"].split()
+        expected = {"node_type": "group", "zarr_format": 3, "attributes": own}
+    else:
+        expected = _expected(path, node)
+    if odd := sorted(key for key in node | expected if node.get(key) != expected.get(key)):
+        raise ValueError(f"the {odd[0]} of {path} is another")
+
+
+def _expected(path: str, node: dict[str, Any]) -> dict[str, Any]:
+    """Metadata of an array as this program writes them, with what may differ, once checked."""
+    kind, attributes, fill = node["data_type"], node["attributes"], node["fill_value"]
+    if not isinstance(kind, str) or fill not in _FILLS.get(kind, ()):
+        raise ValueError(f"{path} has values of the type {kind!r:.40}, {fill!r:.40} where missing")
+    for name, value in attributes.items():
+        if type(value) is not _ARRAY_ATTRIBUTES.get(name):
+            raise ValueError(f"{path} has the attribute {name!r:.40}")
+    file = node["chunk_grid"]["configuration"]["chunk_shape"]
+    size = np.dtype("u1" if kind == "string" else kind).itemsize
+    codecs: list[Any] = [_WORDS if size > 1 else _BYTES, *_PACKED]
+    if kind == "string":
+        codecs[0] = _TEXT
+    chunk = file
+    if node["codecs"][0]["name"] == "sharding_indexed":
+        chunk = node["codecs"][0]["configuration"]["chunk_shape"]
+        shards = {"chunk_shape": chunk, "codecs": codecs, **_SHARDS}
+        codecs = [{"name": "sharding_indexed", "configuration": shards}]
+    dims = node.get("dimension_names", [])
+    _check_shape(path, node["shape"], file, chunk, dims, size)
+    return {
+        "shape": node["shape"],
+        "data_type": kind,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": file}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": fill,
+        "codecs": codecs,
+        "attributes": attributes,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+        **({"dimension_names": dims} if dims else {}),
+    }
+
+
+def _check_shape(
+    path: str, shape: list[int], file: list[int], chunk: list[int], dims: list[str], size: int
+) -> None:
+    """Refuse an array that is cut in no way into files, and these into chunks, of bearable size."""
+    cuts = [*file, *chunk]
+    if (
+        not len(shape) == len(file) == len(chunk) == len(dims)
+        or any(type(number) is not int for number in (*shape, *cuts))
+        or any(number < 0 for number in shape)
+        or any(number < 1 for number in cuts)
+        or not all(map(_NAME.fullmatch, dims))
+        or math.prod(file) * size > MOST_BYTES
+        or math.prod(-(-n // cut) for n, cut in zip(shape, chunk, strict=True)) > MOST_CHUNKS
+    ):
+        raise ValueError(f"the shape, chunks and dimensions of {path} don't go together")
+
+
+def _check_dimensions(nodes: Mapping[str, Any]) -> None:
+    """Refuse arrays of a group that don't agree on the length of a dimension."""
+    lengths: dict[tuple[str, str], int] = {}
+    for path, node in nodes.items():
+        group = path.rpartition("/")[0]
+        if group and nodes[group]["node_type"] != "group":
+            raise ValueError(f"{path} lies in an array")
+        for dim, length in zip(node.get("dimension_names", []), node.get("shape", []), strict=True):
+            if lengths.setdefault((group, dim), length) != length:
+                raise ValueError(f"its arrays don't agree on the length of {dim}")
+
+
+def _check_files(path: Location) -> None:
+    """Refuse a journal with links, which lead out, or pipes, which never end."""
+    if not isinstance(path, Path) or not (path / JOURNAL).is_dir():
+        return
+    with os.scandir(path / JOURNAL) as entries:
+        odd = [e.name for e in entries if e.is_symlink() or not (e.is_file() or e.is_dir())]
+    if odd or (path / JOURNAL).is_symlink():
+        raise ValueError(f"{'/'.join([JOURNAL, *odd[:1]])} is no plain file")

@@ -1,0 +1,224 @@
+"""Stores of strangers: metadata with which Zarr would decode what sweep never writes."""
+
+import copy
+import json
+import os
+import pickle
+import random
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from small import small
+
+import sweep
+from sweep.cli import main
+from sweep.storage.opening import NotAStoreError
+from sweep.tasks import store
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.status import status
+
+
+class Payload:
+    """What leaves a file where it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A store without results, with a text coordinate."""
+    study = small(
+        axes={"instrument.processing.window": ["hann", "hamming"], "target.range": ["9 m", "8 m"]}
+    )
+    return store.create(tmp_path_factory.mktemp("made") / "made.zarr", GridStudy(study))
+
+
+@pytest.fixture
+def theirs(made, tmp_path):
+    """A copy that a test may spoil."""
+    return shutil.copytree(made, tmp_path / "theirs.zarr")
+
+
+def spoil(path, change):
+    """Change the document of a store's root."""
+    document = json.loads((path / "zarr.json").read_text())
+    change(document, document["consolidated_metadata"]["metadata"])
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
+OBJECTS = {
+    "zarr_format": 2, "node_type": "array", "shape": [2], "chunks": [2], "dtype": "|O",
+    "order": "C", "filters": [{"id": "pickle"}], "compressor": None, "fill_value": None,
+    "dimension_separator": ".", "attributes": {"_ARRAY_DIMENSIONS": ["range"]},
+}  # fmt: skip
+
+
+def put(name, **changes):
+    """A change of an array's metadata."""
+    return lambda document, arrays: arrays[name].update(changes)
+
+
+SPOILT = {
+    "pickled objects": lambda document, arrays: arrays.update({"range": OBJECTS}),
+    "text that is unpickled": lambda document, arrays: arrays.update(
+        {"range": {**OBJECTS, "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}}
+    ),
+    "a Zarr array of format 2": put("range", zarr_format=2),
+    "an unknown codec": put("pd_up", codecs=[{"name": "numcodecs.pickle", "configuration": {}}]),
+    "a further codec": lambda document, arrays: arrays["pd_up"]["codecs"].append(
+        {"name": "gzip", "configuration": {"level": 1}}
+    ),
+    "another type": put("pd_up", data_type="complex128"),
+    "a type that Zarr's plug-ins know": put(
+        "pd_up", data_type={"name": "numpy.datetime64", "configuration": {}}
+    ),
+    "keys that lead elsewhere": put(
+        "pd_up", chunk_key_encoding={"name": "v2", "configuration": {"separator": "/"}}
+    ),
+    "a chunk of a petabyte": put(
+        "pd_up",
+        chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2, 2**47]}},
+    ),
+    "chunks without number": put("pd_up", shape=[2, 2**60]),
+    "a length that is none": put("pd_up", shape=[2, True]),
+    "lengths that don't agree": put("pd_up", shape=[2, 5]),
+    "a name that leads out": lambda document, arrays: arrays.update(
+        {"../../etc/passwd": arrays["pd_up"]}
+    ),
+    "a dimension too many": put("pd_up", dimension_names=["window", "range", "range2"]),
+    "an attribute that xarray obeys": put("pd_up", attributes={"scale_factor": 2.0}),
+    "storage transformers": put("pd_up", storage_transformers=[{"name": "x"}]),
+    "no metadata of arrays": lambda document, arrays: document.pop("consolidated_metadata"),
+    "a root that is an array": lambda document, arrays: document.update(node_type="array"),
+    "another layout": lambda document, arrays: document["attributes"].update(layout=4),
+    "a title that is none": lambda document, arrays: document["attributes"].update(title=[1]),
+    "a kind that is none": lambda document, arrays: document["attributes"].update(kind="x"),
+}
+
+
+@pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT)
+def test_a_store_with_metadata_that_sweep_never_writes_is_refused_unread(theirs, tmp_path, change):
+    (theirs / "range" / "0").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
+    spoil(theirs, change)
+    with pytest.raises(NotAStoreError) as refusal:
+        sweep.open(theirs)
+    with pytest.raises(StoreError, match="(?s)^" + str(theirs)):
+        status(theirs)
+    assert "\n" not in str(refusal.value) and str(theirs) in str(refusal.value)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "status S ", "report S ", "compare S S ", "figures S ", "resume S ", "export S x.csv",
+        "finalize S there.zarr", "extend S --set seed=5",
+    ],
+)  # fmt: skip
+def test_every_command_refuses_a_hostile_store_in_one_line(theirs, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    spoil(theirs, SPOILT["pickled objects"])
+    words = command.replace("S ", f"{theirs.name} ").split()
+    told = CliRunner().invoke(main, words, catch_exceptions=False)
+    assert told.exit_code == 2, told.output
+    assert told.output.count("\n") == 1 and "range" in told.output
+    assert sorted(os.listdir(tmp_path)) == ["theirs.zarr"]
+
+
+def test_metadata_of_single_arrays_are_not_read(theirs):
+    """Those of the root's document are, which are checked."""
+    (theirs / ".sweep" / "template.jsonl").unlink()  # has digests of them, which they can forge
+    for name in ("range", "pd_up", "window"):
+        (theirs / name / "zarr.json").write_text(json.dumps(OBJECTS))
+        (theirs / name / ".zarray").write_text(json.dumps(OBJECTS))
+    dataset = sweep.open(theirs)
+    assert dataset.range.values.tolist() == [9, 8]
+    assert dataset.window.values.tolist() == ["hann", "hamming"]
+    assert np.isnan(dataset.pd_up.values).all()
+    assert status(theirs).points == 4
+
+
+def leaves(value, place=()):
+    """Places of everything in a JSON document."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, part in parts:
+        yield (*place, key)
+        if isinstance(part, dict | list):
+            yield from leaves(part, (*place, key))
+
+
+ODD = [
+    None, True, -1, 0, 2**70, 1e308, float("nan"), "", "|O", "../x", "\x1b[2J", "object", [], {},
+    [[]], ["x"], {"name": "pickle"}, {"id": "pickle"}, {"name": "numcodecs.pickle"}, "é" * 5000,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_changes_of_metadata_end_in_words_or_change_nothing(theirs, seed):
+    chance, text = random.Random(seed), (theirs / "zarr.json").read_text()
+    whole = json.loads(text)
+    places = list(leaves(whole))
+    places += [place for place in places if place[0] == "attributes"] * 10
+    for _ in range(60):
+        document = copy.deepcopy(whole)
+        place = chance.choice(places)
+        parent = document
+        for key in place[:-1]:
+            parent = parent[key]
+        if chance.random() < 0.2:
+            del parent[place[-1]]
+        else:
+            parent[place[-1]] = chance.choice(ODD)
+        (theirs / "zarr.json").write_text(json.dumps(document))
+        for read, error in ((sweep.open, NotAStoreError), (status, StoreError)):
+            try:
+                read(theirs)
+            except error as refusal:
+                assert "\n" not in str(refusal) or place == ("attributes", "spec"), place
+                assert "\x1b" not in str(refusal)
+
+
+def test_bytes_in_place_of_a_document_end_in_words(theirs):
+    for text in (b"[" * 10**5, b'{"attributes": ' + b"9" * 5000 + b"}", b"\xff", b"null", b"[1]"):
+        (theirs / "zarr.json").write_bytes(text)
+        with pytest.raises(NotAStoreError, match="damaged"):
+            sweep.open(theirs)
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_a_journal_that_leads_out_of_a_store_is_not_read_or_written(theirs, tmp_path, kind):
+    outside = tmp_path / "outside"
+    outside.write_text("mine\n")
+    receipts = theirs / ".sweep" / "receipts.jsonl"
+    receipts.unlink(missing_ok=True)
+    if kind == "link":
+        receipts.symlink_to(outside)
+    else:
+        os.mkfifo(receipts)
+    told = CliRunner().invoke(main, ["resume", str(theirs)], catch_exceptions=False)
+    assert told.exit_code == 2 and "receipts.jsonl is no plain file" in told.output
+    assert outside.read_text() == "mine\n"
+
+
+@pytest.mark.parametrize("place", ["pd_up", "pd_up/c", "effects/c/0"])
+def test_resuming_writes_through_no_link_out_of_a_store(theirs, tmp_path, place):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    linked = theirs / place
+    shutil.rmtree(linked, ignore_errors=True)
+    linked.parent.mkdir(parents=True, exist_ok=True)
+    linked.symlink_to(outside)
+    if place == "pd_up":
+        shutil.copy(theirs / "pd_down" / "zarr.json", outside)
+    before = os.listdir(outside)
+    command = ["resume", str(theirs), "--scheduler", "none"]
+    told = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert told.exit_code == 2 and "\n" not in told.output.strip()
+    assert os.listdir(outside) == before
