@@ -16,7 +16,7 @@ from sweep.spec.reading import read_document
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
 SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
-KEPT = 3
+KEPT = 4
 """Values kept of a plain axis; zipped axes keep the first of every run of equal grazing angle."""
 
 

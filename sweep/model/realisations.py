@@ -23,7 +23,6 @@ from sweep.model.ground import Plane
 from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.resolution import resolved_categories
-from sweep.model.shot import statistics
 
 ROWS = 4096
 """Draws that are prepared at once, of all points together."""
@@ -98,32 +97,6 @@ def _drawn(p: dict[str, np.ndarray], effects: Collection[str], realisation: Real
         if effect.draw is not None:
             shots = effect.draw(shots, scene, realisation)
     return shots
-
-
-def evaluate(
-    parameters: Parameters,
-    effects: Collection[str],
-    *,
-    keys: np.ndarray,
-    first_draw: int = 0,
-    draws: int,
-) -> dict[str, np.ndarray]:
-    """Statistics of n shots, means over draws of random effects.
-
-    Parameters
-    ----------
-    parameters, effects, keys, first_draw, draws
-        As of :func:`realise`.
-
-    Returns
-    -------
-    dict of (n,) ndarray
-        As of :meth:`Means.results`.
-    """
-    means = Means(len(keys))
-    for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
-        means.add(stretch.point, statistics(stretch.shots))
-    return means.results()
 
 
 def certain(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -32,7 +32,8 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
         ``thesis``: the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence.
         ``lambert``: cos(incidence)/pi.
         ``lommel_seeliger``: 1/pi whatever the incidence; the reflectance is the normal albedo
-        (:func:`normal_albedo`), which at normal incidence is what Lambert's law means by it.
+        w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition surge), which
+        at normal incidence is what Lambert's law means by it.
     cos_incidence : ndarray
         Cosine of the incidence angle, 0..1.
 
@@ -56,24 +57,3 @@ def backscatter_of(law, cos_incidence):
     if law == 0:
         return 0.5 / math.pi
     return (cos_incidence if law == 1 else 1.0) / math.pi
-
-
-def normal_albedo(
-    *, single_scattering_albedo: float, phase_function: float = 1.0, opposition_surge: float = 0.0
-) -> float:
-    """Brightness at zero phase angle over that of a white Lambertian surface lit along its normal.
-
-    w p(0) (1 + B(0)) / 8 of the law of Lommel and Seeliger, which light that is scattered more
-    than once exceeds on bright ground. It is what a lidar calibrated on a Lambertian target
-    measures: the surge is in it.
-
-    Parameters
-    ----------
-    single_scattering_albedo : float
-        w, 0..1.
-    phase_function : float
-        p(0), whose mean over all directions is 1; 1 for grains that scatter evenly.
-    opposition_surge : float
-        B(0), from 0 to 1 for shadow hiding.
-    """
-    return single_scattering_albedo * phase_function * (1 + opposition_surge) / 8

@@ -116,11 +116,6 @@ class Window:
         """Equivalent noise bandwidth [bins of fs/L]."""
         return self.length * self.energy / self.sum**2
 
-    @property
-    def scalloping_loss(self) -> float:
-        """Power lost by a tone half-way between two bins [dB, positive]."""
-        return float(-20 * np.log10(abs(transform(self, np.array([0.5]))[0]) / self.sum))
-
 
 def _shares(weights: np.ndarray) -> tuple[float, ...]:
     return tuple(map(float, weights / weights.sum()))

@@ -115,7 +115,7 @@ def read_image(
 ) -> Terrain:
     """Terrain of a grey image: black is low, white is high, row 0 is the northern one.
 
-    Heights come in steps of one grey level, see `quantum`: smooth them before trusting slopes
+    Heights come in steps of one grey level: smooth them before trusting slopes
     (`sweep.model.geometry.resampling.smooth`).
 
     Parameters
@@ -142,17 +142,6 @@ def read_image(
     north = origin[1] + (levels.shape[0] - 1) * pixel
     corner = (origin[0], north, origin[2])
     return grid(path, heights, spacing=(pixel, -pixel), origin=corner)
-
-
-def quantum(path: str | Path, *, black: float = 0.0, white: float) -> float:
-    """Height of one grey level of an image [m].
-
-    Raises
-    ------
-    SceneError
-        As `read_image`.
-    """
-    return abs(white - black) / float(np.iinfo(_grey(existing(path)).dtype).max)
 
 
 def _grey(path: Path) -> np.ndarray:

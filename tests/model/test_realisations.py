@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from mean_over_draws import evaluate
 from scipy import special
 
 from sweep.model import philox, realisations
@@ -11,7 +12,7 @@ from sweep.model.effects import pointing_jitter, scintillation
 from sweep.model.effects.catalogue import CORE
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.realisations import evaluate, realise
+from sweep.model.realisations import realise
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate as evaluate_without
 from sweep.model.shot import statistics

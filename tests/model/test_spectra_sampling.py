@@ -140,7 +140,7 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
 
     Twice a sharp threshold's spread, as single draws are counted here and averaged there.
     """
-    from sweep.model.realisations import evaluate as averaged
+    from mean_over_draws import evaluate as averaged
 
     parameters = _points(
         table_4_1,

@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from sweep.scenes.errors import SceneError
-from sweep.scenes.grids import quantum, read_array, read_image
+from sweep.scenes.grids import read_array, read_image
 
 HEIGHTS = np.arange(12.0).reshape(3, 4)
 STEPS = {"spacing": (2.0, -2.0)}
@@ -70,7 +70,6 @@ def test_grey_levels_become_heights_between_black_and_white(tmp_path, kind, top)
     # The lower left pixel stands at the origin; the picture's top is north.
     assert ground.height_at(np.array(100.0), np.array(200.0)) == pytest.approx(0.0)
     assert ground.height_at(np.array(102.0), np.array(202.0)) == pytest.approx(40.0)
-    assert quantum(path, black=-10.0, white=40.0) == pytest.approx(50 / top)
 
 
 def test_a_grey_picture_in_three_equal_bands_is_grey(tmp_path):

@@ -3,16 +3,14 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from facet_areas import areas
 
-from sweep.model.geometry.facets import areas
 from sweep.model.geometry.quaternion import about
-from sweep.model.geometry.surfaces import Surface, assemble
+from sweep.model.geometry.surfaces import Surface
 from sweep.scenes.errors import SceneError
 from sweep.scenes.meshes import Placement, read_mesh
 
 BOX = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
-GROUND = Surface("ground", 0.2, roughness=1e-3)
-LEAF = Surface("leaf", 0.4, law="thesis")
 
 
 @pytest.fixture
@@ -93,23 +91,7 @@ def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(t
     assert (report.duplicate, report.degenerate) == (1, 1)
 
 
-def test_objects_with_surfaces_are_put_together_with_one_list_of_them(file):
-    path = file(BOX, "box.ply")
-    near = read_mesh(path)
-    far = read_mesh(path, placement=Placement((50.0, 0.0, 0.0)))
-    mixed = read_mesh(path, surface=1)
-    facets, surfaces = assemble([(near, GROUND), (far, LEAF), (mixed, [LEAF, GROUND])])
-    assert surfaces == (GROUND, LEAF)
-    np.testing.assert_array_equal(facets.surface, [0] * 12 + [1] * 12 + [0] * 12)
-    np.testing.assert_allclose(extents(facets), (51, 2, 3))
-
-
-def test_surfaces_that_do_not_fit_their_objects_are_refused(file):
-    box = read_mesh(file(BOX, "box.ply"), surface=1)
-    with pytest.raises(ValueError, match="beyond the 1 given"):
-        assemble([(box, GROUND)])
-    with pytest.raises(ValueError, match="share a name"):
-        assemble([(box, [GROUND, LEAF]), (box, [GROUND, Surface("leaf", 0.1)])])
+def test_surfaces_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match="reflectance"):
         Surface("shiny", 1.5)
     with pytest.raises(ValueError, match="roughness"):

@@ -22,7 +22,7 @@ def beamlet_rays(
         Unit vectors along the beams, in the body frame.
     across, along : (b,) ndarray
         Tangents of the angles off the axis towards the two vectors of
-        :func:`sweep.model.geometry.jitter.transverse`, in units of `sigma`.
+        :func:`sweep.model.geometry.jitter.transverse_of`, in units of `sigma`.
     sigma : float
         Standard deviation of the beam on each axis [rad].
     """

@@ -82,10 +82,6 @@ class Facets:
         mesh, report = clean(self.vertices, self.faces, self.surface)
         return replace(mesh, origin=mesh.origin + self.origin), report
 
-    def with_surface(self, surface: int) -> Facets:
-        """The same facets, all of one surface."""
-        return replace(self, surface=np.full(len(self.faces), surface, np.int16))
-
 
 def join(parts: Sequence[Facets]) -> Facets:
     """All parts as one, relative to the first one's origin.
@@ -105,9 +101,3 @@ def join(parts: Sequence[Facets]) -> Facets:
         np.concatenate([part.surface for part in parts]),
         origin,
     )
-
-
-def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Areas of triangles [m^2], (m,)."""
-    a, b, c = vertices[np.asarray(faces).T]
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))

@@ -62,54 +62,13 @@ def jitter_attitude(
     return multiply(attitude, from_rotation_vector(turn))
 
 
-def jitter_directions(directions: np.ndarray, *, sigma: float, draws: np.ndarray) -> np.ndarray:
-    """Unit vectors, each thrown off by two independent angles across it, (n, 3).
-
-    Parameters
-    ----------
-    directions : (n, 3) ndarray
-        Unit vectors.
-    sigma : float
-        Standard deviation of each angle [rad]; the angle off has a mean square of 2 sigma^2.
-    draws : (n, 2) ndarray
-        Independent standard normal numbers.
-    """
-    u = np.asarray(directions, float)
-    first, second = transverse(u)
-    angles = np.asarray(draws, float) * sigma
-    off = angles[:, :1] * first + angles[:, 1:] * second
-    angle = np.linalg.norm(off, axis=1, keepdims=True)
-    return np.asarray(u * np.cos(angle) + off * np.sinc(angle / np.pi))
-
-
-def transverse(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across each direction, so that (first, second, direction) is right-handed.
+@njit(cache=True, nogil=True, error_model="numpy")
+def transverse_of(u):
+    """Two unit vectors across a direction, so that (first, second, direction) is right-handed.
 
     For a beam near -z the first lies near x. A smooth function of the direction but along -x
     and x, where no beam of a downward-looking instrument points.
-
-    Parameters
-    ----------
-    directions : (..., 3) ndarray
-        Unit vectors.
     """
-    u = np.ascontiguousarray(directions, float)
-    first, second = np.empty((2, *u.shape))
-    _transverse_rows(u.reshape(-1, 3), first.reshape(-1, 3), second.reshape(-1, 3))
-    return first, second
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _transverse_rows(u, first, second):
-    for i in range(u.shape[0]):
-        one, other = transverse_of((u[i, 0], u[i, 1], u[i, 2]))
-        first[i, 0], first[i, 1], first[i, 2] = one
-        second[i, 0], second[i, 1], second[i, 2] = other
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def transverse_of(u):
-    """:func:`transverse` of one direction, compiled."""
     second = cross(u, (1.0, 0.0, 0.0))
     second = (0.0, 1.0, 0.0) if _length(second) < 1e-6 else _unit(second)
     first = _unit(cross(second, u))

@@ -65,15 +65,6 @@ class LineScan:
         time = cycle / self.rate + beam * self.interval
         return Shots(time, beam, cycle, self._pointing(time, beam))
 
-    def directions(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Beam (n,) and direction (n, 3) that the scanner is set to at times t >= 0 (n,) [s].
-
-        The beam is that of the latest shot to have begun; of several at once, the last.
-        """
-        t = np.atleast_1d(np.asarray(t, float))
-        beam = (self._begun(t) - 1) % self.beams
-        return beam, self._pointing(t, beam)
-
     def across(self, t: np.ndarray) -> np.ndarray:
         """Angle of the sweep from nadir towards the left [rad]; it starts at the right."""
         lines = np.asarray(t, float) * self.line_rate

@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-
 _SMALL = 1e-4
 """Half angle [rad] under which sin(x)/x is its series, good to 1e-18 there."""
 
@@ -139,53 +137,3 @@ def from_heading(
     """
     turned = multiply(about(2, heading), about(1, -np.asarray(pitch, float)))
     return multiply(turned, about(0, roll))
-
-
-def from_axes(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Attitude whose body axes are the given right-handed orthonormal world vectors, (..., 4)."""
-    m = np.stack([x, y, z], axis=-1)
-    trace = np.einsum("...ii", m)
-    diagonal = np.einsum("...ii->...i", m)
-    # Four times the square of each component; dividing by the largest keeps all digits.
-    squares = np.concatenate([1 + trace[..., None], 1 + 2 * diagonal - trace[..., None]], axis=-1)
-    largest = np.argmax(squares, axis=-1)
-    cross = np.stack(
-        [
-            m[..., 2, 1] - m[..., 1, 2],
-            m[..., 0, 2] - m[..., 2, 0],
-            m[..., 1, 0] - m[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    q = np.empty_like(squares)
-    for i in range(4):
-        rows = largest == i
-        q[rows] = _column(m[rows], cross[rows], squares[rows], i)
-    return normalise(q)
-
-
-def _column(m: np.ndarray, cross: np.ndarray, squares: np.ndarray, i: int) -> np.ndarray:
-    """Row i of the matrix 4 q q^T, from the rotation matrix: a multiple of q."""
-    row = np.empty_like(squares)
-    row[:, i] = squares[:, i]
-    if i == 0:
-        row[:, 1:] = cross
-        return row
-    row[:, 0] = cross[:, i - 1]
-    for j in {0, 1, 2} - {i - 1}:
-        row[:, 1 + j] = m[:, i - 1, j] + m[:, j, i - 1]
-    return row
-
-
-def slerp(p: np.ndarray, q: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Rotation a fraction of the shorter way from p to q, at constant rate, (..., 4).
-
-    Parameters
-    ----------
-    p, q : (..., 4) array_like
-        Unit quaternions; q and -q are one rotation.
-    fraction : (...) array_like
-        0 at p, 1 at q.
-    """
-    step = to_rotation_vector(multiply(conjugate(p), q))
-    return multiply(p, from_rotation_vector(step * np.asarray(fraction, float)[..., None]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter
@@ -89,32 +87,3 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
     weight = gaussian_filter(there.astype(float), sigma, mode="nearest")
     smoothed = np.divide(blurred, weight, where=there, out=np.full_like(kept, np.nan))
     return Terrain(smoothed, terrain.spacing, terrain.origin)
-
-
-def smoothing_width(*, quantum: float, spacing: float, slope_error: float) -> float:
-    """Gaussian width that brings the slope error of quantised heights down to a given size [m].
-
-    Rounding to steps of `quantum` adds noise of variance quantum^2/12 to each node. A Gaussian of
-    standard deviation s turns white noise of that variance into slopes of variance
-    quantum^2/12 * dx^2 / (8 pi s^4) along each axis, which is solved for s. It holds where
-    heights change by more than a step over s, so that rounding errors are independent, and for s
-    of a grid step or more, which is what is returned at least.
-
-    Parameters
-    ----------
-    quantum : float
-        Height of one grey level [m].
-    spacing : float
-        Grid step [m].
-    slope_error : float
-        Standard deviation wanted of the slope along an axis [1], > 0.
-
-    Raises
-    ------
-    ValueError
-        For quantities that are not positive.
-    """
-    if not min(quantum, spacing, slope_error) > 0:
-        raise ValueError("quantum, grid step and slope error must be positive")
-    width = (quantum**2 / 12 * spacing**2 / (8 * math.pi * slope_error**2)) ** 0.25
-    return max(width, spacing)

@@ -53,10 +53,6 @@ class Scanner(Protocol):
         """Shots by number (n,), from 0."""
         ...
 
-    def directions(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Beam (n,) and direction (n, 3) that the scanner is set to at times t >= 0 (n,) [s]."""
-        ...
-
 
 @dataclass(frozen=True, eq=False)
 class BeamCycle:
@@ -122,14 +118,6 @@ class BeamCycle:
         cycle, place = np.divmod(np.asarray(index, np.int64), self.beams_per_cycle)
         beam = patterns[cycle % len(patterns), place]
         return Shots(cycle / self.rate + place * interval, beam, cycle, vectors[beam])
-
-    def directions(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Beam (n,) and direction (n, 3) that the scanner is set to at times t >= 0 (n,) [s].
-
-        That of the latest shot to have begun; of several at once, the last.
-        """
-        shots = self.shots(self._begun(np.atleast_1d(t)) - 1)
-        return shots.beam, shots.direction
 
 
 def shots_begun(t: np.ndarray, *, rate: float, each: int, interval: float) -> np.ndarray:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from sweep.model.geometry.facets import Facets, join
 from sweep.model.reflectance import LAWS
 
 
@@ -41,44 +37,3 @@ class Surface:
             raise ValueError(f"{self.name}: no reflectance law {self.law!r}: choose from {laws}")
         if not self.roughness >= 0:
             raise ValueError(f"{self.name}: the roughness must be at least 0 m")
-
-
-def assemble(
-    objects: Sequence[tuple[Facets, Surface | Sequence[Surface]]],
-) -> tuple[Facets, tuple[Surface, ...]]:
-    """Objects with their surfaces as one set of facets with one list of surfaces.
-
-    Parameters
-    ----------
-    objects : sequence of (Facets, Surface or sequence of Surface)
-        Facets, and the surfaces that their indices count.
-
-    Returns
-    -------
-    facets : Facets
-        All facets, relative to the first object's origin.
-    surfaces : tuple of Surface
-        What their indices count now; equal surfaces share one.
-
-    Raises
-    ------
-    ValueError
-        Where a face has no surface, or two different surfaces share a name.
-    """
-    known: dict[Surface, int] = {}
-    parts = []
-    for facets, given in objects:
-        own = (given,) if isinstance(given, Surface) else tuple(given)
-        if len(facets.surface) and not 0 <= facets.surface.min() <= facets.surface.max() < len(own):
-            raise ValueError(f"faces refer to surfaces beyond the {len(own)} given")
-        numbers = [known.setdefault(surface, len(known)) for surface in own]
-        parts.append(_renumbered(facets, numbers))
-    names = [surface.name for surface in known]
-    if len(set(names)) < len(names):
-        raise ValueError(f"two different surfaces share a name: {sorted(names)}")
-    return join(parts), tuple(known)
-
-
-def _renumbered(facets: Facets, numbers: Sequence[int]) -> Facets:
-    surface = np.asarray(numbers, np.int16)[facets.surface]
-    return Facets(facets.vertices, facets.faces, surface, facets.origin)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from effect_points import point_block, scene, tile_block
+from mean_over_draws import evaluate as mean_over_draws
 from scipy import special, stats
 from scipy.integrate import quad
 
@@ -31,7 +32,6 @@ from sweep.model.effects.turbulence import (
     structure_constant,
 )
 from sweep.model.marcum import marcum_q1
-from sweep.model.realisations import evaluate as mean_over_draws
 from sweep.model.shot import evaluate
 
 WAVENUMBER = 2 * np.pi / 1.55e-6

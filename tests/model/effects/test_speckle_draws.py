@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mean_over_draws import evaluate
 
 from sweep.model import philox, truth, window
 from sweep.model.chain import prepare
@@ -9,7 +10,7 @@ from sweep.model.effects import speckle
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.effect import Realisation
 from sweep.model.marcum import marcum_q1
-from sweep.model.realisations import evaluate, realise
+from sweep.model.realisations import realise
 from sweep.model.shot import evaluate as evaluate_without
 from sweep.model.shot import find, statistics
 

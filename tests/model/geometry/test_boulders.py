@@ -2,10 +2,10 @@ import math
 
 import numpy as np
 import pytest
+from facet_areas import areas
 from scipy import integrate
 
 from sweep.model.geometry import boulders, frequency
-from sweep.model.geometry.facets import areas
 from sweep.model.geometry.terrain import Terrain
 
 

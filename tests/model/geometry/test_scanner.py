@@ -126,18 +126,6 @@ def test_any_stretch_of_shots_is_what_it_is_in_the_whole(scan):
         np.testing.assert_array_equal(one[700:730], other)
 
 
-@pytest.mark.parametrize("scan", SCANS)
-def test_at_the_time_of_a_shot_the_scanner_points_along_it(scan):
-    shots = scan.shots(np.arange(200))
-    beam, direction = scan.directions(shots.time)
-    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-15)
-    last_of_its_time = np.append(np.diff(shots.time) > 0, False)
-    np.testing.assert_array_equal(beam[last_of_its_time], shots.beam[last_of_its_time])
-    np.testing.assert_allclose(
-        direction[last_of_its_time], shots.direction[last_of_its_time], atol=1e-15
-    )
-
-
 def test_a_million_shots_in_the_clock_has_not_drifted():
     scan = fixed(beams.corners(0.1), rate=20.0, interval=None)
     assert scan.shots(np.array([4 * 10**9])).time[0] == 10**9 / 20

@@ -2,9 +2,9 @@ import math
 
 import numpy as np
 import pytest
+from facet_areas import areas
 
 from sweep.model.geometry import trees
-from sweep.model.geometry.facets import areas
 from sweep.model.geometry.terrain import Terrain
 
 TREE = trees.Tree(variation=0.0)

@@ -1,0 +1,35 @@
+"""Statistics of shots averaged over draws, all at once."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from sweep.model.preparation import Parameters
+from sweep.model.realisations import Means, realise
+from sweep.model.shot import statistics
+
+
+def evaluate(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int,
+) -> dict[str, np.ndarray]:
+    """Statistics of n shots, means over draws of random effects.
+
+    Parameters
+    ----------
+    parameters, effects, keys, first_draw, draws
+        As of :func:`sweep.model.realisations.realise`.
+
+    Returns
+    -------
+    dict of (n,) ndarray
+        As of :meth:`sweep.model.realisations.Means.results`.
+    """
+    means = Means(len(keys))
+    for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
+        means.add(stretch.point, statistics(stretch.shots))
+    return means.results()
