@@ -15,7 +15,7 @@ from rich.progress import track
 
 from sweep.model.intervals import COUNTED, Interval, bounded_mean, half_width
 from sweep.model.marcum import marcum_q1
-from sweep.model.sampling import Promise, looks, settle
+from sweep.model.sampling import PIECE, Promise, looks, settle
 
 PAGE = Path(__file__).parents[1] / "docs" / "draws.md"
 BEGIN, END = "<!-- written by make stopping -->\n", "<!-- up to here -->\n"
@@ -71,6 +71,10 @@ class Trials:
         self._values, self._method = values, method
         self.number = np.zeros(number, np.int64)
         self.mean, self.spread = np.zeros(number), np.zeros(number)
+
+    def at_once(self, points: int) -> int:
+        """Draws of each of so many points that one `take` is for."""
+        return PIECE
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> None:
         """Draw on, a stretch of points at a time [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""

@@ -30,7 +30,7 @@ def status(store: Location) -> None:
 
     Where it draws, a table says at how many points accuracy.tolerance is met.
     """
-    from sweep.tasks.progress import duration
+    from sweep.tasks.progress import amount, duration
     from sweep.tasks.status import status as read
     from sweep.tasks.succession import beside
 
@@ -39,6 +39,7 @@ def status(store: Location) -> None:
     click.echo(f"{s.title or store}\nstudy {s.study_id}")
     click.echo(
         f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
+        f"{f', {amount(s.points_begun)} more begun' if s.points_begun else ''}"
         f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {in_bytes(s.bytes)} stored"
     )
     if s.rate:

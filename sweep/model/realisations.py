@@ -149,6 +149,14 @@ class Means:
         mean[_LOGARITHMS] = largest
         self._mean[...] = np.where(count > 0, mean, self._mean)
 
+    def sums(self) -> np.ndarray:
+        """All that draws have come to, (3 * outputs, n); :meth:`restore` goes on from there."""
+        return np.concatenate([self._count, self._mean, self._spread])
+
+    def restore(self, sums: np.ndarray) -> None:
+        """Go on from what :meth:`sums` gave before."""
+        self._count[...], self._mean[...], self._spread[...] = np.split(sums, 3)
+
     def results(self) -> dict[str, np.ndarray]:
         """The means by the names of OUTPUTS, standard errors by those of ERROR_OUTPUTS, (n,)."""
         n = self._count

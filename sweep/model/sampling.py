@@ -13,8 +13,8 @@ measures them. Looks come at the same numbers of draws for every point, and what
 depends on nothing but its own draws: other points, blocks and workers change no bit of it.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +23,15 @@ from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_co
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
 from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
 from sweep.model.preparation import Parameters
-from sweep.model.realisations import Means, certain, random_effects, realise
+from sweep.model.realisations import ROWS, Means, certain, random_effects, realise
 from sweep.model.shot import evaluate, statistics
 
 GROWTH = 1.25
 """Draws at a look over those at the one before; the last round's surplus is half of that, about."""
 PIECE = 1 << 16
-"""Draws of a point that are taken at once."""
+"""Draws of a point that are taken at once where nothing but noise is random."""
+LEAST = 16
+"""Draws of a point that are taken at once where random effects are simulated, at the least."""
 
 _COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
 
@@ -66,11 +68,19 @@ class Drawn(Protocol):
     number: np.ndarray
     """(n,) int64: draws of each so far."""
 
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> object:
-        """Draw some of the points, from draw `first` on."""
+    def at_once(self, points: int) -> int:
+        """Draws of each of so many points that one `take` is for: a few seconds at the most."""
+
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> Any:
+        """Draw some of the points, from draw `first` on; their counts, if they are wanted."""
 
     def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
         """By how much a promise is broken of some of the points; 0 where it is kept."""
+
+
+def never() -> bool:
+    """Not to stop before all is drawn."""
+    return False
 
 
 def looks(batch: int, limit: int) -> Iterator[int]:
@@ -95,6 +105,7 @@ def simulate(
     method: str,
     promise: Promise = Promise(),  # noqa: B008  # a tuple
     before: Before | None = None,
+    stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
     """Outputs, their errors, and counts over batches of draws, with all effects.
 
@@ -109,6 +120,9 @@ def simulate(
         What half-widths are held against.
     before : Before, optional
         What was drawn before, from ``first_draw`` on.
+    stop : callable
+        Asked between draws: whether to return with those taken so far. They make a `before` from
+        which another call goes on, and at least some are taken.
 
     Returns
     -------
@@ -118,12 +132,7 @@ def simulate(
         RUNNING, (n, columns).
     """
     sample = Sample(parameters, effects, keys=keys, method=method, before=before)
-    counts = before.counts.copy() if before else no_counts(len(keys), len(batch_sizes), method)
-    number, ends = sample.number.copy(), np.cumsum([0, *batch_sizes])
-    for done in np.unique(number):
-        points, batch = np.flatnonzero(number == done), np.searchsorted(ends, done, "right") - 1
-        if (rest := np.diff(ends[batch:].clip(done))).size:
-            counts[:, points, batch:] += sample.take(points, first_draw + done, rest.tolist())
+    counts = fill(sample, batch_sizes, first_draw=first_draw, before=before, stop=stop)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
@@ -137,14 +146,15 @@ def simulate_until(
     method: str,
     promise: Promise,
     before: Before | None = None,
+    stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
     """Outputs, their errors, and counts, of as many draws of each point as keep a promise.
 
     Parameters
     ----------
-    parameters, effects, keys, method, promise, before
-        As of :func:`simulate`; what was drawn before was drawn for a looser promise, or up to a
-        lower limit.
+    parameters, effects, keys, method, promise, before, stop
+        As of :func:`simulate`; what was drawn before was drawn for the same promise or a looser
+        one, or up to a lower limit.
     batch : int
         Draws of which a look comes after a whole number.
     limit : int
@@ -156,20 +166,65 @@ def simulate_until(
         As of :func:`simulate`, with all draws in one count.
     """
     sample = Sample(parameters, effects, keys=keys, method=method, before=before)
-    settle(sample, np.arange(len(keys)), looks(batch, limit), promise)
+    settle(sample, np.arange(len(keys)), looks(batch, limit), promise, stop)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
-def settle(sample: Drawn, points: np.ndarray, ends: Iterable[int], promise: Promise) -> None:
-    """Draw points until the promise is kept of each, or numbers of draws to look at end.
+def fill(
+    sample: Drawn,
+    batch_sizes: Sequence[int],
+    *,
+    first_draw: int = 0,
+    before: Before | None,
+    stop: Callable[[], bool],
+) -> np.ndarray:
+    """Draw all points as often as batches hold, or until told to stop.
+
+    Returns
+    -------
+    (names, points, batches) int64 ndarray
+        Counts, in the order of DRAW_OUTPUTS.
+    """
+    number, ends = sample.number.copy(), np.cumsum([0, *batch_sizes])
+    room = len(DRAW_OUTPUTS), number.size, len(batch_sizes)
+    counts = before.counts.copy() if before else np.zeros(room, np.int64)
+    drawn = False
+    for done in np.unique(number):
+        points = np.flatnonzero(number == done)
+        step = sample.at_once(points.size)
+        for start in range(done, ends[-1], step):
+            if drawn and stop():
+                return counts
+            last = min(start + step, ends[-1])
+            batches = slice(np.searchsorted(ends, start, "right") - 1, np.searchsorted(ends, last))
+            sizes = np.diff(ends[batches.start : batches.stop + 1].clip(start, last))
+            counts[:, points, batches] += sample.take(points, first_draw + start, sizes.tolist())
+            drawn = True
+    return counts
+
+
+def settle(
+    sample: Drawn,
+    points: np.ndarray,
+    ends: Iterable[int],
+    promise: Promise,
+    stop: Callable[[], bool] = never,
+) -> None:
+    """Draw points until the promise is kept of each, numbers to look at end, or told to stop.
 
     One that has more draws than a look is at was looked at there before, or need not be.
     """
+    drawn = False
     for last in ends:
         number = sample.number[points]
         for done in np.unique(number[number < last]):
-            for start in range(done, last, PIECE):
-                sample.take(points[number == done], start, [min(PIECE, last - start)])
+            alike = points[number == done]
+            step = sample.at_once(alike.size)
+            for start in range(done, last, step):
+                if drawn and stop():
+                    return
+                sample.take(alike, start, [min(step, last - start)])
+                drawn = True
         looked_at = number <= last
         is_open = ~looked_at
         is_open[looked_at] = sample.missed(points[looked_at], promise) > 0
@@ -204,6 +259,10 @@ class Sample:
             self.counts += before.counts.sum(axis=-1)
             if self._means is not None:
                 self._means.go_on_from(before.means)
+
+    def at_once(self, points: int) -> int:
+        """Draws of each of so many points that one `take` is for."""
+        return PIECE if self._means is None else max(LEAST, 4 * ROWS // points)
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
         """Draw some of the points, from draw `first` on.

@@ -7,7 +7,8 @@ pieces change no bit. A detector sees the draws of one point and segment togethe
 depend on the FFT size and on numbers of draws alone.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,16 +16,18 @@ from numba import njit
 
 from sweep.model.chain import prepare
 from sweep.model.intervals import COUNTED, half_width
-from sweep.model.outputs import DRAW_OUTPUTS, PROMISED
+from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.realisations import Means, random_effects, realise
-from sweep.model.sampling import Promise, looks, settle
+from sweep.model.sampling import Before, Promise, fill, looks, never, settle
 from sweep.model.shot import statistics
 from sweep.model.spectra_look import DEFAULTS, VALUES, Methods, View, counted, view_of
 from sweep.model.spectra_outputs import KEPT, WIDTHS
 
 SAMPLES = 1 << 18
 """Samples of the spectra that are held at once."""
+
+FFT_SIZE = "instrument.processing.fft_size"
 
 _COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
 
@@ -37,13 +40,16 @@ def simulate_spectra(
     batch_sizes: Sequence[int],
     promise: Promise = Promise(),  # noqa: B008  # a tuple
     methods: Methods = Methods(),  # noqa: B008  # a tuple
+    before: Before | None = None,
+    stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
     """Outputs of n points, each drawn so many times.
 
     Parameters
     ----------
-    parameters, effects, keys, batch_sizes, promise
+    parameters, effects, keys, batch_sizes, promise, before, stop
         As of :func:`sweep.model.sampling.simulate`; among the parameters those of :data:`DEFAULTS`.
+        What was drawn before was drawn by this function, and stopped.
     methods : Methods
         What the names in the parameters mean.
 
@@ -51,10 +57,10 @@ def simulate_spectra(
     -------
     dict of ndarray
         (n,) by the names of SPECTRA_OUTPUTS and ACCURACY_OUTPUTS, (n, batches) int64 by those of
-        DRAW_OUTPUTS.
+        DRAW_OUTPUTS, and (n, ...) RUNNING, what further draws are added to.
     """
-    sample = SpectraSample(parameters, effects, keys=keys, methods=methods)
-    counts = sample.take(np.arange(len(keys)), 0, batch_sizes)
+    sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
+    counts = fill(sample, batch_sizes, before=before, stop=stop)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
@@ -67,10 +73,12 @@ def simulate_spectra_until(
     limit: int,
     promise: Promise,
     methods: Methods = Methods(),  # noqa: B008  # a tuple
+    before: Before | None = None,
+    stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
     """The same with as many draws as keep a promise on pd, or ``limit``; looks by ``batch``."""
-    sample = SpectraSample(parameters, effects, keys=keys, methods=methods)
-    settle(sample, np.arange(len(keys)), looks(batch, limit), promise)
+    sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
+    settle(sample, np.arange(len(keys)), looks(batch, limit), promise, stop)
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
@@ -79,13 +87,13 @@ class SpectraSample:
 
     Parameters
     ----------
-    parameters, effects, keys, methods
+    parameters, effects, keys, methods, before
         As of :func:`simulate_spectra`.
     """
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
-        methods: Methods,
+        methods: Methods, before: Before | None,
     ) -> None:  # fmt: skip
         size = len(keys)
         self._parameters: dict[str, Any] = {**DEFAULTS, **parameters}
@@ -102,6 +110,21 @@ class SpectraSample:
             for index, shots in prepare(whole, effects):
                 self._fixed.add(index, statistics(shots))
                 self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
+        if before is not None:
+            self.number += before.number
+            self.counts += before.counts.sum(axis=-1)
+            moments, sums = np.split(before.means[RUNNING].T, [self._moments[..., 0].size])
+            self._moments[...] = moments.reshape(self._moments.shape)
+            if not self._prepared:
+                self._fixed.restore(sums)
+
+    def at_once(self, points: int) -> int:
+        """Draws of each of so many points that one `take` is for: some of :data:`SAMPLES`.
+
+        Whole ones, so that a detector sees the same draws together however they are cut.
+        """
+        sizes = np.unique(self._parameters[FFT_SIZE])
+        return max(1, 4 // points) * math.lcm(*(max(1, SAMPLES // int(n)) for n in sizes))
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
         """Draw some of the points, from draw `first` on.
@@ -193,6 +216,7 @@ class SpectraSample:
             "n_draws": self.number,
             **dict(zip(WIDTHS, self._widths(points, promise)[_WIDTH_ORDER], strict=True)),
             "accuracy_missed": self.missed(points, promise),
+            RUNNING: np.concatenate([*self._moments, self._fixed.sums()]).T,
         }
 
 

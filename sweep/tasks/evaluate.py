@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
 from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.study import Found, Known, Results
+from sweep.tasks.study import NONE_FOUND, Found, Known, Results, Stop, Unfinished, together
 
 if TYPE_CHECKING:
-    from sweep.model.sampling import Before, Promise
+    from sweep.model.sampling import Before
     from sweep.spec import Spec
 
 #: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
@@ -37,6 +37,8 @@ def evaluate_block(
     block: int,
     called: Called,
     known: Known = Known(),  # noqa: B008
+    begun: Known = Known(),  # noqa: B008
+    stop: Stop | None = None,
 ) -> Results:
     """Results of one block.
 
@@ -50,31 +52,62 @@ def evaluate_block(
         What is simulated at each of its points, in C order over it.
     known
         What need not be computed: whole points, or their first draws.
+    begun
+        What there is of the block itself, from one that was stopped.
+    stop
+        When to stop, with at least some draws taken; by default never.
 
     Returns
     -------
     dict of ndarray
         Each output of the model with the block's extent as its shape, and what was simulated;
         counts of draws with a last dimension over batches, where the study draws a fixed number.
+
+    Raises
+    ------
+    Unfinished
+        Where it was stopped; the next call goes on, to the same bits.
     """
+    from sweep.model.outputs import RUNNING
+
     extent, size = grid.extent(block), grid.block_size(block)
     results: Results = {EFFECTS: called.flags, ERROR: called.error}
-    for points, found in (known.done, *_computed(spec, grid, block, called, known)):
+    computed = _computed(spec, grid, block, called, known, begun, stop or Stop())
+    for points, found in (known.done, begun.done, *computed):
         for name, values in found.items():
             room = (size, *values.shape[1:])
             results.setdefault(name, np.empty(room, values.dtype))[points] = values
+    if spec.draws.whole_spectra:
+        results.pop(RUNNING, None)  # of use to a block that is begun
     return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
 
-def _computed(spec: Spec, grid: Grid, block: int, called: Called, known: Known) -> Iterator[Found]:
+def _computed(
+    spec: Spec, grid: Grid, block: int, called: Called, known: Known, begun: Known, stop: Stop
+) -> Iterator[Found]:
     """Outputs of a block's points that are not done, those together that call for the same."""
     parameters, order = grid.parameters(block), grid.geometry_order(block)
-    order = order[~np.isin(order, known.done.points)]
+    order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
+    done = [begun.done]
     for members, effects in called.some(order).groups():
         for points in np.split(order[members], range(_step(spec), len(members), _step(spec))):
-            before = drawn_before(spec, known.begun, points)
+            if len(done) > 1 and stop():
+                raise _unfinished(spec, done, NONE_FOUND)
+            ours = np.isin(points, begun.begun.points).any()
+            before = drawn_before(spec, (begun if ours else known).begun, points)
             some = select(parameters, points)
-            yield Found(points, evaluate_points(spec, some, len(points), effects, before))
+            results = evaluate_points(spec, some, len(points), effects, before, stop)
+            if stop.told:
+                raise _unfinished(spec, done, Found(points, results))
+            done.append(Found(points, results))
+            yield done[-1]
+
+
+def _unfinished(spec: Spec, done: list[Found], begun: Found) -> Unfinished:
+    known = Known(together([each for each in done if each.points.size]), begun)
+    draws = begun.results["n_draws"].sum() if begun.points.size else 0
+    part = float(draws) / max(spec.draws.number, spec.draws.limit, 1)
+    return Unfinished(known, known.done.points.size + part)
 
 
 def evaluate_points(
@@ -83,6 +116,7 @@ def evaluate_points(
     count: int,
     effects: Collection[str],
     before: Before | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
@@ -95,8 +129,9 @@ def evaluate_points(
     effects
         Names of the effects that are simulated in all of them. Outputs are means over the
         study's draws where random ones are among them.
-    before
-        Draws that there are already.
+    before, stop
+        Draws that there are already; when to return with those that there are then, by default
+        with all.
 
     Raises
     ------
@@ -104,7 +139,7 @@ def evaluate_points(
         An effect is random and the study has no draws.
     """
     if spec.draws.any:
-        return _drawn(spec, parameters, count, effects, before)
+        return _drawn(spec, parameters, count, effects, before, stop)
     from sweep.model.realisations import random_effects
     from sweep.model.shot import evaluate
 
@@ -171,25 +206,28 @@ def _drawn(
     count: int,
     effects: Collection[str],
     before: Before | None,
+    stop: Callable[[], bool] | None,
 ) -> Results:
-    from sweep.model.sampling import Promise, simulate, simulate_until
+    from sweep.model.sampling import Promise, never, simulate, simulate_until
+    from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
+    from sweep.tasks.user_code import methods
 
-    keys = draw_keys(spec, parameters, count)
     draws, tolerance = spec.draws, parameters["accuracy.tolerance"]
     promise = Promise(tolerance, parameters["accuracy.confidence"], draws.interval)  # type: ignore[arg-type]
-    if draws.whole_spectra:
-        return _in_spectra(spec, parameters, effects, keys, promise)
+    given: dict[str, Any] = {
+        "keys": draw_keys(spec, parameters, count), "promise": promise, "before": before,
+        "stop": stop or never,
+    }  # fmt: skip
     if draws.adaptive:
-        found = simulate_until(
-            parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit,
-            method=draws.method, promise=promise, before=before,
-        )  # fmt: skip
+        given |= {"batch": draws.batch, "limit": draws.limit}
     else:
-        found = simulate(
-            parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), method=draws.method,
-            promise=promise, before=before,
-        )  # fmt: skip
-    return no_sums(spec, count) | found
+        given |= {"batch_sizes": batch_sizes(spec)}
+    draw: Callable[..., Results]
+    if draws.whole_spectra:
+        draw = simulate_spectra_until if draws.adaptive else simulate_spectra
+        return draw(parameters, effects, methods=methods(parameters), **given)
+    draw = simulate_until if draws.adaptive else simulate
+    return no_sums(spec, count) | draw(parameters, effects, method=draws.method, **given)
 
 
 def no_sums(spec: Spec, count: int) -> Results:
@@ -197,30 +235,8 @@ def no_sums(spec: Spec, count: int) -> Results:
     from sweep.model.outputs import RUNNING
     from sweep.model.realisations import RUNNING_COLUMNS
 
-    return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if spec.has_random_effects else {}
-
-
-def _in_spectra(
-    spec: Spec,
-    parameters: Mapping[str, Value],
-    effects: Collection[str],
-    keys: np.ndarray,
-    promise: Promise,
-) -> Results:
-    """Results of whole spectra, looked at by detectors and estimators."""
-    from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
-    from sweep.tasks.user_code import methods
-
-    draws, known = spec.draws, methods(parameters)
-    if draws.adaptive:
-        return simulate_spectra_until(
-            parameters, effects, keys=keys, batch=draws.batch, limit=draws.limit, promise=promise,
-            methods=known,
-        )  # fmt: skip
-    return simulate_spectra(
-        parameters, effects, keys=keys, batch_sizes=batch_sizes(spec), promise=promise,
-        methods=known,
-    )  # fmt: skip
+    some = spec.has_random_effects and not spec.draws.whole_spectra
+    return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}
 
 
 def with_few_draws(spec: Spec, most: int) -> Spec:

@@ -12,7 +12,7 @@ from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
 from sweep.tasks.earlier import Earlier
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
-from sweep.tasks.study import ArrayLayout, Known, Results
+from sweep.tasks.study import ArrayLayout, Known, Results, Stop
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
@@ -169,11 +169,16 @@ class GridStudy:
             name: blocks[..., None] if name in self._further else blocks for name in self._names
         }
 
-    def evaluate(self, block: int) -> Results:
-        """Outputs of a block."""
+    def evaluate(
+        self,
+        block: int,
+        begun: Known = Known(),  # noqa: B008
+        stop: Stop | None = None,
+    ) -> Results:
+        """Outputs of a block; `begun` and `stop` are those of :func:`evaluate_block`."""
         called = self.calling.of_block(block)
         known = self.earlier.known(block, called) if self.earlier else Known()
-        return evaluate_block(self.spec, self.grid, block, called, known)
+        return evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
 
     def compile(self) -> None:
         """Compile the model's kernels."""

@@ -28,11 +28,11 @@ LATE = 2.0
 class Progress(Protocol):
     """What a run tells of itself while it goes on."""
 
-    def begin(self, *, points: int, done: int, unit: str) -> None:
-        """The run begins, with so many points of the study done already."""
+    def begin(self, *, points: int, done: float, unit: str) -> None:
+        """The run begins, with so many points of the study done already, some in part."""
 
-    def advance(self, *, points: int, failed: int) -> None:
-        """Points that were committed and blocks that were given up; both 0 as time passes."""
+    def advance(self, *, points: float, failed: int) -> None:
+        """Points that were computed and blocks that were given up; both 0 as time passes."""
 
     def at_work(self, *, workers: int, stored: int) -> None:
         """Workers that there are, and bytes that are stored; told before `advance`."""
@@ -96,10 +96,10 @@ def working(what: str, told: Progress | None = None) -> Iterator[None]:
 class Silent:
     """No progress shown."""
 
-    def begin(self, *, points: int, done: int, unit: str) -> None:
+    def begin(self, *, points: int, done: float, unit: str) -> None:
         """Nothing."""
 
-    def advance(self, *, points: int, failed: int) -> None:
+    def advance(self, *, points: float, failed: int) -> None:
         """Nothing."""
 
     def at_work(self, *, workers: int, stored: int) -> None:
@@ -123,16 +123,16 @@ class Late:
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
-        self._total, self._done, self._unit = 0, 0, "points"
+        self._total, self._done, self._unit = 0, 0.0, "points"
         self._begun = time.monotonic()
         self._showing = False
 
-    def begin(self, *, points: int, done: int, unit: str) -> None:
+    def begin(self, *, points: int, done: float, unit: str) -> None:
         """The run begins, unseen."""
         self._total, self._done, self._unit = points, done, unit
         self._begun, self._showing = time.monotonic(), False
 
-    def advance(self, *, points: int, failed: int) -> None:
+    def advance(self, *, points: float, failed: int) -> None:
         """Shown from the first time that it is late."""
         self._done += points
         if self._showing:
@@ -167,17 +167,18 @@ class Lines:
 
     def __init__(self, every: float = LINE_EVERY) -> None:
         self._every = every
-        self._points = self._done = self._before = self._failed = 0
+        self._points, self._failed = 0, 0
+        self._done = self._before = 0.0
         self._unit, self._work = "points", ""
         self._begun = self._said = time.monotonic()
 
-    def begin(self, *, points: int, done: int, unit: str) -> None:
+    def begin(self, *, points: int, done: float, unit: str) -> None:
         """First line."""
         self._points, self._done, self._before, self._unit = points, done, done, unit
         self._begun = time.monotonic()
         self._line()
 
-    def advance(self, *, points: int, failed: int) -> None:
+    def advance(self, *, points: float, failed: int) -> None:
         """Another line where it is time for one."""
         self._done += points
         self._failed += failed
@@ -199,9 +200,9 @@ class Lines:
     def _line(self) -> None:
         self._said = time.monotonic()
         rate = (self._done - self._before) / max(self._said - self._begun, 1e-9)
-        parts = [f"{self._done:,} of {self._points:,} {self._unit}"]
+        parts = [f"{amount(self._done)} of {self._points:,} {self._unit}"]
         if rate > 0:
-            parts.append(f"{rate:,.0f} {self._unit}/s")
+            parts.append(f"{amount(rate)} {self._unit}/s")
             if self._done < self._points:
                 parts.append(f"{duration((self._points - self._done) / rate)} left")
         if self._work:
@@ -227,7 +228,7 @@ class Bar:
         work = [words("{task.fields[work]}")] if self.console.width >= BROAD else []
         self._bar = Progress(
             BarColumn(bar_width=min(40, max(self.console.width - BROAD, 8))),
-            words("{task.completed:,.0f} of {task.total:,.0f} {task.description}"),
+            words("{task.fields[done]} of {task.total:,.0f} {task.description}"),
             words("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
             *work,
@@ -236,30 +237,39 @@ class Bar:
             refresh_per_second=REFRESHES,
         )
         self._task: TaskID | None = None
-        self._points = self._failed = 0
+        self._done = self._points = 0.0
+        self._failed = 0
         self._unit = "points"
         self._begun = time.monotonic()
 
-    def begin(self, *, points: int, done: int, unit: str) -> None:
+    def begin(self, *, points: int, done: float, unit: str) -> None:
         """The bar appears."""
         self._begun = time.monotonic()
-        self._unit, self._points = unit, 0
+        self._unit, self._points, self._done = unit, 0.0, done
         self._task = self._bar.add_task(
-            unit, total=points, completed=done, rate="", work="", failures=""
+            unit,
+            total=points,
+            completed=int(done),
+            done=amount(done),
+            rate="",
+            work="",
+            failures="",
         )
         self._bar.start()
 
-    def advance(self, *, points: int, failed: int) -> None:
+    def advance(self, *, points: float, failed: int) -> None:
         """The bar moves."""
         self._points += points
+        self._done += points
         self._failed += failed
         if self._task is None or not (points or failed):
             return
         rate = self._points / max(time.monotonic() - self._begun, 1e-9)
         failures = f"{self._failed} blocks failed" if self._failed else ""
         self._bar.update(
-            self._task, advance=points, rate=f"{rate:,.0f} {self._unit}/s", failures=failures
-        )
+            self._task, completed=self._done, done=amount(self._done),
+            rate=f"{amount(rate)} {self._unit}/s", failures=failures,
+        )  # fmt: skip
 
     def at_work(self, *, workers: int, stored: int) -> None:
         """Shown beside the rate."""
@@ -281,6 +291,13 @@ def at_work(workers: int, stored: int) -> str:
 
     count = f"{workers:,} worker{'' if workers == 1 else 's'}"
     return f"{count}, {decimal(stored)} stored"
+
+
+def amount(points: float) -> str:
+    """Points in words: `4,500`, or `0.31` where one is drawn in part; a low rate in two digits."""
+    if points >= 10 or abs(points - round(points)) < 1e-6:
+        return f"{points:,.0f}"
+    return f"{points:.2g}"
 
 
 def duration(seconds: float) -> str:

@@ -24,7 +24,7 @@ from sweep.tasks.evaluate import no_sums
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.matching import Matching
 from sweep.tasks.older_blocks import DAMAGED, OlderBlocks
-from sweep.tasks.study import NONE_FOUND, Found, Known, Results
+from sweep.tasks.study import Found, Known, Results, together
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec
@@ -77,12 +77,9 @@ class OlderStore:
 
     def _together(self, found: list[Found]) -> Found:
         """Outputs found in several blocks, as the larger study has them."""
-        if not found:
-            return NONE_FOUND
-        points = np.concatenate([each.points for each in found])
-        outputs = found[0].results.keys() - {EFFECTS, ERROR}
-        results = {name: np.concatenate([each.results[name] for each in found]) for name in outputs}
-        return Found(points, no_sums(self._study.spec, points.size) | results)
+        points, results = together(found)
+        outputs = {name: v for name, v in results.items() if name not in (EFFECTS, ERROR)}
+        return Found(points, no_sums(self._study.spec, points.size) | outputs)
 
     def count(self, block: int) -> int:
         """Points of a block of which `known` would tell, if nothing is damaged."""

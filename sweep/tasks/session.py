@@ -17,7 +17,7 @@ import numpy as np
 from sweep.storage.locations import Location
 from sweep.storage.objects import ObjectStoreError
 from sweep.storage.receipts import read_receipts
-from sweep.tasks import store, versions
+from sweep.tasks import begun, store, versions
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.journal import Failure, Journal, Receipt, given_up
@@ -48,6 +48,12 @@ LOOKING = 2.0
 
 #: Seconds without any worker after which that is said.
 ABSENT = 20.0
+
+
+NOT_FOUND = (
+    "block {} is computed in pieces, and what one worker saved was not found by the next: "
+    "do all of them see the same store?"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +163,7 @@ class Session:
         self._retry_failed = retry_failed
         self._tally, self._stored = Tally(), 0
         self._gathered: list[Receipt] = []  # committed as soon as the journal has written them
+        self._begun: dict[int, float] = {}  # points there are of unfinished blocks
 
     def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
         """Compute all that is left, or as much as can be.
@@ -168,7 +175,8 @@ class Session:
         rays
             Rays that were cast for it.
         """
-        begun = time.monotonic()
+        start = time.monotonic()
+        self._begun = begun.begun_points(self._path, self._study.id)
         receipts = read_receipts(self._path, self._study.n_blocks)
         self._stored = int(receipts.sizes.sum())
         look = Look(self._path, self._study, receipts.points > 0)
@@ -184,9 +192,10 @@ class Session:
             done &= look.whole()
         finally:
             look.stop()
-        outcome = self._outcome(done, left_out, stopped, time.monotonic() - begun, rays or {})
+        outcome = self._outcome(done, left_out, stopped, time.monotonic() - start, rays or {})
         if outcome.complete:
             store.remove_partials(self._path)
+            begun.discard_all(self._path)
         self._record(
             "ended", blocks=outcome.blocks_computed, failed=len(outcome.failures), stopped=stopped
         )
@@ -257,7 +266,9 @@ class Session:
                     while compiling.is_alive() and not self._interrupts.stopping:
                         compiling.join(TICK)
                 self._progress.begin(
-                    points=self._study.points, done=points_before, unit=self._study.unit
+                    points=self._study.points,
+                    done=points_before + sum(self._begun.values()),
+                    unit=self._study.unit,
                 )
                 stack.callback(self._progress.end)
                 return self._take(answers, todo)
@@ -294,21 +305,25 @@ class Session:
                 told = True
             if not self._tally.blocks and len(self._tally.failures) >= HOPELESS:
                 return f"the first {HOPELESS} blocks all failed"
-        before = self._tally.points
+        before = self._points()
         self._count(now=True)
-        self._progress.advance(points=self._tally.points - before, failed=0)
+        self._progress.advance(points=self._points() - before, failed=0)
         return "interrupted" if interrupts.stopping else ""
 
     def _commit(self, answer: Answer, todo: Todo) -> None:
-        before = self._tally.points, len(self._tally.failures)
+        before = self._points(), len(self._tally.failures)
         self._journal.commit(*answer.receipts)
         self._gathered += answer.receipts
         for failure in answer.failures:
             self._fail(failure, todo)
+        for block, points in answer.begun.items():
+            if points <= self._begun.get(block, 0.0):
+                raise StoreError(NOT_FOUND.format(block))
+            self._begun[block] = points
         self._count()
         self._progress.at_work(workers=answer.workers, stored=self._stored + self._tally.bytes)
         self._progress.advance(
-            points=self._tally.points - before[0], failed=len(self._tally.failures) - before[1]
+            points=self._points() - before[0], failed=len(self._tally.failures) - before[1]
         )
 
     def _is_seen(self, receipt: Receipt, read: bool) -> bool:
@@ -321,7 +336,13 @@ class Session:
         if self._journal.flush(now=now):
             for receipt in self._gathered:
                 self._tally.add(receipt)
+                if self._begun.pop(receipt.block, None) is not None:
+                    begun.discard(self._path, receipt.block)
             self._gathered.clear()
+
+    def _points(self) -> float:
+        """Points that there are so far of this run's blocks."""
+        return self._tally.points + sum(self._begun.values())
 
     def _fail(self, failure: Failure, todo: Todo) -> None:
         if not todo.again(failure.block):

@@ -8,6 +8,7 @@ from typing import Any
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.receipts import read_receipts
 from sweep.tasks import journal, lock, studies
+from sweep.tasks.begun import begun_points
 from sweep.tasks.grid_study import GridStudy
 
 
@@ -23,6 +24,7 @@ class Status:
     points_done: int
     blocks: int
     blocks_done: int
+    points_begun: float  # drawn in part, in blocks that take long
     failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
     holder: lock.Holder | None  # who writes to it
     holder_lives: bool
@@ -68,6 +70,7 @@ def status(store: str | Location) -> Status:
         points_done=points,
         blocks=study.n_blocks,
         blocks_done=receipts.blocks,
+        points_begun=sum(begun_points(path, study.id).values()),
         failures=journal.given_up(path, study.n_blocks),
         holder=holder,
         holder_lives=holder is not None and lock.is_live(path, holder),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -30,6 +31,40 @@ class Known(NamedTuple):
     """Points that need not be computed."""
     begun: Found = NONE_FOUND
     """Points that were drawn less often."""
+
+
+def together(found: Sequence[Found]) -> Found:
+    """Results of several parts of a block as one; the names are those of the first."""
+    if not found:
+        return NONE_FOUND
+    names = found[0].results
+    return Found(
+        np.concatenate([each.points for each in found]),
+        {name: np.concatenate([each.results[name] for each in found]) for name in names},
+    )
+
+
+@dataclass
+class Stop:
+    """Time that a piece of a block's work may take: asked between draws whether it is over."""
+
+    at: float = float("inf")
+    """By `time.monotonic`."""
+    told: bool = False
+    """Whether it was over when asked."""
+
+    def __call__(self) -> bool:
+        """Whether the time is over."""
+        self.told = self.told or time.monotonic() >= self.at
+        return self.told
+
+
+class Unfinished(Exception):
+    """A block was stopped: what there is of it, and to how many points that comes."""
+
+    def __init__(self, known: Known, points: float) -> None:
+        super().__init__()
+        self.known, self.points = known, points
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,8 +74,8 @@ def _raise_in(thread: int, error: type[BaseException] | None) -> None:
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), raised)
 
 
-def limited(work: Callable[[], T], seconds: float | None) -> T:
-    """Do some work, for no longer than some seconds; None sets no limit.
+def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) -> T:
+    """Do some work, for no longer than some seconds less those spent before; None sets no limit.
 
     Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
     later ends itself; a process that computes on its own account waits for it to return.
@@ -87,7 +87,7 @@ def limited(work: Callable[[], T], seconds: float | None) -> T:
     """
     if seconds is None:
         return work()
-    alarm = _Alarm(seconds, deadly=_is_worker_process())
+    alarm = _Alarm(max(seconds - spent, 0.0), deadly=_is_worker_process())
     where: _Interruption | None = None
     # No context manager: an interruption on the way into its exit would go past it.
     try:

@@ -52,7 +52,7 @@ class Todo:
         return True
 
     def put_back(self, blocks: list[int]) -> None:
-        """Put blocks back whose answer was lost, by no fault of theirs."""
+        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun."""
         self._returned.extend(blocks)
 
     @property

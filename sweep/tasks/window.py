@@ -70,6 +70,7 @@ def plain(job: Job, todo: Todo, stopping: Callable[[], bool], seen: Seen) -> Ite
         answer = work(job.path, job.study_id, blocks, job.terms)
         if not all(seen(receipt, False) for receipt in answer.receipts):
             answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in blocks])
+        todo.put_back(list(answer.begun))
         yield answer
         if answer.unfit is not None:
             raise answer.unfit
@@ -320,9 +321,9 @@ class Window:
         self._heard[answer.worker] = time.monotonic()
         self._pace.learn(answer)
         self._failed_at.update((failure.block, answer.worker) for failure in answer.failures)
+        done = {r.block for r in answer.receipts} | {f.block for f in answer.failures}
+        self._put_back([block for block in task.blocks if block not in done])
         if answer.unfit is not None:
-            done = {r.block for r in answer.receipts} | {f.block for f in answer.failures}
-            self._put_back([block for block in task.blocks if block not in done])
             self._leave_out(answer.worker, answer.host, answer.unfit)
         return answer
 
@@ -340,11 +341,10 @@ class Window:
             return _failed(future.exception(), blocks)
         if future.status == "cancelled":
             raise SchedulerLost("its tasks were cancelled")
-        self._put_back(blocks)  # the worker died between its answer and our asking for it
-        return Answer()
+        return Answer()  # the worker died between its answer and our asking for it
 
     def _put_back(self, blocks: list[int]) -> None:
-        """Put blocks back that are to be sent again, by no fault of theirs."""
+        """Put blocks back that are begun, or to be sent again by no fault of theirs."""
         self._todo.put_back(blocks)
         self._copies.update(blocks)
 

@@ -8,15 +8,18 @@ import socket
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 from sweep.storage.locations import located
-from sweep.tasks import store, versions
+from sweep.tasks import begun, store, versions
+from sweep.tasks.begun import Begun
 from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Failure, Receipt
-from sweep.tasks.study import Evaluate, Study
+from sweep.tasks.study import Evaluate, Results, Stop, Study, Unfinished
 from sweep.tasks.time_limit import limited, worker_address
 
 #: Errors of the place that results go to: every further block would meet them too.
@@ -24,6 +27,10 @@ STORAGE_ERRORS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
     errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
+
+#: Seconds after which draws are saved, and their block put back for another task: what is lost
+#: where a worker dies, and waited for after Ctrl-C.
+PIECE_SECONDS = 10.0
 
 #: Studies that a worker holds open at once.
 STUDIES_OPEN = 4
@@ -35,6 +42,7 @@ class Answer:
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
+    begun: dict[int, float] = field(default_factory=dict)  # points there are of unfinished blocks
     worker: str = ""  # address of the one that computed them, where there is one
     host: str = ""  # its machine
     unfit: Exception | None = None  # why that worker can't compute any
@@ -128,6 +136,8 @@ class Terms:
 def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
     """Evaluate and write blocks, each on its own: one that raises does not stop the next.
 
+    Of one that takes long a piece is computed, and saved for the next task.
+
     Parameters
     ----------
     path, study_id
@@ -151,28 +161,46 @@ def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
 
 
 def _work(answer: Answer, opened: Opened, blocks: list[int], terms: Terms) -> None:
-    written = []
+    written, stop_at = [], time.monotonic() + PIECE_SECONDS
     for block in blocks:
         try:
-            written.append(_one(opened, block, terms))
+            found = _one(opened, block, terms, Stop(stop_at))
+            if isinstance(found, Receipt):
+                written.append(found)
+            else:
+                answer.begun[block] = found
         except StoreError:
             raise
         except Exception as error:
             if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
                 raise
             answer.failures.append(failure(block, error))
-    if terms.durable and written:
+    if terms.durable and (written or answer.begun):
         store.sync(opened.arrays.path)
     answer.receipts = written
 
 
-def _one(opened: Opened, block: int, terms: Terms) -> Receipt:
-    held = opened.study
-    begun = time.perf_counter()
-    evaluate = partial(terms.evaluate, held) if terms.evaluate else held.evaluate
-    results = limited(partial(evaluate, block), terms.seconds)
+def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | float:
+    """Receipt of a block, or the points that there are of it."""
+    held, path, before = opened.study, opened.arrays.path, Begun()
+    start = time.perf_counter()
+    evaluate: Callable[[], Results]
+    if terms.evaluate:
+        evaluate = partial(terms.evaluate, held, block)
+    elif isinstance(held, GridStudy) and held.spec.draws.any:
+        before = begun.read(path, held.id, block)
+        evaluate = partial(held.evaluate, block, before.known, stop)
+    else:
+        evaluate = partial(held.evaluate, block)
+    try:
+        results = limited(evaluate, terms.seconds, before.seconds)
+    except Unfinished as unfinished:
+        _refuse_another(str(path), held.id)
+        spent = before.seconds + time.perf_counter() - start
+        begun.write(path, held.id, block, Begun(unfinished.known, unfinished.points, spent))
+        return unfinished.points
     evaluated = time.perf_counter()
-    _refuse_another(str(opened.arrays.path), held.id)  # its driver may be long dead
+    _refuse_another(str(path), held.id)  # its driver may be long dead
     written = opened.arrays.write(block, results)
     ended = time.perf_counter()
     return Receipt(
@@ -180,7 +208,7 @@ def _one(opened: Opened, block: int, terms: Terms) -> Receipt:
         points=held.block_size(block),
         bytes=written.bytes,
         digest=written.digest,
-        seconds=round(ended - begun, 6),
+        seconds=round(before.seconds + ended - start, 6),
         write_seconds=round(ended - evaluated, 6),
         host=socket.gethostname(),
         pid=os.getpid(),

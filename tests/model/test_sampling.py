@@ -175,6 +175,9 @@ class Coins:
         self.pd, self.method, self.random = pd, method, np.random.default_rng(2)
         self.hits, self.number = np.zeros((2, number), np.int64)
 
+    def at_once(self, points):
+        return sampling.PIECE
+
     def take(self, points, first, batch_sizes):
         assert (self.number[points] == first).all()
         self.hits[points] += self.random.binomial(sum(batch_sizes), self.pd, points.size)

@@ -1,0 +1,273 @@
+"""Blocks whose draws take long: computed in pieces, stopped, killed and gone on with."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from small import STUDY, quiet, receipts, small, tree
+
+from sweep.model import sampling, spectra_sampling
+from sweep.tasks import begun, worker
+from sweep.tasks.begun import Begun
+from sweep.tasks.driver import extend, resume, run
+from sweep.tasks.errors import StoreError
+from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.packing import pack
+from sweep.tasks.progress import Lines, Silent
+from sweep.tasks.status import status
+from sweep.tasks.verify import verify
+
+QUICK = {**STUDY["instrument"], "laser": {**STUDY["instrument"]["laser"], "power": "0.1 W"}}
+QUICK["processing"] = {**QUICK["processing"], "fft_size": "2^11", "tnr": 6}
+
+KINDS = {
+    "fixed": {"number": 500, "batch": 70},
+    "noise alone": {"number": 500, "batch": 200, "method": "noise"},
+    "adaptive": {"limit": 700, "batch": 60},
+    "spectra": {"number": 90, "batch": 40, "method": "spectra"},
+    "adaptive spectra": {"limit": 90, "batch": 25, "method": "spectra"},
+}
+
+
+def drawn(kind="fixed", ranges=("2 km",), **draws):
+    """Points that are drawn; their ground is rough but where noise alone is to be random."""
+    rough = {**STUDY["target"], "roughness": "10 um", "reflectance": 0.2}
+    return small(
+        instrument=QUICK, target=STUDY["target"] if kind == "noise alone" else rough,
+        draws=KINDS[kind] | draws, accuracy={"tolerance": 0.03}, storage={},
+        axes={"target.range": list(ranges)},
+    )  # fmt: skip
+
+
+def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
+    """Take so few draws at once; by default save them each time, as though they had taken long."""
+    assign(sampling, "PIECE", piece)
+    assign(sampling, "ROWS", rows)
+    assign(spectra_sampling, "SAMPLES", samples)
+    assign(worker, "PIECE_SECONDS", seconds)
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """Points of a block that were saved, piece by piece."""
+    points, real = [], begun.write
+
+    def write(path, study_id, block, found):
+        points.append(found.points)
+        real(path, study_id, block, found)
+
+    monkeypatch.setattr(begun, "write", write)
+    cut(monkeypatch.setattr)
+    return points
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Stores computed in one piece, by what is drawn."""
+    stores = {}
+
+    def made(kind, ranges=("2 km",)):
+        if (kind, ranges) not in stores:
+            store = tmp_path_factory.mktemp("whole") / "whole.zarr"
+            with pytest.MonkeyPatch.context() as context:
+                cut(context.setattr, piece=1 << 16, rows=4096, samples=1 << 18, seconds=600.0)
+                context.setattr(begun, "write", None)  # short blocks are never saved
+                assert quiet(drawn(kind, ranges), store).complete
+            stores[kind, ranges] = tree(store)
+        return stores[kind, ranges]
+
+    return made
+
+
+class Told(Silent):
+    """Notes how far a run is, and does something then."""
+
+    def __init__(self, then=lambda told: None):
+        self.points, self.then = [], then
+
+    def begin(self, *, points, done, unit):
+        self.points.append(done)
+
+    def advance(self, *, points, failed):
+        if points:
+            self.points.append(self.points[-1] + points)
+            self.then(self)
+
+
+def interrupted(spec, store, pieces=2):
+    """A run that is told to stop, once, as soon as some pieces of a block are there."""
+    told = Told(lambda told: len(told.points) == 1 + pieces and os.kill(os.getpid(), signal.SIGINT))
+    outcome = run(spec, store=store, scheduler="none", progress=told)
+    assert outcome.stopped == "interrupted" and not outcome.complete
+    return told
+
+
+def left(store):
+    """Names of what is saved of blocks that are begun."""
+    return sorted(file.name for file in (store / ".sweep").glob("begun*"))
+
+
+@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize("kind", KINDS)
+def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
+    told, store = Told(), tmp_path / "pieces.zarr"
+    assert run(drawn(kind), store=store, progress=told, **place).complete
+    assert tree(store) == whole(kind)
+    assert len(saved) >= 3 and saved == sorted(set(saved)) and 0 < saved[0] < saved[-1] < 1
+    assert told.points == [0, *saved, 1] and receipts(store) == [0] and left(store) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_block_of_several_points_is_stopped_at_any_of_them(
+    kind, whole, saved, tmp_path, monkeypatch
+):
+    ranges = ("100 m", "1 km", "2 km", "6 km")
+    expected = whole(kind, ranges)
+    monkeypatch.setattr("sweep.tasks.evaluate.SUB_BATCH", 2)
+    assert quiet(drawn(kind, ranges), tmp_path / "pieces.zarr").complete
+    assert tree(tmp_path / "pieces.zarr") == expected
+    assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)
+
+
+def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(whole, saved, tmp_path):
+    store = tmp_path / "stopped.zarr"
+    interrupted(drawn(), store)
+    assert len(saved) == 2 and left(store) == ["begun-0"] and receipts(store) == []
+    assert status(store).points_begun == saved[-1] and status(store).points_done == 0
+    assert verify(store)[0].sound and not verify(store)[0].complete
+    with pytest.raises(StoreError, match="lacks 1 block"):
+        pack(store, tmp_path / "packed.zarr")
+    told = Told()
+    assert resume(store, scheduler="none", progress=told).complete
+    assert told.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
+    assert tree(store) == whole("fixed") and left(store) == []
+    assert status(store).points_begun == 0
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from test_begun import cut, drawn, quiet
+from sweep.tasks import begun
+
+def write(path, study_id, block, found, real=begun.write):
+    real(path, study_id, block, found)
+    if found.points > 0.5:
+        os.kill(os.getpid(), 9)
+
+begun.write = write
+cut()
+quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["fixed", "spectra"])
+def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
+    kind, whole, saved, tmp_path, monkeypatch
+):
+    store = tmp_path / "killed.zarr"
+    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(store), kind], env={**os.environ, "PYTHONPATH": here}
+    )
+    assert killed.returncode == -signal.SIGKILL and left(store) == ["begun-0"]
+    before = status(store).points_begun * drawn(kind).draws.number
+    monkeypatch.setattr(GridStudy, "compile", lambda study: None)  # it draws once
+    taken = []
+    for sample in (sampling.Sample, spectra_sampling.SpectraSample):
+
+        def take(self, points, first, batch_sizes, real=sample.take):
+            taken.append((first, sum(batch_sizes)))
+            return real(self, points, first, batch_sizes)
+
+        monkeypatch.setattr(sample, "take", take)
+    assert quiet_resume(store).complete
+    assert taken[0][0] == before > 0
+    assert sum(number for _, number in taken) == drawn(kind).draws.number - before
+    assert tree(store) == whole(kind) and left(store) == []
+
+
+def quiet_resume(store, **changes):
+    return resume(store, scheduler="none", progress=False, **changes)
+
+
+def flipped(file):
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def cut_short(file):
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def emptied(file):
+    file.write_bytes(b"")
+
+
+def anothers(file):
+    """What is saved of the same block of another study."""
+    interrupted(drawn(number=600), file.parents[2] / "other.zarr")
+    file.write_bytes((file.parents[2] / "other.zarr" / ".sweep" / file.name).read_bytes())
+
+
+@pytest.mark.parametrize("damage", [flipped, cut_short, emptied, anothers])
+def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved, tmp_path):
+    store = tmp_path / "damaged.zarr"
+    interrupted(drawn(), store)
+    damage(store / ".sweep" / "begun-0")
+    assert status(store).points_begun == 0
+    saved.clear()
+    assert quiet_resume(store).complete
+    assert saved[0] < 0.5 and tree(store) == whole("fixed") and left(store) == []
+
+
+def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
+    store = tmp_path / "extended.zarr"
+    assert quiet(drawn(number=170), store).complete
+    saved.clear()
+    changes = {"draws.number": 500}
+    assert extend(store, changes=changes, scheduler="none", progress=False).complete
+    assert len(saved) >= 2 and saved[0] > 170 / 500 and tree(store) == whole("fixed")
+    assert left(store) == []
+
+
+def test_workers_that_do_not_find_what_others_saved_end_the_run(saved, tmp_path, monkeypatch):
+    monkeypatch.setattr(begun, "read", lambda *place: Begun())
+    with pytest.raises(StoreError, match="do all of them see the same store"):
+        quiet(drawn(), tmp_path / "lost.zarr")
+    assert len(saved) == 2
+
+
+def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
+    store = tmp_path / "slow.zarr"
+    interrupted(drawn(), store)
+    place = store, status(store).study_id, 0
+    found = begun.read(*place)
+    begun.discard(store, 0)
+    begun.write(*place, found._replace(seconds=100.0))
+    outcome = quiet_resume(store, block_timeout=99.0)
+    assert "longer than the 99 s" in outcome.failures[0].error and left(store) == ["begun-0"]
+    assert quiet_resume(store, block_timeout=1000.0, retry_failed=True).complete
+    assert left(store) == []
+
+
+def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
+    store = tmp_path / "timed.zarr"
+    interrupted(drawn(), store)
+    spent = begun.read(store, status(store).study_id, 0).seconds
+    outcome = quiet_resume(store)
+    assert outcome.work_seconds > spent > 0
+
+
+def test_lines_tell_the_part_of_a_point(capsys):
+    lines = Lines(every=-1.0)
+    lines.begin(points=2, done=0, unit="points")
+    for part in (0.31, 0.69, 1.0):
+        lines.advance(points=part, failed=0)
+    told = [line.split(",")[0] for line in capsys.readouterr().err.splitlines()]
+    assert told == ["0 of 2 points", "0.31 of 2 points", "1 of 2 points", "2 of 2 points"]
