@@ -24,7 +24,7 @@ from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen, working
-from sweep.tasks.recipe import EXTENDS, read_recipe, refuse_damaged_recipe, write_recipe
+from sweep.tasks.recipe import CODE, EXTENDS, read_recipe, refuse_damaged_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate
@@ -342,6 +342,22 @@ def _note(path: Location, spec: Declared, **facts: str) -> None:
         write_recipe(path, **read_recipe(path) | facts)
 
 
+def _tell_changed_code(path: Location, spec: Declared, told: Progress) -> None:
+    """Say which of the user's modules a store, or the one that it extends, was not begun with."""
+    if not (here := user_code.digests(spec)):
+        return
+    recipe = read_recipe(path)
+    older = read_recipe(located(recipe[EXTENDS])) if EXTENDS in recipe else {}
+    begun = here | older.get(CODE, {}) | recipe.get(CODE, {})
+    write_recipe(path, **recipe | {CODE: begun})
+    for module in here:
+        if begun[module] != here[module]:
+            told.say(
+                f"the module {module} has changed since {path} was begun: what was computed before "
+                "has the results of the old code. Put it back, or run the study anew"
+            )
+
+
 def _go_on(
     path: Location,
     study: GridStudy | FlightStudy,
@@ -353,6 +369,7 @@ def _go_on(
     lock, most = Lock(path), study.n_blocks
     try:
         journal = _journal(path, place.terms.durable)
+        _tell_changed_code(path, study.spec, told)
         with Interrupts() as interrupts, Pool(place, most=most, say=told.say) as pool:
             session = Session(
                 path, study, pool=pool, progress=told, interrupts=interrupts,

@@ -18,6 +18,9 @@ RECIPE = "recipe.json"
 #: The place of the store that points are taken from, while this one is extended from it.
 EXTENDS = "extends"
 
+#: Digests of the modules of the user's that it was begun with.
+CODE = "code"
+
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
     """Put down where a study's files are, in one step."""

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
+from hashlib import blake2b
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,15 +67,30 @@ def check(spec: Spec | SceneSpec) -> None:
     CodeError
         Where one may not run, can't be imported, or does not answer as it must.
     """
+    for role, name in _named(spec):
+        _try(role, name)
+
+
+def digests(spec: Spec | SceneSpec) -> dict[str, str]:
+    """Digest of each module, as it is imported here, whose functions a study names."""
+    modules = {name.partition(":")[0] for _, name in _named(spec)}
+    sources = {module: getattr(import_module(module), "__file__", None) for module in modules}
+    return {
+        module: blake2b(Path(source).read_bytes(), digest_size=16).hexdigest()
+        for module, source in sources.items()
+        if source
+    }
+
+
+def _named(spec: Spec | SceneSpec) -> Iterator[tuple[str, str]]:
+    """Roles and names of the functions that a study names."""
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "whole_spectra", False):
         return
     for role, path in _PATHS.items():
         on_axes = [m.values for axis in spec.axes for m in axis.members if m.path == path]
         names = on_axes[0] if on_axes else [spec.parameters()[path]]
-        for name in dict.fromkeys(map(str, names)):
-            if ":" in name:
-                _try(role, name)
+        yield from ((role, name) for name in dict.fromkeys(map(str, names)) if ":" in name)
 
 
 def methods(parameters: Mapping[str, Any]) -> Methods:

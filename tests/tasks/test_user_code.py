@@ -14,6 +14,7 @@ from sweep.tasks import plan as planned
 from sweep.tasks import timing, user_code
 from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
+from sweep.tasks.progress import Silent
 
 CODE = """
     import numpy as np
@@ -109,6 +110,38 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
     user_code.guarded.cache_clear()
     with pytest.raises(CodeError, match="not allowed"):
         sweep.resume(tmp_path / "a.zarr", progress=False)
+
+
+class Told(Silent):
+    """Progress that keeps what is said."""
+
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, tmp_path, extended):
+    user_code.allow([mine])
+    store, larger = tmp_path / "a.zarr", {"target.range": ["500 m", "2250 m", "4 km", "5 km"]}
+    assert quiet(study(f"{mine}:detect"), store).complete
+
+    def told():
+        sys.modules.pop(mine, None)
+        progress, place = Told(), {"scheduler": "none", "overwrite": True}
+        if extended:
+            spec = study(f"{mine}:detect", **larger)
+            sweep.extend(store, spec, to=tmp_path / "b.zarr", progress=progress, **place)
+        else:
+            sweep.resume(store, scheduler="none", progress=progress)
+        return [line for line in progress.lines if f"the module {mine} has changed" in line]
+
+    assert told() == []
+    with (tmp_path / f"{mine}.py").open("a") as file:
+        file.write("changed = True\n")
+    assert len(told()) == len(told()) == 1
 
 
 @pytest.mark.parametrize(
