@@ -105,9 +105,10 @@ def tell_accuracy(store: Location) -> None:
             "at",
         )
     if rays := rays_table(store):
+        kind, each = ("rays", "shot") if rays[0].scanner else ("beamlets", "point")
         print_table(
-            "What more rays may change",
-            ["", "rays a shot", "met", "worst", "missed by", "at"],
+            f"What more {kind} may change",
+            ["", f"{kind} a {each}", "met", "worst", "missed by", "at"],
             [_rays_cells(row) for row in rays],
             "at",
         )

@@ -45,7 +45,8 @@ def prepare(
         Names of the effects that are simulated.
     """
     for index, p in resolved_categories(DEFAULTS | dict(parameters), effects, SHARED):
-        shots = assembled(p, index.size, Plane(p, index.size), effects)
+        plane = Plane(p, index.size, moving="doppler_spread" in effects)
+        shots = assembled(p, index.size, plane, effects)
         yield index, replace(shots, alike=True)
 
 

@@ -37,21 +37,22 @@ def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.nd
     number : int
         Beamlets, at least 1; [T 3.3.1] uses 109, a full hexagonal lattice in a circle.
     pattern : str
-        One of :data:`PATTERNS`. A square has the whole root of as many on each side.
+        One of :data:`PATTERNS`, or ``3 lines`` for as many parallel ones. A square has the whole
+        root of as many on each side.
 
     Returns
     -------
     offsets : (2, number) ndarray
         Angles off the axis in units of the beam's standard deviation (Theta/4), across the
         plane's slope and along it. Their weighted mean is 0 and, from three beamlets on, their
-        covariance the identity; but that those of a line all lie one deviation to the same side,
-        which has the mean square of both sides.
+        covariance the identity; but that those of lines all lie to the same side, which has the
+        mean square of both sides.
     weights : (number,) ndarray
         Power fractions; they sum to 1.
     """
     if number == 1:
         return np.zeros((2, 1)), np.ones(1)
-    if pattern in ("line", "square"):
+    if pattern.endswith(("line", "lines", "square")):
         return _product(pattern, number)
     if number == 2:
         return np.array([[0.0, 0.0], [-1.0, 1.0]]), np.array([0.5, 0.5])
@@ -88,12 +89,16 @@ def _sunflower(number: int) -> np.ndarray:
 
 def _product(pattern: str, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Offsets and weights of a Gaussian's rules along the slope, and across it."""
-    if pattern == "line":
-        along, weights = gaussian_rule(number)
-        return np.array([np.ones(number), along]), weights
-    nodes, weights = gaussian_rule(max(math.isqrt(number), 2))
-    across, along = (v.ravel() for v in np.meshgrid(nodes, nodes))
-    return np.array([across, along]), np.outer(weights, weights).ravel()
+    if pattern == "square":
+        side = max(math.isqrt(number), 2)
+        (x, x_weights), (y, y_weights) = gaussian_rule(side), gaussian_rule(side)
+    else:
+        lines = 1 if pattern == "line" else int(pattern.split()[0])
+        y, y_weights = gaussian_rule(number // lines)
+        nodes, weights = gaussian_rule(2 * lines)
+        x, x_weights = nodes[lines:], 2 * weights[lines:]
+    across, along = (v.ravel() for v in np.meshgrid(x, y))
+    return np.array([across, along]), np.outer(y_weights, x_weights).ravel()
 
 
 _PATTERNS = {"hexagonal": _hexagonal, "sunflower": _sunflower}

@@ -47,19 +47,22 @@ class Plane:
         Parameters as arrays, of :func:`sweep.model.preparation.categories`.
     size : int
         Points n.
+    moving : bool
+        Whether beamlets see velocities of their own. Where not, points that differ in velocity
+        alone share their rows.
     """
 
     beside = None
 
-    def __init__(self, p: Mapping[str, np.ndarray], size: int) -> None:
+    def __init__(self, p: Mapping[str, np.ndarray], size: int, *, moving: bool = True) -> None:
         self._law = str(p["target.reflectance_law"])
         self._number = int(p["footprint.beamlets"])
         self._pattern = pattern(p)
         columns = np.broadcast_arrays(
             p["target.grazing_angle"],
             p["instrument.laser.beam_divergence"],
-            p["target.radial_velocity"],
-            p["target.transverse_velocity"],
+            p["target.radial_velocity"] if moving else 0.0,
+            p["target.transverse_velocity"] if moving else 0.0,
         )
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
@@ -73,10 +76,7 @@ class Plane:
     @cached_property
     def beamlets(self) -> Footprints:
         """The whole footprint: a row for each distinct geometry."""
-        across = self._columns[3]
-        # The velocity along the beam spreads the lines only where one across it is looked at too.
-        columns = [*self._columns[:2], np.where(across == 0, 0.0, self._columns[2]), across]
-        shapes, row = np.unique(np.stack(columns), axis=1, return_inverse=True)
+        shapes, row = np.unique(np.stack(self._columns), axis=1, return_inverse=True)
         offset, cos_incidence, weights = footprint.plane_footprint(
             grazing_angle=shapes[0],
             beam_divergence=shapes[1],

@@ -10,12 +10,24 @@ in bins of fs/L, a rule of nodes x_j and weights w_j is off by
 at most, in units of the power that one line on a bin has there: by what the rule makes of cosines
 up to 2 pi s. Gauss and Hermite's rule is best for narrow spreads; for wide ones even steps are, as
 they are all but exact up to where they alias.
+
+To second order the range rises with the square of the distance from the axis, across the slope as
+along it: f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of nodes
+at x = 1 has the mean of x^2, and misses (t c)^2 at the most. More lines lie at the positive nodes
+of a rule of twice as many:
+
+    x ^      .  .  .  .  .      3 lines of 5 nodes, weighted by the Gaussians of x and y;
+      |      .  .  .  .  .      as f is even in x, there is no need of their mirror images
+      |      .  .  .  .  .
+      +-----------------------> y, along the slope
 """
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sweep.model.effects.lobes import Lobe, lobe
 from sweep.model.window import samples
@@ -55,9 +67,24 @@ COUNTS = np.array(
 )
 """Numbers of nodes to choose from; wide steps, as points of different numbers go apart."""
 
+LINES = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
+"""Numbers of parallel lines of nodes to choose from."""
+
+MOST = int(COUNTS[-1])
+"""Nodes of all lines together, at the most."""
+
+ONE_LINE = 0.1
+"""Of the tolerance, what one line may miss across the slope without that more are looked at."""
+
 _FLOOR = 1e-10
 """Error of even steps, for what lies beyond their reach."""
 _SAMPLES, _LAGS = 1024, 4096
+_CURVES = np.geomspace(1e-6, 100.0, 97)
+_CURVED_LAGS, _CURVED_TURNS, _RATIOS = (
+    512,
+    np.geomspace(1e-6, 1e3, 512),
+    np.geomspace(1e-6, 1e3, 97),
+)
 _CHEBYSHEV = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
 
 
@@ -78,50 +105,170 @@ def gaussian_rule(number: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes, weights
 
 
+class Spread(NamedTuple):
+    """Places of a footprint's lines, s y + c (x^2 + y^2), in bins of fs/L."""
+
+    deviation: np.ndarray
+    """(n,): most of |s|, steeper where the plane is, over the segments."""
+    slope: np.ndarray
+    """(segments, n): |s| of each segment."""
+    curve: np.ndarray
+    """(segments, n): |c| of each segment."""
+
+    @property
+    def smoothing(self) -> np.ndarray:
+        """Deviation that smooths what lines miss across the slope, (segments, n).
+
+        |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
+        """
+        return np.asarray(self.slope / np.sqrt(1 + (4 * np.pi * self.curve) ** 2))
+
+
 def nodes_needed(
-    window_name: str, deviation: np.ndarray, tolerance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    window_name: str, spread: Spread, tolerance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes with which the largest bin's power is within a tolerance, or as near as any are.
 
     Parameters
     ----------
     window_name : str
         Canonical name of the record's window.
-    deviation : (n,) ndarray
-        Standard deviation of the lines' places [bins of fs/L], >= 0.
+    spread : Spread
+        Of n points.
     tolerance : (n,) ndarray
         On the largest bin's power, over that power itself, wherever the lines lie.
 
     Returns
     -------
+    lines : (n,) int64 ndarray
+        Parallel lines of nodes, 1 for most points.
     number : (n,) int64 ndarray
-        Nodes, 2 at least.
+        Nodes of each line, 2 at least.
     error : (n,) ndarray
-        What they may be off by; 1 for spreads beyond all that is provided for, 400 bins.
+        What they may be off by; 1 where they say nothing.
     """
-    spreads, errors = _errors(window_name)
-    off = errors[:, np.searchsorted(spreads, deviation)]  # of the next wider spread
-    serves = off <= tolerance
-    best = np.where(off.min(axis=0) < 1, off.argmin(axis=0), COUNTS.size - 1)
-    rung = np.where(serves.any(axis=0), serves.argmax(axis=0), best)
-    return COUNTS[rung], np.take_along_axis(off, rung[None], axis=0)[0]
+    spreads, errors, least = _errors(window_name)
+    place = np.searchsorted(spreads, spread.deviation)  # of the next wider spread
+    missed = _of_one_line(window_name, spread) / least[place]
+    rung, error = _cheapest(errors[:, place] + missed, COUNTS[:, None], tolerance)
+    lines = np.ones(rung.shape, np.int64)
+    several = (error > tolerance) & (missed > ONE_LINE * tolerance)
+    if several.any():
+        some = Spread(*(np.asarray(values)[..., several] for values in spread))
+        rungs, further, left = _of_lines(window_name, some, tolerance[several])
+        better = left < np.minimum(error[several], 1.0)
+        some = np.flatnonzero(several)[better]
+        rung[some], lines[some], error[some] = rungs[better], further[better], left[better]
+    return lines, COUNTS[rung], np.minimum(error, 1.0)
+
+
+def _cheapest(
+    error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Row of the cheapest (rows, n) whose error is tolerated, or of the least error; its error."""
+    price = np.where(error <= tolerance, cost, np.inf)
+    row = np.where(np.isfinite(price).any(axis=0), price.argmin(axis=0), error.argmin(axis=0))
+    return row, np.take_along_axis(error, row[None], axis=0)[0]
+
+
+def _of_lines(
+    window_name: str, spread: Spread, tolerance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row of :data:`COUNTS`, lines and error for spreads that one line of nodes misses."""
+    spreads, errors, least = _errors(window_name)
+    along, across = _curved_errors(window_name)
+    curve, slope = spread.curve.max(axis=0), spread.slope.max(axis=0)
+    # Where squares alone spread the lines, what the rules make of squares is all that counts.
+    steep = spread.deviation * np.minimum(slope / curve, 1.0)
+    largest = least[np.searchsorted(spreads, spread.deviation)]
+    place = np.searchsorted(_CURVES, curve)
+    off = errors[:, np.searchsorted(spreads, steep)] + along[:, place] / largest
+    missed = np.zeros((LINES.size, curve.size))
+    for s, c in zip(spread.smoothing, spread.curve, strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.searchsorted(_RATIOS, np.where(s > 0, c / s, np.inf))
+            smooth = _smoothed_errors()[:, ratio] * (_peak(window_name) / (2 * np.pi * s))
+        here = np.fmin(across[:, np.searchsorted(_CURVES, c)], smooth)
+        missed = np.maximum(missed, here / largest)
+    total = off[:, None] + missed
+    cost = COUNTS[:, None] * LINES
+    total = np.where((cost <= MOST)[..., None], total, np.inf).reshape(-1, curve.size)
+    best, error = _cheapest(total, cost.reshape(-1, 1), tolerance)
+    return best // LINES.size, LINES[best % LINES.size], error
+
+
+def _of_one_line(window_name: str, spread: Spread) -> np.ndarray:
+    """What a line misses of squares in powers, over the power of a line on a bin, (n,).
+
+    As much again is for what the fewest nodes along the slope miss of them.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        density = _peak(window_name) / (2 * np.pi * spread.smoothing)
+        smooth = density * math.sqrt(np.pi / 2) * (spread.curve / spread.smoothing) ** 2
+    form = lobe(window_name, _SAMPLES, _SAMPLES)
+    return np.asarray(2 * np.fmin(form.curvature * spread.curve**2, smooth).max(axis=0))
 
 
 @lru_cache(maxsize=32)
-def _errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Deviations (m,), and the error of each count up to each and beyond all, (counts, m + 1)."""
+def _errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of each count by deviation, over the largest bin's power; and that power.
+
+    Deviations (m,), errors (counts, m + 1) up to each and beyond all, largest bins (m + 1,).
+    """
     spreads = np.geomspace(1e-3, 400.0, 96)
     least = _largest_bin(lobe(window_name, _SAMPLES, _SAMPLES), spreads)
     lag = (np.arange(_LAGS) + 0.5) / _LAGS
     weight = _autocorrelation(window_name, lag)
-    errors = np.ones((COUNTS.size, spreads.size + 1))
+    errors = np.empty((COUNTS.size, spreads.size + 1))
     for row, number in zip(errors, COUNTS.tolist(), strict=True):
+        row[:] = np.append(_boundless(spreads, number), np.inf)
         for i, spread in enumerate(spreads.tolist()):
-            row[i] = (weight * _departure(number, 2 * np.pi * spread * lag)).sum() / least[i]
-            if row[i] > 1:
-                row[i:] = 1.0  # wider spreads are no better
-                break
-    return spreads, np.maximum.accumulate(errors, axis=1)
+            off = (weight * _departure(number, 2 * np.pi * spread * lag)).sum() / least[i]
+            if off > 1:
+                break  # wider spreads are no better
+            row[i] = off
+        row[-1] = _boundless(1e3, number)
+    return spreads, np.maximum.accumulate(errors, axis=1), np.append(least, least[-1])
+
+
+def _boundless(spread: ArrayLike, number: int) -> np.ndarray:
+    """What stands for errors without a bound, 1 or more: the nodes' distance [bins]."""
+    return np.maximum(1.0, 2 * REACH * np.asarray(spread) / number)
+
+
+@lru_cache(maxsize=32)
+def _curved_errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors by curve, over the power of a line on a bin: of counts along, of lines across."""
+    lag = (np.arange(_CURVED_LAGS) + 0.5) / _CURVED_LAGS
+    weight = _autocorrelation(window_name, lag)
+    turn = 2 * np.pi * lag * _CURVES[:, None]
+
+    def of(number: int) -> np.ndarray:
+        off = (weight * np.interp(turn, _CURVED_TURNS, _curved_departure(number))).sum(axis=1)
+        return np.append(np.where(off < 1, off, _boundless(_CURVES, number)), 1e3)
+
+    along, across = COUNTS.tolist(), (2 * LINES).tolist()
+    return np.array([of(number) for number in along]), np.array([of(number) for number in across])
+
+
+@lru_cache(maxsize=1)
+def _smoothed_errors() -> np.ndarray:
+    """Mean of what lines miss of squares, over a Gaussian 1 / ratio wide, (lines, ratios + 1)."""
+    turn = np.linspace(0.0, 8.0, 801)[1:]
+    weight = np.exp(-0.5 * turn**2) * (turn[1] - turn[0])
+    found = np.full((LINES.size, _RATIOS.size + 1), np.inf)
+    for row, lines in zip(found, LINES.tolist(), strict=True):
+        off = np.interp(turn * _RATIOS[:, None], _CURVED_TURNS, _curved_departure(2 * lines))
+        row[:-1] = (weight * off).sum(axis=1)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _curved_departure(number: int) -> np.ndarray:
+    """How far a rule's mean of exp(i turn x^2) may be from 1 / sqrt(1 - 2 i turn), up to turns."""
+    x, w = gaussian_rule(number)
+    mean = np.array([(w * np.exp(1j * turn * x**2)).sum() for turn in _CURVED_TURNS.tolist()])
+    return np.maximum.accumulate(np.abs(mean - 1 / np.sqrt(1 - 2j * _CURVED_TURNS)))
 
 
 def _largest_bin(shape: Lobe, deviation: np.ndarray) -> np.ndarray:
@@ -139,6 +286,13 @@ def _autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _SAMPLES)) ** 2)[: _SAMPLES + 1]
     at_lags = np.interp(lag * _SAMPLES, np.arange(_SAMPLES + 1), r)
     return np.asarray(np.abs(at_lags) / at_lags.sum())
+
+
+@lru_cache(maxsize=32)
+def _peak(window_name: str) -> float:
+    """Largest density of the autocorrelation over lags [1/record]."""
+    lag = (np.arange(_LAGS) + 0.5) / _LAGS
+    return float(_autocorrelation(window_name, lag).max()) * _LAGS
 
 
 def _departure(number: int, turn: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ def _drawn(p: dict[str, np.ndarray], effects: Collection[str], realisation: Real
     for effect in chosen:
         if effect.turn is not None:
             p = effect.turn(p, realisation)
-    scene = Scene(p, Plane(p, size))
+    scene = Scene(p, Plane(p, size, moving="doppler_spread" in effects))
     shots = assembled(p, size, scene.ground, effects)
     for effect in chosen:
         if effect.draw is not None:

@@ -23,7 +23,6 @@ import numpy as np
 from sweep.model import detection, ground, quadrature
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.line_spread import range_to_bins, velocity_to_bins
-from sweep.model.effects.lobes import lobe
 from sweep.model.effects.plane_geometry import plane_range_moments, plane_velocity_moments
 from sweep.model.preparation import (
     AUTOMATIC,
@@ -49,7 +48,7 @@ SHARE = 0.25
 EFFECTS_SHARE = 0.8
 """For effects that are left out, if beamlets are given; the rest is that of lines."""
 
-FINEST = int(quadrature.COUNTS[-1])
+FINEST = quadrature.MOST
 
 RAYS = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
 """Rays that may be cast for a shot of a flight: whole shells of the lattice, as only these are
@@ -69,8 +68,6 @@ _UNSURE = 19
 """Rays up to which smooth ground is taken for far rougher than it is: how much is no measure."""
 
 _SEGMENTS = 3
-_SQUARE_SIDE = 64
-"""Beamlets on a side of a square at the most."""
 
 
 def resolved_categories(
@@ -167,18 +164,13 @@ def beamlets_needed(
 
     The error is that of the probabilities of detection, summed over the segments.
     """
-    along, across = _spreads(p, size)
     per_power = _pd_for_power(p) + np.zeros(size)
     allowed = SHARE * np.asarray(p["accuracy.tolerance"], float) / per_power
-    number, error = quadrature.nodes_needed(_window(p), along, allowed)
-    # Across the slope all that a line of beamlets does not show is how the squares vary.
-    missed = 0.5 * lobe(_window(p), 1024, 1024).curvature * 2 * across**2
-    square = (missed > allowed) | (str(p[PATTERN]) == "square")
-    side = np.minimum(number, _SQUARE_SIDE)
-    error = np.where(square & (number > _SQUARE_SIDE), 1.0, error)
+    lines, number, error = quadrature.nodes_needed(_window(p), _spread(p, size), allowed)
+    several = np.char.add(lines.astype(str), " lines")
     return (
-        np.where(square, side * side, number),
-        np.where(square, "square", "line"),
+        lines * number,
+        np.where(lines == 1, "line", several),
         np.minimum(error * per_power, 1.0),
     )
 
@@ -191,29 +183,23 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(_SEGMENTS * steepest / 2)
 
 
-def _spreads(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Deviation of the lines' places along the slope, and their mean across it [bins of fs/L]."""
-    sigma = np.asarray(p[LASER + "beam_divergence"], float) / 4
+def _spread(p: Mapping[str, np.ndarray], size: int) -> quadrature.Spread:
+    """How far the lines of up, Doppler and down segment lie apart [bins of fs/L]."""
+    angle, along = p["target.grazing_angle"], np.asarray(p["target.radial_velocity"], float)
+    divergence = np.asarray(p[LASER + "beam_divergence"], float)
+    across = np.asarray(p["target.transverse_velocity"], float)
+    sigma, slope = divergence / 4, divergence / 4 / np.tan(angle)
     bins = p[PROCESSING + "sample_rate"] / p["record"]
     rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
     shape: dict[str, Any] = {
-        "grazing_angle": p["target.grazing_angle"],
-        "beam_divergence": p[LASER + "beam_divergence"],
-        "number": FINEST,
-        "pattern": "line",
-    }
+        "grazing_angle": angle, "beam_divergence": divergence, "number": FINEST, "pattern": "line",
+    }  # fmt: skip
     # Beyond the horizon the moments have no bound: there the plain one has to do.
     rms = plane_range_moments(**shape).rms
-    rms = np.where(np.isfinite(rms), rms, sigma / np.tan(p["target.grazing_angle"]))
-    speed = np.asarray(p["target.transverse_velocity"], float)
-    velocity = plane_velocity_moments(
-        across=speed, along=np.where(speed != 0, p["target.radial_velocity"], 0.0), **shape
-    ).rms
+    rms = np.where(np.isfinite(rms), rms, slope)
+    velocity = plane_velocity_moments(across=across, along=along, **shape).rms
     per_range = range_to_bins(
-        range=p["target.range"],
-        beta=doppler_ratio(np.asarray(p["target.radial_velocity"])),
-        chirp_rate=rate,
-        bin_width=bins,
+        range=p["target.range"], beta=doppler_ratio(along), chirp_rate=rate, bin_width=bins
     )
     per_speed = velocity_to_bins(
         range=p["target.range"],
@@ -221,8 +207,12 @@ def _spreads(p: Mapping[str, np.ndarray], size: int) -> tuple[np.ndarray, np.nda
         chirp_rate=rate,
         bin_width=bins,
     )
-    nothing = np.zeros(size)
-    return per_range * rms + per_speed * velocity + nothing, per_range * sigma**2 / 2 + nothing
+    signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
+    return quadrature.Spread(
+        deviation=per_range * rms + per_speed * velocity + nothing,
+        slope=abs(per_speed * across * sigma + signs * per_range * slope) + nothing,
+        curve=abs(per_speed * along + signs * per_range) * (sigma**2 / 2) + nothing,
+    )
 
 
 def _window(p: Mapping[str, np.ndarray]) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model import resolution
 from sweep.storage.locations import Location, located
 from sweep.storage.opening import open_group
 from sweep.tasks import studies
@@ -85,7 +86,7 @@ def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
 class RaysRow:
     """How well a scanner's probabilities and magnitudes are known, for what its rays leave."""
 
-    scanner: str
+    scanner: str  # none for a grid, whose points and beamlets are counted as shots and rays
     shots: int  # that are computed and see something, times places along the axes
     met: int  # of these, within the tolerance
     error: float  # of the worst
@@ -97,11 +98,13 @@ class RaysRow:
     @property
     def missed(self) -> float:
         """By how much the tolerance is missed by the worst shot; 0 where it is met."""
-        return max(0.0, self.error - self.tolerance)
+        return max(0.0, self.error - self.tolerance) if self.shots > self.met else 0.0
 
 
 def rays_table(store: str | Location) -> list[RaysRow]:
     """A row for each scanner; none where the tolerance does not say how many rays there are.
+
+    Of a grid one row, with no scanner, where even the most beamlets are too few for some points.
 
     Raises
     ------
@@ -110,9 +113,26 @@ def rays_table(store: str | Location) -> list[RaysRow]:
     """
     path = located(store)
     _, study = studies.read(path)
+    if isinstance(study, GridStudy):
+        return [row] if (row := _of_beamlets(path, study)).missed else []
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
     return [row for scanner in study.scanners if (row := _of_rays(path, study, scanner)).shots]
+
+
+def _of_beamlets(path: Location, study: GridStudy) -> RaysRow:
+    worst, total, most = _Worst(), 0, 0
+    tolerance = np.broadcast_to(_tolerance(study.spec), study.grid.shape)
+    tolerance = np.maximum(resolution.SHARE * tolerance, resolution.LEAST_RAYS_TOLERANCE)
+    names = "beamlets_error", "beamlets"
+    for place, (error, number) in pieces(path, study, names, done_blocks(path, study)):
+        start = tuple(part.start for part in place)
+        worst.add(error, tolerance[place], number.astype(np.int64), start)
+        total, most = total + int(number.sum()), max(most, int(number.max()))
+    where, mean = _place(study.spec.axes, worst.index), total / max(worst.points, 1)
+    return RaysRow(
+        "", worst.points, worst.met, worst.half_width, worst.tolerance, where, mean, most
+    )  # fmt: skip
 
 
 def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:

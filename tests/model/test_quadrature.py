@@ -1,9 +1,12 @@
 """Few nodes for the mean over a Gaussian: moments, and power over bins against the continuum."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from sweep.model.quadrature import COUNTS, gaussian_rule, nodes_needed
+from sweep.model.footprint import beamlets
+from sweep.model.quadrature import COUNTS, MOST, Spread, gaussian_rule, nodes_needed
 from sweep.model.window import samples
 
 LENGTH = 128
@@ -28,6 +31,13 @@ def test_gauss_and_hermites_rule_is_exact_for_polynomials(number):
         assert (weights * nodes ** (2 * k)).sum() == pytest.approx(moment, rel=1e-11)
 
 
+def needed(window, deviation, tolerance, curve=0.0):
+    """Lines, nodes and error where all segments are alike."""
+    s, tolerance = np.broadcast_arrays(deviation, np.asarray(tolerance, float))
+    c = np.broadcast_to(curve, s.shape)
+    return nodes_needed(window, Spread(s + 10 * c, s[None], c[None]), tolerance)
+
+
 def power_of_bins(window, offset, deviation, rule):
     """Mean of |W|^2 over a spread of lines, by the window's autocorrelation; rule or continuum."""
     w = samples(window, LENGTH)
@@ -48,8 +58,8 @@ def test_power_is_within_the_tolerance_of_the_continuum_wherever_lines_lie(windo
     counts = []
     for deviation in np.geomspace(2e-3, 12.0, 25):
         for tolerance in (1e-1, 1e-3, 1e-6):
-            number, error = nodes_needed(window, np.array([deviation]), np.array([tolerance]))
-            assert error[0] <= tolerance
+            lines, number, error = needed(window, np.array([deviation]), tolerance)
+            assert error[0] <= tolerance and lines[0] == 1
             counts.append(number[0])
             for offset in (0.0, 0.3, 0.5):
                 exact = power_of_bins(window, offset, deviation, None)
@@ -68,12 +78,45 @@ def test_even_steps_are_exact_but_for_their_reach_and_where_they_alias(number):
 
 def test_narrow_spreads_need_few_nodes_and_more_accuracy_costs_few_more():
     tolerance = np.array([1e-1, 1e-3, 1e-6])
-    number, _ = nodes_needed("hamming", np.full(3, 0.25), tolerance)
+    _, number, _ = needed("hamming", np.full(3, 0.25), tolerance)
     assert (number <= [3, 5, 7]).all()
-    wide, _ = nodes_needed("hamming", np.full(3, 5.0), tolerance)
+    _, wide, _ = needed("hamming", np.full(3, 5.0), tolerance)
     assert wide[2] <= 1.5 * wide[0] + 1
 
 
+@pytest.mark.parametrize("window", ["hamming", "rectangular", "flattop"])
+def test_lines_across_the_slope_are_within_the_tolerance_of_the_continuum(window):
+    """Of s y + c (x^2 + y^2), by its own transform: over x and y by Gaussian integrals."""
+    rng, w = np.random.default_rng(17), samples(window, LENGTH)
+    lag = np.arange(-LENGTH + 1, LENGTH)
+    turn, r = 2 * np.pi * lag / LENGTH, np.correlate(w, w, "full")
+    bins = np.exp(1j * np.arange(-40, 40.0, 0.5)[:, None] * turn) * r
+    several = 0
+    for _ in range(60):
+        s, c = 10 ** rng.uniform(-2, 1), 10 ** rng.uniform(-5, 0)
+        curved = 1 - 2j * turn * c
+        exact = (bins * np.exp(-((turn * s) ** 2) / 2 / curved) / curved).sum(axis=1).real
+        for tolerance in (1e-2, 1e-4, 1e-6, 0.0):
+            (lines,), (number,), (error,) = needed(window, np.array([s]), tolerance, c)
+            assert (error <= max(tolerance, 1e-7) or c > 0.03) and lines * number <= MOST
+            (x, y), share = beamlets(lines * number, f"{lines} lines")
+            mean = (share * np.exp(1j * turn[:, None] * (s * y + c * (x**2 + y**2)))).sum(axis=1)
+            found = (bins * mean).sum(axis=1).real
+            assert abs(found - exact).max() <= error * exact.max() + 1e-12
+            several += lines > 1
+    assert several > 60
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_a_tighter_tolerance_never_has_the_larger_error(window):
+    rng = np.random.default_rng(18)
+    s, c = 10 ** rng.uniform(-3, 3.5, 300), 10 ** rng.uniform(-7, 2, 300)
+    found = [needed(window, s, tolerance, c) for tolerance in (1.0, 1e-2, 1e-5, 1e-8, 0.0)]
+    for looser, tighter in pairwise(found):
+        assert (tighter[2] <= looser[2]).all()
+
+
 def test_spreads_beyond_what_is_provided_for_take_the_most_and_say_so():
-    number, error = nodes_needed("hamming", np.array([1e4, np.inf]), np.array([1e-3, 1e-3]))
+    lines, number, error = needed("hamming", np.array([1e4, 1e6]), 1e-3)
+    assert lines.tolist() == [1, 1]
     assert number.tolist() == [COUNTS[-1]] * 2 and error.tolist() == [1.0, 1.0]

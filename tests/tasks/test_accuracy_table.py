@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from click.testing import CliRunner
 from small import STUDY, quiet, small
 
-from sweep.tasks.accuracy_table import accuracy_table
+from sweep.cli import main
+from sweep.tasks.accuracy_table import accuracy_table, rays_table
 
 ROUGH = {
     "target": STUDY["target"] | {"roughness": "10 um"},
@@ -89,3 +91,22 @@ def test_blocks_that_are_not_computed_are_not_told(tmp_path):
 
 def test_a_study_without_draws_has_none(tmp_path):
     assert accuracy_table(quiet(small(axes={}), tmp_path / "none.zarr").store) == []
+
+
+def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_path):
+    """Over thousands of bins: a beam of 50 mrad that grazes the ground."""
+    laser = {"wavelength": "1550 nm", "power": "1 W", "beam_divergence": "50 mrad"}
+    spec = small(
+        instrument=STUDY["instrument"] | {"laser": laser},
+        footprint={"beamlets": "auto", "phases": "incoherent"},
+        axes={"target.grazing_angle": ["0.5 deg", "89 deg", "90 deg"]},
+        target=STUDY["target"] | {"range": "10 km"},
+    )
+    store = quiet(spec, tmp_path / "wide.zarr").store
+    (row,) = rays_table(store)
+    assert (row.shots, row.met, row.most, row.error) == (3, 2, 4096, 1.0)
+    assert row.where == "grazing_angle 0.5 deg"
+    said = CliRunner().invoke(main, ["status", str(store)]).output
+    assert "What more beamlets may change" in said and "2 of 3" in said
+    met = small(footprint={"beamlets": "auto", "phases": "incoherent"}, axes={})
+    assert rays_table(quiet(met, tmp_path / "met.zarr").store) == []

@@ -1,7 +1,8 @@
-"""Doppler spread: the beam's divergence sees a velocity across it as different radial velocities.
+"""Doppler spread: over the beam's divergence one velocity has different radial velocities.
 
 Called for when 2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad:
-1.4 bins of 4.6 kHz). It acts on the lines' positions in all three segments.
+1.4 bins of 4.6 kHz), or v (1 - cos theta) of a velocity along a wide beam is not. It acts on the
+lines' positions in all three segments.
 """
 
 from dataclasses import replace

@@ -146,9 +146,8 @@ def put_planes(table, law, beam, out):
             continue
         along = max(abs(table[4, t]), abs(table[5, t]))
         across = max(abs(table[6, t]), abs(table[7, t]))
-        velocities = across, along if across > 0 else 0.0
         ranges = _range_moments(angle[0], divergence[1], reach)
-        moved = _velocity_moments(velocities, angle[0], divergence[1], reach)
+        moved = _velocity_moments((across, along), angle[0], divergence[1], reach)
         for m in range(3):
             out[RANGES + m, t], out[VELOCITIES + m, t] = ranges[m], moved[m]
 

@@ -67,7 +67,7 @@ def test_over_tiles_they_are_those_of_the_ends(law):
     ranges, across, along = moments(angle, ends[1], reach)
     sideways, closing = abs(speeds[1]).max(axis=0), abs(speeds[0]).max(axis=0)
     np.testing.assert_allclose(found[6:9], ranges, 1e-12)
-    moved = sideways * across + np.where(sideways > 0, closing, 0) * along
+    moved = sideways * across + closing * along
     np.testing.assert_allclose(found[9:], moved, 1e-12)
     power = 3 if law == "lambert" else 2
     q = [divergence / 4 / np.tan(ends[0]), ends[1] / 4 / np.tan(angle)]

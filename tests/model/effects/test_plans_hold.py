@@ -140,7 +140,7 @@ def test_leakage_that_is_asked_for_keeps_the_tolerance_too(table_4_1, velocity, 
             for name in ("p_leakage_up", "p_leakage_down"):
                 error = abs(of_kept[name] - truth[name])[here].max()
                 worst[mode] = max(worst[mode], error)
-    assert worst["on"] < 1e-5 and worst["auto"] > 50 * worst["on"]
+    assert worst["on"] < min(1e-4, tolerance / 10) and worst["auto"] > 10 * worst["on"]
 
 
 def test_the_image_of_a_still_target_is_kept_for_the_magnitude_s_sake(table_4_1):

@@ -157,7 +157,7 @@ def frequencies(block, segment):
 def test_a_level_single_beamlet_has_no_footprint(table_4_1):
     single = point_block(scene(table_4_1, 5, 1, beamlets=1))
     assert footprint.bound(single) is None and not np.any(single.spread.extreme)
-    block = point_block(scene(table_4_1, 5, 1, across=0.0))
+    block = point_block(scene(table_4_1, 5, 1, across=0.0, radial_velocity=0.0))
     assert doppler_spread.bound(block) is None and several_returns.bound(block) is None
 
 
