@@ -13,8 +13,9 @@ measures them. Looks come at the same numbers of draws for every point, and what
 depends on nothing but its own draws: other points, blocks and workers change no bit of it.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +34,7 @@ PIECE = 1 << 16
 LEAST = 16
 """Draws of a point that are taken at once where random effects are simulated, at the least."""
 
-_COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
+COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
 
 
 class Promise(NamedTuple):
@@ -62,20 +63,58 @@ class Before(NamedTuple):
     """(n,) by the names of OUTPUTS, and RUNNING; for points with random effects."""
 
 
-class Drawn(Protocol):
-    """Points that can be drawn on."""
+class Drawn(ABC):
+    """What has been drawn of n points so far, added up, to be drawn on.
 
-    number: np.ndarray
-    """(n,) int64: draws of each so far."""
+    Parameters
+    ----------
+    size, before
+        Number of points; what was drawn of them before.
+    """
 
+    def __init__(self, size: int, before: Before | None) -> None:
+        self.number = np.zeros(size, np.int64)
+        self.counts = np.zeros((len(DRAW_OUTPUTS), size), np.int64)
+        if before is not None:
+            self.number += before.number
+            self.counts += before.counts.sum(axis=-1)
+
+    @abstractmethod
     def at_once(self, points: int) -> int:
         """Draws of each of so many points that one `take` is for: a few seconds at the most."""
 
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> Any:
-        """Draw some of the points, from draw `first` on; their counts, if they are wanted."""
+    @abstractmethod
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
+        """Draw some of the points, from draw `first` on.
+
+        Returns
+        -------
+        (names, points, batches) int64 ndarray
+            Counts of these draws, in the order of DRAW_OUTPUTS.
+        """
+
+    @abstractmethod
+    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """How far pd of some points may be off with the promised confidence, (4, points).
+
+        By the names of PROMISED; nan for what there is not.
+        """
 
     def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
-        """By how much a promise is broken of some of the points; 0 where it is kept."""
+        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
+        widths = self.half_widths(points, promise)
+        over = widths - promise.of(points, self.number.size).tolerance
+        return np.fmax.reduce(over, axis=0, initial=0.0)
+
+    def accuracy(self, promise: Promise) -> dict[str, np.ndarray]:
+        """(n,) by the names of ACCURACY_OUTPUTS."""
+        points = np.arange(self.number.size)
+        widths = zip(PROMISED, self.half_widths(points, promise), strict=True)
+        return {
+            "n_draws": self.number,
+            **{f"{name}_half_width": width for name, width in widths},
+            "accuracy_missed": self.missed(points, promise),
+        }
 
 
 def never() -> bool:
@@ -233,8 +272,8 @@ def settle(
             return
 
 
-class Sample:
-    """What has been drawn of n points so far, added up.
+class Sample(Drawn):
+    """Draws held against probabilities, or in noise, with or without random effects.
 
     Parameters
     ----------
@@ -246,32 +285,22 @@ class Sample:
         self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str,
         before: Before | None = None,
     ) -> None:  # fmt: skip
+        super().__init__(len(keys), before)
         self._parameters, self._effects = parameters, effects
         self._keys, self._method = keys, method
-        self.counts = no_counts(len(keys), 1, method)[..., 0]
-        self.number = np.zeros(len(keys), np.int64)
         self._means = Means(len(keys)) if random_effects(effects) else None
         if self._means is None:
             values = evaluate(parameters, effects)
             self._outputs = {name: np.broadcast_to(v, (len(keys),)) for name, v in values.items()}
-        if before is not None:
-            self.number += before.number
-            self.counts += before.counts.sum(axis=-1)
-            if self._means is not None:
-                self._means.go_on_from(before.means)
+        elif before is not None:
+            self._means.go_on_from(before.means)
 
     def at_once(self, points: int) -> int:
-        """Draws of each of so many points that one `take` is for."""
+        """As of :class:`Drawn`."""
         return PIECE if self._means is None else max(LEAST, 4 * ROWS // points)
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
-        """Draw some of the points, from draw `first` on.
-
-        Returns
-        -------
-        (names, points, batches) int64 ndarray
-            Counts of these draws, in the order of DRAW_OUTPUTS.
-        """
+        """As of :class:`Drawn`."""
         if self._means is None:
             found = draw(
                 self._some(points), {name: v[points] for name, v in self._outputs.items()},
@@ -311,10 +340,7 @@ class Sample:
         }
 
     def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
-        """How far pd of some points may be off with the promised confidence, (4, points).
-
-        By the names of PROMISED; nan for what there is not.
-        """
+        """As of :class:`Drawn`."""
         confidence, n = promise.of(points, self.number.size).confidence, self.number[points]
         if self._means is not None:
             mean, variance, number = self._means.moments(PROMISED, points)
@@ -325,26 +351,14 @@ class Sample:
         exact = np.stack([0.0 * self._outputs[name][points] for name in PROMISED])
         if self._method == "probabilities":
             return exact
-        successes = self.counts[_COUNT_OF][:, points]
+        successes = self.counts[COUNT_OF][:, points]
         interval = COUNTED[promise.interval](successes=successes, trials=n, confidence=confidence)
         return exact + half_width(successes / n, interval)
 
-    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
-        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
-        widths = self.half_widths(points, promise)
-        over = widths - promise.of(points, self.number.size).tolerance
-        return np.fmax.reduce(over, axis=0, initial=0.0)
-
     def results(self, promise: Promise) -> dict[str, np.ndarray]:
         """Outputs, their errors and their accuracy, (n,) each."""
-        points = np.arange(self.number.size)
-        widths = dict(zip(PROMISED, self.half_widths(points, promise), strict=True))
         if self._means is None:
             outputs = self._outputs | certain(self._outputs)
         else:
             outputs = self._means.results() | {RUNNING: self._means.running()}
-        return outputs | {
-            "n_draws": self.number,
-            **{f"{name}_half_width": width for name, width in widths.items()},
-            "accuracy_missed": self.missed(points, promise),
-        }
+        return outputs | self.accuracy(promise)

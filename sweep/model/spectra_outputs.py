@@ -1,6 +1,6 @@
 """What sampling by whole spectra yields for each point: names, units, meaning."""
 
-from sweep.model.outputs import ACCURACY_OUTPUTS, NO_DOPPLER, OUTPUTS, Output
+from sweep.model.outputs import NO_DOPPLER, OUTPUTS, Output
 
 KEPT = ("snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance")
 """Of :data:`sweep.model.outputs.OUTPUTS`, what does not depend on the detector."""
@@ -48,6 +48,3 @@ SPECTRA_OUTPUTS: dict[str, Output] = {
     **_resolved("radial_velocity", "radial velocity, positive when closing", "m s-1"),
 }
 """Floats, one a point; beside them stand ACCURACY_OUTPUTS and DRAW_OUTPUTS."""
-
-WIDTHS = tuple(name for name in ACCURACY_OUTPUTS if name.endswith("_half_width"))
-"""Half-widths of pd, in the order of :data:`sweep.model.outputs.PROMISED`."""

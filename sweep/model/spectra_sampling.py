@@ -19,17 +19,15 @@ from sweep.model.intervals import COUNTED, half_width
 from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.realisations import Means, random_effects, realise
-from sweep.model.sampling import Before, Promise, fill, looks, never, settle
+from sweep.model.sampling import COUNT_OF, Before, Drawn, Promise, fill, looks, never, settle
 from sweep.model.shot import statistics
 from sweep.model.spectra_look import DEFAULTS, VALUES, Methods, View, counted, view_of
-from sweep.model.spectra_outputs import KEPT, WIDTHS
+from sweep.model.spectra_outputs import KEPT
 
 SAMPLES = 1 << 18
 """Samples of the spectra that are held at once."""
 
 FFT_SIZE = "instrument.processing.fft_size"
-
-_COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
 
 
 def simulate_spectra(
@@ -82,8 +80,8 @@ def simulate_spectra_until(
     return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
-class SpectraSample:
-    """What has been drawn of n points so far, added up.
+class SpectraSample(Drawn):
+    """Draws of whole spectra.
 
     Parameters
     ----------
@@ -96,11 +94,10 @@ class SpectraSample:
         methods: Methods, before: Before | None,
     ) -> None:  # fmt: skip
         size = len(keys)
+        super().__init__(size, before)
         self._parameters: dict[str, Any] = {**DEFAULTS, **parameters}
         self._effects = effects
         self._keys, self._methods = keys, methods
-        self.counts = np.zeros((len(DRAW_OUTPUTS), size), np.int64)
-        self.number = np.zeros(size, np.int64)
         self._moments = np.zeros((3, len(VALUES), size))  # number, mean, sum of squares about it
         self._fixed = Means(size)
         self._prepared: dict[int, tuple[Shots, int]] = {}
@@ -111,8 +108,6 @@ class SpectraSample:
                 self._fixed.add(index, statistics(shots))
                 self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
         if before is not None:
-            self.number += before.number
-            self.counts += before.counts.sum(axis=-1)
             moments, sums = np.split(before.means[RUNNING].T, [self._moments[..., 0].size])
             self._moments[...] = moments.reshape(self._moments.shape)
             if not self._prepared:
@@ -127,13 +122,7 @@ class SpectraSample:
         return max(1, 4 // points) * math.lcm(*(max(1, SAMPLES // int(n)) for n in sizes))
 
     def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
-        """Draw some of the points, from draw `first` on.
-
-        Returns
-        -------
-        (names, points, batches) int64 ndarray
-            Counts of these draws, in the order of DRAW_OUTPUTS.
-        """
+        """As of :class:`Drawn`."""
         ends = first + np.cumsum([0, *batch_sizes])
         counts = np.zeros((len(DRAW_OUTPUTS), points.size, len(batch_sizes)), np.int64)
         for place, point in enumerate(points):
@@ -170,31 +159,25 @@ class SpectraSample:
             for path, v in self._parameters.items()
         }
 
-    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
-        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
-        widths = self._widths(points, promise)
-        over = widths - promise.of(points, self.number.size).tolerance
-        return np.fmax.reduce(over, axis=0, initial=0.0)
-
     def _shares(self, points: np.ndarray) -> np.ndarray:
         """Shares of draws with a detection, (4, points), by the names of PROMISED."""
-        shares = self.counts[_COUNT_OF][:, points] / self.number[points]
+        shares = self.counts[COUNT_OF][:, points] / self.number[points]
         segments = np.asarray(self._parameters["instrument.receiver.architecture"]) != "direct"
         there = np.broadcast_to(segments, self.number.shape)[points]
         shares[PROMISED.index("pd_doppler")] += np.where(there, 0.0, np.nan)
         return shares
 
-    def _widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
-        """Half-widths of the shares' intervals, (4, points)."""
+    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+        """Those of the shares' intervals, as of :class:`Drawn`."""
         confidence = promise.of(points, self.number.size).confidence
         interval = COUNTED[promise.interval](
-            successes=self.counts[_COUNT_OF][:, points], trials=self.number[points],
+            successes=self.counts[COUNT_OF][:, points], trials=self.number[points],
             confidence=confidence,
         )  # fmt: skip
         return half_width(self._shares(points), interval)
 
     def results(self, promise: Promise) -> dict[str, np.ndarray]:
-        """Outputs and their accuracy, (n,) each."""
+        """Outputs, their accuracy and RUNNING."""
         points = np.arange(self.number.size)
         n, mean, square = (dict(zip(VALUES, part, strict=True)) for part in self._moments)
         fixed = self._fixed.results()
@@ -212,15 +195,8 @@ class SpectraSample:
                     f"{name}_rmse": np.sqrt(mean[name] ** 2 + square[name] / n[name]),
                     f"{name}_bound": np.sqrt(mean[f"{name}_2"]),
                 }
-        return outputs | {
-            "n_draws": self.number,
-            **dict(zip(WIDTHS, self._widths(points, promise)[_WIDTH_ORDER], strict=True)),
-            "accuracy_missed": self.missed(points, promise),
-            RUNNING: np.concatenate([*self._moments, self._fixed.sums()]).T,
-        }
-
-
-_WIDTH_ORDER = [PROMISED.index(name.removesuffix("_half_width")) for name in WIDTHS]
+        running = np.concatenate([*self._moments, self._fixed.sums()]).T
+        return outputs | self.accuracy(promise) | {RUNNING: running}
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,28 +73,19 @@ def read(path: Location, study_id: str, block: int) -> Begun:
 
 def begun_points(path: Location, study_id: str) -> dict[int, float]:
     """Points that there are, in part, of blocks that are begun."""
-    numbers = [file.name.removeprefix(PREFIX) for file in _files(path)]
+    numbers = [file.name.removeprefix(PREFIX) for file in (path / JOURNAL).glob(f"{PREFIX}*")]
     found = {int(each): read(path, study_id, int(each)) for each in numbers if each.isdecimal()}
     return {block: begun.points for block, begun in found.items() if begun.points}
 
 
-def discard(path: Location, block: int) -> None:
-    """Remove what there is of a block, where there is something."""
-    _file(path, block).unlink(missing_ok=True)
-
-
-def discard_all(path: Location) -> None:
-    """Remove what there is of blocks of a store that is complete."""
-    for file in _files(path):
+def discard(path: Location, block: int | str = "*") -> None:
+    """Remove what there is of a block, or of all."""
+    for file in (path / JOURNAL).glob(f"{PREFIX}{block}"):
         file.unlink(missing_ok=True)
 
 
 def _file(path: Location, block: int) -> Location:
     return path / JOURNAL / f"{PREFIX}{block}"
-
-
-def _files(path: Location) -> Iterable[Location]:
-    return (path / JOURNAL).glob(f"{PREFIX}*")
 
 
 def _arrays(known: Known) -> dict[str, Any]:

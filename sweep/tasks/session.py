@@ -195,7 +195,7 @@ class Session:
         outcome = self._outcome(done, left_out, stopped, time.monotonic() - start, rays or {})
         if outcome.complete:
             store.remove_partials(self._path)
-            begun.discard_all(self._path)
+            begun.discard(self._path)
         self._record(
             "ended", blocks=outcome.blocks_computed, failed=len(outcome.failures), stopped=stopped
         )

@@ -278,6 +278,19 @@ def test_whole_spectra_are_drawn_anew_and_it_says_so(tmp_path, capsys):
     assert tree(store) == at_once(spec, tmp_path)
 
 
+def test_spectra_of_random_effects_are_taken_where_points_are_added(tmp_path, computed):
+    same = {
+        "target": {**STUDY["target"], "roughness": "10 um"},
+        "draws": {"method": "spectra", "number": 4},
+        "accuracy": {"tolerance": 0},  # else effects follow from the points that are there
+    }
+    store = quiet(small(axes={RANGE: ["1 km"]}, **same), tmp_path / "store.zarr").store
+    spec = small(axes={RANGE: ["1 km", "2 km"]}, **same)
+    computed.clear()
+    assert larger(store, spec).complete and computed == [1]
+    assert tree(store) == at_once(spec, tmp_path)
+
+
 @pytest.mark.parametrize("errors, new", [({}, 12), (CLOSE, 0)], ids=["by tolerance", "given"])
 def test_a_tighter_tolerance_computes_what_follows_from_it(tmp_path, computed, errors, new):
     older = small(axes=COARSE, accuracy={"tolerance": 1e-2, **errors})
