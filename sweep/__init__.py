@@ -6,8 +6,13 @@ as a DataTree with `open_scene`, and `export` its point clouds.
 
 from __future__ import annotations
 
+import os
+import stat
+import sys
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import version as _version
+from pathlib import Path
 from typing import Any
 
 __version__ = _version("sweep")
@@ -24,6 +29,42 @@ _HOMES = {
 }
 
 __all__ = ["__version__", *_HOMES]
+
+
+def _is_writable(folder: Path) -> bool:
+    """Whether files can be put into a folder, which may be still to be made."""
+    while not folder.exists():
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def _own_folder() -> str:
+    """A temporary folder that nobody else can write: the kernels in it are run."""
+    import tempfile
+
+    folder = Path(tempfile.gettempdir()) / f"sweep-kernels-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+        return str(folder)
+    return tempfile.mkdtemp(prefix="sweep-kernels-")
+
+
+def _keep_kernels() -> None:
+    """Have numba keep kernels in a temporary folder where it can neither beside this package nor in
+    the user's own cache, as in containers and shared installations.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    places = Path(__file__).parent / "model" / "__pycache__", cache / "numba"
+    if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):
+        return
+    os.environ["NUMBA_CACHE_DIR"] = _own_folder()
+    if "numba" in sys.modules:  # it has read its settings already
+        sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
+
+
+_keep_kernels()
 
 
 def __getattr__(name: str) -> Any:

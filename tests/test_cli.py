@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import re
@@ -8,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 from click.testing import CliRunner
 from drawn_files import shows
 
@@ -150,6 +152,35 @@ def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
         "wrong.yaml",
     ]
     assert (here / "notes" / "text").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("figures", "a.zarr", "--output", "no/figures"),
+        ("report", "a.zarr", "--output", "no/page.html"),
+        ("shot", "small.yaml", "--output", "no/shot"),
+        ("spectra", "small.yaml", "--output", "no/spectra.npz"),
+        ("spectra", "small.yaml", "--output", "no/spectra.zarr"),
+    ],
+)
+def test_a_folder_that_can_not_be_written_is_told_in_a_line(here, monkeypatch, arguments):
+    one = STUDY[: STUDY.index("axes:")]
+    (here / "small.yaml").write_text(one)
+    driver.run(Spec.from_mapping(yaml.safe_load(one)), store="a.zarr", scheduler="none",
+               progress=False)  # fmt: skip
+    (here / "no").write_text("a file in the folder's place")
+    refused(sweep(*arguments), "no", ": mend that, or name another place\n")
+    (here / "no").unlink()
+    make = os.mkdir
+
+    def locked(path, *how, **where):
+        if "no" in Path(path).parts:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        make(path, *how, **where)
+
+    monkeypatch.setattr(os, "mkdir", locked)
+    refused(sweep(*arguments), ": Permission denied: mend that, or name another place\n")
 
 
 def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch):

@@ -69,6 +69,8 @@ def test_mistakes_over_a_scene_end_in_plain_words_and_exit_code_2(here):
     refused(sweep("export", "results/none.zarr", "a.las"), "there is no store")
     sweep("run", "descent.yaml", "--scheduler", "none")
     refused(sweep("export", "results/descent.zarr", "a.xyz"), "suffix", ".ply")
+    below = "descent.yaml/a.ply"  # a file where a folder should be
+    refused(sweep("export", "results/descent.zarr", below), "descent.yaml: ", "name another place")
     refused(sweep("export", "results/descent.zarr", "a.ply", "--draw", "7"), "numbered 0 to 1")
     (eyepoints,) = (here / "results" / "eyepoints").iterdir()
     refused(sweep("resume", eyepoints), "holds eyepoints")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,12 @@ from sweep.cli.telling import (
 from sweep.storage.locations import Location
 
 MISTAKE = 2
+
+#: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
+UNUSABLE = {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
+    errno.EISDIR, errno.ENAMETOOLONG,
+}  # fmt: skip
 
 SPEC = click.argument("spec", type=LocalPath(exists=True, dir_okay=False))
 STORE = click.argument("store", type=StorePath())
@@ -51,9 +58,13 @@ class Commands(click.Group):
                 NotAStoreError, ObjectStoreError, SceneError, SpecError, TaskError, UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
-            if not isinstance(said, told):
+            if isinstance(said, told):
+                click.echo(str(said), err=True)
+            elif isinstance(said, OSError) and said.filename and said.errno in UNUSABLE:
+                place = f"{said.filename}: {said.strerror}"
+                click.echo(f"{place}: mend that, or name another place", err=True)
+            else:
                 raise
-            click.echo(str(said), err=True)
             ctx.exit(MISTAKE)
 
 

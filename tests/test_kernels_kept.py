@@ -1,0 +1,56 @@
+"""Kernels are kept somewhere, however little of a machine can be written."""
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sweep
+
+CODE = """
+import numba, numpy, os, numba.core.config
+from sweep.model.geometry.quaternion import rotate
+rotate(numpy.eye(4)[:1], numpy.ones((1, 3)))
+assert os.environ["NUMBA_CACHE_DIR"] == numba.core.config.CACHE_DIR
+print(numba.core.config.CACHE_DIR)
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The package where nothing can be written beside it, by root neither."""
+    folder = tmp_path_factory.mktemp("installed")
+    shutil.copytree(
+        Path(sweep.__file__).parent, folder / "sweep", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    for package in [path for path in (folder / "sweep").rglob("*") if path.is_dir()]:
+        (package / "__pycache__").touch()
+    return folder
+
+
+def kept(installed, temporary):
+    """Where kernels are kept, without a home."""
+    nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), os.devnull)
+    environment = {name: value for name, value in os.environ.items() if "NUMBA" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, cwd=installed,
+        env=environment | nowhere | {"TMPDIR": str(temporary), "PYTHONPATH": str(installed)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    folder = Path(done.stdout.strip())
+    assert any(folder.rglob("*.nbi"))
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and folder.parent == temporary
+    return folder.name
+
+
+@pytest.mark.long
+def test_without_a_folder_of_its_own_kernels_are_kept_in_a_temporary_one(installed, tmp_path):
+    mine = f"sweep-kernels-{os.getuid()}"
+    assert kept(installed, tmp_path) == kept(installed, tmp_path) == mine
+    (tmp_path / mine).chmod(0o777)  # others may have put code there
+    another = kept(installed, tmp_path)
+    assert another != mine and another.startswith("sweep-kernels-")
