@@ -3,12 +3,11 @@
 from sweep.cli.commands import main
 from sweep.cli.compare import compare
 from sweep.cli.extend import extend
-from sweep.cli.files import certificates, schema
 from sweep.cli.report import report
 from sweep.cli.spectra import spectra
 from sweep.cli.stores import finalize, status, verify
 
-for command in (extend, status, verify, finalize, report, compare, spectra, certificates, schema):
+for command in (extend, status, verify, finalize, report, compare, spectra):
     main.add_command(command)
 
 __all__ = ["main"]

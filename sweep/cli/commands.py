@@ -10,13 +10,20 @@ from typing import Any
 
 import click
 
-from sweep.cli.accuracy import conclude_accuracy
-from sweep.cli.assignments import assignments
-from sweep.cli.options import ALLOW_CODE, FORMAT, WORKERS, computing
-from sweep.cli.places import LocalPath, StorePath, shown
+from sweep.cli.options import (
+    ALLOW_CODE,
+    FORMAT,
+    WORKERS,
+    LocalPath,
+    StorePath,
+    assignments,
+    computing,
+    shown,
+)
 from sweep.cli.telling import (
     INCOMPLETE,
     conclude,
+    conclude_accuracy,
     effects_of,
     grid_plan,
     scene_plan,
@@ -344,3 +351,31 @@ def export(
     with working("writing points"):
         points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=where)
     click.echo(f"{shown(file.absolute())}: {points:,} points")
+
+
+@main.command()
+@click.argument("directory", type=LocalPath(file_okay=False))
+@click.option("--days", type=click.IntRange(min=1), default=365, help="How long they hold [365].")
+def certificates(directory: Path, days: int) -> None:
+    """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
+
+    What is printed goes into the cluster's file: scheduler, workers and client then talk TLS, and
+    refuse whoever has no such certificate. Keep the directory to yourself, where all machines of
+    the cluster see it.
+    """
+    from sweep.tasks.clusters.certificates import make
+
+    files = make(directory.absolute(), days)
+    click.echo("security:")
+    for name, file in files._asdict().items():
+        click.echo(f"  {name}: {file}")
+
+
+@main.command()
+def schema() -> None:
+    """Print the JSON Schema of specs, for editors that check while one types."""
+    import json
+
+    from sweep.spec import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sweep.cli.places import LocalPath, StorePath
+from sweep.cli.options import LocalPath, StorePath
 from sweep.cli.telling import INCOMPLETE, print_table
 from sweep.storage.locations import Location
 

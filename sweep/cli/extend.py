@@ -7,9 +7,7 @@ from typing import Any
 
 import click
 
-from sweep.cli.assignments import assignments
-from sweep.cli.options import computing
-from sweep.cli.places import LocalPath, StorePath, shown
+from sweep.cli.options import LocalPath, StorePath, assignments, computing, shown
 from sweep.cli.telling import conclude
 from sweep.storage.locations import Location
 

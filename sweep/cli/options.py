@@ -1,13 +1,75 @@
-"""Options that several commands have: how they compute, and the format of pictures."""
+"""How places and values are written on the command line, and options that several commands have."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
-from sweep.cli.places import LocalPath
+from sweep.storage.locations import Location, located
+
+
+class LocalPath(click.Path):
+    """A path here, in which ~ stands for the user's own folder, after `--output=` too."""
+
+    def __init__(self, **rules: Any) -> None:
+        super().__init__(path_type=Path, **rules)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path, as click checks it."""
+        return super().convert(os.path.expanduser(value), param, ctx)
+
+
+class StorePath(click.ParamType):
+    """A path, or an address in an object store."""
+
+    name = "path"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Location:
+        """The place that is meant."""
+        return located(str(value))
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Paths, as the shell completes them."""
+        return [CompletionItem(incomplete, type="file")]
+
+
+def shown(path: Location) -> Location:
+    """A place as short as it can be written from here."""
+    here = Path.cwd()
+    if isinstance(path, Path) and path.is_relative_to(here):
+        return path.relative_to(here)
+    return path
+
+
+def assignments(
+    texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
+) -> dict[str, str]:
+    """Values by name, as written after an option.
+
+    Raises
+    ------
+    BadParameter
+        Where one is not NAME=VALUE.
+    """
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name.strip() and equals and value.strip()):
+            raise click.BadParameter(
+                f"{text!r} is not NAME=VALUE, as in {example}", param_hint=option
+            )
+        found[name.strip()] = value.strip()
+    return found
+
 
 WORKERS = click.option(
     "--workers",

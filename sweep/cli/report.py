@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
-from sweep.cli.places import LocalPath, StorePath, shown
+from sweep.cli.options import LocalPath, StorePath, shown
 from sweep.storage.locations import Location, beside
 
 
@@ -29,7 +32,6 @@ def report(store: Location, output: Path | None) -> None:
       sweep report results/range_angle.zarr
       sweep report results/forest_scan.zarr -o forest.html
     """  # noqa: D301
-    from sweep.cli.pieces import bar
     from sweep.report.writing import write
     from sweep.tasks.studies import read
 
@@ -38,3 +40,40 @@ def report(store: Location, output: Path | None) -> None:
     with bar("opening the store") as say:
         write(store, file, say)
     click.echo(f"{shown(file)}: {file.stat().st_size / 1e6:.1f} MB")
+
+
+@contextmanager
+def bar(begin: str) -> Iterator[Callable[[str], None]]:
+    """A bar on standard error while its block runs; gone at its end.
+
+    Parameters
+    ----------
+    begin
+        What is being done at first.
+
+    Yields
+    ------
+    callable
+        Is told what is being done next.
+    """
+    from dask.callbacks import Callback
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        step = progress.add_task(begin, total=None)
+
+        def say(text: str) -> None:
+            nonlocal step
+            progress.remove_task(step)  # a task that has a total cannot lose it
+            step = progress.add_task(f"making: {text}", total=None)
+
+        def started(graph: Mapping[Any, Any], state: Mapping[str, Any]) -> None:
+            progress.reset(step, total=len(state["waiting"]) + len(state["ready"]))
+
+        def done(*of_task: Any) -> None:
+            progress.advance(step)
+
+        with Callback(start_state=started, posttask=done):
+            yield say

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sweep.cli.places import LocalPath, StorePath
+from sweep.cli.options import LocalPath, StorePath
 from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def spectra(
       sweep spectra s3://bucket/cfar.zarr --at range=2km -o spectra.npz
     """  # noqa: D301
     from sweep.analysis.shot_figure import chosen
-    from sweep.cli.assignments import assignments
+    from sweep.cli.options import assignments
     from sweep.tasks.progress import working
     from sweep.tasks.spectra_export import spectra as drawn
     from sweep.tasks.spectra_export import write

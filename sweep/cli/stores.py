@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sweep.cli.places import StorePath, shown
+from sweep.cli.options import StorePath, shown
 from sweep.cli.telling import INCOMPLETE, in_bytes, tell_accuracy
 from sweep.storage.locations import Location, files_below
 

@@ -139,7 +139,7 @@ def _accuracy_cells(row: AccuracyRow) -> list[str]:
 
 def _scene_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
     """Title, headings and rows of a scene's summary."""
-    from sweep.tasks.scene_summary import scene_summary
+    from sweep.tasks.summary import scene_summary
 
     headings = ["scanner", "shots", "mean pd", "true", "false points", "velocity"]
     return (
@@ -310,3 +310,27 @@ def in_bytes(count: int) -> str:
             break
         size /= 1000
     return f"{size:.3g} {unit}"
+
+
+def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location], bool]:
+    """Print what settings came to, and draw it: the files, and whether it was not interrupted.
+
+    Leaves with the exit code of what is incomplete where nothing was measured.
+    """
+    if not measured:
+        click.echo("Interrupted before any point was through: nothing is kept.", err=True)
+        sys.exit(INCOMPLETE)
+    from sweep.analysis.accuracy import report, text
+
+    dataset, settings = report.opened(store)
+    print_table(
+        "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
+        list(text.SHORT), text.short_rows(settings), "setting",
+    )  # fmt: skip
+    print_table(
+        "Cheapest setting for each error", list(text.CHEAPEST), text.cheapest_rows(settings),
+        "cheapest setting",
+    )  # fmt: skip
+    for sentence in text.sentences(dataset, settings):
+        click.echo(sentence)
+    return [store, *report.draw(store)], dataset.attrs["stopped"] != "interrupted"

@@ -19,7 +19,7 @@ from sweep.tasks import studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import receipted
-from sweep.tasks.pieces import done_blocks, pieces
+from sweep.tasks.summary import done_blocks, pieces
 
 if TYPE_CHECKING:
     from sweep.spec import Axis, Spec
