@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sweep.analysis import canvas
-from sweep.analysis.accuracy import figure, report, text
+from sweep.analysis.accuracy import report, text
 from sweep.spec import load
 from sweep.tasks.accuracy.run import measure
 from sweep.tasks.accuracy.rungs import WRITTEN, Rung
@@ -154,7 +154,7 @@ def section(name: str, study: Study, time_limit: float) -> str:
         store = Path(folder) / f"{name}.zarr"
         measure(spec, store_path=store, time_limit=time_limit)
         dataset, settings = report.opened(store)
-    picture = canvas.save(figure.draw(dataset, settings), DOCS / f"accuracy_{name}.png")
+    picture = canvas.save(report.sheet(dataset, settings), DOCS / f"accuracy_{name}.png")
     put = ", ".join(f"`{k}: {v}`" for k, v in study.overrides.items() if k != "title")
     source = f"`experiments/{study.experiment}.yaml`" + (f" with {put}" if put else "")
     parts = [

@@ -12,10 +12,10 @@ import numpy as np
 
 import sweep
 from sweep.analysis import labels, noise_only
-from sweep.analysis.false_alarms import entries
 from sweep.analysis.figures import Study
 from sweep.analysis.shot_figure import chosen
 from sweep.analysis.shot_spectra import simulated
+from sweep.analysis.tables import entries
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec import load
 

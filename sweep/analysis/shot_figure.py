@@ -7,13 +7,89 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from sweep.analysis import canvas, labels, shot_drawing, shot_text
+import numpy as np
+
+from sweep.analysis import canvas, labels, shot_drawing
 from sweep.analysis.cuts import GRAZING_ANGLE
-from sweep.analysis.shot_spectra import Parameters, Shot, simulated
-from sweep.analysis.tabular import Block, Page
+from sweep.analysis.shot_spectra import Parameters, Segment, Shot, simulated
+from sweep.analysis.tabular import Block, Cell, Page, percent
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.spec import Spec
 from sweep.spec.fields import parameter_rules
+
+
+def blocks(shot: Shot) -> list[Block]:
+    """Tables of a shot."""
+    return [_noise(shot), _segments(shot), _report(shot), _false_alarms(shot)]
+
+
+def _noise(shot: Shot) -> Block:
+    """Noise at the ADC by source, in volts and shares of the variance."""
+    sources = {
+        name: float(np.asarray(value).item()) for name, value in shot.prepared.noise_sources.items()
+    }
+    total = sum(sources.values())
+    rows: list[list[Cell]] = [
+        [name.replace("_", " "), f"{math.sqrt(value):.4e}", percent(value / total, ".4g")]
+        for name, value in sorted(sources.items(), key=lambda item: -item[1])
+        if value > 0
+    ]
+    rows.append(["total", f"{math.sqrt(total):.4e}", percent(1.0, ".4g")])
+    return Block("Noise at the ADC", ("source", "V rms", "share"), rows)
+
+
+def _segments(shot: Shot) -> Block:
+    columns = (
+        "segment", "beat (MHz)", "seen at (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
+        "groups",
+    )  # fmt: skip
+    heading = (
+        f"Segments (noise of a bin {shot.dbv(shot.noise_level):.1f} dBV rms, threshold "
+        f"{shot.dbv(shot.threshold):.1f} dBV)"
+    )
+    return Block(heading, columns, [_segment_row(shot, segment) for segment in shot.segments])
+
+
+def _segment_row(shot: Shot, segment: Segment) -> list[Cell]:
+    peak = segment.peak
+    return [
+        segment.name,
+        f"{segment.beat / 1e6:+.6f}",
+        f"{segment.frequency[peak] / 1e6:.6f}",
+        peak,
+        f"{shot.dbv(segment.magnitude[peak]):.1f}",
+        f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
+        f"{segment.pd:.6g}",
+        len(segment.groups),
+    ]
+
+
+def _report(shot: Shot) -> Block:
+    """Range and radial velocity: true, reported, and the error in the units of a bin."""
+    p = shot.prepared
+    true = float(p.range[0]), float(p.radial_velocity[0])
+    rows = [
+        ["range (m)", f"{true[0]:.4f}", f"{shot.range:.4f}", f"{shot.range - true[0]:+.4f}"],
+        [
+            "radial velocity (m/s)", f"{true[1]:.5f}", f"{shot.radial_velocity:.5f}",
+            f"{shot.radial_velocity - true[1]:+.5f}",
+        ],
+    ]  # fmt: skip
+    verdict = "detected" if shot.detected else "NOT detected: read off the strongest bins"
+    return Block(f"Report ({verdict})", ("", "true", "reported", "error"), rows)
+
+
+def _false_alarms(shot: Shot) -> Block:
+    o = shot.outputs
+    rows = [
+        ["one bin, noise", f"{o['pfa_bin']:.4e}"],
+        ["up-chirp segment, noise", f"{o['pfa_segment']:.4e}"],
+        ["both chirp segments, noise", f"{o['pfa_shot']:.4e}"],
+        ["up-chirp segment, leakage", f"{o['p_leakage_up']:.4e}"],
+        ["down-chirp segment, leakage", f"{o['p_leakage_down']:.4e}"],
+    ]
+    return Block("False alarms", ("", "probability"), rows)
+
 
 MOST_SHOTS = 3
 """Values of a study's only axis up to which each is drawn."""
@@ -159,5 +235,5 @@ def _blocks(shots: list[Shot]) -> list[Block]:
         prefix = f"{shot.label}: " if shot.label else ""
         parameters = Block(f"{prefix}Shot", ("parameter", "value"), _told(shot, _TOLD))
         found += [parameters]
-        found += [Block(prefix + b.heading, b.columns, b.rows) for b in shot_text.blocks(shot)]
+        found += [Block(prefix + b.heading, b.columns, b.rows) for b in blocks(shot)]
     return found

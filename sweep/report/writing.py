@@ -3,24 +3,198 @@
 from __future__ import annotations
 
 import os
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import itables.options
+import jinja2
+import numpy as np
 import pandas
+from itables import to_html_datatable
+from itables.javascript import generate_init_offline_itables_html
+from markupsafe import Markup
+from plotly.io.json import to_json_plotly
+from plotly.offline import get_plotlyjs
 
 from sweep.analysis import labels
+from sweep.analysis.cells import known
 from sweep.analysis.defaults import default_figures
 from sweep.analysis.figures import Study, made_page
 from sweep.analysis.mean_table import outputs_page
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
 from sweep.analysis.scenes.figures import SceneStudy
+from sweep.analysis.scenes.quantities import INTERPOLATED, QUANTITIES, shown
+from sweep.analysis.scenes.recording import Thinned
 from sweep.analysis.tabular import Page as TablePage
-from sweep.report import asked, clouds, detector, flights, heat_maps, lines, reach, samples
+from sweep.report import asked, clouds, detector, flights, heat_maps, lines, looks, reach
+from sweep.report.clouds import Seen
 from sweep.report.page import Chart, Page, Section, Table, Text
-from sweep.report.rendering import rendered
 from sweep.spec import Slices, Surface
 from sweep.storage.locations import Location, located
+
+ROWS = 10
+"""Rows of a table that are shown at a time."""
+
+
+LONG = 40
+"""Characters from which on a cell holds a sentence."""
+
+
+def rendered(page: Page) -> str:
+    """The page as the text of a file."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sweep.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals |= {"table": _table, "chart_json": _chart_json, "download": _download}
+    environment.tests |= {
+        "chart": lambda item: isinstance(item, Chart),
+        "sheet": lambda item: isinstance(item, Table),
+        "text": lambda item: isinstance(item, Text),
+    }
+    return environment.get_template("report.html").render(
+        page=page,
+        plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        tables=Markup(generate_init_offline_itables_html(itables.options.dt_bundle)),
+        themes=_in_script(to_json_plotly(looks.themes())),
+    )
+
+
+def _in_script(json_text: str) -> Markup:
+    """JSON that can stand in a page, whatever words it holds."""
+    return Markup(json_text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
+def _chart_json(chart: Chart) -> Markup:
+    """What the page's script needs of a chart."""
+    relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in chart.controls if c.relayout}
+    return _in_script(
+        to_json_plotly({"figure": chart.figure.to_dict(), "relayouts": relayouts, "cut": chart.cut})
+    )
+
+
+def _table(table: Table, number: int) -> Markup:
+    """A table with its sorting, searching and downloading."""
+    csv = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
+    with pandas.option_context("display.float_format", "{:.6g}".format):
+        return Markup(_datatable(table.frame, number, csv))
+
+
+def _datatable(frame: pandas.DataFrame, number: int, csv: dict[str, str]) -> str:
+    return str(
+        to_html_datatable(
+            frame,
+            connected=False,
+            table_id=f"table-{number}",
+            showIndex=False,
+            maxBytes=0,
+            maxColumns=0,
+            classes="display compact",
+            style="width:100%",
+            columnDefs=[{"targets": _long(frame), "className": "long"}],
+            buttons=[csv, "copyHtml5"],
+            pageLength=ROWS,
+            display_logo_when_loading=False,
+        )
+    )
+
+
+def _long(frame: pandas.DataFrame) -> list[int]:
+    """Columns of sentences, which need some width."""
+    return [
+        i
+        for i, name in enumerate(frame.columns)
+        if frame[name].map(lambda cell: len(str(cell))).max() > LONG
+    ]
+
+
+def _download(text: Text) -> str:
+    """A text as an address that can be saved."""
+    return f"data:text/plain;charset=utf-8;base64,{b64encode(text.text.encode()).decode()}"
+
+
+MOST_ROWS = 1000
+
+COLUMNS = (
+    "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
+    "p_leakage_up", "false_alarms", "snr_up", "snr_doppler", "range_error",
+    "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
+    "radial_velocity_bound", "beamlets", "n_draws", "effects_error",
+)  # fmt: skip
+
+OF_POINTS = (
+    "time", "beam", "x", "y", "z", "range", "radial_velocity", "snr", "pd", "true_range",
+    "true_radial_velocity", "flags",
+)  # fmt: skip
+
+
+def grid_points(study: Study) -> Table | None:
+    """Points of a grid, every k-th along its longest axes; none where there is a single one."""
+    dataset = study.dataset
+    if not study.spec.axes:
+        return None
+    names = [name for name in COLUMNS if name in dataset]
+    dims = dict(zip(dataset[names[0]].dims, dataset[names[0]].shape, strict=True))
+    size = dict(dims)
+    while np.prod(list(size.values())) > MOST_ROWS:
+        longest = max(size, key=lambda dim: size[dim])
+        size[longest] -= max(1, size[longest] // 10)
+    chosen = {
+        dim: np.unique(np.linspace(0, dims[dim] - 1, number).round().astype(int))
+        for dim, number in size.items()
+    }
+    part = dataset[names].isel(chosen)  # type: ignore[arg-type]
+    for name in names:
+        part[name] = known(part[name]).assign_attrs(dataset[name].attrs)
+    frame = part.to_dataframe().reset_index()
+    frame = frame[[c for c in frame.columns if c in dataset.coords or c in names]]
+    frame = frame.rename(columns={c: _headed(c, dataset[c].attrs) for c in frame.columns})
+    total = int(np.prod(list(dims.values())))
+    return Table("Points", _told(len(frame), total), frame, "points")
+
+
+def _headed(name: str, attributes: dict[str, str]) -> str:
+    units = str(attributes.get("units", ""))
+    return name if units in ("", "1") else f"{name} [{units}]"
+
+
+def _told(rows: int, total: int) -> list[str]:
+    if rows == total:
+        return [f"All {total:,} points."]
+    return [
+        f"{rows:,} of {total:,} points, spread over all: reduced for this page. The store has "
+        "every one."
+    ]
+
+
+def cloud_points(found: list[Seen]) -> Table:
+    """Points of clouds of the first draw, with what a reader wants of each."""
+    frames, total = [], 0
+    for seen in found:
+        rows = Thinned(MOST_ROWS // len(found))
+        for part in seen.recording.stretches():
+            rows.add(seen.recording.points(list(OF_POINTS), part, ranges=INTERPOLATED))
+        total += rows.total
+        if rows.total:
+            table = rows.rows()
+            columns = {
+                _unit(name): shown(name, values) if name != "flags" else values
+                for name, values in table.items()
+            }
+            frames.append(pandas.DataFrame({"recorded by": seen.words or "the scanner"} | columns))
+    frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
+    return Table("Points", _told(len(frame), total), frame, "points")
+
+
+def _unit(name: str) -> str:
+    units = "dB" if name == "snr" else QUANTITIES[name].units
+    return name if units in ("", "1") else f"{name} [{units}]"
+
 
 Say = Callable[[str], None]
 """Is told what is being made."""
@@ -86,7 +260,7 @@ def _grid_page(store: Location, say: Say) -> Page:
     effects = asked.effects([dataset["effects"]], spec.modes(), dataset.coords)
     told = asked.accuracy(dataset, spec)
     say("points")
-    points = samples.grid_points(study)
+    points = grid_points(study)
     return Page(
         spec.title,
         spec.question,
@@ -171,7 +345,7 @@ def _scene_page(store: Location, say: Say) -> Page:
     told = asked.accuracy(groups[0], spec)
     say("points")
     came = flights.returns(seen)
-    points = samples.cloud_points(seen)
+    points = cloud_points(seen)
     without = [] if cloud else ["No shot has brought back a point."]
     return Page(
         spec.title,

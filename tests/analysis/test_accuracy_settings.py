@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis.accuracy import figure, report, settings, text
+from sweep.analysis.accuracy import report, settings, text
 from sweep.analysis.opening import NotAStoreError
 
 MADE_UP = [
@@ -205,7 +205,7 @@ def test_the_page_has_every_setting_and_the_sentences(dataset):
 
 
 def test_marks_stand_at_times_and_errors(dataset):
-    sheet = figure.draw(dataset, settings.settings_in(dataset))
+    sheet = report.sheet(dataset, settings.settings_in(dataset))
     (axes,) = sheet.axes
     marks = {
         tuple(np.ravel(line.get_data()))
@@ -213,7 +213,7 @@ def test_marks_stand_at_times_and_errors(dataset):
         if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
     }
     expected = {
-        (us, max(max(e), figure.FLOOR)) for _, kind, _, us, e in MADE_UP if kind != "reference"
+        (us, max(max(e), report.FLOOR)) for _, kind, _, us, e in MADE_UP if kind != "reference"
     }
     assert {(round(t, 9), e) for t, e in marks} == expected
     assert axes.get_xscale() == axes.get_yscale() == "log"
@@ -235,7 +235,7 @@ def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dat
         )
     ]  # fmt: skip
     others = [setting for setting in found if setting.kind != "adaptive"]
-    (axes,) = figure.draw(dataset, [*four, *others]).axes
+    (axes,) = report.sheet(dataset, [*four, *others]).axes
     words = [t.get_text() for t in axes.texts]
     assert "1e-1 … 1e-3" in words and "1e-4" in words and "1e-3" not in words
 
@@ -254,7 +254,7 @@ def test_names_keep_off_marks_and_each_other(dataset):
             (beamlets, "223 beamlets", np.nan, 22.0, 9e-4),
         )
     ]  # fmt: skip
-    sheet = figure.draw(dataset, [*found, *crowd])
+    sheet = report.sheet(dataset, [*found, *crowd])
     (axes,) = sheet.axes
     names = [text.get_window_extent() for text in axes.texts]
     assert len(names) >= 8

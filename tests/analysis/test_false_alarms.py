@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
 
-from sweep.analysis import cuts, false_alarms, leakage, tables
+from sweep.analysis import cuts, leakage, tables
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points
 
@@ -21,7 +21,7 @@ def power(tmp_path_factory):
 @pytest.fixture(scope="module")
 def entries(power):
     found, spec, _ = power
-    return false_alarms.entries(found, spec, by="power", printed=PRINTED)
+    return tables.entries(found, spec, by="power", printed=PRINTED)
 
 
 def test_rows_are_the_settings_and_columns_the_three_cuts(entries):
@@ -43,9 +43,7 @@ def test_noise_alone_is_the_closed_form_and_knows_nothing_of_power(entries):
 
 def test_noise_alone_follows_the_setting_of_its_row():
     spec = study({"instrument.processing.fft_size": ["2^16", "2^18"], "cut": CUTS})
-    sizes = [
-        false_alarms.reference(spec, {"instrument.processing.fft_size": n}) for n in (2**16, 2**18)
-    ]
+    sizes = [tables.reference(spec, {"instrument.processing.fft_size": n}) for n in (2**16, 2**18)]
     assert [size.bins for size in sizes] == [2**16, 2**18]
     # 16 times the pairs of bins, to first order in N p = 1e-4
     assert sizes[1].model / sizes[0].model == pytest.approx(16.0, rel=2e-4)
@@ -54,7 +52,7 @@ def test_noise_alone_follows_the_setting_of_its_row():
 def test_half_the_bins_give_a_quarter_of_the_alarms():
     processing = INSTRUMENT["processing"] | {"bins_counted": "half"}
     spec = study({}, instrument=INSTRUMENT | {"processing": processing})
-    found = false_alarms.reference(spec, {})
+    found = tables.reference(spec, {})
     assert found.bins == 2**16
     # the model leaves out the bins of the strongest line and its neighbours: 3 of 65,536
     assert found.model == pytest.approx(found.closed_form, rel=2 * 3 / 2**16)
@@ -186,7 +184,7 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
         "target.range": {"log": ["10 m", "1 km"], "number": 3},
     }
     found = Points.of(open_store(stored(tmp_path, axes)))
-    result = false_alarms.entries(found, study(axes), by="power")
+    result = tables.entries(found, study(axes), by="power")
     assert [e.row for e in result][:2] == [
         "power 1 W, FFT size 2^16",
         "power 1 W, FFT size 2^17",

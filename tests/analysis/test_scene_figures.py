@@ -11,8 +11,7 @@ from PIL import Image
 from sweep.analysis.figures import draw
 from sweep.analysis.opening import NotAStoreError
 from sweep.analysis.scenes import figures, scatter_figure
-from sweep.analysis.scenes.defaults import default_figures
-from sweep.analysis.scenes.figures import SceneStudy
+from sweep.analysis.scenes.figures import SceneStudy, default_figures
 from sweep.analysis.scenes.opening import opened
 from sweep.analysis.scenes.places import place
 from sweep.analysis.scenes.recording import Interval

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from drawn_scenes import MAPPING, cut_short, flown, scene
 
-from sweep.analysis.scenes import errors_over_altitude, navigation_figure, navigation_table
+from sweep.analysis.scenes import errors_over_altitude, figures, navigation_figure
 from sweep.analysis.scenes.errors_over_altitude import curves
 from sweep.analysis.scenes.opening import opened
 from sweep.analysis.scenes.places import place
@@ -127,7 +127,7 @@ def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_s
 
 def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp_path):
     (curve,) = curves(recordings(scene_store, spec, "1 W"), quantity="altitude", bins=3)
-    page = navigation_table.page(
+    page = figures.navigation_page(
         [curve], quantity="altitude", show="all", title="T", remarks=["a note"]
     )
     text, table = page.save(tmp_path, "navigation")
@@ -138,5 +138,5 @@ def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp
     assert sum(int(row["cycles"]) for row in rows) == curve.tally.attempts.sum()
     said = text.read_text()
     assert "square: altitude" in said and "in m;" in said and "a note" in said
-    only = navigation_table.page([curve], quantity="altitude", show="bias", title="", remarks=[])
+    only = figures.navigation_page([curve], quantity="altitude", show="bias", title="", remarks=[])
     assert "rmse" not in only.records[0] and "bias" in only.records[0]

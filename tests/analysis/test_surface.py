@@ -3,7 +3,7 @@ import pytest
 import xarray as xr
 from matplotlib.colors import LogNorm
 
-from sweep.analysis import canvas, cells, surface, surface_figure
+from sweep.analysis import canvas, cells, figures, surface
 from sweep.analysis.selection import Points
 
 UNITS = {"range": "m", "grazing_angle": "deg"}
@@ -33,7 +33,7 @@ def grid_of(found):
 def drawn(found, **changes):
     options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "long_name": "pd"}
     options |= {"title": "", "note": ""}
-    return surface_figure.draw(found, **(options | changes))
+    return figures.drawn_surface(found, **(options | changes))
 
 
 def pixels(sheet):

@@ -5,22 +5,137 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import dask.array
 import numpy as np
 import xarray as xr
+from contourpy import contour_generator
+from scipy.special import ndtri
 
 from sweep.analysis.answers import (
     alarms,
     comparison,
-    contours,
     errors,
     flight_comparison,
     limits,
     physical,
     probability,
     roc,
-    summary,
 )
+from sweep.analysis.answers.limits import deviate
+from sweep.analysis.answers.physical import coordinate
+from sweep.analysis.answers.probability import named
 from sweep.spec import SceneSpec, Spec
+
+STATISTICS = ("mean", "least", "largest", "number")
+
+
+def summarised(dataset: xr.Dataset) -> xr.Dataset:
+    """Mean, extremes and number of the computed points of every output.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or a part of it.
+
+    Returns
+    -------
+    xarray.Dataset
+        Every variable of floats over `statistic`, lazy; nan where no point is finite. The store
+        goes through memory chunk by chunk, each chunk once.
+    """
+    result = xr.Dataset(coords={"statistic": list(STATISTICS)}, attrs=dataset.attrs)
+    for name, array in dataset.data_vars.items():
+        if array.dtype.kind == "f":
+            result[name] = xr.DataArray(_reduced(array), dims=["statistic"], attrs=array.attrs)
+    return result
+
+
+def _reduced(array: xr.DataArray) -> dask.array.Array:
+    """The statistics of an array, (4,)."""
+    data = array.chunk().data if array.chunks is None else array.data
+    axis = data.ndim
+    parts = data.map_blocks(
+        _of_block, dtype=float, new_axis=axis, chunks=(*((1,) * n for n in data.numblocks), (4,))
+    )
+    return parts.reshape(-1, 4).rechunk(-1).map_blocks(
+        _of_all, dtype=float, drop_axis=0, chunks=((4,),)
+    )  # fmt: skip
+
+
+def _of_block(block: np.ndarray) -> np.ndarray:
+    """Sum, extremes and number of the finite values of a block, (1, .., 1, 4)."""
+    known = block[np.isfinite(block)]
+    least, largest = (known.min(), known.max()) if known.size else (np.inf, -np.inf)
+    return np.array([known.sum(), least, largest, known.size]).reshape((1,) * block.ndim + (4,))
+
+
+def _of_all(parts: np.ndarray) -> np.ndarray:
+    """The statistics of all blocks together, from (blocks, 4)."""
+    number = parts[:, 3].sum()
+    if not number:
+        return np.array([np.nan, np.nan, np.nan, 0.0])
+    return np.array([parts[:, 0].sum() / number, parts[:, 1].min(), parts[:, 2].max(), number])
+
+
+def contour(
+    dataset: xr.Dataset,
+    pd: float = 0.9,
+    *,
+    x: str = "range",
+    y: str = "grazing_angle",
+    segment: str = "shot",
+) -> xr.Dataset:
+    """Lines along which the probability of detection is at a level.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it; of any dimension other than the two one value selected.
+    pd
+        The level, 0 < pd < 1.
+    x, y
+        Coordinates, each with a dimension of its own.
+    segment
+        ``shot``, ``up``, ``doppler`` or ``down``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over `vertex`: the two coordinates in their units, and `line`, the number of the line that
+        the vertex is of, in order along it; none where pd is nowhere at the level. Between the
+        grid's points, places are interpolated as :mod:`sweep.analysis.answers.limits` does.
+
+    Raises
+    ------
+    ValueError
+        A coordinate that is not there, or further dimensions.
+    """
+    if not 0 < pd < 1:
+        raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
+    across, up = coordinate(dataset, x), coordinate(dataset, y)
+    array = dataset[named("pd", segment)]
+    if set(array.dims) != {across.name, up.name}:
+        others = ", ".join(str(d) for d in array.dims if d not in (across.name, up.name))
+        raise ValueError(
+            f"a contour goes over {across.name} and {up.name} as dimensions: "
+            + (f"select one value along {others}" if others else "they share one, or lack it")
+        )
+    z = deviate(array, dataset.get(named("miss", segment))).transpose(up.name, across.name)
+    found = contour_generator(
+        across.values, up.values, np.ma.masked_invalid(z.values)
+    ).lines(float(ndtri(pd)))  # fmt: skip
+    lines = [np.asarray(line) for line in found]
+    vertices = np.concatenate(lines) if lines else np.empty((0, 2))
+    numbers = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    return xr.Dataset(
+        {
+            str(across.name): ("vertex", vertices[:, 0], across.attrs),
+            str(up.name): ("vertex", vertices[:, 1], up.attrs),
+            "line": ("vertex", numbers, {"units": "1", "long_name": "number of the line"}),
+        },
+        attrs=dataset.attrs,
+    )
+
 
 ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two of a kind"
 
@@ -91,8 +206,8 @@ class SweepAccessor:
     def contour(
         self, pd: float = 0.9, *, x: str = "range", y: str = "grazing_angle", segment: str = "shot"
     ) -> xr.Dataset:
-        """Lines of constant pd over two coordinates: :func:`.contours.contour`."""
-        return contours.contour(self._dataset, pd, x=x, y=y, segment=segment)
+        """Lines of constant pd over two coordinates: :func:`contour`."""
+        return contour(self._dataset, pd, x=x, y=y, segment=segment)
 
     def false_alarms_per_second(
         self, rate: str | float | None = None, *, leakage: bool = False
@@ -127,8 +242,8 @@ class SweepAccessor:
         return comparison.compare(self._dataset, other)
 
     def summary(self) -> xr.Dataset:
-        """Mean, extremes and number of every output: :func:`.summary.summary`."""
-        return summary.summary(self._dataset)
+        """Mean, extremes and number of every output: :func:`summarised`."""
+        return summarised(self._dataset)
 
 
 @xr.register_datatree_accessor("sweep")

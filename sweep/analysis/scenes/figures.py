@@ -16,18 +16,18 @@ from sweep.analysis.scenes import (
     cloud_figure,
     errors_over_altitude,
     navigation_figure,
-    navigation_table,
     scatter_figure,
     shot_figure,
 )
-from sweep.analysis.scenes.defaults import default_figures
 from sweep.analysis.scenes.errors_over_altitude import Curve
 from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
+from sweep.analysis.scenes.navigation_figure import AVAILABILITY, BIAS, COMPONENTS, RMSE, UNITS
 from sweep.analysis.scenes.opening import opened
 from sweep.analysis.scenes.places import Place, place
 from sweep.analysis.scenes.quantities import QUANTITIES
 from sweep.analysis.scenes.recording import Interval, Recording
 from sweep.analysis.scenes.terrain import Ground
+from sweep.analysis.tabular import Block, Cell, Page
 from sweep.model.effects.flags import names_of
 from sweep.spec import SceneSpec
 from sweep.spec.scene_figures import (
@@ -39,6 +39,81 @@ from sweep.spec.scene_figures import (
     ShotSpectra,
 )
 from sweep.storage.locations import Location, located
+
+LENGTH = "vector"
+
+
+def navigation_page(
+    curves: Sequence[Curve], *, quantity: str, show: str, title: str, remarks: Sequence[str]
+) -> Page:
+    """A block for each scanner, a row for each bin of altitude.
+
+    Parameters
+    ----------
+    curves
+        Errors of each scanner.
+    quantity, show
+        ``velocity`` or ``altitude``; ``availability``, ``bias``, ``rmse`` or ``all``.
+    title, remarks
+        What stands over the page and under it.
+    """
+    shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
+    blocks, records = [], []
+    for curve in curves:
+        own = [_record(curve, i, quantity, shown) for i in range(curve.edges.size - 1)]
+        columns = [name for name in own[0] if name != "scanner"]
+        rows = [[record[name] for name in columns] for record in own]
+        blocks.append(Block(f"{labels.coordinate(curve.scanner)}: {quantity}", columns, rows))
+        records += own
+    notes = [
+        "from, to: true altitude above ground [m]; cycles: measurement cycles times draws.",
+        f"bias, rmse, stated: in {UNITS[quantity]}; stated: root of the mean variance that",
+        "  solutions give for themselves; error of bias: its standard error.",
+        *remarks,
+    ]
+    return Page(title, blocks, notes, records)
+
+
+def _record(curve: Curve, i: int, quantity: str, shown: Sequence[str]) -> dict[str, Cell]:
+    """One line of the CSV file."""
+    record: dict[str, Cell] = {
+        "scanner": curve.scanner,
+        "from": float(curve.edges[i]),
+        "to": float(curve.edges[i + 1]),
+        "cycles": int(curve.tally.attempts[i]),
+        "solved": int(curve.tally.count[i]),
+    }
+    names = COMPONENTS[quantity]
+    if AVAILABILITY in shown:
+        record["available"] = float(curve.tally.availability[i])
+    if BIAS in shown:
+        for k, name in enumerate(names):
+            record[f"bias {name}".strip()] = float(curve.bias[i, k])
+            record[f"error of bias {name}".strip()] = float(curve.bias_error[i, k])
+    if RMSE in shown:
+        for k, name in enumerate((*names, LENGTH) if len(names) > 1 else names):
+            record[f"rmse {name}".strip()] = float(curve.rmse[i, k])
+            record[f"stated {name}".strip()] = float(curve.predicted[i, k])
+    return record
+
+
+COLOURS = ("range", "radial_velocity")
+
+
+def default_figures(tree: xr.DataTree) -> list[SceneFigure]:
+    """Each scanner's cloud by range, with the flight path, and by velocity; navigation."""
+    scanners = [str(name) for name in tree.attrs["scanners"]]
+    figures: list[SceneFigure] = [
+        CloudFigure(kind="cloud", scanner=scanner, colour=colour, path=colour == "range")
+        for scanner in scanners
+        for colour in COLOURS
+    ]
+    if any("velocity_status" in tree[scanner] for scanner in scanners):
+        figures += [
+            NavigationFigure(kind="navigation", quantity=quantity)
+            for quantity in ("velocity", "altitude")
+        ]
+    return figures
 
 
 @dataclass(frozen=True)
@@ -113,7 +188,7 @@ def _made(study: SceneStudy, figure: SceneFigure, directory: Path, form: str) ->
     at = place(study.spec, figure.where)
     if isinstance(figure, NavigationTable):
         curves = _curves(study, figure, at)
-        page = navigation_table.page(
+        page = navigation_page(
             curves, quantity=figure.quantity, show=figure.show,
             title=figure.title or study.spec.title, remarks=[labels.joined([at.words, study.note])],
         )  # fmt: skip
