@@ -41,8 +41,10 @@ def block_of(
         As of :func:`sweep.model.eyepoints.seen_ground`.
     instrument : TileLink
         Of the parameters there, each the same for all shots.
-    edges, rotating
-        As of :meth:`sweep.model.effects.block.Block.of_cast`.
+    edges : (tiles + 1,) int ndarray
+        Tile i holds the shots from ``edges[i]`` up to ``edges[i + 1]``, one at least.
+    rotating : bool
+        Whether any surface belongs to a body that turns.
     """
     axes = axis_parameters(eyepoints)
     axes[HEIGHT] = instrument[HEIGHT].low + height_of_target(eyepoints)

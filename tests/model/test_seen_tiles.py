@@ -4,9 +4,9 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from cast_blocks import block_of_cast
 from small_scenes import flight, instrument, observed, plate
 
-from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.effects.planning import plan
 from sweep.model.effects.span import Span
@@ -39,7 +39,7 @@ def test_the_block_is_that_of_the_footprints(table_4_1, number, architecture, su
     assert len(seen.time) == EDGES[-1] and {*seen.surface.ravel()} >= {0, 1}
     assert number == 1 or (seen.surface < 0).any()
     shots, ground = seen_ground(seen, parameters, SURFACES)
-    slow = Block.of_cast(dict(shots), ground.beamlets, ground.beside, EDGES, rotating=True)
+    slow = block_of_cast(dict(shots), ground.beamlets, ground.beside, EDGES, rotating=True)
     own = {
         path: value if isinstance(value, str) else Span.of(np.asarray(value)[()])
         for path, value in parameters.items()

@@ -74,13 +74,6 @@ def phase(
     return np.asarray(alpha * t**2 * (frequency + slope * chirped))
 
 
-def drift_bins(
-    *, carrier: np.ndarray, acceleration: np.ndarray, duration: np.ndarray
-) -> np.ndarray:
-    """Bins of fs/L over which the beat drifts within the record, 2 f_seg (a / c) T_w^2, (n,)."""
-    return 2 * np.asarray(carrier) * acceleration / SPEED_OF_LIGHT * np.asarray(duration) ** 2
-
-
 @counted
 def error(block: "Block") -> Error | None:
     """The phase that acceleration adds over a block's tiles."""

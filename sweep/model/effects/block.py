@@ -6,7 +6,6 @@ and of what :func:`sweep.model.preparation.bare` would compute from them anywher
 same formulas at the ends. Nothing is computed before it is asked for.
 """
 
-from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
@@ -18,12 +17,11 @@ from sweep.model.effects.line_spread import Line, Moments, Spreads
 from sweep.model.effects.span import Span, monotone
 from sweep.model.effects.tile_geometry import Geometry
 from sweep.model.effects.tile_link import Parameters, TileLink
-from sweep.model.ground import Footprints
-from sweep.model.preparation import RECEIVER, relative_amplitude
+from sweep.model.preparation import relative_amplitude
 
 
 class Block(TileLink):
-    """Some tiles whose points are all of one category: of :meth:`of_plane` or :meth:`of_cast`.
+    """Some tiles whose points are all of one category: of :meth:`of_plane`, or of shots.
 
     Spans have one entry a tile, or are scalars where all tiles share them.
     """
@@ -68,42 +66,6 @@ class Block(TileLink):
             raise ValueError(f"spans over different numbers of tiles: {sizes}")
         geometry = tile_geometry.plane(parameters, *TileLink(parameters).beamlets)
         return cls(parameters, max(sizes, default=1), geometry)
-
-    @classmethod
-    def of_cast(
-        cls,
-        parameters: Mapping[str, np.ndarray | float | str],
-        footprints: Footprints,
-        beside: np.ndarray | None,
-        edges: np.ndarray,
-        rotating: bool = False,
-    ) -> "Block":
-        """Tiles of shots whose footprints rays have found.
-
-        Parameters
-        ----------
-        parameters : mapping
-            As of :func:`sweep.model.chain.prepare_cast`: scalars, or (n,) by shot.
-        footprints : Footprints
-            Of the n shots.
-        beside : (rows, beamlets) bool ndarray, optional
-            Beamlets on other surfaces than the axis's.
-        edges : (tiles + 1,) int ndarray
-            Tile i holds the shots from ``edges[i]`` up to ``edges[i + 1]``, one at least.
-        rotating : bool
-            Whether any surface belongs to a body that turns.
-        """
-        edges = np.asarray(edges)
-        spans: dict[str, Span | str] = {}
-        for path, value in parameters.items():
-            array = np.asarray(value)
-            if array.dtype.kind in "UO":
-                spans[path] = str(array.flat[0])
-            else:
-                spans[path] = tile_geometry.over(array, edges) if array.ndim else Span.of(array[()])
-        amplitudes = str(spans[RECEIVER + "architecture"])
-        geometry = tile_geometry.cast(footprints, beside, edges, amplitudes, rotating)
-        return cls(spans, edges.size - 1, geometry)
 
     @property
     def reach(self) -> float:

@@ -35,32 +35,6 @@ _SHAPES = ("quadratic", "cubic", "sinusoidal")
 _PEAKS = tuple(f"instrument.chirp.{shape}_error" for shape in _SHAPES)
 
 
-def frequency_error(
-    u: np.ndarray,
-    *,
-    quadratic: np.ndarray,
-    cubic: np.ndarray,
-    sinusoidal: np.ndarray,
-    periods: np.ndarray,
-) -> np.ndarray:
-    """Frequency error e [Hz] at place u along the sweep, -1..1 from lowest to highest frequency.
-
-    Parameters
-    ----------
-    u : ndarray
-        Place along the sweep; arrays broadcast.
-    quadratic, cubic, sinusoidal : ndarray
-        Peaks [Hz] of the errors, either sign.
-    periods : ndarray
-        Periods of the sinusoidal error over the sweep, > 0.
-    """
-    return (
-        quadratic * (2 * u**2 - 1)
-        + cubic * (4 * u**3 - 3 * u)
-        + sinusoidal * np.sin(np.pi * periods * u)
-    )
-
-
 def phase(
     x: np.ndarray,
     *,
@@ -88,7 +62,9 @@ def phase(
     range, radial_velocity : (n,) ndarray
         Of the target at the segment's start [m, m/s], positive closing.
     quadratic, cubic, sinusoidal, periods : (n,) ndarray
-        As of :func:`frequency_error`.
+        Peaks [Hz], either sign, of a frequency error quadratic (2 u^2 - 1) + cubic (4 u^3 - 3 u)
+        + sinusoidal sin(pi periods u) at place u along the sweep, -1..1 from lowest to highest
+        frequency; periods of the last over the sweep, > 0.
     start, duration : (n,) ndarray
         Acquisition delay t_0 and length L/fs of the record [s].
     """

@@ -7,9 +7,7 @@ take; and sums, whose order holds these up, are taken of four shots beside each 
 
 import math
 
-import numpy as np
-
-from sweep.model.compiling import borrowing, inlined
+from sweep.model.compiling import inlined
 
 WHOLE, GAIN, RANGES, OWN_RANGES, VELOCITIES, BESIDE, APART = 0, 1, 2, 5, 8, 11, 12
 FIELDS = 13
@@ -18,44 +16,13 @@ FIELDS = 13
 ROOM = 4
 """Rows of as many numbers as shots that are looked at together have rays, to work in."""
 
+
 _RAYS = 512
 
 
 def together(beamlets: int) -> int:
     """Shots that are looked at together: so many that what is made of them stays at hand."""
     return max(_RAYS // beamlets, 1)
-
-
-def fields_of(
-    offset: np.ndarray, doppler: np.ndarray, echo: np.ndarray, others: np.ndarray, by_roots: bool
-) -> np.ndarray:
-    """Fields of footprints, (fields, n): echo, gain, moments and what lies beside.
-
-    Parameters
-    ----------
-    offset, doppler, echo, others : (n, beamlets) ndarray
-        Of :class:`sweep.model.ground.Footprints`; whether beamlets lie on others surfaces.
-    by_roots : bool
-        Whether amplitudes are the roots of echoes.
-    """
-    found = np.empty((FIELDS, len(echo)))
-    beamlets = echo.shape[1]
-    group = together(beamlets)
-    room = np.empty((ROOM, group * beamlets))
-    seen = tuple(np.ascontiguousarray(values).ravel() for values in (offset, doppler, echo, others))
-    _each(seen, beamlets, group, by_roots, room, found)
-    return found
-
-
-@borrowing(nogil=True)
-def _each(seen, beamlets, group, by_roots, room, out):
-    """Fill in the fields of all footprints."""
-    offset, doppler, echo, others = seen
-    for first in range(0, out.shape[1], group):
-        stop = min(first + group, out.shape[1])
-        rays = slice(first * beamlets, stop * beamlets)
-        some = offset[rays], doppler[rays], echo[rays], others[rays]
-        set_fields(some, stop - first, True, by_roots, room, out[:, first:stop])
 
 
 @inlined(nogil=True)

@@ -67,18 +67,6 @@ def record_times(x: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> n
     return start[:, None] + duration[:, None] * (np.asarray(x) + 1) / 2
 
 
-def drift_bins(
-    *,
-    sign: int,
-    chirp_rate: np.ndarray,
-    radial_velocity: np.ndarray,
-    duration: np.ndarray,
-) -> np.ndarray:
-    """Bins of fs/L over which the beat drifts within the record, (n,), signed."""
-    beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
-    return 2 * sign * chirp_rate * beta * (1 + beta / 2) * np.asarray(duration) ** 2
-
-
 @counted
 def error(block: "Block") -> Error | None:
     """The phase that range walk adds over a block's tiles."""

@@ -32,7 +32,6 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model import philox
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene
 from sweep.model.effects.line_spread import image_factor
@@ -61,16 +60,6 @@ def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray
     """
     phase = 4 * math.pi * np.asarray(roughness, float) / np.asarray(wavelength, float)
     return np.asarray(np.exp(-(phase**2)))
-
-
-def segment_coherence(*, roughness: ArrayLike, bandwidth: ArrayLike) -> np.ndarray:
-    """Correlation of a patch's amplitudes at optical frequencies ``bandwidth`` [Hz] apart, 0..1.
-
-    The mean of exp(2 i dk h) over normal heights h, dk = 2 pi bandwidth / c. One draw for all
-    segments, as done here, takes it as 1.
-    """
-    phase = 4 * math.pi * np.asarray(bandwidth, float) / SPEED_OF_LIGHT
-    return np.asarray(np.exp(-0.5 * (phase * np.asarray(roughness, float)) ** 2))
 
 
 def factors(
@@ -159,43 +148,6 @@ def fixed_bin_detection(
     """
     s = np.sqrt(np.asarray(bin_deviation, float) ** 2 + np.asarray(diffuse_power, float) / 2)
     return marcum_q1(np.asarray(steady, float) / s, np.asarray(threshold, float) / s).q
-
-
-def joint_detection(
-    *,
-    powers: tuple[ArrayLike, ArrayLike],
-    covariance: ArrayLike,
-    bin_deviation: ArrayLike,
-    threshold: ArrayLike,
-) -> np.ndarray:
-    """Mean chance that two given bins of different segments both cross, all signal diffuse, 0..1.
-
-    Both are circular complex normal with the total powers T_1, T_2 (signal and noise), their
-    noises independent. With u_i = Th^2 / T_i, r^2 = |covariance|^2 / (T_1 T_2), s = 1 - r^2,
-    the bivariate Rayleigh distribution [Simon and Alouini, Digital Communication over Fading
-    Channels, 6.1] gives
-
-        e^{-u_1} [1 - Q_1(sqrt(2 u_2/s), r sqrt(2 u_1/s))] + e^{-u_2} Q_1(r sqrt(2 u_2/s),
-        sqrt(2 u_1/s))
-
-    Parameters
-    ----------
-    powers : (array_like, array_like)
-        Mean |X|^2 of the diffuse signal in each bin.
-    covariance : array_like
-        |E X_1 X_2*| of the signals.
-    bin_deviation, threshold : array_like
-        sigma and Th, the same in both.
-    """
-    noise = 2 * np.asarray(bin_deviation, float) ** 2
-    first, second = (np.asarray(power, float) + noise for power in powers)
-    square = np.asarray(threshold, float) ** 2
-    u, v = square / first, square / second
-    r2 = np.abs(covariance) ** 2 / (first * second)
-    far_u, far_v, r = np.sqrt(2 * u / (1 - r2)), np.sqrt(2 * v / (1 - r2)), np.sqrt(r2)
-    return np.asarray(
-        np.exp(-u) * marcum_q1(far_v, r * far_u).p + np.exp(-v) * marcum_q1(r * far_v, far_u).q
-    )
 
 
 def drawn_change(

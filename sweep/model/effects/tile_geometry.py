@@ -16,12 +16,10 @@ from sweep.model.effects.footprint_fields import (
     RANGES,
     VELOCITIES,
     WHOLE,
-    fields_of,
 )
 from sweep.model.effects.line_spread import Moments
 from sweep.model.effects.plane_geometry import put_planes
 from sweep.model.effects.span import Span
-from sweep.model.ground import Footprints
 from sweep.model.preparation import LASER, RECEIVER
 from sweep.model.reflectance import LAWS
 
@@ -83,28 +81,6 @@ def plane(p: Mapping[str, Span | str], number: int, pattern: str) -> Geometry:
         beside_share=Span.of(0.0),
         flat=True,
     )
-
-
-def cast(
-    footprints: Footprints,
-    beside: np.ndarray | None,
-    edges: np.ndarray,
-    architecture: str,
-    rotating: bool,
-) -> Geometry:
-    """Tiles of shots whose footprints rays have found.
-
-    Parameters
-    ----------
-    footprints, beside, edges, rotating
-        As of :meth:`sweep.model.effects.block.Block.of_cast`.
-    architecture : str
-        The receiver's.
-    """
-    row, offset, doppler, echo = footprints
-    others = np.zeros(echo.shape, np.bool_) if beside is None else beside
-    found = fields_of(offset, doppler, echo, others, architecture != "direct")
-    return of_fields(over(found[:, row], edges), rotating)
 
 
 def of_fields(fields: Span, rotating: bool = False) -> Geometry:

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from cast_blocks import block_of_cast
 from effect_points import ACROSS, point_block, scene, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model.chain import prepare, prepare_cast
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.footprint_phase import phase_reach
 from sweep.model.ground import Cast, Footprints
@@ -168,7 +168,7 @@ def test_shots_of_a_flight_are_tiled_by_stretches(table_4_1):
         range=rng.uniform(100, 200, shots), radial_velocity=rng.normal(0, 10, shots), beamlets=7
     )
     edges = np.array([0, 4, 5, 20, 30])
-    block = Block.of_cast(parameters, footprints, beside, edges, rotating=True)
+    block = block_of_cast(parameters, footprints, beside, edges, rotating=True)
     assert block.size == 4 and block.rotating
     tile = np.repeat(np.arange(4), np.diff(edges))
     power = echo / echo.sum(axis=1, keepdims=True)
@@ -207,7 +207,7 @@ def test_shots_that_send_back_next_to_nothing_have_moments(table_4_1, bright):
     footprints = Footprints(np.arange(2), offset, np.zeros_like(offset), np.full((2, 7), bright))
     parameters = DEFAULTS | table_4_1(range=np.full(2, 100.0), beamlets=7)
     beside = np.arange(7) < 3
-    block = Block.of_cast(parameters, footprints, np.stack([beside, beside]), np.array([0, 2]))
+    block = block_of_cast(parameters, footprints, np.stack([beside, beside]), np.array([0, 2]))
     there = bright > 0
     for moments in (block.ranges, block.geometry.own_ranges):
         np.testing.assert_allclose(list(moments), 1e-3 * there, rtol=1e-12)
@@ -219,7 +219,7 @@ def test_in_direct_detection_echoes_add_without_gain(table_4_1):
     nothing = np.zeros_like(echo)
     footprints = Footprints(np.arange(3), nothing, nothing, echo)
     parameters = DEFAULTS | table_4_1(architecture="direct", range=np.full(3, 100.0), beamlets=7)
-    block = Block.of_cast(parameters, footprints, None, np.array([0, 3]))
+    block = block_of_cast(parameters, footprints, None, np.array([0, 3]))
     assert block.gain.low == block.gain.high == 1.0
 
 

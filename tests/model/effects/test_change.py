@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pd_changes import pd_change
 
-from sweep.model.effects.change import Change, pd_change
+from sweep.model.effects.change import Change
 from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1

@@ -5,6 +5,7 @@ import pytest
 from effect_points import point_block, scene, shots_of, small, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
+from pd_changes import pd_change
 from scipy.integrate import quad
 
 from sweep.model.effects.atmosphere import (
@@ -19,7 +20,6 @@ from sweep.model.effects.atmosphere import (
     visibility_extinction,
 )
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.change import pd_change
 from sweep.model.effects.extinction import bound, dimming
 from sweep.model.effects.span import Span
 from sweep.model.marcum import marcum_q1

@@ -13,11 +13,11 @@ from effect_points import (
     shots_of,
     tile_block,
 )  # fmt: skip
+from pd_changes import pd_change
 from windows import marked
 
 from sweep.model.effects import footprint_phase, image, leakage
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.change import pd_change
 from sweep.model.effects.planning import plan
 from sweep.model.effects.span import Span
 from sweep.model.shot import find

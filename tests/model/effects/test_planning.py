@@ -7,11 +7,12 @@ import pytest
 from effect_points import scene, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
+from pd_changes import pd_change
 
 from sweep.model.chances import log_at_least_one
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.change import Change, pd_change
+from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Effect
 from sweep.model.effects.planning import plan
 from sweep.model.effects.probability_bounds import pd_change_within, probability_changes

@@ -3,11 +3,11 @@ the tolerance, at single points and anywhere in tiles."""
 
 import numpy as np
 import pytest
+from cast_blocks import block_of_cast
 from effect_points import found, point_block, scene, shots_of, tile_block
 
 from sweep.model import shot
 from sweep.model.chain import prepare_cast
-from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
 from sweep.model.effects.planning import plan
 from sweep.model.ground import Cast, Footprints
@@ -184,7 +184,7 @@ def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, 
             fft_size=2**13, phases=phases, power=10 ** rng.uniform(-3, 0), window="hann",
         )  # fmt: skip
         edges = np.arange(0, POINTS + 1, stretch)
-        block = Block.of_cast(parameters, footprints, beside, edges)
+        block = block_of_cast(parameters, footprints, beside, edges)
         tile = np.repeat(np.arange(block.size), stretch)
         ground = Cast(footprints, beside)
         made, still = (plan(block, modes, 0.05, CHOICE) for modes in ({}, STILL))
@@ -210,7 +210,7 @@ def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     edges = np.array([0, 2, 4])
     parameters = DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
     turning, still = (
-        plan(Block.of_cast(parameters, footprints, None, edges, rotating=r), {}, 0.5,
+        plan(block_of_cast(parameters, footprints, None, edges, rotating=r), {}, 0.5,
              [effect for effect in EFFECTS if effect.name == "rotation"])
         for r in (True, False)
     )  # fmt: skip

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from effect_points import magnitudes, point_block, scene, shots_of, small, tile_block
+from pd_changes import pd_change
 from scipy import stats
 
 from sweep.model import philox
 from sweep.model.effects import pointing_jitter
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.change import pd_change
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.pointing_jitter import angles, turned
 from sweep.model.realisations import realise

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from adc import truth_quantise
 from effect_points import point_block
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +16,6 @@ from sweep.model.effects.quantisation import (
     bound,
     rounding_change,
     step,
-    truth_quantise,
     variance,
 )
 from sweep.model.effects.span import Span

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from effect_points import point_block
+from pd_changes import pd_change
 
 from sweep.model import window
 from sweep.model.chain import prepare
-from sweep.model.effects.change import pd_change
 from sweep.model.effects.relative_intensity_noise import bound, current_variance
 from sweep.model.marcum import marcum_q1
 from sweep.model.noise import bin_deviation

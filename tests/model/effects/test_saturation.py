@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from adc import truth_quantise
 from effect_points import point_block, scene, shots_of, small, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +11,6 @@ from scipy.special import erf
 
 from sweep.model import window
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.quantisation import truth_quantise
 from sweep.model.effects.saturation import bound, clipped, clipping, harmonic_amplitude
 from sweep.model.effects.span import Span
 

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from effect_points import magnitudes, point_block, scene, small, tile_block
+from pd_changes import pd_change
 from scipy.integrate import quad
+from speckle_pairs import joint_detection
 
 from sweep.model import philox, truth
 from sweep.model.chain import prepare
 from sweep.model.effects import speckle
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.change import pd_change
 from sweep.model.marcum import marcum_q1
 from sweep.model.realisations import realise
 from sweep.model.shot import evaluate, find
@@ -37,7 +38,7 @@ def test_both_cross_as_an_integral_over_one_of_the_two_says():
                 return np.exp(-t) * marcum_q1(mean / np.sqrt(rest / 2), 6 / np.sqrt(rest / 2)).q
 
             exact, _ = quad(rice, 36.0 / first, 60.0, epsabs=1e-13, limit=200)
-            found = speckle.joint_detection(
+            found = joint_detection(
                 powers=powers, covariance=covariance, bin_deviation=1.0, threshold=6.0
             )
             assert found == pytest.approx(exact, rel=1e-8)
@@ -53,19 +54,6 @@ def test_the_coherent_share_is_that_of_a_sum_over_random_heights():
         assert abs(abs(mean) - np.sqrt(share)) < 5 / np.sqrt(number)
     assert speckle.coherent_share(roughness=np.inf, wavelength=wavelength) == 0
     assert speckle.coherent_share(roughness=0.0, wavelength=wavelength) == 1
-
-
-def test_segments_speckle_alike_as_far_as_their_frequencies_do():
-    rng = np.random.default_rng(4)
-    number, light, wavelength = 200, 299792458.0, 1550e-9
-    for roughness in (0.01, 0.03):
-        heights = rng.normal(scale=roughness, size=(4000, number))
-        first = np.exp(4j * np.pi * heights / wavelength).sum(axis=1)
-        second = np.exp(4j * np.pi * heights * (1 / wavelength + 1e9 / light)).sum(axis=1)
-        correlation = abs((first.conj() * second).mean()) / number
-        exact = speckle.segment_coherence(roughness=roughness, bandwidth=1e9)
-        assert abs(correlation - exact) < 5 / np.sqrt(4000)
-    assert speckle.segment_coherence(roughness=10e-6, bandwidth=1e9) > 1 - 1e-6
 
 
 def drawn_scene(number, table_4_1):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from mean_over_draws import evaluate
+from speckle_pairs import joint_detection
 
 from sweep.model import philox, truth, window
 from sweep.model.chain import prepare
@@ -166,7 +167,7 @@ def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     parameters = at_snrs(table_4_1, SNRS, beamlets=1)
     shots, plain = prepared(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
-    exact = speckle.joint_detection(
+    exact = joint_detection(
         powers=powers, covariance=np.sqrt(powers[0] * powers[1]), bin_deviation=1.0,
         threshold=shots.threshold / shots.bin_deviation,
     )  # fmt: skip
@@ -243,7 +244,7 @@ def joint(parameters, phase):
     """Chance of both chirps where beamlets part by normal phases [rad] of this deviation."""
     shots, plain = prepared(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
-    return speckle.joint_detection(
+    return joint_detection(
         powers=powers, covariance=np.exp(-0.5 * phase**2) * np.sqrt(powers[0] * powers[1]),
         bin_deviation=1.0, threshold=shots.threshold / shots.bin_deviation,
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cast_blocks import block_of_cast
 from effect_points import (
     ACROSS,
     CLOSED,
@@ -15,6 +16,7 @@ from effect_points import (
     small,
     tile_block,
 )
+from pd_changes import pd_change
 
 from sweep.model.chain import prepare_cast
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -25,8 +27,7 @@ from sweep.model.effects import (
     line_spread,
     several_returns,
 )
-from sweep.model.effects.block import Block
-from sweep.model.effects.change import Change, pd_change
+from sweep.model.effects.change import Change
 from sweep.model.footprint import beamlets as pattern_of
 from sweep.model.ground import Cast, Footprints
 from sweep.model.shot import find
@@ -222,7 +223,7 @@ def test_several_returns_change_no_more_than_their_bound(table_4_1):
             find(prepare_cast(parameters, ground, e))
             for e in ((*before, "several_returns"), before)
         )
-        block = Block.of_cast(parameters, footprints, others, np.arange(31))
+        block = block_of_cast(parameters, footprints, others, np.arange(31))
         change = several_returns.bound(block)
         inside, ratio = held(change, on[:, 2], off[:, 2])
         assert inside.all()
