@@ -8,7 +8,6 @@ other three.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,8 +72,6 @@ def heightfield(
     z: np.ndarray,
     *,
     spacing: tuple[float, float],
-    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
-    hole: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and upward-facing triangles of a grid of heights.
 
@@ -84,10 +81,6 @@ def heightfield(
         Heights [m]; NaN where there is none.
     spacing : (dx, dy) of float
         Step from column to column and from row to row [m]; either may be negative.
-    origin : (3,) array_like
-        Added to every vertex [m]; leave it 0 and keep it beside, where it is large.
-    hole : (rows, columns) bool array_like, optional
-        Further nodes without a height.
 
     Returns
     -------
@@ -103,8 +96,7 @@ def heightfield(
     """
     z = np.asarray(z, float)
     _check(z, spacing)
-    present = np.isfinite(z) if hole is None else np.isfinite(z) & ~np.asarray(hole, bool)
-    faces = _triangles(present)
+    faces = _triangles(np.isfinite(z))
     if spacing[0] * spacing[1] < 0:
         faces = faces[:, ::-1]
     used = np.zeros(z.size, bool)
@@ -112,7 +104,7 @@ def heightfield(
     number = np.cumsum(used) - 1
     row, column = np.divmod(np.flatnonzero(used), z.shape[1])
     vertices = np.column_stack([column * spacing[0], row * spacing[1], z.ravel()[used]])
-    return vertices + np.asarray(origin, float), number[faces]
+    return vertices + 0.0, number[faces]  # never -0.0
 
 
 def _check(z: np.ndarray, spacing: tuple[float, float]) -> None:

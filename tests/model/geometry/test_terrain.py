@@ -78,14 +78,6 @@ def test_a_missing_node_takes_half_of_each_of_its_four_cells():
     assert np.isfinite(vertices).all() and len(vertices) == 24
 
 
-def test_a_mask_makes_the_same_holes_as_missing_heights():
-    z, hole = hilly(6, 6), np.random.default_rng(2).random((6, 6)) < 0.2
-    masked = heightfield(z, spacing=(1.0, 1.0), hole=hole)
-    missing = heightfield(np.where(hole, np.nan, z), spacing=(1.0, 1.0))
-    for one, other in zip(masked, missing, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @given(st.integers(0, 2**32), st.sampled_from([(2.0, 3.0), (2.0, -3.0), (-1.0, 0.5)]))
 def test_the_height_at_a_place_is_that_of_the_facet_over_it(seed, spacing):
     """Against barycentric weights on the triangles themselves, holes included."""
