@@ -499,3 +499,10 @@ def _mapping() -> dict:
     import yaml
 
     return yaml.safe_load(STUDY)
+
+
+def test_a_study_is_extended_by_the_file_of_a_larger_one(here):
+    assert sweep("run", "small.yaml", "--scheduler", "none").exit_code == 0
+    (here / "larger.yaml").write_text(STUDY.replace("[1 W, 3 W]", "[1 W, 3 W, 5 W]"))
+    done = sweep("extend", "results/small.zarr", "larger.yaml", "--scheduler", "none")
+    assert done.exit_code == 0 and "results/small.zarr: 120 of 120 points" in done.stdout

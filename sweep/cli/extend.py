@@ -28,7 +28,11 @@ from sweep.storage.locations import Location
     type=StorePath(),
     help="Where the larger store goes; the old one then stays [in its place].",
 )
-@click.option("--overwrite", is_flag=True, help="Begin anew where an extension was begun.")
+@click.option(
+    "--overwrite",
+    is_flag=True,
+    help="Begin anew where one was begun; with --store, replace what is there.",
+)
 @computing
 def extend(
     store: Location,
@@ -61,11 +65,10 @@ def extend(
 
     if spec is None and not fields:
         raise click.UsageError("name the larger study, or what is to change in it with --set")
-    texts = assignments(fields, "--set", "draws.limit=1e6")
     outcome = driver.extend(
         store,
         load(spec) if spec else None,
-        changes=written(texts),
+        changes=written(assignments(fields, "--set", "draws.limit=1e6")) if fields else None,
         to=to,
         overwrite=overwrite,
         **how,
