@@ -76,6 +76,18 @@ def test_what_is_kept_of_an_interrupted_measurement_is_told_with_exit_code_3(her
     assert (here / "results" / "small_accuracy.png").exists()
 
 
+def test_a_study_that_was_run_into_its_place_meanwhile_is_left_alone(here, monkeypatch):
+    whole, store = measure.Measurement.run, "results/small_accuracy.zarr"
+
+    def beside_another(self):
+        assert sweep("run", "small.yaml", "--scheduler", "none", "--store", store).exit_code == 0
+        return whole(self)
+
+    monkeypatch.setattr(measure.Measurement, "run", beside_another)
+    refused(sweep("accuracy", "small.yaml", "--points", "3", "--overwrite"), "a study's results")
+    assert "complete" in sweep("status", store).stdout
+
+
 def test_help_says_what_is_measured_and_how():
     told = sweep("accuracy", "--help").stdout
     for word in ("tolerances", "thesis", "Ctrl-C", "--time-limit", "--points", "xarray"):

@@ -13,10 +13,11 @@ import xarray as xr
 import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
 from sweep.model.outputs import RUNNING
 from sweep.storage import opening, sealing
-from sweep.storage.locations import JOURNAL, Location, located, zarr_store
+from sweep.storage.locations import JOURNAL, Location, located
 from sweep.storage.opening import CHECKED, NotAStoreError
 from sweep.storage.receipts import read_receipts
 from sweep.storage.sealing import read_lines
+from sweep.storage.unreplaced import readable
 
 BATCH = "batch"
 PIECE = 2**20
@@ -59,11 +60,14 @@ def open(path: str | Location) -> xr.Dataset:
     ------
     NotAStoreError
         Where there is no store of a study, or one whose coordinates are lost or damaged.
+    ReplacedError
+        Later, where values are read that are not read yet, and another study's store is in the
+        place by then: the store was extended, or run anew.
     """
     path = located(path)
-    read_attributes(path, GRID)
+    study = read_attributes(path, GRID)
     refuse_lost(path)
-    dataset = xr.open_zarr(zarr_store(path), chunks=None, **CHECKED)
+    dataset = xr.open_zarr(readable(path, study["study_id"]), chunks=None, **CHECKED)
     points = dataset["effects"]
     blocks = map(math.ceil, np.divide(points.shape, points.encoding["chunks"]))
     dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))

@@ -59,10 +59,12 @@ class Commands(click.Group):
             from sweep.scenes.errors import SceneError
             from sweep.spec import SpecError
             from sweep.storage.objects import ObjectStoreError, worded
+            from sweep.storage.unreplaced import ReplacedError
             from sweep.tasks.errors import TaskError
 
             told = (
-                NotAStoreError, ObjectStoreError, SceneError, SpecError, TaskError, UnsupportedShot,
+                NotAStoreError, ObjectStoreError, ReplacedError, SceneError, SpecError, TaskError,
+                UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
             if isinstance(said, told):
@@ -110,7 +112,11 @@ def main() -> None:
     type=StorePath(),
     help="Where to, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
 )
-@click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+@click.option(
+    "--overwrite",
+    is_flag=True,
+    help="Replace a store that is there, once the new one is complete; on disk only.",
+)
 @computing
 def run(spec: Path, store: Location | None, overwrite: bool, **how: Any) -> None:
     """Compute the study SPEC into a Zarr store.
@@ -131,7 +137,7 @@ def run(spec: Path, store: Location | None, overwrite: bool, **how: Any) -> None
     study, path = load(spec), store or _default_store(spec)
     warn_before(study, path)
     outcome = driver.run(study, store=path, overwrite=overwrite, **how)
-    conclude(outcome, shown(outcome.store))
+    conclude(outcome, shown(path))
 
 
 def _default_store(spec: Path) -> Path:

@@ -32,7 +32,6 @@ def status(store: Location) -> None:
     """
     from sweep.tasks.progress import amount, duration
     from sweep.tasks.status import status as read
-    from sweep.tasks.succession import beside
 
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"
@@ -55,14 +54,27 @@ def status(store: Location) -> None:
         click.echo("not running; all that is left has failed")
     else:
         click.echo(f"not running; sweep resume {store}  goes on.")
-    if isinstance(store, Path) and beside(store).exists():
-        click.echo(f"being extended: sweep status {beside(store)}  says how far that is.")
+    _tell_what_is_under_way(store)
     for block, failure in sorted(s.failures.items()):
         click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
     if s.failures:
         click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.")
     if s.blocks_done:
         tell_accuracy(store)
+
+
+def _tell_what_is_under_way(store: Location) -> None:
+    from sweep.storage.atomic_replace import real
+    from sweep.tasks.errors import StoreError
+    from sweep.tasks.identity import under_way
+    from sweep.tasks.recipe import EXTENDS, read_recipe
+
+    try:
+        if new := under_way(real(store)):
+            what = "extended" if EXTENDS in read_recipe(new) else "replaced"
+            click.echo(f"being {what}: sweep status {new}  says how far that is.")
+    except StoreError as error:
+        click.echo(str(error))
 
 
 @click.command()

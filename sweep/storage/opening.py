@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.atomic_replace import settle
 from sweep.storage.chunks import ZSTD_LEVEL
 from sweep.storage.locations import JOURNAL, Location, zarr_store
 from sweep.storage.objects import ObjectStoreError
@@ -169,6 +170,7 @@ def _ours(path: Location, attributes: Any) -> dict[str, Any]:
 
 def _document(path: Location) -> dict[str, Any]:
     """The document of a store's root, a group."""
+    settle(path)
     try:
         if isinstance(path, Path) and not (path / "zarr.json").is_file():
             raise FileNotFoundError
@@ -190,6 +192,14 @@ def listed_attributes(path: Location) -> dict[str, Any]:
     """Attributes of a store by the list of what it was made of; empty where that is damaged."""
     found: dict[str, Any] = next(read_lines(path / JOURNAL / MANIFEST), {}).get("attributes", {})
     return found
+
+
+def study_id(path: Location) -> str:
+    """Id of the study in a store of any version, damaged or not; empty where there is none."""
+    try:
+        return str(_ours(path, _document(path)["attributes"])["study_id"])
+    except NotAStoreError:
+        return str(listed_attributes(path).get("study_id", ""))
 
 
 def remedy(path: Location) -> str:

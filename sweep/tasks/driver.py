@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.atomic_replace import beside, put, real, replaced_by, settle
 from sweep.storage.locations import PACKED, Location, located
+from sweep.storage.opening import study_id
 from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
@@ -24,11 +26,18 @@ from sweep.tasks.journal import Journal, committed, receipted
 from sweep.tasks.lock import Lock
 from sweep.tasks.pool import Place, Pool
 from sweep.tasks.progress import Progress, chosen, working
-from sweep.tasks.recipe import CODE, EXTENDS, read_recipe, refuse_damaged_recipe, write_recipe
+from sweep.tasks.recipe import (
+    CODE,
+    EXTENDS,
+    REPLACES,
+    forget_older,
+    read_recipe,
+    refuse_damaged_recipe,
+    write_recipe,
+)
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate
-from sweep.tasks.succession import beside, succeed, under_way
 from sweep.tasks.template import refuse_damaged
 from sweep.tasks.worker import Terms
 
@@ -72,7 +81,7 @@ def run(
     cluster
         The file that describes a cluster, or what such a file holds; `workers` fixes how many.
     overwrite
-        Whether to put the new store in the place of one that is there.
+        Whether to put the new store in the place of one that is there, once it is complete.
     progress
         True for a bar or lines on standard error, False for none, or a `Progress`.
     block_timeout
@@ -96,22 +105,16 @@ def run(
         Where a store is in the way or can't be written; where no scheduler or worker is to be had;
         where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
-    path, told = located(store).absolute(), chosen(progress)
+    path, told = real(located(store)), chosen(progress)
     user_code.check(spec)
-    study = studies.study_of(spec, path)
     place = Place(
         client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
         processes=processes, terms=Terms(evaluate, block_timeout, durable),
         performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec)  # fmt: skip
-    _make(path, study, overwrite, told)
-    if durable:
-        sync(path)
-    try:
-        return _go_on(path, study, place, told)
-    except ClusterError:
-        remove(path)  # nothing was computed, and the next try should not meet it
-        raise
+    if not overwrite:
+        _refuse_in_the_way(path, studies.study_of(spec, path))
+    return _into(path, spec, place, told, replace=overwrite, anew=True)
 
 
 def resume(
@@ -130,7 +133,7 @@ def resume(
     performance_report: str | Path | None = None,
     evaluate: Evaluate | None = None,
 ) -> Outcome:
-    """Compute what a store lacks; where it is being extended, what the larger one lacks.
+    """Compute what a store lacks; where it is being extended or replaced, what the new one lacks.
 
     Parameters
     ----------
@@ -153,8 +156,9 @@ def resume(
     ClusterError
         Where there is no scheduler or worker to be had.
     """
-    named = located(store).absolute()
-    path = under_way(named) or named
+    named = real(located(store))
+    named = replaced_by(named) if isinstance(named, Path) else named
+    path = identity.under_way(named) or named
     attributes, study = _held(path)
     if spec is not None:
         identity.refuse_other_study(path, attributes, study.spec, spec)
@@ -169,8 +173,11 @@ def resume(
         performance_report=None if performance_report is None else Path(performance_report),
     ).for_spec(spec or study.spec)  # fmt: skip
     if path != named:
-        told = chosen(progress)
-        return _grow(named, path, spec or study.spec, place, told, retry_failed=retry_failed)
+        extends = read_recipe(path).get(EXTENDS)
+        return _into(
+            named, spec or study.spec, place, chosen(progress), replace=True, anew=False,
+            extends=extends and located(extends), retry_failed=retry_failed,
+        )  # fmt: skip
     return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
 
 
@@ -224,8 +231,7 @@ def extend(
     StoreError, ClusterError
         As in `run` and `resume`; where the study asked for is not a larger one.
     """
-    path, told = located(store).absolute(), chosen(progress)
-    under_way(path)
+    path, told = real(located(store)), chosen(progress)
     attributes, older = _held(path)
     asked = changed(older.spec if spec is None else spec, changes or {})
     user_code.check(asked)
@@ -239,13 +245,12 @@ def extend(
         told.say(f"nothing to extend: {path} holds this very study")
         return _go_on(path, older, place, told)
     refuse_unlike(path, older.spec, asked)
-    new = _successor(path, to)
-    if overwrite or not new.exists():
-        _make(new, studies.study_of(asked, new), overwrite, told)
-    begun, held = _held(new)
-    identity.refuse_other_study(new, begun, held.spec, asked)
-    _refuse_unsound(new, begun, held)
-    return _grow(path, new, asked, place, told)
+    goal = path if to is None else real(located(to))
+    if not overwrite:
+        identity.under_way(goal)
+    return _into(
+        goal, asked, place, told, replace=overwrite or goal == path, anew=overwrite, extends=path
+    )
 
 
 def _declared(cluster: Declaration | None) -> AnyCluster | None:
@@ -275,71 +280,112 @@ def _refuse_unsound(
     refuse_damaged(path)
 
 
-def _successor(path: Location, to: str | Location | None) -> Location:
-    """Where a larger store is made."""
-    if to is not None and located(to).absolute() != path:
-        return located(to).absolute()
-    if not isinstance(path, Path):
-        raise StoreError(
-            f"{path} can't be extended in its place, as an object store has no renaming: "
-            "name another place for the larger store with --store; this one then stays"
-        )
-    return beside(path)
+def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
+    """Refuse a place in which there is something, or for which something is under way."""
+    new = identity.under_way(path)
+    if path.exists():
+        attributes, held = _held(path)
+        identity.refuse_other_study(path, attributes, held.spec, study.spec)
+        done = int(np.count_nonzero(receipted(path, study)))
+        said = f"{path} holds this study already, {done} of {study.n_blocks} blocks done"
+    elif new:
+        said = f"a study is under way in {new}"
+    else:
+        return
+    raise StoreError(f"{said}: `sweep resume {path}` goes on with it, --overwrite begins anew")
 
 
-def _grow(
+def _into(
     path: Location,
-    new: Location,
     asked: Declared,
     place: Place,
     told: Progress,
     *,
+    replace: bool,
+    anew: bool,
+    extends: Location | None = None,
     retry_failed: bool = False,
 ) -> Outcome:
-    """Compute what a larger store lacks, and have it succeed the one that it extends."""
+    """Compute a study into its place, or beside a store whose place it takes once it is complete.
+
+    Parameters
+    ----------
+    path, asked
+        The place, and the study.
+    replace
+        Whether a store that is there is to be replaced.
+    anew
+        Whether to begin anew where the study was begun.
+    extends
+        The store of a smaller study, whose results are taken.
+    """
+    settle(path)
+    new, facts = path, _facts(asked)
     with ExitStack() as stack:
-        in_place = isinstance(path, Path) and isinstance(new, Path) and new == beside(path)
-        if in_place:
+        if replace and path.exists():
+            identity.refuse_to_replace(path)
             stack.callback(Lock(path).release)
-        _note(new, asked, **{EXTENDS: str(path)})
-        study = _held(new)[1]
-        told.say(what_is_there(new, study))
-        outcome = _go_on(new, study, place, told, retry_failed=retry_failed)
-        if outcome.complete and isinstance(path, Path) and in_place:
-            succeed(path, durable=place.terms.durable)
-            return replace(outcome, store=path)
+        if replace and isinstance(path, Path) and (path.exists() or beside(path).exists()):
+            new = beside(path)
+            facts[REPLACES] = study_id(path)
+        if extends is not None:
+            facts[EXTENDS] = str(extends)
+        there = new.exists()
+        study = studies.study_of(asked, new, extends)
+        if there and anew:
+            Lock(new).release()  # refuses where someone writes to it
+        elif there:
+            begun, held = _held(new)
+            identity.refuse_other_study(new, begun, held.spec, asked)
+            _refuse_unsound(new, begun, held)
+            write_recipe(new, **read_recipe(new) | facts)
+        if isinstance(study, FlightStudy) and (anew or not there):
+            with working("building the scene", told):
+                reports = study.reports
+            for line in reports:
+                told.say(line)
+
+        def prepare(pool: Pool) -> None:
+            if there and anew:
+                pool.connect()  # what was begun goes when there are workers for what replaces it
+            if anew or not there:
+                durable = place.terms.durable
+                create(new, study, replace=there, recipe=facts, durable=durable)
+            if extends is not None:
+                told.say(what_is_there(new, study))
+            if new != path:
+                told.say(f"{path} stays as it is until {new} is complete and takes its place")
+
+        try:
+            outcome = _go_on(new, study, place, told, prepare=prepare, retry_failed=retry_failed)
+        except ClusterError:
+            if not there:
+                remove(new)  # nothing was computed, and the next try should not meet it
+            raise
+        if outcome.complete and isinstance(path, Path) and new == beside(path):
+            _succeed(path, durable=place.terms.durable)
+            return dataclasses.replace(outcome, store=path)
         return outcome
 
 
-def _make(path: Location, study: GridStudy | FlightStudy, overwrite: bool, told: Progress) -> None:
-    if path.exists() and overwrite:
-        identity.refuse_foreign(path)  # what is not a store of ours is not ours to remove
-        lock = Lock(path)  # refuses where someone writes to it
-        remove(path)
-        lock.release()
-    elif path.exists():
-        attributes, held = _held(path)
-        identity.refuse_other_study(path, attributes, held.spec, study.spec)
-        done = int(np.count_nonzero(receipted(path, study)))
+def _succeed(path: Path, *, durable: bool) -> None:
+    """Put the complete store beside a place, which the caller has locked, into it."""
+    new = beside(path)
+    try:
+        if durable:
+            sync(new)
+        put(new, path)
+        forget_older(path)  # where it stands now it extends and replaces nothing
+    except OSError as error:
         raise StoreError(
-            f"{path} holds this study already, {done} of {study.n_blocks} blocks done: "
-            f"`sweep resume {path}` goes on with it, --overwrite begins anew"
-        )
-    if isinstance(study, FlightStudy):
-        with working("building the scene", told):
-            reports = study.reports
-        for line in reports:
-            told.say(line)
-    create(path, study)
-    _note(path, study.spec)
+            f"{new} can't take the place of {path}: {error.strerror or error}"
+        ) from error
 
 
-def _note(path: Location, spec: Declared, **facts: str) -> None:
-    """Put down where the files of a store's study are, and what else is to be known of it."""
-    if (base := getattr(spec, "base", None)) is not None:
-        facts["base"] = str(base.absolute())
-    if facts:
-        write_recipe(path, **read_recipe(path) | facts)
+def _facts(spec: Declared) -> dict[str, str]:
+    """Where the files of a study are, for the recipe of its store."""
+    base = getattr(spec, "base", None)
+    return {} if base is None else {"base": str(base.absolute())}
 
 
 def _tell_changed_code(path: Location, spec: Declared, told: Progress) -> None:
@@ -365,27 +411,30 @@ def _go_on(
     told: Progress,
     *,
     retry_failed: bool = False,
+    prepare: Callable[[Pool], None] = lambda pool: None,
 ) -> Outcome:
-    lock, most = Lock(path), study.n_blocks
-    try:
-        journal = _journal(path, place.terms.durable)
+    with (
+        Interrupts() as interrupts,
+        ExitStack() as stack,  # the lock goes when the workers are gone
+        Pool(place, most=study.n_blocks, say=told.say) as pool,
+    ):
+        prepare(pool)
+        lock = Lock(path)
+        stack.callback(lock.release)
         _tell_changed_code(path, study.spec, told)
-        with Interrupts() as interrupts, Pool(place, most=most, say=told.say) as pool:
-            session = Session(
-                path, study, pool=pool, progress=told, interrupts=interrupts,
-                journal=journal, lock=lock, retry_failed=retry_failed,
-            )  # fmt: skip
-            if isinstance(study, GridStudy):
-                return session.to_its_end()
-            _note(path, study.spec)
-            if _is_done(path, study) and eyepoints_are_sound(study):
-                return session.to_its_end()
-            rays, why = cast(
-                study, pool=pool, told=told, interrupts=interrupts, retry_failed=retry_failed
-            )
-            return session.to_its_end(before=why, rays=rays)
-    finally:
-        lock.release()
+        session = Session(
+            path, study, pool=pool, progress=told, interrupts=interrupts,
+            journal=_journal(path, place.terms.durable), lock=lock, retry_failed=retry_failed,
+        )  # fmt: skip
+        if isinstance(study, GridStudy):
+            return session.to_its_end()
+        write_recipe(path, **read_recipe(path) | _facts(study.spec))
+        if _is_done(path, study) and eyepoints_are_sound(study):
+            return session.to_its_end()
+        rays, why = cast(
+            study, pool=pool, told=told, interrupts=interrupts, retry_failed=retry_failed
+        )
+        return session.to_its_end(before=why, rays=rays)
 
 
 def _is_done(path: Location, study: FlightStudy) -> bool:

@@ -11,6 +11,10 @@ class StoreError(TaskError):
     """A store that can't be used as asked."""
 
 
+class BusyError(StoreError):
+    """A store that another process writes to."""
+
+
 class ClusterError(TaskError):
     """A scheduler or workers that can't be had."""
 

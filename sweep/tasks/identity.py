@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sweep.storage import opening
+from sweep.storage.atomic_replace import beside, settle
 from sweep.storage.locations import JOURNAL, Location
 from sweep.storage.opening import MANIFEST, NotAStoreError
 from sweep.storage.sealing import read_lines
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
 from sweep.tasks.journal import LOGS
+from sweep.tasks.recipe import REPLACES, read_recipe
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -77,6 +79,42 @@ def refuse_foreign(path: Location) -> None:
         opening.refuse_foreign(path)
     except NotAStoreError as error:
         raise StoreError(str(error)) from None
+
+
+def refuse_to_replace(path: Location) -> None:
+    """Refuse to replace what no version of this program has made, or what can't be renamed.
+
+    Raises
+    ------
+    StoreError
+        As of :func:`refuse_foreign`, and in an object store.
+    """
+    if not isinstance(path, Path):
+        raise StoreError(
+            f"{path} can't be replaced or extended in its place, as an object store has no "
+            "renaming: name another place with --store; this one then stays"
+        )
+    refuse_foreign(path)
+
+
+def under_way(path: Location) -> Path | None:
+    """The store that is to take the place of the one at a path, where one was begun.
+
+    Raises
+    ------
+    StoreError
+        Where it was begun to take the place of another store than is there now.
+    """
+    settle(path)
+    if not isinstance(path, Path) or not (new := beside(path)).exists():
+        return None
+    if read_recipe(new).get(REPLACES) != opening.study_id(path):
+        now = "holds another study now" if path.exists() else "is gone"
+        raise StoreError(
+            f"{new} was begun to take the place of a store at {path}, which {now}: "
+            f"`rm -r {new}`, or have --overwrite begin anew"
+        )
+    return new
 
 
 def refuse_other_study(

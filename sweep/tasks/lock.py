@@ -16,7 +16,7 @@ import psutil
 
 from sweep.storage.claims import Claim, claim
 from sweep.storage.locations import JOURNAL, Location
-from sweep.tasks.errors import StoreError
+from sweep.tasks.errors import BusyError, StoreError
 
 LOCK = "lock"
 
@@ -104,8 +104,8 @@ class Lock:
 
     Raises
     ------
-    StoreError
-        Where a living driver holds it, or the store can't be written.
+    BusyError, StoreError
+        Where a living driver holds it; where the store can't be written.
     """
 
     def __init__(self, store_path: Location) -> None:
@@ -122,7 +122,7 @@ class Lock:
     def _refuse_a_living_one(self) -> None:
         other = holder(self._store)
         if other and other.token not in _left and is_live(self._store, other):
-            raise StoreError(
+            raise BusyError(
                 f"{self._store} is being written by process {other.pid} on {other.host}: "
                 "wait for it, or stop it; `sweep status` shows how far it is"
             )

@@ -7,10 +7,7 @@ is complete, chunks are better kept many to a file: to copy, to archive, to open
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import tempfile
-import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
@@ -20,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.storage import sealing
+from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
@@ -77,24 +75,16 @@ def pack(
     told = Late(chosen(progress))
     try:
         if isinstance(output, Path):
-            _pack_aside(path, output, study, told)
+            with draft(output) as aside:
+                aside.mkdir()
+                _pack(path, aside, study, told)
+                store.sync(aside)  # else a power cut may leave the name without the values
         else:
             with remote.making(output):
                 _pack(path, output, study, told)
     except OSError as error:
         raise StoreError(f"{output} can't be made: {error.strerror or error}") from error
     return output
-
-
-def _pack_aside(path: Location, output: Path, study: Study, told: Progress) -> None:
-    aside = output.with_name(f".{output.name}.packing-{os.getpid()}-{uuid.uuid4().hex[:8]}")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        aside.mkdir()
-        _pack(path, aside, study, told)
-        os.rename(aside, output)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _pack(path: Location, output: Location, study: Study, told: Progress) -> None:
@@ -115,6 +105,8 @@ def _pack(path: Location, output: Location, study: Study, told: Progress) -> Non
             told.advance(points=1, failed=0)
     finally:
         told.end()
+    if studies.read(path)[0]["study_id"] != study.id:
+        raise StoreError(f"{path} was extended or replaced while it was copied: try again")
     for name in (*LOGS, RECIPE):
         if content := b"".join(map(_without_host, read_lines(path / JOURNAL / name))):
             put_whole(output / JOURNAL / name, content)

@@ -93,6 +93,21 @@ class Pool:
         """How blocks are computed."""
         return self._place.terms
 
+    @property
+    def _is_plain(self) -> bool:
+        return self._place.client is None and self._place.scheduler == cluster.NONE
+
+    def connect(self) -> None:
+        """Reach the workers now, not with the first study.
+
+        Raises
+        ------
+        ClusterError
+            Where there is no scheduler or worker to be had.
+        """
+        if not self._is_plain:
+            self._connected()
+
     def answers(
         self, job: Job, todo: Todo, stopping: Callable[[], bool], seen: Seen
     ) -> Iterator[Answer]:
@@ -103,7 +118,7 @@ class Pool:
         ClusterError
             Where there is no scheduler or worker to be had.
         """
-        if self._place.client is None and self._place.scheduler == cluster.NONE:
+        if self._is_plain:
             if self._place.performance_report is not None:
                 self._say("no performance report: a plain loop has no scheduler to tell of it")
             return plain(job, todo, stopping, seen)

@@ -21,6 +21,9 @@ EXTENDS = "extends"
 #: Digests of the modules of the user's that it was begun with.
 CODE = "code"
 
+#: Id of the study whose store this one is to take the place of; empty where there is none.
+REPLACES = "replaces"
+
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
     """Put down where a study's files are, in one step."""
@@ -34,9 +37,10 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
 
 
 def forget_older(store_path: Path) -> None:
-    """Take away which store a study's extends."""
+    """Take away which store a study's extends and replaces."""
     facts = read_recipe(store_path)
-    facts.pop(EXTENDS, None)
+    for name in (EXTENDS, REPLACES):
+        facts.pop(name, None)
     if facts:
         write_recipe(store_path, **facts)
     else:

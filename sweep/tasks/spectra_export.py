@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.atomic_replace import draft
 from sweep.tasks.errors import StoreError
 from sweep.tasks.evaluate import draw_keys
 
@@ -162,21 +163,37 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
     Raises
     ------
     StoreError
-        Where the suffix is another, or something is in the way.
+        Where the suffix is another, or something is in the way: with `overwrite`, what this
+        function did not write.
     """
     if path.suffix not in SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(SUFFIXES)}")
-    if path.exists() and not overwrite:
-        raise StoreError(f"{path} is there already: --overwrite puts the new one in its place")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.stem}.writing{path.suffix}")
-    if path.suffix == ".npz":
-        arrays = {str(name): value.values for name, value in dataset.variables.items()}
-        arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
-        np.savez_compressed(draft, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
-        draft.replace(path)
-        return
-    dataset.to_zarr(draft, mode="w", zarr_format=3, consolidated=False)
     if path.exists():
-        shutil.rmtree(path)
-    draft.rename(path)
+        if not overwrite:
+            raise StoreError(f"{path} is there already: --overwrite puts the new one in its place")
+        if not _is_written_here(path):
+            raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another --output")
+    try:
+        with draft(path.resolve(), replace=overwrite) as made:
+            if path.suffix == ".zarr":
+                dataset.to_zarr(made, mode="w", zarr_format=3, consolidated=False)
+                return
+            arrays = {str(name): value.values for name, value in dataset.variables.items()}
+            arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
+            with open(made, "wb") as file:  # by a name, numpy would give it a suffix
+                np.savez_compressed(file, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
+    except OSError as error:
+        raise StoreError(f"{path} can't be written: {error.strerror or error}") from error
+
+
+def _is_written_here(path: Path) -> bool:
+    """Whether a file or folder is what `write` makes, by the names in it."""
+    names = {*TOLD, "attributes"}
+    try:
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return {name.removesuffix(".npy") for name in archive.namelist()} == names
+        found = {child.name for child in path.iterdir() if (child / "zarr.json").is_file()}
+        return found == names - {"attributes"}
+    except (OSError, zipfile.BadZipFile):
+        return False

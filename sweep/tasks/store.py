@@ -8,11 +8,10 @@ follows from the study.
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import os
-import shutil
 import tempfile
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
@@ -22,12 +21,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from sweep.storage import chunks, locations
+from sweep.storage.atomic_replace import discard, draft
 from sweep.storage.locations import JOURNAL, Location, each, located
 from sweep.storage.objects import in_words
 from sweep.storage.opening import LAYOUT, MANIFEST, open_group
 from sweep.storage.sealing import digest, digest_of, sealed
 from sweep.tasks import remote, versions
-from sweep.tasks.errors import StoreError
+from sweep.tasks.errors import BusyError, StoreError
+from sweep.tasks.recipe import write_recipe
 from sweep.tasks.study import ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
@@ -41,11 +42,29 @@ WRITTEN_WHOLE: ArrayConfigLike = {
 }  # else a chunk equal to the fill looks undone
 
 
-def create(path: str | Location, study: Content) -> Location:
+def create(
+    path: str | Location,
+    study: Content,
+    *,
+    replace: bool = False,
+    recipe: Mapping[str, Any] | None = None,
+    durable: bool = False,
+) -> Location:
     """A new store without results: every array's metadata, what is known beforehand, and the spec.
 
     It is built beside its place and renamed into it, so that a creation cut short leaves nothing
     that looks like a store; one in an object store is built here and sent, its root last.
+
+    Parameters
+    ----------
+    path, study
+        Its place, and what it is to hold.
+    replace
+        Whether it replaces what is there; never in an object store.
+    recipe
+        Facts for :mod:`sweep.tasks.recipe`.
+    durable
+        Whether all of it is to be on the disk before it is in its place.
 
     Raises
     ------
@@ -53,30 +72,35 @@ def create(path: str | Location, study: Content) -> Location:
         Where something is in its place, or the place can't be written.
     """
     path = located(path)
-    if not isinstance(path, Path):
-        with tempfile.TemporaryDirectory() as here:
-            build(Path(here) / path.name, study, new_attributes(study))
-            return remote.send(Path(here) / path.name, path)
-    building = path.with_name(f".{path.name}.creating-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        build(building, study, new_attributes(study))
-        os.rename(building, path)
+        if isinstance(path, Path):
+            with draft(path, replace=replace) as building:
+                _build_new(building, study, recipe)
+                if durable:
+                    sync(building)
+        else:
+            with tempfile.TemporaryDirectory() as here:
+                _build_new(Path(here) / path.name, study, recipe)
+                remote.send(Path(here) / path.name, path)
     except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST) and path.exists():
+            raise BusyError(f"{path} is there already: another process has made it") from error
         raise StoreError(f"{path} can't be made: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     return path
+
+
+def _build_new(path: Path, study: Content, recipe: Mapping[str, Any] | None) -> None:
+    build(path, study, new_attributes(study))
+    if recipe:
+        write_recipe(path, **recipe)
 
 
 def remove(path: Location) -> None:
     """Take a store away, out of its place in one step."""
-    if not isinstance(path, Path):
+    if isinstance(path, Path):
+        discard(path)
+    else:
         remote.remove(path)
-        return
-    aside = path.with_name(f".{path.name}.removing-{os.getpid()}-{uuid.uuid4().hex[:8]}")
-    os.rename(path, aside)
-    shutil.rmtree(aside)
 
 
 def build(

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, located
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
@@ -83,7 +84,8 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
     if attributes["kind"] == "eyepoints":
         return _eyepoints(path, recipe, base)
     spec = read_spec(path, attributes["spec"], base)
-    return study_of(spec, path, located(recipe[EXTENDS]) if EXTENDS in recipe else None)
+    extends = located(recipe[EXTENDS]) if EXTENDS in recipe else None
+    return study_of(spec, path, extends if extends != real(path) else None)
 
 
 def _eyepoints(path: Location, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:

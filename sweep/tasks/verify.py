@@ -12,6 +12,7 @@ import google_crc32c
 import numpy as np
 
 from sweep.storage import sealing
+from sweep.storage.atomic_replace import settle
 from sweep.storage.locations import JOURNAL, PACKED, PARTIAL, Location, located, names_below
 from sweep.storage.sealing import damaged_lines, read_sealed
 from sweep.tasks import identity, journal, lock, store, studies, template
@@ -95,6 +96,7 @@ def verify(
         `spec`; where it can't be repaired.
     """
     path, told = located(path).absolute(), Late(chosen(progress))
+    settle(path)
     study = _study(path, spec if repair else None)
     stores: dict[Location, AnyStudy | None] = {path: study}
     if isinstance(study, FlightStudy):

@@ -249,12 +249,12 @@ def test_a_creation_cut_short_looks_like_no_store_and_is_cleared(
     assert remote_tree(place) == tree(undisturbed)
 
 
-def test_overwriting_takes_away_everything_of_the_old_store(memory, undisturbed):
-    quiet(six(draws={"number": 20, "batch": 10}), memory)
-    assert "batch_draws/zarr.json" in remote_tree(memory)
+def test_nothing_is_overwritten_where_nothing_can_be_set_aside(memory, undisturbed):
+    quiet(six(), memory)
     with pytest.raises(StoreError, match="another study"):
-        quiet(six(), memory)
-    assert quiet(six(), memory, scheduler="none", overwrite=True).complete
+        quiet(six(seed=4), memory)
+    with pytest.raises(StoreError, match="an object store has no renaming: name another place"):
+        quiet(six(seed=4), memory, scheduler="none", overwrite=True)
     assert remote_tree(memory) == tree(undisturbed)
 
 

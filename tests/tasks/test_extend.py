@@ -17,13 +17,14 @@ from small_flights import small_scene
 
 from sweep.cli import main
 from sweep.model import sampling
+from sweep.storage.atomic_replace import beside
 from sweep.tasks import evaluate
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.lock import Lock
 from sweep.tasks.progress import Silent
-from sweep.tasks.succession import beside
+from sweep.tasks.status import status
 from sweep.tasks.verify import verify
 
 AXES = STUDY["axes"]
@@ -317,13 +318,14 @@ def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name)
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 4
     chunk.write_bytes(content)
-    assert larger(store, spec).complete
+    outcome = larger(store, spec)
+    assert outcome.complete
     size = next(
         GridStudy(small()).block_size(b)
         for b in range(12)
         if GridStudy(small()).chunks(b)[name] == (0, 1, 0)
     )
-    assert sum(computed) == 72 + size
+    assert sum(computed) == outcome.points_computed == 72 + size
     assert tree(store) == at_once(spec, tmp_path)
 
 
@@ -347,7 +349,8 @@ def test_its_own_place_named_is_its_own_place(tmp_path, undisturbed, computed):
 def test_changes_say_what_is_larger(tmp_path, undisturbed, computed):
     store = copied(undisturbed, tmp_path)
     outcome = larger(store, None, changes={f"axes.{POWER}": ["1 W", "2 W", "3 W"]})
-    assert outcome.complete and sum(computed) == 36
+    assert outcome.complete and sum(computed) == outcome.points_computed == 36
+    assert outcome.points_done == outcome.points == 108
     assert tree(store) == at_once(small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]}), tmp_path)
 
 
@@ -439,7 +442,8 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from small import STUDY, small
-from sweep.tasks import driver, succession
+from sweep.storage import atomic_replace
+from sweep.tasks import driver
 from sweep.tasks.journal import Journal
 
 store, moment = Path(sys.argv[2]), sys.argv[3]
@@ -454,7 +458,7 @@ def committing(self, *receipts):
         die()
 
 def renaming(old, new):
-    ahead = {"old": store, "new": succession.beside(store)}
+    ahead = {"old": store, "new": atomic_replace.beside(store)}
     if moment == f"before the {''.join(k for k, v in ahead.items() if v == Path(old))} one moves":
         die()
     rename(old, new)
@@ -462,11 +466,14 @@ def renaming(old, new):
 if moment == "three blocks":
     Journal.commit = committing
 elif moment == "as the old one is removed":
-    succession.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
+    atomic_replace.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
 else:
     os.rename = renaming
-axes = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
-driver.extend(store, small(axes=axes), progress=False, scheduler="none")
+spec = small(axes={**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]})
+if sys.argv[4] == "overwrite":
+    driver.run(spec, store=store, overwrite=True, progress=False, scheduler="none")
+else:
+    driver.extend(store, spec, progress=False, scheduler="none")
 """
 
 MOMENTS = (
@@ -476,19 +483,23 @@ MOMENTS = (
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("again", ["extend", "resume"])
+@pytest.mark.parametrize(
+    "how, again", [("extend", "extend"), ("extend", "resume"), ("overwrite", "resume")]
+)
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
-    tmp_path, undisturbed, computed, moment, again
+    tmp_path, undisturbed, computed, moment, how, again
 ):
     path, spec = copied(undisturbed, tmp_path), small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]})
     larger_tree = at_once(spec, tmp_path)
     here = str(Path(__file__).parent)
-    ended = subprocess.run([sys.executable, "-c", CLIENT, here, str(path), moment], check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", CLIENT, here, str(path), moment, how], check=False
+    )
     assert ended.returncode == -signal.SIGKILL
     grid = GridStudy(spec).grid
-    whole = [tree(each) for each in tmp_path.iterdir() if each.name != "at_once.zarr"]
-    assert tree(undisturbed) in whole or larger_tree in whole
+    there = status(path)  # the next command
+    assert there.complete and tree(path) in (tree(undisturbed), larger_tree)
     computed.clear()
     if again == "extend":
         assert larger(path, spec).complete
@@ -496,5 +507,10 @@ def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
         assert resume(path, progress=False, scheduler="none").complete
     assert tree(path) == larger_tree
     assert {each.name for each in tmp_path.iterdir()} == {"at_once.zarr", path.name}
-    there = sum(map(grid.block_size, range(3))) // 3 if moment == "three blocks" else 36
-    assert sum(computed) == 36 - there
+    taken = 72 if how == "extend" else 0
+    done = (
+        sum(map(grid.block_size, range(3))) * (1 - taken / 108)
+        if moment == "three blocks"
+        else 108 - taken
+    )
+    assert sum(computed) == 108 - taken - done

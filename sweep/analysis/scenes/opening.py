@@ -8,8 +8,9 @@ from typing import Any
 import xarray as xr
 
 from sweep.analysis.opening import SCENE, progress, read_attributes, refuse_lost
-from sweep.storage.locations import Location, located, zarr_store
+from sweep.storage.locations import Location, located
 from sweep.storage.opening import CHECKED
+from sweep.storage.unreplaced import readable
 
 STRETCH = 8192
 """Shots, times draws, that are read at a time."""
@@ -45,7 +46,8 @@ def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
     """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
     attributes = read_attributes(path, SCENE)
     refuse_lost(path)
-    tree = xr.open_datatree(zarr_store(path), engine="zarr", chunks=chunks, **CHECKED)
+    store = readable(path, attributes["study_id"])
+    tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **CHECKED)
     tree.encoding["source"] = str(path)
     tree.attrs |= progress(path, *_extent(tree, attributes))
     return tree

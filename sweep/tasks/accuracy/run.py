@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks import identity, store, versions
 from sweep.tasks.accuracy.bench import Bench
@@ -83,6 +84,7 @@ def measure(
             "this study draws whole spectra, which have no settings to try: "
             "leave out draws.method, detector and estimator"
         )
+    store_path = real(store_path)
     _refuse_in_the_way(store_path, overwrite)
     told = chosen(progress)
     with Interrupts() as interrupts:
@@ -95,9 +97,8 @@ def measure(
         except Nothing:
             return False
     stored = storing(study_of(spec, store_path))  # type: ignore[arg-type]
-    if store_path.exists():
-        store.remove(store_path)
-    store.create(store_path, Content(spec, bench, measured, stored))
+    _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
+    store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
     return True
 
 
@@ -108,6 +109,7 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
         raise StoreError(f"{path} holds a study's results: name another --store")
     if not overwrite:
         raise StoreError(f"{path} is there already: --overwrite measures anew")
+    identity.refuse_to_replace(path)
 
 
 class Content:
