@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import ExitStack
+
 from sweep.storage.locations import Location
 from sweep.tasks import identity
-from sweep.tasks.errors import StoreError
+from sweep.tasks.errors import BusyError, StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.interrupt import Interrupts
@@ -16,6 +19,9 @@ from sweep.tasks.recipe import read_recipe, write_recipe
 from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import create
 from sweep.tasks.template import refuse_damaged
+
+#: Seconds between looks at rays that another run casts.
+WAITING = 0.5
 
 
 def eyepoints_are_sound(study: FlightStudy) -> bool:
@@ -44,7 +50,7 @@ def cast(
     Raises
     ------
     StoreError
-        Where an eyepoint store is not what its name says, or is being written by someone else.
+        Where an eyepoint store is not what its name says, or can't be written.
     SceneError
         Where a file of the scene is missing, changed or unfit.
     """
@@ -55,8 +61,15 @@ def cast(
             rays[eyepoints.scanner] = 0
             continue
         _ = eyepoints.world  # what is wrong with the scene is the user's to mend, not a block's
-        told.say(f"casting {eyepoints.rays:,} rays through the scanner '{eyepoints.scanner}'")
-        outcome = _fill(path, eyepoints, pool, told, interrupts, retry_failed)
+        with ExitStack() as stack:
+            if not (lock := _locked(path, eyepoints, pool, told, interrupts)):
+                return rays, f"eyepoints of '{eyepoints.scanner}': interrupted"
+            stack.callback(lock.release)
+            if _is_whole(path, eyepoints):  # another run has cast them meanwhile
+                rays[eyepoints.scanner] = 0
+                continue
+            told.say(f"casting {eyepoints.rays:,} rays through the scanner '{eyepoints.scanner}'")
+            outcome = _fill(path, eyepoints, pool, told, interrupts, lock, retry_failed)
         rays[eyepoints.scanner] = eyepoints.rays_in(outcome.points_computed)
         if not outcome.complete:
             return rays, f"eyepoints of '{eyepoints.scanner}': {_why(outcome)}"
@@ -75,32 +88,47 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
     return bool(read_recipe(path)) and bool(committed(path, eyepoints).all())
 
 
+def _locked(
+    path: Location, eyepoints: EyepointStudy, pool: Pool, told: Progress, interrupts: Interrupts
+) -> Lock | None:
+    """The lock of an eyepoint store, made if need be, once no other run casts the same rays.
+
+    None where the run is interrupted before.
+    """
+    waiting = False
+    while not interrupts.stopping:
+        try:
+            if not path.exists():
+                create(path, eyepoints, durable=pool.terms.durable)
+            return Lock(path)
+        except BusyError as error:
+            if not waiting:
+                told.say(f"waiting for rays that another run casts: {error}")
+                waiting = True
+            time.sleep(WAITING)
+    return None
+
+
 def _fill(
     path: Location,
     eyepoints: EyepointStudy,
     pool: Pool,
     told: Progress,
     interrupts: Interrupts,
+    lock: Lock,
     retry_failed: bool,
 ) -> Outcome:
-    if not path.exists():
-        create(path, eyepoints)
-    lock = Lock(path)
-    try:
-        write_recipe(
-            path,
-            spec=eyepoints.spec.to_json(),
-            base=str(eyepoints.spec.base.absolute()),
-            scanner=eyepoints.scanner,
-        )
-        session = Session(
-            path, eyepoints, pool=pool, progress=told, interrupts=interrupts,
-            journal=Journal(path, durable=pool.terms.durable), lock=lock,
-            retry_failed=retry_failed,
-        )  # fmt: skip
-        return session.to_its_end()
-    finally:
-        lock.release()
+    write_recipe(
+        path,
+        spec=eyepoints.spec.to_json(),
+        base=str(eyepoints.spec.base.absolute()),
+        scanner=eyepoints.scanner,
+    )
+    session = Session(
+        path, eyepoints, pool=pool, progress=told, interrupts=interrupts,
+        journal=Journal(path, durable=pool.terms.durable), lock=lock, retry_failed=retry_failed,
+    )  # fmt: skip
+    return session.to_its_end()
 
 
 def _why(outcome: Outcome) -> str:

@@ -20,8 +20,11 @@ from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.lock import Lock
+from sweep.tasks.progress import Silent
 from sweep.tasks.scene_plan import scene_plan
 from sweep.tasks.status import status
+from sweep.tasks.store import create
 from sweep.tasks.summary import scene_summary
 
 
@@ -213,6 +216,29 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
         quiet(spec, tmp_path / "x.zarr")
     with pytest.raises(StoreError, match="holds eyepoints"):
         resume(one, progress=False, scheduler="none")
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["in part", "to their end"])
+def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
+    path = tmp_path / "scene.zarr"
+    study = EyepointStudy(small_scene(), "three")
+    theirs = eyepoints_path(path, study.id)
+    lock = Lock(create(theirs, study))
+
+    class Other(Silent):
+        """The other run, which goes on when this one waits."""
+
+        def say(self, text):
+            if "waiting for rays" in text:
+                if whole:
+                    cast = eyepoints_path(undisturbed.store, study.id)
+                    shutil.copytree(cast, theirs, dirs_exist_ok=True)
+                lock.release()
+
+    outcome = run(small_scene(), store=path, scheduler="none", progress=Other())
+    assert outcome.complete
+    assert outcome.rays == undisturbed.rays | ({"three": 0} if whole else {})
+    assert tree(tmp_path) == tree(undisturbed.store.parent)
 
 
 def test_another_study_in_the_store_is_refused_with_what_differs(undisturbed):
