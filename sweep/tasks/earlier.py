@@ -13,6 +13,9 @@ KnownThere = TypeVar("KnownThere", covariant=True)
 class Earlier(Protocol[KnownThere]):
     """Where results of a study may be had without computing them."""
 
+    taken: dict[int, int]
+    """Points of each block that `known` had whole."""
+
     def known(self, block: int, called: Called) -> KnownThere:
         """What is there of a block, computed as it would be here."""
 

@@ -77,6 +77,7 @@ class OlderFlight:
     def __init__(self, path: Location, older: FlightStudy, study: FlightStudy) -> None:
         self._older, self._study = older, study
         self._blocks = OlderBlocks(path, older)
+        self.taken: dict[int, int] = {}
         self._lattice = Lattice(older.spec)
 
     @cached_property
@@ -105,6 +106,7 @@ class OlderFlight:
                 results = {name: older[name][there, drawn] for name in NAVIGATION}
                 here = share.cycles.ours.start + whole
                 navigation.append(Patch(here, share.draws.ours, results))
+        self.taken[block] = sum(p.rows.size * (p.draws.stop - p.draws.start) for p in points)
         return KnownCloud(points, navigation)
 
     def count(self, block: int) -> int:

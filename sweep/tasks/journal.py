@@ -41,6 +41,7 @@ class Receipt:
     host: str
     pid: int
     versions: dict[str, str]
+    taken: int = 0  # of its points, those that a smaller study's store had
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,6 +55,7 @@ class OlderStore:
     def __init__(self, path: Location, older: GridStudy, study: GridStudy) -> None:
         self._older, self._study = older, study
         self._blocks = OlderBlocks(path, older)
+        self.taken: dict[int, int] = {}
         self._is_whole = are_alike(older.spec, study.spec)
         self._is_begun = not self._is_whole and goes_on(older.spec, study.spec)
 
@@ -73,6 +74,7 @@ class OlderStore:
             results = {name: values[share.place[same]] for name, values in older.items()}
             found.append(Found(share.points[same], results))
         together = self._together(found)
+        self.taken[block] = together.points.size if self._is_whole else 0
         return Known(done=together) if self._is_whole else Known(begun=together)
 
     def _together(self, found: list[Found]) -> Found:

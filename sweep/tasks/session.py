@@ -66,7 +66,7 @@ class Outcome:
     blocks: int
     points_done: int  # committed, in this run or before
     blocks_done: int
-    points_computed: int  # in this run
+    points_computed: int  # in this run; not those that a smaller study's store had
     blocks_computed: int
     failures: tuple[Failure, ...]
     left_out: int  # blocks that were given up before and not tried again
@@ -87,6 +87,7 @@ class Tally:
     """What one run has done so far."""
 
     points: int = 0
+    taken: int = 0
     blocks: int = 0
     seconds: float = 0.0
     write_seconds: float = 0.0
@@ -96,6 +97,7 @@ class Tally:
     def add(self, receipt: Receipt) -> None:
         """Count a committed block."""
         self.points += receipt.points
+        self.taken += receipt.taken
         self.blocks += 1
         self.bytes += receipt.bytes
         self.seconds += receipt.seconds
@@ -225,7 +227,7 @@ class Session:
             blocks=self._study.n_blocks,
             points_done=self._study.points_in(before) + tally.points,
             blocks_done=int(np.count_nonzero(before)) + tally.blocks,
-            points_computed=tally.points,
+            points_computed=tally.points - tally.taken,
             blocks_computed=tally.blocks,
             failures=tuple(tally.failures),
             left_out=left_out,

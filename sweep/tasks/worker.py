@@ -11,8 +11,8 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
+from sweep.storage.atomic_replace import stamp
 from sweep.storage.locations import located
 from sweep.tasks import begun, store, versions
 from sweep.tasks.begun import Begun
@@ -91,36 +91,21 @@ def _open(path: str, study_id: str) -> Opened:
 
 def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
-    held = _held(path, _stamp(path))
+    held = _held(path, stamp(located(path)))
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
 
 
-def _stamp(path: str) -> tuple[int, ...] | None:
-    """What tells a store's metadata from any other that were or will be in their place.
-
-    None where there is no such thing: reading them is then the only way to know.
-    """
-    if not isinstance(located(path), Path):
-        return None
-    try:
-        with open(f"{path}/zarr.json", "rb") as file:  # opened: a file server is asked anew
-            found = os.fstat(file.fileno())
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
-
-
-def _held(path: str, stamp: tuple[int, ...] | None) -> str:
+def _held(path: str, found: tuple[int, ...] | None) -> str:
     """Id of the study in a store; read again where its stamp is another."""
     from sweep.tasks.identity import read_attributes
 
     known = _stamps.get(path)
-    if known and stamp and known[0] == stamp:
+    if known and found and known[0] == found:
         return known[1]
     held = str(read_attributes(located(path))["study_id"])
-    if stamp:
-        _stamps[path] = stamp, held
+    if found:
+        _stamps[path] = found, held
     return held
 
 
@@ -203,6 +188,7 @@ def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | floa
     _refuse_another(str(path), held.id)  # its driver may be long dead
     written = opened.arrays.write(block, results)
     ended = time.perf_counter()
+    earlier = getattr(held, "earlier", None)
     return Receipt(
         block=block,
         points=held.block_size(block),
@@ -213,6 +199,7 @@ def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | floa
         host=socket.gethostname(),
         pid=os.getpid(),
         versions=versions.software(),
+        taken=earlier.taken.pop(block, 0) if earlier else 0,
     )
 
 
