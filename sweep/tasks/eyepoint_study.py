@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, SceneOutput
+from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks.grid_study import described
 from sweep.tasks.study import ArrayLayout, Results
@@ -38,7 +39,7 @@ SIZES = {"xyz": 3, "xyz_again": 3}
 
 def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
     """Eyepoint store of a geometry, for the study stored at a path."""
-    return study_path.parent / EYEPOINTS / f"{geometry_id}.zarr"
+    return real(study_path).parent / EYEPOINTS / f"{geometry_id}.zarr"
 
 
 class EyepointStudy:

@@ -9,6 +9,7 @@ from sweep.analysis.opening import read_attributes
 from sweep.model.eyepoints import Eyepoints
 from sweep.model.scene_outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, zarr_store
 from sweep.storage.opening import CHECKED, NotAStoreError
 
@@ -18,7 +19,7 @@ FOLDER = "eyepoints"
 
 def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
     """Store of the eyepoints that a scanner's clouds were made of."""
-    return store_path.parent / FOLDER / f"{scanner.attrs['geometry_id']}.zarr"
+    return real(store_path).parent / FOLDER / f"{scanner.attrs['geometry_id']}.zarr"
 
 
 def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
