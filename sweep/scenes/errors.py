@@ -31,9 +31,11 @@ def existing(path: str | Path) -> Path:
     Raises
     ------
     SceneError
-        Where it is not, or is a folder.
+        Where it is not, or is no plain file: a pipe would be waited for.
     """
     path = Path(path)
+    if str(path).startswith("/vsi"):
+        raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
     if path.is_dir():
         raise SceneError(path, "is a folder", "name the file in it")
     if not path.exists():
@@ -42,4 +44,6 @@ def existing(path: str | Path) -> Path:
             near = sorted(other.name for other in path.parent.glob(f"*{path.suffix}"))[:5]
             remedy += f" (there is: {', '.join(near)})" if near else ""
         raise SceneError(path, "does not exist", remedy)
+    if not path.is_file():
+        raise SceneError(path, "is a pipe or a device", "name a plain file")
     return path

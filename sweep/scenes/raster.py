@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +18,18 @@ from sweep.scenes.errors import SceneError, existing
 
 MOST_CELLS = 50_000_000
 """Heights read at once at most: 100 million triangles."""
+
+#: Rows that a digest is taken of at a time.
+_ROWS = 256
+
+#: For GDAL: it opens no address as a file, and its requests go to a port where nobody answers.
+_NO_NETWORK = {
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none", "GDAL_HTTP_PROXY": "127.0.0.1:1",
+}  # fmt: skip
+
+_SOURCE = re.compile(r"<Source(?:Filename|Dataset)([^>]*)>([^<]*)<")
+_SUBDATASET = re.compile(r"[A-Z0-9_]{2,}:")
+_LARGEST_VRT = 1 << 26
 
 _METRE = {"", "m", "metre", "meter", "metres", "meters"}
 _FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937}
@@ -67,16 +84,74 @@ def read_raster(
     return Terrain(heights, spacing, np.array([left * east, top * north, 0.0]))
 
 
-def _opened(path: Path) -> Any:
-    """Dataset of a raster; rasterio's import takes a third of a second and waits for its use."""
+def raster_digest(path: str | Path) -> str:
+    """Digest of what a raster holds: its heights, their spacing and its frame.
+
+    These may come from other files: those that a .vrt names, a world file, a mask.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    str
+        BLAKE2b, 128 bits, in hexadecimal digits.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing or no raster.
+    """
+    from rasterio.windows import Window as Pixels
+
+    path = existing(path)
+    with _opened(path) as data:
+        frame = (data.shape, data.transform, data.crs and data.crs.to_wkt())
+        digest = hashlib.blake2b(repr(frame).encode(), digest_size=16)
+        for band in data.indexes:
+            scale = data.scales[band - 1], data.offsets[band - 1], data.units[band - 1]
+            digest.update(repr(scale).encode())
+            for top in range(0, data.height, _ROWS):
+                rows = Pixels(0, top, data.width, min(_ROWS, data.height - top))
+                digest.update(_values(data, band, rows).tobytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Dataset of a raster; rasterio's import takes a third of a second and waits for its use.
+
+    A raster may name sources on other machines. None of them is asked for anything.
+    """
     import rasterio
 
+    _look_for_sources(path, set())
     try:
-        return rasterio.open(path)
+        with rasterio.Env(**_NO_NETWORK), rasterio.open(path) as data:
+            yield data
     except rasterio.errors.RasterioError as error:
         raise SceneError(
-            path, f"is no raster that can be read ({error})", "convert it to a GeoTIFF"
+            path,
+            f"is no raster that can be read ({error.__cause__ or error})",
+            "convert it to a GeoTIFF; nothing is fetched over the network",
         ) from None
+
+
+def _look_for_sources(path: Path, seen: set[Path]) -> None:
+    """Refuse a .vrt with sources that are no files here: GDAL may take zeros for what is lost."""
+    with path.open("rb") as file:
+        content = file.read(_LARGEST_VRT) if b"<VRTDataset" in file.peek(1024)[:1024] else b""
+    for attributes, name in _SOURCE.findall(content.decode(errors="replace")):
+        if "://" in name or "/vsi" in name:
+            raise SceneError(
+                path, f"is no raster that can be read (its source is {name})",
+                "fetch that: nothing is fetched over the network",
+            )  # fmt: skip
+        source = path.parent / unescape(name) if '"1"' in attributes else Path(unescape(name))
+        if source not in seen and not _SUBDATASET.match(name):
+            _look_for_sources(existing(source), seen | {source})
 
 
 def _straight(path: Path, data: Any, pixel: float | None) -> Any:
@@ -159,10 +234,15 @@ def _view(path: Path, data: Any, transform: Any, window: Window | None) -> Any:
     return view
 
 
+def _values(data: Any, band: int, view: Any) -> np.ndarray:
+    """Values of a band as they are stored, NaN where there are none."""
+    values = data.read(band, window=view, masked=True)
+    return np.asarray(np.ma.filled(values.astype(float), np.nan))
+
+
 def _heights(path: Path, data: Any, band: int, view: Any) -> np.ndarray:
     """Heights [m], NaN where the raster has no data."""
-    values = data.read(band, window=view, masked=True)
-    heights = np.ma.filled(values.astype(float), np.nan)
+    heights = _values(data, band, view)
     heights[~np.isfinite(heights)] = np.nan
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,8 +30,8 @@ class Files:
     base: Path
     digests: Mapping[str, str] = field(default_factory=dict)
 
-    def path(self, written: str) -> Path:
-        """Where a file is.
+    def path(self, written: str, digest: Callable[[Path], str] = file_digest) -> Path:
+        """Where a file is, whose digest is as its rule says.
 
         Raises
         ------
@@ -40,7 +40,7 @@ class Files:
         """
         path = self.base / os.path.expanduser(written)
         known = self.digests.get(written)
-        if known is not None and file_digest(path) != known:
+        if known is not None and digest(path) != known:
             raise SceneError(
                 path,
                 "has changed since the study was declared",
@@ -49,8 +49,8 @@ class Files:
         return path
 
 
-def named_files(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, str]]:
-    """Places in a spec that name a file, with the path written there."""
-    for key, rule, value in leaves(part, path):
+def named_files(part: BaseModel) -> Iterator[tuple[Key, File, str]]:
+    """Places in a spec that name a file, with their rule and the path written there."""
+    for key, rule, value in leaves(part, ()):
         if isinstance(rule, File):
-            yield key, value
+            yield key, rule, value

@@ -10,6 +10,7 @@ import numpy as np
 
 import sweep.spec.quantities as of
 from sweep.model.reflectance import LAWS
+from sweep.scenes.raster import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import File, Several
 from sweep.spec.rules import Choice, Numeric, Text
@@ -130,7 +131,6 @@ class Ground(Material, ABC):
         """
         from sweep.model.geometry.resampling import refine, smooth
         from sweep.model.geometry.terrain import Terrain
-        from sweep.scenes.raster import MOST_CELLS
 
         terrain = self.survey(files)
         if terrain.heights.size * self.factor**2 > MOST_CELLS:
@@ -225,7 +225,7 @@ class RasterGround(Ground):
     owns_coordinates = True
 
     kind: Literal["raster"]
-    file: Annotated[str, File(about="The raster, whatever rasterio reads")]
+    file: Annotated[str, File(about="The raster, whatever rasterio reads", digest=raster_digest)]
     band: Annotated[int, of.count("Band that holds the heights", "1")] = 1
     window: Annotated[
         tuple[float, ...] | None,
@@ -251,10 +251,8 @@ class RasterGround(Ground):
 
     def survey(self, files: Files) -> Terrain:
         """Heights of the raster."""
-        from sweep.scenes.raster import read_raster
-
         return read_raster(
-            files.path(self.file),
+            files.path(self.file, raster_digest),
             band=self.band,
             window=self.window,  # type: ignore[arg-type]
             metres_per_degree=self.metres_per_degree,  # type: ignore[arg-type]

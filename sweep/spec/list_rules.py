@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from sweep.scenes.digests import file_digest
 from sweep.spec.mistakes import near_miss
 from sweep.spec.rules import Numeric, Rule
 from sweep.units import QuantityError
@@ -235,7 +238,15 @@ class Flag(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class File(Rule):
-    """Path of a file, relative to the one that names it."""
+    """Path of a file, relative to the one that names it.
+
+    Parameters
+    ----------
+    digest
+        Digest of what is read from the file.
+    """
+
+    digest: Callable[[Path], str] = file_digest
 
     def read(self, written: object) -> str:
         """The path, as written."""

@@ -165,16 +165,15 @@ def _placed_origin(name: str, parts: Parts) -> Iterator[Finding]:
 
 def _file_findings(parts: Parts, base: Path) -> Iterator[Finding]:
     """Files that are missing or can not be read."""
-    from sweep.scenes.digests import file_digest
     from sweep.scenes.errors import SceneError
 
     things = [((*OBJECTS, name), thing) for name, thing in parts.objects.items()]
     if parts.platform is not None:
         things.append((("platform",), parts.platform))
     for location, thing in things:
-        for key, file in named_files(thing):
+        for key, rule, file in named_files(thing):
             try:
-                file_digest(Files(base).path(file))
+                rule.digest(Files(base).path(file))
             except SceneError as error:
-                rule = f"names a file that {error.rule}"
-                yield Finding((*location, *key), rule, error.remedy, file)
+                broken = f"names a file that {error.rule}"
+                yield Finding((*location, *key), broken, error.remedy, file)

@@ -279,6 +279,5 @@ class SceneSpec(Study):
 
 def _digests(spec: SceneSpec, base: Path) -> dict[str, str]:
     """Digest of every file that a spec names, by its path as written."""
-    from sweep.scenes.digests import file_digest
-
-    return {written: file_digest(Files(base).path(written)) for _, written in named_files(spec)}
+    files = Files(base)
+    return {written: rule.digest(files.path(written)) for _, rule, written in named_files(spec)}

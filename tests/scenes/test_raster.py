@@ -1,4 +1,7 @@
+import http.server
 import math
+import os
+import threading
 import warnings
 
 import numpy as np
@@ -8,7 +11,7 @@ from rasterio import Affine
 
 from sweep.scenes.degrees import metres_per_degree
 from sweep.scenes.errors import SceneError
-from sweep.scenes.raster import read_raster
+from sweep.scenes.raster import raster_digest, read_raster
 
 HEIGHTS = np.arange(20, dtype=np.float32).reshape(4, 5)
 SOUTHWARDS = Affine(2.0, 0.0, 500_000.0, 0.0, -3.0, 4_000_000.0)
@@ -193,3 +196,88 @@ def test_a_degree_of_longitude_and_of_latitude_are_those_of_the_ellipsoid():
     assert metres_per_degree(60.0, radius=1e6, flattening=0.0) == pytest.approx(
         (math.radians(5e5), math.radians(1e6))
     )
+
+
+def vrt(path, source):
+    """A raster of the heights in another place."""
+    path.write_text(
+        '<VRTDataset rasterXSize="5" rasterYSize="4"><SRS>EPSG:32617</SRS>'
+        "<GeoTransform>500000, 2, 0, 4000000, 0, -3</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        f'<SourceFilename relativeToVRT="0">{source}</SourceFilename><SourceBand>1</SourceBand>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    return path
+
+
+def test_the_digest_of_a_raster_follows_the_files_that_it_takes_its_heights_from(tiff, tmp_path):
+    over = vrt(tmp_path / "over.vrt", tiff())
+    again = vrt(tmp_path / "again.vrt", over)
+    before = raster_digest(over), raster_digest(again)
+    assert before[0] == before[1] == raster_digest(tiff())
+    tiff(HEIGHTS + 500)
+    after = raster_digest(over), raster_digest(again)
+    assert after[0] == after[1] != before[0]
+
+
+def test_the_digest_of_a_raster_follows_its_world_file_and_not_its_encoding(tiff, tmp_path):
+    path, world = tiff(crs=None, transform=None), tmp_path / "dem.tfw"
+    digests = []
+    for step in (2, 3):
+        world.write_text(f"{step}\n0\n0\n-{step}\n10\n10\n")
+        digests.append(raster_digest(path))
+    assert digests[0] != digests[1]
+    assert raster_digest(tiff()) == raster_digest(tiff(name="b.tif", compress="deflate"))
+    assert raster_digest(tiff()) != raster_digest(tiff(name="c.tif", nodata=3))
+    assert raster_digest(tiff()) != raster_digest(tiff(name="d.tif", scale=(2.0, 0.0)))
+    assert raster_digest(tiff()) != raster_digest(tiff(name="e.tif", units="ft"))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "/vsicurl/URL",
+        "/vsicurl_streaming/URL",
+        "/vsicurl?url=URL",
+        "URL",
+        "/vsisubfile/0_99,/vsicurl/URL",
+    ],
+)
+def test_a_raster_fetches_nothing_over_the_network(tiff, tmp_path, source):
+    tiff()
+    asked = []
+
+    class Told(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *given):
+            super().__init__(*given, directory=tmp_path)
+
+        def log_message(self, *words):
+            asked.append(words)
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Told) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_address[1]}/dem.tif"
+        over = vrt(tmp_path / "over.vrt", source.replace("URL", url))
+        for read in (read_raster, raster_digest):
+            with pytest.raises(SceneError, match=r"over\.vrt: is no raster.*over the network"):
+                read(over)
+        server.shutdown()
+    assert not asked
+
+
+def test_a_raster_over_one_that_is_lost_is_refused_every_time(tmp_path, tiff):
+    over = vrt(tmp_path / "over.vrt", vrt(tmp_path / "within.vrt", tiff()))
+    assert read_raster(over).heights.max() == 19
+    tiff().unlink()
+    for read in (read_raster, raster_digest, read_raster):
+        with pytest.raises(SceneError, match=r"dem\.tif: does not exist"):
+            read(over)
+
+
+def test_what_is_no_plain_file_is_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "dem.tif")
+    for read in (read_raster, raster_digest):
+        with pytest.raises(SceneError, match="pipe or a device; name a plain file"):
+            read(tmp_path / "dem.tif")
+        with pytest.raises(SceneError, match="no file of this machine; fetch it"):
+            read("/vsicurl/http://127.0.0.1:9/dem.tif")

@@ -1,5 +1,6 @@
 """What makes a scene study that one, and its geometry: content, never names or places."""
 
+import copy
 import json
 import pickle
 import shutil
@@ -246,6 +247,39 @@ def test_a_file_that_has_changed_since_is_refused(study_with_files):
     for one in (spec, stored):
         with pytest.raises(SceneError, match=r"box\.stl: has changed since .* bring the old"):
             one.world()
+
+
+def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
+    """Old eyepoints would be used without a word where it counted by its own bytes."""
+    import rasterio
+
+    def fill(height):
+        with rasterio.open(
+            tmp_path / "dem.tif", "w", driver="GTiff", width=50, height=50, count=1,
+            dtype="float32", crs="EPSG:32617", transform=rasterio.Affine(4, 0, 0, 0, -4, 200),
+        ) as data:  # fmt: skip
+            data.write(np.full((1, 50, 50), height, np.float32))
+
+    fill(0)
+    (tmp_path / "dem.vrt").write_text(
+        '<VRTDataset rasterXSize="50" rasterYSize="50"><SRS>EPSG:32617</SRS>'
+        "<GeoTransform>0, 4, 0, 200, 0, -4</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        '<SourceFilename relativeToVRT="1">dem.tif</SourceFilename><SourceBand>1</SourceBand>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    mapping = copy.deepcopy(RICH)
+    mapping["scene"]["objects"]["ground"] = {
+        "kind": "raster", "file": "dem.vrt", "reflectance": 0.1
+    }  # fmt: skip
+    flat = spec_of(mapping, tmp_path)
+    fill(500)
+    raised = spec_of(mapping, tmp_path)
+    name = next(iter(flat.scanners))
+    assert flat.id != raised.id and flat.geometry_id(name) != raised.geometry_id(name)
+    with pytest.raises(SceneError, match=r"dem\.vrt: has changed since"):
+        from_stored(flat.to_json(), base=tmp_path).world()
+    assert from_stored(raised.to_json(), base=tmp_path).world().reports
 
 
 def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
