@@ -54,16 +54,15 @@ class Commands(click.Group):
         except (click.exceptions.Exit, click.ClickException, click.Abort):
             raise
         except Exception as error:
-            from sweep.analysis.opening import NotAStoreError
             from sweep.model.unsupported import UnsupportedShot
             from sweep.scenes.errors import SceneError
             from sweep.spec import SpecError
             from sweep.storage.objects import ObjectStoreError, worded
             from sweep.storage.unreplaced import ReplacedError
-            from sweep.tasks.errors import TaskError
+            from sweep.tasks.errors import StoreError, TaskError
 
             told = (
-                NotAStoreError, ObjectStoreError, ReplacedError, SceneError, SpecError, TaskError,
+                ObjectStoreError, ReplacedError, SceneError, SpecError, StoreError, TaskError,
                 UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
@@ -312,9 +311,6 @@ def accuracy(
 @FORMAT
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
-    from sweep.tasks.studies import check
-
-    check(store)
     from sweep.analysis.figures import draw
     from sweep.tasks.progress import working
 

@@ -65,7 +65,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
 
 
 def _print_summary(store: Location) -> None:
-    from sweep.tasks.identity import read_attributes
+    from sweep.storage.opening import read_attributes
 
     print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
 

@@ -10,8 +10,6 @@ from urllib.parse import unquote
 
 from sweep.scenes.errors import SceneError, existing
 
-_CHUNK = 1 << 20
-
 
 def file_digest(path: str | Path) -> str:
     """Digest of a file's bytes, and of those of the files that it is read with.
@@ -39,8 +37,7 @@ def file_digest(path: str | Path) -> str:
     for part in (path, *_companions(path)):
         try:
             with existing(part).open("rb") as file:
-                while content := file.read(_CHUNK):
-                    digest.update(content)
+                hashlib.file_digest(file, lambda: digest)
         except OSError as error:
             raise SceneError(part, f"cannot be read ({error.strerror})", "check it") from None
     return digest.hexdigest()

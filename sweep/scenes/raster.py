@@ -85,19 +85,9 @@ def read_raster(
 
 
 def raster_digest(path: str | Path) -> str:
-    """Digest of what a raster holds: its heights, their spacing and its frame.
+    """Digest of a raster's heights, spacing and frame, as :func:`sweep.scenes.digests.file_digest`.
 
-    These may come from other files: those that a .vrt names, a world file, a mask.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    str
-        BLAKE2b, 128 bits, in hexadecimal digits.
+    They may come from other files: those that a .vrt names, a world file, a mask.
 
     Raises
     ------

@@ -74,18 +74,16 @@ _WORDS = {"name": "bytes", "configuration": {"endian": "little"}}
 _SHARDS = {"index_codecs": [_WORDS, _CHECKSUM], "index_location": "end"}
 
 
-class NotAStoreError(ValueError):
+class StoreError(Exception):
+    """A store that can't be used as asked."""
+
+
+class NotAStoreError(StoreError, ValueError):
     """A path at which there is no store of a study, or none that this program can read."""
 
 
 def open_group(path: Location, mode: Any = "r") -> zarr.Group:
-    """The arrays of a store, by its checked document.
-
-    Raises
-    ------
-    NotAStoreError
-        As of :func:`read_document`.
-    """
+    """The arrays of a store, by its checked document; raises as :func:`read_document`."""
     import zarr
 
     read_document(path)
@@ -93,13 +91,7 @@ def open_group(path: Location, mode: Any = "r") -> zarr.Group:
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
-    """Attributes of a store.
-
-    Raises
-    ------
-    NotAStoreError
-        As of :func:`read_document`.
-    """
+    """Attributes of a store; raises as :func:`read_document`."""
     attributes: dict[str, Any] = read_document(path)["attributes"]
     return attributes
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 
+from sweep.storage import opening
 from sweep.storage.locations import Location
 from sweep.tasks import identity
 from sweep.tasks.errors import BusyError, StoreError
@@ -80,7 +81,7 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
     """Whether an eyepoint store is there with all of its blocks."""
     if not path.exists():
         return False
-    attributes = identity.read_attributes(path)
+    attributes = opening.read_attributes(path)
     if attributes["study_id"] != eyepoints.id:
         raise StoreError(f"{path} holds other eyepoints than its name says: remove it")
     identity.refuse_other_versions(path, attributes, where="this machine")

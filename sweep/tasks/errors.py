@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from sweep.storage.opening import StoreError as StoreError
+
 
 class TaskError(Exception):
     """A study that can't be run as asked: the text says why and what to do."""
-
-
-class StoreError(TaskError):
-    """A store that can't be used as asked."""
 
 
 class BusyError(StoreError):

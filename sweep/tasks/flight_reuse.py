@@ -19,6 +19,7 @@ from sweep.model.resolution import by_tolerance
 from sweep.model.scene_outputs import NAVIGATION, POINTS, STATISTICS
 from sweep.scenes.errors import SceneError
 from sweep.spec import Spec
+from sweep.storage import opening
 from sweep.storage.locations import Location
 from sweep.tasks import identity
 from sweep.tasks.calling import EFFECTS, Called
@@ -184,7 +185,7 @@ class OlderFlight:
 def older_flight(path: Location, study: FlightStudy) -> OlderFlight | None:
     """What the store at a path knows of a study; None where it is gone, or knows nothing."""
     try:
-        attributes = identity.read_attributes(path)
+        attributes = opening.read_attributes(path)
         identity.refuse_other_versions(path, attributes, where="this machine")
         recipe = read_recipe(path)
         base = Path(recipe["base"]) if "base" in recipe else None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from sweep.storage import opening
 from sweep.storage.atomic_replace import beside, settle
 from sweep.storage.locations import JOURNAL, Location
-from sweep.storage.opening import MANIFEST, NotAStoreError
+from sweep.storage.opening import MANIFEST
 from sweep.storage.sealing import read_lines
 from sweep.tasks import versions
 from sweep.tasks.errors import StoreError
@@ -37,34 +37,6 @@ def read_spec(path: Location, text: str, base: Path | None = None) -> Spec | Sce
         ) from error
 
 
-def read_attributes(path: Location) -> dict[str, Any]:
-    """Attributes of a store, by its group's metadata alone.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store, or not one that this version of the program can read.
-    """
-    try:
-        return opening.read_attributes(path)
-    except NotAStoreError as error:
-        raise StoreError(str(error)) from None
-
-
-def recognised(path: Location, attributes: Any) -> dict[str, Any]:
-    """Attributes of a store, where this version of the program can read it.
-
-    Raises
-    ------
-    StoreError
-        Where it can't.
-    """
-    try:
-        return opening.recognised(path, attributes)
-    except NotAStoreError as error:
-        raise StoreError(str(error)) from None
-
-
 def refuse_foreign(path: Location) -> None:
     """Refuse what no version of this program has made; a damaged store of ours passes.
 
@@ -73,12 +45,8 @@ def refuse_foreign(path: Location) -> None:
     StoreError
         Where neither the group says that it is ours nor any line of the journal is whole.
     """
-    if any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
-        return
-    try:
+    if not any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
         opening.refuse_foreign(path)
-    except NotAStoreError as error:
-        raise StoreError(str(error)) from None
 
 
 def refuse_to_replace(path: Location) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from sweep.model.resolution import by_tolerance
 from sweep.spec import Spec
 from sweep.spec.detector_check import is_method
+from sweep.storage import opening
 from sweep.storage.locations import Location
 from sweep.tasks import identity
 from sweep.tasks.calling import EFFECTS, ERROR, TOLERANCE, Called
@@ -144,7 +145,7 @@ class OlderStore:
 def older_store(path: Location, study: GridStudy) -> OlderStore | None:
     """What the store at a path knows of a study; None where it is gone, or knows nothing."""
     try:
-        attributes = identity.read_attributes(path)
+        attributes = opening.read_attributes(path)
         identity.refuse_other_versions(path, attributes, where="this machine")
         held = identity.read_spec(path, attributes.get("spec", "{}"))
     except StoreError:

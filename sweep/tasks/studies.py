@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, located
+from sweep.storage.opening import read_attributes
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_reuse import older_flight
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.identity import read_attributes, read_spec
+from sweep.tasks.identity import read_spec
 from sweep.tasks.recipe import EXTENDS, read_recipe
 from sweep.tasks.reuse import older_store
 
@@ -43,18 +44,6 @@ def study_of(
     if isinstance(spec, SceneSpec):
         return FlightStudy(spec, path, partial(older_flight, extends) if extends else None)
     return GridStudy(spec, partial(older_store, extends) if extends else None)
-
-
-def check(path: Location) -> None:
-    """See that a path holds what `sweep figures` can draw.
-
-    Raises
-    ------
-    StoreError
-        As of :func:`read`.
-    """
-    if read_attributes(path)["kind"] != ACCURACY:
-        read(path)
 
 
 def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:

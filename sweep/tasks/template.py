@@ -38,8 +38,8 @@ def attributes(path: Location) -> dict[str, Any]:
         Where there is no store, or not one of this program's; where both are damaged.
     """
     if listed := opening.listed_attributes(path):
-        return identity.recognised(path, listed)
-    found = identity.read_attributes(path)
+        return opening.recognised(path, listed)
+    found = opening.read_attributes(path)
     if any(_wrong(path, o, digest) for o, digest in digests(path).items() if o == "zarr.json"):
         raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     return found

@@ -98,7 +98,7 @@ def _refuse_another(path: str, study_id: str) -> None:
 
 def _held(path: str, found: tuple[int, ...] | None) -> str:
     """Id of the study in a store; read again where its stamp is another."""
-    from sweep.tasks.identity import read_attributes
+    from sweep.storage.opening import read_attributes
 
     known = _stamps.get(path)
     if known and found and known[0] == found:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks import identity, store, versions
@@ -105,7 +106,7 @@ def measure(
 def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
     if not path.exists():
         return
-    if identity.read_attributes(path)["kind"] != ACCURACY:
+    if opening.read_attributes(path)["kind"] != ACCURACY:
         raise StoreError(f"{path} holds a study's results: name another --store")
     if not overwrite:
         raise StoreError(f"{path} is there already: --overwrite measures anew")
