@@ -45,6 +45,6 @@ def block_of_cast(
     found, room = np.empty((FIELDS, number)), np.empty((ROOM, number * beamlets))
     flat = tuple(np.ascontiguousarray(values).ravel() for values in seen)
     by_roots = spans["instrument.receiver.architecture"] != "direct"
-    set_fields(flat, number, True, by_roots, room, found)
+    set_fields(flat, number, by_roots, room, found)
     geometry = tile_geometry.of_fields(tile_geometry.over(found[:, row], edges), rotating)
     return Block(spans, edges.size - 1, geometry)

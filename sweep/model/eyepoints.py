@@ -18,7 +18,6 @@ from sweep.model.compiling import borrowing, inlined
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.atmosphere import PATH_ELEVATION
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.footprint_fields import together
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.beamlet_rays import beamlet_rays
 from sweep.model.geometry.jitter import PointingJitter
@@ -32,6 +31,9 @@ from sweep.model.preparation import Parameters, Shots
 
 HEIGHT = "atmosphere.target_height"
 SUNLIGHT = "target.solar_irradiance"
+
+_RAYS = 512
+"""Rays of shots that are looked at together: so many that what is made of them stays at hand."""
 _LAMBERT = reflectance.LAWS.index("lambert")
 
 
@@ -253,7 +255,7 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
     (n, beamlets) bool ndarray
         Whether a beamlet meets another surface than the reference beamlet.
     """
-    rays, materials = to_look_at(eyepoints, surfaces)
+    rays, materials = _to_look_at(eyepoints, surfaces)
     shape = eyepoints.offset.shape
     sent, relative, doppler, echo = np.empty((4, *shape))
     beside = np.empty(shape, np.bool_)
@@ -262,10 +264,10 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
     return sent.sum(axis=1), relative, doppler, echo, beside
 
 
-def to_look_at(
+def _to_look_at(
     eyepoints: Eyepoints, surfaces: Sequence[Surface]
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """What :func:`look_at` needs of shots, one after the other, and of surfaces.
+    """What :func:`_look_at` needs of shots, one after the other, and of surfaces.
 
     Returns
     -------
@@ -288,7 +290,8 @@ def to_look_at(
         eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
         eyepoints.surface,
     )  # fmt: skip
-    weight = eyepoints.weight[None].repeat(together(len(eyepoints.weight)), axis=0).ravel()
+    together = max(_RAYS // len(eyepoints.weight), 1)
+    weight = np.tile(eyepoints.weight, together)
     bright, laws = _materials(tuple(surfaces))
     return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
 
@@ -311,12 +314,12 @@ def _look(rays, materials, room, found):
         stop = min(first + group, ranges.size)
         some = slice(first * beamlets, stop * beamlets)
         here = sent[some], relative[some], doppler[some], echo[some], beside[some]
-        look_at(first, stop, rays, materials, room, here)
+        _look_at(first, stop, rays, materials, room, here)
 
 
 @inlined(nogil=True)
-def look_at(first, stop, rays, materials, room, found):
-    """What some footprints send back, and from where, ray by ray; whether any may lie beside.
+def _look_at(first, stop, rays, materials, room, found):
+    """What some footprints send back, and from where, ray by ray.
 
     All rays of shots are taken at once, however few each has, as the machine's vectors like it.
     """
@@ -329,14 +332,13 @@ def look_at(first, stop, rays, materials, room, found):
     for i in range(first, stop):
         for j in range((i - first) * beamlets, (i - first + 1) * beamlets):
             room[j] = ranges[i]
-    axis, several = surface[0], not _is_one(surface)
-    if several:
-        _look_each(beamlets, (room, offset, velocity, cosine, surface), materials, found)
-    else:
+    if _is_one(surface):
+        axis = surface[0]
         _look_alike((room, offset, velocity, cosine), weight, bright[axis], laws[axis], found)
+    else:
+        _look_each(beamlets, (room, offset, velocity, cosine, surface), materials, found)
     for j in range(sent.size):  # by itself, as the machine's vectors take it
         echo[j] /= (1 + relative[j]) * (1 + relative[j])
-    return several
 
 
 @inlined(nogil=True)

@@ -17,16 +17,8 @@ ROOM = 4
 """Rows of as many numbers as shots that are looked at together have rays, to work in."""
 
 
-_RAYS = 512
-
-
-def together(beamlets: int) -> int:
-    """Shots that are looked at together: so many that what is made of them stays at hand."""
-    return max(_RAYS // beamlets, 1)
-
-
 @inlined(nogil=True)
-def set_fields(seen, number, several, by_roots, room, out):
+def set_fields(seen, number, by_roots, room, out):
     """Fields of a number of footprints, of which some may lie on several surfaces."""
     offset, doppler, echo, others = seen
     rays = echo.size
@@ -43,11 +35,6 @@ def set_fields(seen, number, several, by_roots, room, out):
             out[GAIN, k] = max(out[GAIN, k], 1.0)
     _put_moments(offset, share, number, out[RANGES:])
     _put_moments(doppler, share, number, out[VELOCITIES:])
-    if not several:
-        for k in range(number):
-            for m in range(3):
-                out[OWN_RANGES + m, k] = out[RANGES + m, k]
-        return
     for j in range(rays):
         one[j] = share[j] if others[j] else 0.0
         two[j] = abs(offset[j]) if one[j] > 0.0 else 0.0
