@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
 
 from sweep.tasks.errors import SchedulerLost, StoreError
@@ -306,8 +306,9 @@ class Window:
         except queue.Empty:
             self._check()
         else:
-            if self._outrun.pop(future.key, None) is None:
+            if future.key in self._flying:
                 answer = self._arrival(future)
+            self._outrun.pop(future.key, None)
         self._verify(answer)
         return answer
 
@@ -315,8 +316,8 @@ class Window:
         task = self._flying[future.key]
         for key in task.futures:
             del self._flying[key]
-        del task.futures[future.key]
-        self._outrun |= task.futures
+        for key in takewhile(lambda key: key != future.key, task.futures):
+            self._outrun[key] = task.futures[key]  # so that its worker does not look idle
         answer = self._answer(future, task.blocks)
         self._heard[answer.worker] = time.monotonic()
         self._pace.learn(answer)
