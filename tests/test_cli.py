@@ -287,6 +287,36 @@ def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_with
     assert all(cell in " ".join(shown) for cell in cells)
 
 
+@pytest.mark.parametrize(
+    "processing, alarms, warned",
+    [
+        ("tnr: 7", "any in a shot with probability 0.359, in both chirps 0.0397", "0.359"),
+        ("tnr: 9", "any in a shot with probability 0.000462, in both chirps 5.35e-08", ""),
+        ("bins_counted: all, tnr: 7", "probability 0.589, in both chirps 0.129", "0.589"),
+    ],
+)
+def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing, alarms, warned):
+    (here / "small.yaml").write_text(STUDY.replace("tnr: 8", processing))
+    for result in (sweep("plan", "small.yaml"), sweep("run", "small.yaml", "--scheduler", "none")):
+        assert alarms in result.stdout
+        warning = f"warning: noise alone raises a false alarm in a shot with probability {warned}"
+        assert (warning in result.stderr) == bool(warned)
+
+
+def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
+    from sweep.analysis.noise_only import alarms_of_study
+
+    text = STUDY.replace("instrument.laser.power: [1 W, 3 W]", "instrument.processing.tnr: [7, 9]")
+    (any_, both), last = alarms_of_study(Spec.from_mapping(yaml.safe_load(text)))
+    p = 2.7183 ** (-(4 - 3.14159) / 4 * 49)
+    assert any_ == pytest.approx(1 - (1 - p) ** 2**14, rel=1e-3)
+    assert both == pytest.approx((1 - (1 - p) ** 2**13) ** 2, rel=1e-3) and last < (any_, both)
+    cfar = STUDY.replace("tnr: 8", "tnr: 8, detector: {kind: ca_cfar, pfa: 1e-9}")
+    drawn = yaml.safe_load(cfar + "draws: {method: spectra, number: 2}")
+    ((any_, _),) = alarms_of_study(Spec.from_mapping(drawn))
+    assert any_ == pytest.approx(2**14 * 1e-9, rel=1e-4)
+
+
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
     here, monkeypatch
 ):

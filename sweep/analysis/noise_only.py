@@ -9,10 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from itertools import product
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import xarray as xr
+
+from sweep.model.detectors import DETECTORS, FIXED
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
+
+#: Thresholds and detectors of a study that are looked at, about.
+MOST_LOOKED_AT = 400
 
 Chances = TypeVar("Chances", np.ndarray, xr.DataArray)
 
@@ -42,6 +51,36 @@ def segment_probability(bin_probability: np.ndarray, bins: float) -> np.ndarray:
 def shot_probability(tnr: float, bins: float) -> float:
     """Probability that both of two segments of so many bins raise a false alarm, 0..1."""
     return float(segment_probability(np.asarray(bin_probability(tnr)), bins)) ** 2
+
+
+def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
+    """Probabilities that noise raises an alarm in any chirp of a shot, and in both, 0..1.
+
+    One pair for each of the thresholds, FFT sizes and detectors of a study, of which some hundreds
+    are looked at where axes have more; none for detectors of the user's own.
+    """
+    axes = [
+        axis for axis in study.axes
+        if any(member.path.startswith("instrument.processing.") for member in axis.members)
+    ]  # fmt: skip
+    most = max(2, int(MOST_LOOKED_AT ** (1 / max(len(axes), 1))))
+    found = []
+    along = (np.linspace(0, axis.size - 1, min(axis.size, most)).astype(int) for axis in axes)
+    for place in product(*along):
+        parameters = study.parameters()
+        for axis, index in zip(axes, place, strict=True):
+            parameters |= {member.path: member.values[index] for member in axis.members}
+        kind = parameters.get("instrument.processing.detector.kind", FIXED)
+        if kind == FIXED:
+            in_a_bin = bin_probability(float(parameters["instrument.processing.tnr"]))
+        elif kind in DETECTORS:
+            in_a_bin = float(parameters["instrument.processing.detector.pfa"])
+        else:
+            continue
+        bins = bins_counted(parameters)
+        once, twice = (float(segment_probability(np.asarray(in_a_bin), n * bins)) for n in (1, 2))
+        found.append((twice, once**2))
+    return found
 
 
 def shot_with_leakage(

@@ -22,6 +22,7 @@ from sweep.cli.options import (
 )
 from sweep.cli.telling import (
     INCOMPLETE,
+    alarms_told,
     conclude,
     conclude_accuracy,
     effects_of,
@@ -29,6 +30,7 @@ from sweep.cli.telling import (
     scene_plan,
     tell_effects,
     warn_before,
+    warn_of_alarms,
 )
 from sweep.storage.locations import Location
 
@@ -190,10 +192,13 @@ def plan(spec: Path, workers: int | None) -> None:
         else:
             lines = list(grid_plan(study, workers))
         effects = effects_of(study, _default_store(spec))
+    if alarms := alarms_told(study):
+        lines.append(("false alarms", alarms))
     # Nothing is printed before all is known: any of it may find a point that can't be simulated.
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
     tell_effects(effects)
+    warn_of_alarms(study)
 
 
 @main.command()

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 INCOMPLETE = 3
 
+MANY_ALARMS = 0.01
+"""Probability of a false alarm in a shot beyond which a study is warned of."""
+
 LEAST_WORDS, BETWEEN = 14, 3
 """Characters of a table: a column of sentences at the least, and between columns."""
 
@@ -65,9 +68,12 @@ def conclude(outcome: Outcome, store: Location) -> None:
 
 
 def _print_summary(store: Location) -> None:
-    from sweep.storage.opening import read_attributes
+    from sweep.tasks import studies
 
-    print_table(*(_scene_rows if read_attributes(store)["kind"] == "scene" else _grid_rows)(store))
+    attributes, study = studies.read(store)
+    print_table(*(_scene_rows if attributes["kind"] == "scene" else _grid_rows)(store))
+    if alarms := alarms_told(study.spec):
+        click.echo(f"False alarms of noise: {alarms}.")
 
 
 def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
@@ -267,8 +273,35 @@ def tell_effects(table: EffectsTable) -> None:
     warn(table)
 
 
+def alarms_told(study: Spec | SceneSpec) -> str:
+    """Probability of a false alarm in a shot, in words; empty where it is not known."""
+    from sweep.analysis.noise_only import alarms_of_study
+
+    if not (found := alarms_of_study(study)):
+        return ""
+    any_, both = (
+        " to ".join(dict.fromkeys(f"{chance:.3g}" for chance in (min(each), max(each))))
+        for each in zip(*found, strict=True)
+    )
+    return f"any in a shot with probability {any_}, in both chirps {both}"
+
+
+def warn_of_alarms(study: Spec | SceneSpec) -> None:
+    """Say where noise alone raises alarms in more than one shot of a hundred."""
+    from sweep.analysis.noise_only import alarms_of_study
+
+    most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
+    if most > MANY_ALARMS:
+        click.echo(
+            f"warning: noise alone raises a false alarm in a shot with probability {most:.3g} "
+            f"(more than {MANY_ALARMS:g}): raise instrument.processing.tnr, or lower detector.pfa",
+            err=True,
+        )
+
+
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
-    """Before a run: which effects are forced off though they matter."""
+    """Before a run: false alarms in many shots, and effects that are forced off and matter."""
+    warn_of_alarms(study)
     if "off" in study.modes().values():
         warn(effects_of(study, store, costs=False))
 
