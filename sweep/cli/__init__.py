@@ -3,9 +3,8 @@
 from sweep.cli.commands import main
 from sweep.cli.compare import compare
 from sweep.cli.extend import extend
-from sweep.cli.report import report
 from sweep.cli.spectra import spectra
-from sweep.cli.stores import finalize, status, verify
+from sweep.cli.stores import finalize, report, status, verify
 
 for command in (extend, status, verify, finalize, report, compare, spectra):
     main.add_command(command)

@@ -235,8 +235,8 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a scene will take."""
     from sweep.model.resolution import BEAMLETS, RAYS
+    from sweep.tasks.plan import scene_plan as planned
     from sweep.tasks.progress import duration
-    from sweep.tasks.scene_plan import scene_plan as planned
 
     p = planned(study, store=store, workers=workers)
     for report in p.reports:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sweep.tasks.calling import Calling
 from sweep.tasks.grid import Grid
-from sweep.tasks.timing import timed
+from sweep.tasks.plan import timed
 
 if TYPE_CHECKING:
     from sweep.spec import Spec

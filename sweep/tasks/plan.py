@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import psutil
 
+from sweep.storage.locations import Location
 from sweep.tasks import cluster
 from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import compile_kernels, select
-from sweep.tasks.grid import Grid
+from sweep.tasks.evaluate import compile_kernels, evaluate_points, select, with_few_draws
+from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
+from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.grid import Grid, Value
 from sweep.tasks.grid_study import further_dims, output_names
-from sweep.tasks.timing import timed
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
 
 #: Time that measuring may take [s], and places of the grid that it looks at.
 MEASURING = 1.0
 PLACES = 16
+
+#: Time that measuring a scanner may take [s], about, and the shots to begin with.
+MEASURING_SCANNER = 0.5
+FIRST_SHOTS = 64
 
 #: Draws of a point while measuring.
 MOST_DRAWS = 1000
@@ -129,3 +137,147 @@ def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple
         most = MOST_SPECTRA if spec.draws.whole_spectra else MOST_DRAWS
         left_out += timed(spec, part, len(members), effects, most_draws=most).left_out
     return len(chosen), left_out
+
+
+class Seconds(NamedTuple):
+    """Time of some points on one core."""
+
+    taken: float
+    """Measured."""
+    left_out: float
+    """Of draws that were left out: of all up to their limit, of points that are not settled."""
+
+
+def timed(
+    spec: Spec,
+    parameters: Mapping[str, Value],
+    count: int,
+    effects: Collection[str],
+    *,
+    most_draws: int,
+) -> Seconds:
+    """Time of some points, each drawn so many times at the most.
+
+    The other parameters are those of :func:`evaluate_points`.
+    """
+    fewer = with_few_draws(spec, most_draws)
+    if spec.draws.whole_spectra:
+        evaluate_points(with_few_draws(spec, 1), parameters, count, effects)  # makes tables once
+    begun = time.perf_counter()
+    found = evaluate_points(fewer, parameters, count, effects)
+    taken = time.perf_counter() - begun
+    most, drawn = (max(s.draws.number, s.draws.limit) for s in (spec, fewer))
+    if most == drawn:
+        return Seconds(taken, 0.0)
+    if spec.draws.whole_spectra:  # a point's spectrum without noise costs as much as many draws
+        begun = time.perf_counter()
+        evaluate_points(with_few_draws(spec, 1), parameters, count, effects)
+        alone = time.perf_counter() - begun
+        each = max(taken - alone, 0.0) / (drawn - 1)
+        return Seconds(taken, each * (most - drawn))
+    unsettled = float(np.mean(found["accuracy_missed"] > 0)) if spec.draws.adaptive else 1.0
+    return Seconds(taken, taken * unsettled * (most / drawn - 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScannerPlan:
+    """What one scanner will take."""
+
+    name: str
+    cycles: int
+    shots: int
+    rays: int
+    is_cast: bool  # eyepoints are there already
+    seconds_a_ray: float  # on one worker, measured
+    seconds_a_draw: float  # of one shot, with radiometry and navigation
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenePlan:
+    """What a study of a scene will take."""
+
+    scanners: tuple[ScannerPlan, ...]
+    draws: int
+    places: int  # along the axes
+    blocks: int
+    chunks: int
+    bytes: int  # before compression, of the point clouds
+    workers: int
+    seconds: float  # of the whole study, estimated
+    worker_memory: int  # bytes, estimated
+    reports: tuple[str, ...]  # what was mended as the scene was loaded
+
+
+def scene_plan(spec: SceneSpec, *, store: Location, workers: int | None = None) -> ScenePlan:
+    """What a study of a scene will take, from its size and from measuring some of its own shots.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    store
+        Where it would be stored: eyepoints are looked for beside it.
+    workers
+        Workers it would run on; default those of the spec, else all cores.
+    """
+    study = FlightStudy(spec, store.absolute())
+    eyepoints = list(study.eyepoint_studies())
+    scanners = tuple(_scanner(study, each) for each in eyepoints)
+    arrays = [a for a in study.arrays() if a.values is None]
+    chunks = sum(
+        math.prod(-(-n // c) for n, c in zip(a.shape, a.chunks, strict=True)) for a in arrays
+    )
+    workers = workers or spec.execution.workers or cluster.cores()
+    places = math.prod(int(axis.size) for axis in spec.axes)
+    draws = int(spec.draws.number)
+    work = sum(
+        (0 if s.is_cast else s.rays * s.seconds_a_ray) + s.shots * draws * places * s.seconds_a_draw
+        for s in scanners
+    )
+    block = sum(math.prod(a.chunks) * np.dtype(a.dtype).itemsize for a in arrays)
+    return ScenePlan(
+        scanners=scanners,
+        draws=draws,
+        places=places,
+        blocks=study.n_blocks,
+        chunks=chunks,
+        bytes=sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in arrays),
+        workers=workers,
+        seconds=START + (work + chunks * WRITE_CHUNK) / min(workers, study.n_blocks),
+        worker_memory=psutil.Process().memory_info().rss + 2 * block // len(scanners),
+        reports=eyepoints[0].world.reports,
+    )
+
+
+def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    from sweep.scenes.eyepoint_arrays import from_arrays
+
+    part = study.scanners[eyepoints.scanner].part(0)
+    first_draw, end = study.scanners[eyepoints.scanner].draw_range(part)
+    weight = eyepoints.weight
+
+    def timed(cycles: int) -> tuple[float, float]:
+        begun = time.perf_counter()
+        numbers = eyepoints.spread(cycles)
+        seen = eyepoints.see(numbers)
+        cast = time.perf_counter()
+        shots = from_arrays(seen, weight)
+        study.look(part, seen, shots, study.call(part, shots), numbers)
+        return cast - begun, time.perf_counter() - cast
+
+    timed(1)  # compiles what there is to compile
+    cycles = max(1, FIRST_SHOTS // eyepoints.shots_a_cycle)
+    casting, looking = timed(min(cycles, eyepoints.cycles))
+    while casting + looking < MEASURING_SCANNER / 4 and cycles < eyepoints.cycles:
+        cycles *= 4
+        casting, looking = timed(min(cycles, eyepoints.cycles))
+    shots = min(cycles, eyepoints.cycles) * eyepoints.shots_a_cycle
+    return ScannerPlan(
+        name=eyepoints.scanner,
+        cycles=eyepoints.cycles,
+        shots=eyepoints.points,
+        rays=eyepoints.rays,
+        is_cast=eyepoints_path(study.path, eyepoints.id).exists(),
+        seconds_a_ray=casting / eyepoints.rays_in(shots),
+        seconds_a_draw=looking / (shots * (end - first_draw)),
+    )

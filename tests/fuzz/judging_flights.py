@@ -14,7 +14,7 @@ from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.scene_plan import scene_plan
+from sweep.tasks.plan import scene_plan
 from sweep.tasks.stretches import Part
 from sweep.tasks.study import Results
 

@@ -10,7 +10,7 @@ from unittest import mock
 
 from spoilt_specs import NOTHING, places, put
 
-from sweep.tasks import effects_table, plan, scene_map, scene_plan
+from sweep.tasks import effects_table, plan, scene_map
 
 
 @contextmanager
@@ -18,8 +18,8 @@ def swiftly() -> Iterator[None]:
     """Context in which plans measure each thing once, and maps of scenes are coarse."""
     with (
         mock.patch.object(plan, "MEASURING", 1e-3),
-        mock.patch.object(scene_plan, "MEASURING", 1e-3),
-        mock.patch.object(scene_plan, "FIRST_SHOTS", 1),
+        mock.patch.object(plan, "MEASURING_SCANNER", 1e-3),
+        mock.patch.object(plan, "FIRST_SHOTS", 1),
         mock.patch.object(scene_map, "NODES", 24),
         mock.patch.object(effects_table, "COST_POINTS", 1),
         mock.patch.object(effects_table, "COST_TILES", 1),

@@ -21,8 +21,8 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.lock import Lock
+from sweep.tasks.plan import scene_plan
 from sweep.tasks.progress import Silent
-from sweep.tasks.scene_plan import scene_plan
 from sweep.tasks.status import status
 from sweep.tasks.store import create
 from sweep.tasks.summary import scene_summary

@@ -11,7 +11,7 @@ from small import quiet, small
 
 import sweep
 from sweep.tasks import plan as planned
-from sweep.tasks import timing, user_code
+from sweep.tasks import user_code
 from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
 from sweep.tasks.progress import Silent
@@ -216,9 +216,8 @@ def test_a_plan_measures_what_draws_take(monkeypatch):
         return {}
 
     clock = SimpleNamespace(perf_counter=lambda: ticks[0])
-    monkeypatch.setattr(timing, "evaluate_points", evaluated)
-    for module in (timing, planned):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(planned, "evaluate_points", evaluated)
+    monkeypatch.setattr(planned, "time", clock)
     few, many = (study() for _ in range(2))
     many = many.model_copy(update={"draws": many.draws.model_copy(update={"number": 10_000})})
     assert few.draws.number == 3
