@@ -56,7 +56,8 @@ stability: $(READY)
 fuzz: $(READY)
 	$(BIN)/python tests/fuzz/campaign.py --seed $(SEED)
 
-# Some 200 kills of clients, workers, nannies and schedulers, two minutes: docs/reliability.md.
+# Some 200 kills of clients, workers, nannies, schedulers and commands, and power cuts where the machine
+# allows them, ten minutes: docs/reliability.md.
 KILLS ?= 210
 chaos: $(READY)
 	$(BIN)/python tests/faults/chaos.py --kills $(KILLS) --seed $(SEED)

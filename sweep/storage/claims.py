@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, put_whole
 from sweep.storage.objects import ObjectPath, ObjectStoreError, Tag
 
 #: Tries at a claim that others try for, too.
@@ -60,7 +60,7 @@ class FileClaim:
             judge()
             self._path.unlink(missing_ok=True)
             mine = self._path.with_name(f"lock.{uuid.uuid4().hex}")
-            mine.write_text(text)
+            put_whole(mine, text.encode())  # an empty lock, after a power cut, would look alive
             try:
                 os.link(mine, self._path)  # fails where somebody was quicker, on NFS too
             finally:

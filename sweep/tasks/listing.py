@@ -102,7 +102,7 @@ def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _is_chunk(found: os.stat_result) -> bool:
-    """Whether what is in a chunk's place is a file with something in it."""
+    """True for a file with something in it; a directory in a chunk's place has a size, too."""
     return stat.S_ISREG(found.st_mode) and found.st_size > 0
 
 

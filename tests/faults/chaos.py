@@ -1,8 +1,11 @@
 """Hundreds of seeded kills: `make chaos`, or `make chaos KILLS=1000 SEED=7`.
 
-Processes of small studies are killed with SIGKILL, before, in and after the write of a block and
-its commit; the studies are resumed, killed again, and in the end held against one that nobody
-disturbed. Every process is forked from this one, so that a kill costs little more than itself.
+Processes of small studies are killed before, in and after the write of a block and its commit, and
+commands that replace, repair or copy a store between any two of their changes to the disk. The
+studies are resumed, killed again, and in the end held against one that nobody disturbed. Most die
+by SIGKILL, some by SIGTERM or SIGHUP, and some with the power of a disk of their own, which then
+holds what was on it and nothing that the operating system still had in memory. Every process is
+forked from this one, so that a kill costs little more than itself.
 """
 
 from __future__ import annotations
@@ -10,10 +13,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import ctypes
+import fcntl
 import os
 import random
 import shutil
 import signal
+import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,7 +27,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -32,12 +38,13 @@ from distributed import Nanny, Scheduler
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from small import receipts, small, tree
+from small import copied, receipts, small, tree
 
 from sweep.storage import locations
 from sweep.tasks import journal, store, window
-from sweep.tasks.driver import resume, run
+from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.packing import pack
 from sweep.tasks.verify import verify
 
 BLOCKS = 12
@@ -50,16 +57,29 @@ BEFORE_WRITE, BETWEEN_CHUNKS, IN_A_FILE, AFTER_WRITE = (
 BEFORE_COMMIT, IN_COMMIT, AFTER_COMMIT = "before a commit", "in a commit", "after a commit"
 WRITES = (BEFORE_WRITE, BETWEEN_CHUNKS, IN_A_FILE, AFTER_WRITE)
 COMMITS = (BEFORE_COMMIT, IN_COMMIT, AFTER_COMMIT)
+ANYWHERE, REPLACING = "at any change", "as it is replaced"
+CHANGES = (ANYWHERE, REPLACING, REPLACING)
+"""Of a command's changes to the disk, by number; the first ones from a renaming of the store on."""
+
+KILL, POWER = ("SIGKILL",), ("power",)
+ANY_SIGNAL = ("SIGKILL", "SIGTERM", "SIGHUP")
+DURABLE = {"durable": True}
+
+MOST_CHANGES = {"extend": 2600, "overwrite": 2600, "repair": 85, "finalize": 400}
+"""Changes of a command to the disk, about."""
+
+LARGER = {"axes.instrument.laser.power": ["1 W", "3 W", "4 W"]}
+"""What the study is extended by."""
 
 
 @dataclass(frozen=True)
 class Kill:
-    """Who dies, or stands still, when: as a block reaches a moment."""
+    """Who dies, or stands still, and when: as a block, or a change by its number, is reached."""
 
     victim: str
     moment: str
     block: int
-    signal: signal.Signals = signal.SIGKILL
+    by: str = "SIGKILL"
 
 
 @dataclass(frozen=True)
@@ -70,9 +90,10 @@ class Kind:
     victim: str
     moments: tuple[str, ...]
     cluster: str  # "" plain loop, "own" of the client, "other" processes
-    share: int  # of a hundred kills
+    share: int  # of the kills
     a_leg: int = 1  # kills that one leg of a study can take
-    signal: signal.Signals = signal.SIGKILL
+    by: tuple[str, ...] = KILL
+    command: str = "run"
 
 
 KINDS = (
@@ -80,10 +101,67 @@ KINDS = (
     Kind("client with its cluster", "client", COMMITS, "own", 12),
     Kind("client, its cluster lives on", "client", COMMITS, "lasting", 10),
     Kind("worker", "here", WRITES, "own", 20, a_leg=4),
-    Kind("worker, frozen", "here", WRITES, "other", 6, a_leg=2, signal=signal.SIGSTOP),
+    Kind("worker, frozen", "here", WRITES, "other", 6, a_leg=2, by=("SIGSTOP",)),
     Kind("nanny", "nanny", WRITES, "other", 9, a_leg=2),
     Kind("scheduler", "scheduler", WRITES, "other", 8),
+    Kind("client, by SIGTERM or SIGHUP", "here", WRITES + COMMITS, "", 10, by=ANY_SIGNAL[1:]),
+    Kind("extend", "here", CHANGES, "", 25, by=ANY_SIGNAL, command="extend"),
+    Kind("run --overwrite", "here", CHANGES, "", 25, by=ANY_SIGNAL, command="overwrite"),
+    Kind("verify --repair", "here", (ANYWHERE,), "", 25, by=ANY_SIGNAL, command="repair"),
+    Kind("finalize", "here", CHANGES, "", 15, by=ANY_SIGNAL, command="finalize"),
+    Kind("power, run --durable", "here", WRITES + COMMITS, "", 15, by=POWER),
+    Kind("power, extend --durable", "here", CHANGES, "", 15, by=POWER, command="extend"),
+    Kind("power, verify --repair", "here", (ANYWHERE,), "", 10, by=POWER, command="repair"),
+    Kind("power, finalize", "here", CHANGES, "", 10, by=POWER, command="finalize"),
 )
+
+
+class Disk:
+    """A disk of its own in a file, whose power can be cut.
+
+    Parameters
+    ----------
+    directory
+        Where the file is, and the disk mounted.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._image, self.place = directory / "disk.img", directory / "disk"
+        self.place.mkdir(parents=True)
+        with open(self._image, "wb") as image:
+            image.truncate(48 << 20)
+        _command("mkfs.ext4", "-q", str(self._image))
+        self.switch_on()
+
+    def switch_on(self) -> None:
+        """Mount it: what its journal holds is put in its place."""
+        _command("mount", "-o", "loop", str(self._image), str(self.place))
+
+    def cut(self) -> None:
+        """Cut its power: nothing that is not on it will be, and no process can use it."""
+        shut_down, without_the_log = 0x8004587D, struct.pack("I", 2)  # EXT4_IOC_SHUTDOWN
+        place = os.open(self.place, os.O_RDONLY)
+        fcntl.ioctl(place, shut_down, without_the_log)
+        os.close(place)
+
+    def switch_off(self) -> None:
+        """Unmount it."""
+        _command("umount", str(self.place))
+
+
+def _command(*words: str) -> None:
+    subprocess.run(words, check=True, capture_output=True)
+
+
+def has_disks(directory: Path) -> bool:
+    """True where this machine allows disks of one's own whose power can be cut."""
+    try:
+        disk = Disk(directory / "trial")
+        disk.cut()
+        disk.switch_off()
+    except (OSError, subprocess.CalledProcessError):
+        return False
+    return True
 
 
 class Arena:
@@ -93,12 +171,17 @@ class Arena:
     ----------
     directory
         A place of its own.
+    disk
+        Where the store is, in place of the directory.
     """
 
-    def __init__(self, directory: Path) -> None:
-        self.directory, self.store = directory, directory / "stores" / "small.zarr"
+    def __init__(self, directory: Path, disk: Disk | None = None) -> None:
+        self.directory, self.disk = directory, disk
+        self.store = (disk.place if disk else directory) / "stores" / "small.zarr"
         self.store.parent.mkdir(parents=True)
+        self.output = self.store.with_name("small_final.zarr")
         self.log = directory / "log"
+        self.log.touch()
         self.kills: list[Kill] = []
         self.pids: dict[str, int] = {}
 
@@ -116,7 +199,10 @@ class Arena:
                 os.close(os.open(self.mark(kill), os.O_CREAT | os.O_EXCL))
             except FileExistsError:
                 continue
-            os.kill(self._pid(kill.victim), kill.signal)
+            if kill.by == "power":
+                self.disk.cut()
+            cause = signal.SIGKILL if kill.by == "power" else signal.Signals[kill.by]
+            os.kill(self._pid(kill.victim), cause)
 
     def mark(self, kill: Kill) -> Path:
         """File that stands for a kill that happened."""
@@ -145,9 +231,34 @@ ARENA: list[Arena] = []
 """The one of this process; those that are forked from it inherit it."""
 
 
+def set_changes(arena: Arena) -> None:
+    """Have every change to a disk pass by the arena first."""
+    number = {ANYWHERE: 0, REPLACING: -1}  # of the change; from a renaming of the store on
+    stores = {arena.store, arena.output}
+
+    def trapped(change, *arguments, **options):
+        first = arguments[0]
+        place = Path(os.readlink(f"/proc/self/fd/{first}") if isinstance(first, int) else first)
+        if place.is_absolute() and arena.store.parent not in place.parents:
+            return change(*arguments, **options)
+        if change is rename and stores & {place, Path(arguments[1])}:
+            number[REPLACING] = max(number[REPLACING], 0)
+        for moment in number:
+            if number[moment] >= 0:
+                arena.reached(moment, number[moment])
+                number[moment] += 1
+        return change(*arguments, **options)
+
+    rename = os.rename
+    for name in ("write", "fsync", "rename", "replace", "link", "unlink", "rmdir", "mkdir"):
+        setattr(os, name, partial(trapped, getattr(os, name)))
+
+
 def set_traps(arena: Arena) -> None:
     """Have all that is written and committed from here on pass by the arena, here and in forks."""
     ARENA[:] = [arena]
+    if any(kill.moment in CHANGES for kill in arena.kills):
+        set_changes(arena)
     write, commit, put, append = (
         store.Arrays.write, journal.Journal.commit, locations.put, os.write,
     )  # fmt: skip
@@ -293,32 +404,75 @@ class Count:
     hanging: int = 0
 
 
-def leg(arena: Arena, scheduler: str | None) -> Callable[[], object]:
-    """A run or resumption of the study, in a process that may be killed."""
+def leg(arena: Arena, scheduler: str | None, command: str = "run") -> Callable[[], object]:
+    """A command on the study, in a process that may be killed."""
 
     def go_on() -> None:
         arena.pids["client"] = os.getpid()
+        tempfile.tempdir = str(arena.directory)
         set_traps(arena)
         place = {"scheduler": scheduler} if scheduler else {"workers": 2}
-        again = arena.store.exists()
-        start = resume if again else run
-        spec = {} if again else {"spec": small()}
-        start(**spec, store=arena.store, evaluate=evaluate, progress=False, **place)
+        how = {"evaluate": evaluate, "progress": False, "durable": bool(arena.disk), **place}
+        path = arena.store
+        if command == "extend":
+            extend(path, changes=LARGER, **how)
+        elif command == "overwrite":
+            run(other(), store=path, overwrite=True, **how)
+        elif command == "repair":
+            verify(path, repair=True, progress=False)
+        elif command == "finalize" and not arena.output.exists():
+            pack(path, arena.output, progress=False)
+        elif command == "run" and path.exists():
+            resume(path, **how)
+        elif command == "run":
+            run(small(), store=path, **how)
 
     return go_on
 
 
+def other():
+    """The study that takes the place of the small one by --overwrite."""
+    return small(footprint={"beamlets": 7})
+
+
+def set_up(arena: Arena, command: str, undisturbed: Path, dice: random.Random) -> None:
+    """Put what a command needs in its place: a complete store, for repair a damaged one."""
+    if command == "run":
+        return
+    copied(undisturbed, arena.store.parent).rename(arena.store)
+    if command == "repair":
+        listed = ".sweep/template.jsonl"
+        names = dice.sample(["pd_up/zarr.json", "range/c/0", "grazing_angle/zarr.json", listed], 3)
+        for name in ("zarr.json", *names):
+            content = bytearray((arena.store / name).read_bytes())
+            content[len(content) * 2 // 3] ^= 4
+            (arena.store / name).write_bytes(content)
+    if arena.disk:
+        store.sync(arena.store)
+
+
 def plan(arena: Arena, kind: Kind, dice: random.Random, most: int) -> list[Kill]:
     """Kills of the next leg, at blocks that are still to be done."""
+    moment = dice.choice(kind.moments)
+    if moment in CHANGES:
+        number = dice.randrange(MOST_CHANGES[kind.command] if moment == ANYWHERE else 12)
+        return [Kill(kind.victim, moment, number, dice.choice(kind.by))] if most else []
     left = [block for block in range(BLOCKS) if block not in receipts(arena.store)]
     ahead = left[: max(4, kind.a_leg * 2)]
     blocks = dice.sample(ahead, min(kind.a_leg, most, len(ahead)))
-    return [Kill(kind.victim, dice.choice(kind.moments), block, kind.signal) for block in blocks]
+    return [
+        Kill(kind.victim, dice.choice(kind.moments), block, dice.choice(kind.by))
+        for block in blocks
+    ]
 
 
-def torment(kind: Kind, dice: random.Random, most: int, directory: Path) -> tuple[Arena, Count]:
+def torment(
+    kind: Kind, dice: random.Random, most: int, directory: Path, undisturbed: Path
+) -> tuple[Arena, Count]:
     """One study, killed and resumed until it is done or was killed as often as it may be."""
-    arena, count = Arena(directory), Count(studies=1)
+    disk = Disk(directory) if kind.by == POWER else None
+    arena, count = Arena(directory, disk), Count(studies=1)
+    set_up(arena, kind.command, undisturbed, dice)
     with cluster(arena, 2) if kind.cluster == "lasting" else nullcontext() as lasting:
         for _ in range(2 * most):
             arena.kills = plan(arena, kind, dice, most - sum(count.kills.values()))
@@ -326,8 +480,13 @@ def torment(kind: Kind, dice: random.Random, most: int, directory: Path) -> tupl
                 break
             _one_leg(arena, kind, count, lasting)
             count.kills.update(kill.moment for kill in arena.done())
+            if kind.command in ("extend", "overwrite"):  # there is the old one, or the new one
+                (report,) = verify(arena.store, progress=False)
+                count.lost += not (report.sound and report.complete)
     arena.kills = []
-    _one_leg(arena, KINDS[0], count, None)
+    _one_leg(arena, replace(kind, cluster=""), count, None)
+    if kind.command == "repair":
+        _one_leg(arena, KINDS[0], count, None)
     return arena, count
 
 
@@ -336,28 +495,35 @@ def _one_leg(arena: Arena, kind: Kind, count: Count, lasting: str | None) -> Non
         arena.mark(kill).unlink(missing_ok=True)
     with cluster(arena, 3) if kind.cluster == "other" else nullcontext() as other:
         scheduler = {"": "none", "own": None, "lasting": lasting, "other": other}[kind.cluster]
-        pid = forked(leg(arena, scheduler))
+        pid = forked(leg(arena, scheduler, kind.command))
         count.hanging += not ended(pid)
         end(pid)
+    if arena.disk:
+        arena.disk.switch_off()
+        arena.disk.switch_on()
 
 
-def judge(arena: Arena, kind: Kind, count: Count, undisturbed: dict[str, str]) -> None:
+def judge(arena: Arena, kind: Kind, count: Count, undisturbed: Path) -> None:
     """Hold a study that was tormented against the undisturbed one."""
-    may_race = kind.signal == signal.SIGSTOP  # two are at the same block, and one commits it
     committed: set[str] = set()
+    made = arena.output if kind.command == "finalize" else arena.store
+    anew = kind.command == "overwrite"
+    may_race = "SIGSTOP" in kind.by  # two are at the same block, and one commits it
     for line in arena.log.read_text().splitlines():
         block, what = line.split()
         if what == "committed":
             committed.add(block)
         else:
-            count.lost += block in committed and not may_race
-    written = Counter(receipts(arena.store))
-    count.lost += BLOCKS - len(written)
+            count.lost += block in committed and not (anew or may_race)
+    written = Counter(receipts(made))
+    count.lost += len(receipts(undisturbed)) - len(written)
     count.twice += sum(number > 1 for number in written.values())
-    (report,) = verify(arena.store, progress=False)
-    alone = [child.name for child in arena.store.parent.iterdir()] == [arena.store.name]
-    same = tree(arena.store) == undisturbed
-    count.different += not (same and alone and report.sound and report.complete)
+    reports = [report for path in {arena.store, made} for report in verify(path, progress=False)]
+    alone = set(arena.store.parent.iterdir()) == {arena.store, made}
+    whole = all(report.sound and report.complete for report in reports)
+    count.different += not (tree(made) == tree(undisturbed) and alone and whole)
+    if arena.disk:
+        arena.disk.switch_off()
 
 
 def prepare() -> None:
@@ -371,6 +537,20 @@ def prepare() -> None:
         "distributed.comm.timeouts.connect": "5s",
         "distributed.admin.tick.limit": "60s",
     })  # fmt: skip
+
+
+def undisturbed_stores(directory: Path) -> dict[str, Path]:
+    """What each command makes where nobody disturbs it."""
+
+    def make() -> None:
+        run(small(), store=made["run"], scheduler="none", progress=False)
+        extend(made["run"], changes=LARGER, to=made["extend"], scheduler="none", progress=False)
+        run(other(), store=made["overwrite"], scheduler="none", progress=False)
+        pack(made["run"], made["finalize"], progress=False)
+
+    made = {name: directory / f"{name}.zarr" for name in ("run", "extend", "overwrite", "finalize")}
+    assert ended(forked(make))
+    return made | {"repair": made["run"]}
 
 
 def campaign(
@@ -392,16 +572,17 @@ def campaign(
     directory = Path(tempfile.mkdtemp(prefix="chaos-"))
     whole = sum(kind.share for kind in kinds)
     try:
-        undisturbed = directory / "undisturbed.zarr"
-        ended(forked(lambda: run(small(), store=undisturbed, scheduler="none", progress=False)))
-        expected = tree(undisturbed)
+        expected = undisturbed_stores(directory / "undisturbed")
+        if not has_disks(directory):
+            kinds = tuple(kind for kind in kinds if kind.by != POWER)
+            print("this machine allows no power cuts", file=sys.stderr)
         for kind in track(kinds, "killing", disable=not show):
             count, wanted = counts[kind.name], -(-kills * kind.share // whole)
             while (so_far := sum(count.kills.values())) < wanted:
                 place = directory / f"{kind.name}-{count.studies}".replace(" ", "_")
                 most = min(a_study, wanted - so_far)
-                arena, one = torment(kind, dice, most, place)
-                judge(arena, kind, one, expected)
+                arena, one = torment(kind, dice, most, place, expected["run"])
+                judge(arena, kind, one, expected[kind.command])
                 _add(count, one)
                 if not (one.lost or one.twice or one.different or one.hanging):
                     shutil.rmtree(place)
@@ -423,10 +604,11 @@ def _add(count: Count, one: Count) -> None:
 
 def told(counts: dict[str, Count]) -> Table:
     """The table of a campaign."""
-    headings = ["killed", *WRITES, *COMMITS, "kills", "studies", "lost", "twice", "not identical"]
+    moments = (*WRITES, *COMMITS, ANYWHERE, REPLACING)
+    headings = ["killed", *moments, "kills", "studies", "lost", "twice", "not identical"]
     table = Table(*headings, box=None)
     for name, count in counts.items():
-        numbers = [count.kills[moment] for moment in (*WRITES, *COMMITS)]
+        numbers = [count.kills[moment] for moment in moments]
         ends = [sum(numbers), count.studies, count.lost, count.twice, count.different]
         table.add_row(name, *[str(n) if n else "-" for n in numbers], *map(str, ends))
     return table
@@ -437,9 +619,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=210)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="Part of the names of kinds of kills.")
     arguments = parser.parse_args()
     begun = time.monotonic()
-    counts = campaign(arguments.kills, arguments.seed, show=True)
+    kinds = tuple(kind for kind in KINDS if arguments.only in kind.name)
+    counts = campaign(arguments.kills, arguments.seed, kinds=kinds, show=True)
     Console(width=200).print(told(counts))
     kills = sum(sum(count.kills.values()) for count in counts.values())
     wrong = sum(c.lost + c.twice + c.different + c.hanging for c in counts.values())

@@ -15,6 +15,7 @@ from small import evaluated, logged, receipts, small, tree
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.status import status
+from sweep.tasks.verify import verify
 
 BLOCKS = 12
 SLOW = 0.15
@@ -189,6 +190,40 @@ def test_a_plain_loop_killed(tmp_path, undisturbed):
         os.kill(client.pid, signal.SIGKILL)
         client.wait()
     finish(tmp_path, undisturbed)
+
+
+#: Repairs a store, and dies as the first, second, ... object is about to get its place.
+REPAIRS = """
+import os, sys
+from sweep.tasks.verify import verify
+
+store, replace, deaths = sys.argv[1], os.replace, 0
+
+def deadly(draft, name):
+    if str(name).startswith(store) and next(left, None) is None:
+        os._exit(9)
+    replace(draft, name)
+
+for last in range(3):
+    if not os.fork():
+        left, os.replace = iter(range(last)), deadly
+        verify(store, repair=True, progress=False)
+    deaths += os.waitstatus_to_exitcode(os.wait()[1]) == 9
+print(deaths)
+"""
+
+
+def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp_path, undisturbed):
+    store = tmp_path / "small.zarr"
+    run(small(), store=store, scheduler="none", progress=False)
+    for name in ("beamlets", "effects", "noise_variance", "pd_up", "snr_up", ""):
+        (store / name / "zarr.json").write_bytes(b"damaged")
+    with process(sys.executable, "-c", REPAIRS, str(store)) as repairs:
+        assert repairs.communicate()[0] == "3\n"
+    (report,) = verify(store, repair=True, progress=False)
+    assert report.sound
+    assert resume(store, progress=False, scheduler="none").complete
+    assert tree(store) == undisturbed
 
 
 @pytest.mark.long
