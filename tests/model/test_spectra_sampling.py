@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from sweep.model import philox
+from sweep.model import philox, spectra_sampling
 from sweep.model.chain import prepare
 from sweep.model.interpolation import noise_correlation
 from sweep.model.noisy_spectra import noise_of, signal_of
-from sweep.model.sampling import Promise
+from sweep.model.outputs import DRAW_OUTPUTS
+from sweep.model.sampling import Before, Promise
 from sweep.model.shot import evaluate
 from sweep.model.spectra_look import DETECTOR, ESTIMATOR, Methods
 from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
@@ -133,6 +134,41 @@ def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
     )  # fmt: skip
     assert again["pd_shot"][0] == found["pd_shot"][0]
     assert again["n_detected_shot"][0, 0] == found["n_detected_shot"][0]
+
+
+def _in_pieces(draw, **given):
+    """Results of draws that are stopped as soon as can be and gone on with, and how often."""
+    before, number, pieces = None, -1, 0
+    while True:
+        found = draw(before=before, stop=lambda: True, **given)
+        if found["n_draws"].sum() == number:
+            return found, pieces
+        number, pieces = found["n_draws"].sum(), pieces + 1
+        counts = np.stack([found[name].reshape(len(found["n_draws"]), -1) for name in DRAW_OUTPUTS])
+        before = Before(found["n_draws"], counts, found)
+
+
+@pytest.mark.parametrize("much", [{"batch_sizes": [40, 30]}, {"batch": 16, "limit": 70}])
+def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
+    much, table_4_1, monkeypatch
+):
+    """A threshold set by all that is seen at once: 5 draws at 2048 points, 10 at 1024."""
+    monkeypatch.setattr(spectra_sampling, "SAMPLES", 5 * 2048)
+
+    def over_the_median(power, setting):
+        return power > 8 * np.median(power)
+
+    sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
+    parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
+    given = {"parameters": parameters, "effects": EFFECTS, "keys": _keys(3), **much}
+    given |= {"promise": Promise(0.1), "methods": Methods({"m:f": over_the_median})}
+    draw = simulate_spectra if "batch_sizes" in much else simulate_spectra_until
+    whole, (found, pieces) = draw(**given), _in_pieces(draw, **given)
+    assert pieces > 3
+    for name, values in whole.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    monkeypatch.setattr(spectra_sampling, "SAMPLES", 3 * 2048)
+    assert (draw(**given)["pfa_bin"] != whole["pfa_bin"]).all()
 
 
 def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):

@@ -97,10 +97,13 @@ class Told(Silent):
             self.then(self)
 
 
-def interrupted(spec, store, pieces=2):
+PLACES = [{"scheduler": "none"}, {"workers": 2, "processes": False}]
+
+
+def interrupted(spec, store, pieces=2, place=PLACES[0]):
     """A run that is told to stop, once, as soon as some pieces of a block are there."""
     told = Told(lambda told: len(told.points) == 1 + pieces and os.kill(os.getpid(), signal.SIGINT))
-    outcome = run(spec, store=store, scheduler="none", progress=told)
+    outcome = run(spec, store=store, progress=told, **place)
     assert outcome.stopped == "interrupted" and not outcome.complete
     return told
 
@@ -110,7 +113,7 @@ def left(store):
     return sorted(file.name for file in (store / ".sweep").glob("begun*"))
 
 
-@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
     told, store = Told(), tmp_path / "pieces.zarr"
@@ -132,16 +135,19 @@ def test_a_block_of_several_points_is_stopped_at_any_of_them(
     assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)
 
 
-def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(whole, saved, tmp_path):
+@pytest.mark.parametrize("place", PLACES)
+def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(
+    place, whole, saved, tmp_path
+):
     store = tmp_path / "stopped.zarr"
-    interrupted(drawn(), store)
+    interrupted(drawn(), store, place=place)
     assert len(saved) == 2 and left(store) == ["begun-0"] and receipts(store) == []
     assert status(store).points_begun == saved[-1] and status(store).points_done == 0
     assert verify(store)[0].sound and not verify(store)[0].complete
     with pytest.raises(StoreError, match="lacks 1 block"):
         pack(store, tmp_path / "packed.zarr")
     told = Told()
-    assert resume(store, scheduler="none", progress=told).complete
+    assert resume(store, progress=told, **place).complete
     assert told.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
     assert tree(store) == whole("fixed") and left(store) == []
     assert status(store).points_begun == 0
