@@ -126,13 +126,14 @@ def settle(location: Location) -> None:
     put back. What is half made or half removed is removed. The work of living processes is left
     alone, and so is everything where the folder can't be written.
     """
-    if not isinstance(location, Path):
+    path = real(location)
+    if not isinstance(path, Path):
         return
     with suppress(OSError):
-        for name in os.listdir(location.parent):
+        for name in os.listdir(path.parent):
             if left := _LEFT.fullmatch(name):
                 with suppress(OSError):
-                    _settle(location.parent / name, left)
+                    _settle(path.parent / name, left)
 
 
 def stamp(location: Location) -> tuple[int, ...] | None:

@@ -120,6 +120,7 @@ def test_links_to_stores_stay_and_lead_to_the_new_one(undisturbed, tmp_path, how
     else:
         assert quiet(larger(), link, scheduler="none", overwrite=True).complete
     assert link.is_symlink() and link.resolve() == store
+    os.rename(store, store.with_name(f".copy.zarr.replaced-{dead()}-ab12cd34"))
     assert status(link).study_id == larger().id
     assert list((tmp_path / "disk").iterdir()) == [store]
 
