@@ -100,9 +100,14 @@ def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
 
 
 def tell_accuracy(store: Location) -> None:
-    """Print how well what is drawn is known, where anything is, and what rays leave of flights."""
+    """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
     from sweep.tasks.accuracy_table import accuracy_table, rays_table
+    from sweep.tasks.summary import beyond_model
 
+    number, why = beyond_model(store)
+    if number:
+        told = f"points beyond the model, which have no results: {number:,}; the first: {why}"
+        click.echo(f"warning: {told}", err=True)
     if rows := accuracy_table(store):
         print_table(
             "Half-widths of what is drawn",

@@ -98,6 +98,8 @@ def _try_window(name: str, parameters: tuple[float, ...]) -> None:
     except UserWarning:
         rule = "has parameters that make it unsuitable for spectral analysis"
         raise QuantityError(rule, "take others, for chebwin 45 or more") from None
+    except RuntimeWarning:  # samples beyond what a number can be
+        raise QuantityError("has parameters that make no usable window") from None
     except (ValueError, TypeError, ArithmeticError, MemoryError):
         known = name in _WINDOWS or name in _SCIPY_WINDOWS
         if known:

@@ -126,7 +126,7 @@ def _of_beamlets(path: Location, study: GridStudy) -> RaysRow:
     tolerance = np.maximum(resolution.SHARE * tolerance, resolution.LEAST_RAYS_TOLERANCE)
     names = "beamlets_error", "beamlets"
     for place, (error, number) in pieces(path, study, names, done_blocks(path, study)):
-        start = tuple(part.start for part in place)
+        start, number = tuple(part.start for part in place), np.nan_to_num(number)
         worst.add(error, tolerance[place], number.astype(np.int64), start)
         total, most = total + int(number.sum()), max(most, int(number.max()))
     where, mean = _place(study.spec.axes, worst.index), total / max(worst.points, 1)

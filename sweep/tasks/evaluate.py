@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
 from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.study import NONE_FOUND, Found, Known, Results, Stop, Unfinished, together
+from sweep.tasks.study import (
+    NO_COUNT,
+    NONE_FOUND,
+    Found,
+    Known,
+    Results,
+    Stop,
+    Unfinished,
+    together,
+)
 
 if TYPE_CHECKING:
     from sweep.model.sampling import Before
@@ -62,6 +74,7 @@ def evaluate_block(
     dict of ndarray
         Each output of the model with the block's extent as its shape, and what was simulated;
         counts of draws with a last dimension over batches, where the study draws a fixed number.
+        Of points that are beyond the model nan, or -1 of counts; nothing where all of them are.
 
     Raises
     ------
@@ -76,7 +89,10 @@ def evaluate_block(
     for points, found in (known.done, begun.done, *computed):
         for name, values in found.items():
             room = (size, *values.shape[1:])
-            results.setdefault(name, np.empty(room, values.dtype))[points] = values
+            if name not in results:  # what no point has found stays unknown
+                unknown = NO_COUNT if values.dtype.kind == "i" else np.nan
+                results[name] = np.full(room, unknown, values.dtype)
+            results[name][points] = values
     if spec.draws.whole_spectra:
         results.pop(RUNNING, None)  # of use to a block that is begun
     return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
@@ -88,19 +104,29 @@ def _computed(
     """Outputs of a block's points that are not done, those together that call for the same."""
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
-    done = [begun.done]
-    for members, effects in called.some(order).groups():
-        for points in np.split(order[members], range(_step(spec), len(members), _step(spec))):
-            if len(done) > 1 and stop():
-                raise _unfinished(spec, done, NONE_FOUND)
-            ours = np.isin(points, begun.begun.points).any()
-            before = drawn_before(spec, (begun if ours else known).begun, points)
-            some = select(parameters, points)
+    done, step = [begun.done], _step(spec)
+    left = deque(
+        (effects, points)
+        for members, effects in called.some(order).groups()
+        for points in np.split(order[members], range(step, len(members), step))
+    )
+    while left:
+        effects, points = left.popleft()
+        if len(done) > 1 and stop():
+            raise _unfinished(spec, done, NONE_FOUND)
+        ours = np.isin(points, begun.begun.points).any()
+        before = drawn_before(spec, (begun if ours else known).begun, points)
+        some = select(parameters, points)
+        try:
             results = evaluate_points(spec, some, len(points), effects, before, stop)
-            if stop.told:
-                raise _unfinished(spec, done, Found(points, results))
-            done.append(Found(points, results))
-            yield done[-1]
+        except UnsupportedShot:  # costs the point that is beyond the model, and no other
+            if len(points) > 1:
+                left.extendleft((effects, half) for half in np.array_split(points, 2)[::-1])
+            continue
+        if stop.told:
+            raise _unfinished(spec, done, Found(points, results))
+        done.append(Found(points, results))
+        yield done[-1]
 
 
 def _unfinished(spec: Spec, done: list[Found], begun: Found) -> Unfinished:
@@ -256,4 +282,5 @@ def compile_kernels(spec: Spec, grid: Grid) -> None:
     modes, once = spec.modes(), with_few_draws(spec, 1)
     may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
     for effects in ({*may_be, *Calling(spec, grid).of_point(0)}, ()):
-        evaluate_points(once, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)
+        with suppress(UnsupportedShot):
+            evaluate_points(once, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)

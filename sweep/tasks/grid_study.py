@@ -12,7 +12,7 @@ from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
 from sweep.tasks.earlier import Earlier
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
 from sweep.tasks.grid import Grid
-from sweep.tasks.study import ArrayLayout, Known, Results, Stop
+from sweep.tasks.study import NO_COUNT, ArrayLayout, Known, Results, Stop
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 #: Dimension of the batches of draws.
 BATCH = "batch"
-
-#: Fill of counts; a number of draws or detections is never negative.
-NO_COUNT = -1
 
 
 def outputs_of(spec: Spec) -> dict[str, Output]:
@@ -178,7 +175,14 @@ class GridStudy:
         """Outputs of a block; `begun` and `stop` are those of :func:`evaluate_block`."""
         called = self.calling.of_block(block)
         known = self.earlier.known(block, called) if self.earlier else Known()
-        return evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
+        results = evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
+        extent = self.grid.extent(block)
+        for name in self._names:
+            if name not in results:  # all of its points are beyond the model
+                layout = self._output(name)
+                room = extent + layout.shape[len(extent) :]
+                results[name] = np.full(room, layout.fill, layout.dtype)
+        return results
 
     def compile(self) -> None:
         """Compile the model's kernels."""

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import Location, located
 from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
+from sweep.tasks.evaluate import evaluate_points, select, with_few_draws
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import receipted
@@ -83,6 +85,33 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
         return "", rows, share
     told = [_row(name, *values) for (name, _), values in zip(parts, of_parts, strict=True)]
     return _heading(spec.axes[0]), [*told, *rows], share
+
+
+def beyond_model(store: str | Location) -> tuple[int, str]:
+    """How many points are beyond the model, of those that are looked at, and why the first is."""
+    path = located(store)
+    _, study = studies.read(path)
+    if not isinstance(study, GridStudy):
+        return 0, ""
+    number, why = 0, ""
+    blocks = _some(done_blocks(path, study), int(np.prod(study.grid.block_shape)))
+    for block, (_, (shot,)) in zip(blocks, pieces(path, study, ("pd_shot",), blocks), strict=True):
+        points = np.flatnonzero(np.isnan(shot))
+        if points.size and not number:
+            why = why_beyond(study, int(block), points[:1])
+        number += points.size
+    return number, why
+
+
+def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
+    """Why the model does not hold for a point of a block."""
+    ((_, names),) = study.calling.of_block(block).some(point).groups()
+    try:
+        parameters = select(study.grid.parameters(block), point)
+        evaluate_points(with_few_draws(study.spec, 1), parameters, 1, names)
+    except UnsupportedShot as error:
+        return str(error)
+    return "it is not any more"
 
 
 def _within(values: np.ndarray, place: tuple[slice, ...], part: slice) -> np.ndarray:

@@ -17,6 +17,7 @@ from sweep.tasks import plan as planning
 from sweep.tasks.effects_table import effects_table
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.study import Results
+from sweep.tasks.summary import why_beyond
 
 ROUNDING = 1e-9
 """What sums of probabilities may be off: 1e-12 seen, and no effect is as small."""
@@ -64,7 +65,10 @@ def judge(file: Path) -> Verdict:
             effects_table(spec, costs=False)
             study = GridStudy(spec)
             for block in range(study.n_blocks):
-                look_at_results(spec, study, study.evaluate(block), block)
+                results = study.evaluate(block)
+                if (beyond := np.flatnonzero(np.isnan(results["pd_shot"]))).size:
+                    raise UnsupportedShot(why_beyond(study, block, beyond[:1]))
+                look_at_results(spec, study, results, block)
         except UnsupportedShot as error:
             assert "instrument." in str(error) and ": " in str(error)
             return Verdict((str(error)[:50],))

@@ -17,7 +17,6 @@ from plain_study import INSTRUMENT
 from random_studies import drop, mended, studies
 
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.unsupported import UnsupportedShot
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import SceneSpec, Spec, SpecError, from_stored
 from sweep.tasks.flight_study import FlightStudy
@@ -56,10 +55,11 @@ def steady(written, *paths):
 def results_of(written):
     """Results of a study of one block; studies that are refused are passed over."""
     try:
-        study = GridStudy(Spec.from_mapping(written))
-        return study.evaluate(0)
-    except (SpecError, UnsupportedShot):
+        results = GridStudy(Spec.from_mapping(written)).evaluate(0)
+    except SpecError:
         assume(False)
+    assume(not np.isnan(results["pd_shot"]).any())  # what is beyond the model
+    return results
 
 
 def falls(values):
@@ -128,10 +128,7 @@ def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
     spec = Spec.from_mapping(written)
     again = from_stored(spec.to_json())
     assert again.id == spec.id
-    try:
-        ours, theirs = GridStudy(spec).evaluate(0), GridStudy(again).evaluate(0)
-    except UnsupportedShot:
-        return
+    ours, theirs = GridStudy(spec).evaluate(0), GridStudy(again).evaluate(0)
     for name, values in ours.items():
         assert np.array_equal(values, theirs[name], equal_nan=values.dtype.kind == "f"), name
 

@@ -57,6 +57,7 @@ FIELDS = [
     ("instrument.processing.window", "kaiser", "parameters that this window does not take"),
     ("instrument.processing.window", "kaiser(x)", "must be the name of a window"),
     ("instrument.processing.window", 3, "must be the name of a window"),
+    ("instrument.processing.window", "kaiser(1000)", "has parameters that make no usable window"),
     ("instrument.processing.acquisition_delay", "-1 us", "must be at least 0 s"),
     ("target.reflectance", 1.1, "must be at most 1"),
     ("target.reflectance", -0.1, "must be at least 0"),

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
-from small import small
+import xarray as xr
+from click.testing import CliRunner
+from small import quiet, small
 
+from sweep.cli import main
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS, RUNNING
 from sweep.model.realisations import RUNNING_COLUMNS
 from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid
+from sweep.tasks.summary import beyond_model
 
 RANDOM = (*CORE, "speckle", "pointing_jitter")
 
@@ -43,3 +47,36 @@ def test_random_effects_are_refused_in_a_study_without_draws():
     with pytest.raises(ValueError, match="speckle: simulated by draws"):
         evaluate_points(spec, parameters, count, (*CORE, "speckle"))
     assert set(evaluate_points(spec, parameters, count, CORE)) == set(OUTPUTS)
+
+
+@pytest.mark.parametrize(
+    "draws", [{}, {"number": 3}, {"limit": 20, "batch": 10}, {"number": 2, "method": "spectra"}]
+)
+def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
+    accelerations = ["0 m/s^2", "1 m/s^2", "1e6 m/s^2", "2 m/s^2", "9e5 m/s^2"]
+    modes = {"acceleration": "on", "range_walk": "on"}  # whatever is beside a point
+    given = {"draws": draws, "effects": modes, "axes": {"target.acceleration": accelerations}}
+    outcome = quiet(small(**given), tmp_path / "some.zarr")
+    assert outcome.complete and not outcome.failures
+    kept = given | {"axes": {"target.acceleration": [accelerations[k] for k in (0, 1, 3)]}}
+    part = xr.open_zarr(quiet(small(**kept), tmp_path / "part.zarr").store)
+    whole = xr.open_zarr(outcome.store)
+    for name in part.data_vars:
+        found, there = whole[name].values, part[name].values
+        if name != "effects_error":
+            np.testing.assert_array_equal(found[[0, 1, 3]], there, name)
+        if not name.startswith("effects"):
+            lost = found[[2, 4]]
+            assert (np.isnan(lost) if lost.dtype.kind == "f" else lost == -1).all(), name
+    number, why = beyond_model(outcome.store)
+    assert number == 2 and "target.acceleration" in why and "some 500 can be simulated" in why
+    assert beyond_model(tmp_path / "part.zarr") == (0, "")
+    told = CliRunner().invoke(main, ["status", str(outcome.store)])
+    assert told.exit_code == 0 and why in told.stderr
+
+
+def test_a_block_beyond_the_model_is_committed_without_results(tmp_path):
+    spec = small(axes={"target.acceleration": ["1e6 m/s^2", "9e5 m/s^2"]})
+    outcome = quiet(spec, tmp_path / "none.zarr")
+    assert outcome.complete
+    assert np.isnan(xr.open_zarr(outcome.store).pd_shot.values).all()
