@@ -40,14 +40,15 @@ def beat_scale(
 ) -> np.ndarray:
     """Amplitude of the beat photocurrent [A] that one unit of relative echo makes.
 
-    Coherent architectures: 2 M Re eta sqrt(P_lo P), to be multiplied by the square root of a
-    beamlet's relative echo power. Direct detection: m M Re P, to be multiplied by the relative
-    echo power itself, hence 2 dB of SNR for each dB of light.
+    Coherent architectures: 2 M Re sqrt(eta P_lo P), to be multiplied by the square root of a
+    beamlet's relative echo power; eta is the heterodyne efficiency, a share of power. Direct
+    detection: m M Re P, to be multiplied by the relative echo power itself, hence 2 dB of SNR for
+    each dB of light.
 
     [T 2.22] takes 2 Re^2 P^2 as the mean square current, which is the peak of a fully modulated
     echo; with P the mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
     """
     if architecture == "direct":
         return modulation_index * apd_gain * responsivity * echo_power_scale
-    mixed = np.sqrt(local_oscillator_power * echo_power_scale)
-    return 2 * apd_gain * responsivity * mixing_efficiency * mixed
+    mixed = np.sqrt(mixing_efficiency * (local_oscillator_power * echo_power_scale))
+    return 2 * apd_gain * responsivity * mixed

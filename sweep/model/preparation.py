@@ -187,6 +187,8 @@ class Shots:
     phase: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
     """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
     phase_errors: tuple[PhaseError, ...] = ()
+    walk: np.ndarray | float = 0.0
+    """Seconds of closing by which the beat's range is below that at the segment's start, (n,)."""
     alike: bool = False
     """Whether many shots have the same phase errors, as those of a flight do not."""
     gaussian_width: np.ndarray | None = None

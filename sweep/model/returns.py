@@ -16,6 +16,9 @@ strongest group is detected, and a false alarm raised, in the very draws that ar
   other bins by its order statistic. Within the three bins noise is correlated as the window does;
   otherwise bins are independent, as in the closed forms.
 
+The interpolated range is put right for what range walk moves it by, v_r (T_w + 2 t_0), by the
+velocity that is measured with it.
+
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
 spread, of which the instrument is taken to know the size (:func:`interpolation.spread_error`).
 
@@ -155,6 +158,9 @@ def draw_returns(
             workspace(stretch.lines, shots.fft_size),
             (values[part], flags[part], beamlet[part], group[part]),
         )  # fmt: skip
+    # What the ground came nearer by within the record, which the measured velocity tells.
+    walk = np.broadcast_to(shots.walk, n)[:, None, None]
+    values[..., FINE] += values[..., 2 + FINE] * walk
     columns = [values[..., k] for k in range(values.shape[-1])]
     return Returns._make([*columns, flags, beamlet, group])
 

@@ -210,7 +210,8 @@ class Receiver(Part):
     mixing_efficiency: Annotated[
         float,
         Numeric(
-            about="Efficiency at which echo and local oscillator mix",
+            about="Heterodyne efficiency: share of the echo's power that mixes with the local "
+            "oscillator, as which it counts in the SNR",
             example="0.7",
             at_least="1e-9",
             at_most="1",

@@ -61,8 +61,14 @@ class Navigation(Part):
     ] = 0.0
     ground_slope: Annotated[
         float,
-        of.number("Standard deviation of the ground's slope", "0.1", at_least="0", at_most="10"),
-    ] = 0.0
+        of.number(
+            "Standard deviation of the ground's slope, as far as it is known beforehand; 10 leaves "
+            "the slope to the points, 0 says that the ground is level",
+            "0.1",
+            at_least="0",
+            at_most="10",
+        ),
+    ] = 10.0
     relief: Annotated[
         float, of.length("Standard deviation of the ground's height", "1 m", at_least="0 m")
     ] = 0.0

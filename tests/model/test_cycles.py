@@ -16,6 +16,7 @@ from sweep.model.geometry.surfaces import Surface
 from sweep.model.navigation_screening import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
 from sweep.model.scene_outputs import NAVIGATION
+from sweep.spec.scene_sections import Navigation
 
 DRAWS = 20_000
 """A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of
@@ -171,11 +172,16 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     rest = flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
     seen = _seen(FOUR, path=path, bodies=[plate()], motion=[rest])
     points = _points(seen)
-    free, held, rough = (
+    free, usual, held, rough = (
         _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
-        for slope, relief in ((np.inf, 0.0), (0.0, 0.0), (0.0, 7.0))
-    )
+        for slope, relief in (
+            (np.inf, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
+        )
+    )  # fmt: skip
     np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
+    # As a study has it if it says nothing: off by far less than it states.
+    off = np.abs(usual["altitude"] - 900.0) / np.sqrt(usual["altitude_variance"])
+    assert off.max() < 1e-3 and (usual["altitude_variance"] < 1e-2).all()
     assert (np.abs(held["altitude"] - 900.0) > 1.0).all()
     np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4, rtol=1e-3)
 

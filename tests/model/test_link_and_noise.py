@@ -148,7 +148,7 @@ def test_shot_limited_snr_is_linear_in_light_and_ignores_the_local_oscillator(sh
         ("instrument.laser.power", 2.0, 2.0),
         ("instrument.telescope.aperture", 2.0, 4.0),
         ("target.range", 2.0, 1 / 4),
-        ("instrument.receiver.mixing_efficiency", 0.5, 0.25),
+        ("instrument.receiver.mixing_efficiency", 0.5, 0.5),
         ("instrument.receiver.excess_noise_factor", 3.0, 1 / 3),
         ("instrument.receiver.apd_gain", 5.0, 1.0),
         ("instrument.receiver.local_oscillator_power", 7.0, 1.0),

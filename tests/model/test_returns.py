@@ -9,6 +9,7 @@ from scipy import ndimage, stats
 from sweep.model import philox, truth
 from sweep.model.chain import prepare
 from sweep.model.draws import draw
+from sweep.model.effects.catalogue import CORE
 from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
 from sweep.model.peaks import RATIO, WHOLE, _free_bin, _largest, draw_in_noise
@@ -361,6 +362,28 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
         assert (coarse > reported).all()
         assert coarse.min() >= 0.999 * width / np.sqrt(24)
         assert (np.abs(whole - expected[:, None]) < 1.1 * width).all()
+
+
+@pytest.mark.parametrize(("velocity", "delay"), [(55.0, 0.0), (-55.0, 0.0), (30.0, 1e-4)])
+def test_interpolated_ranges_of_moving_ground_are_those_at_the_beginning(
+    table_4_1, velocity, delay
+):
+    """The record's middle shows 12 mm less at 55 m/s closing, and more after a delay."""
+    parameters = table_4_1(
+        range=1000 + RANGE_BIN * np.linspace(0, 1, 20, endpoint=False), window="hann",
+        radial_velocity=velocity, beamlets=1, power=5.0, phases="incoherent",
+        acquisition_delay=delay,
+    )  # fmt: skip
+    walking, still = (*CORE, "range_walk"), CORE
+    for effects in (walking, still):
+        ((_, shots),) = prepare(parameters, effects)
+        got = _drawn(shots, draws=200, method="noise")
+        assert (got.flags[..., 0] == TRUE).all()
+        off = got.range_interpolated[..., 0] - shots.range[:, None]
+        stated = got.range_interpolated_standard_error[..., 0]
+        assert abs(off.mean()) < 5 * stated.mean() / np.sqrt(off.size) + 5e-5
+    uncorrected = abs(velocity) * (2 * delay + 2**17 / 600e6)
+    assert uncorrected > 0.01 > 20 * stated.mean() / np.sqrt(off.size)
 
 
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])

@@ -105,6 +105,22 @@ def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1):
     assert coarse["range_rmse"] > 2 * found["range_bound"]
 
 
+def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
+    """By 41 mm within the record of 137 us at 300 m/s."""
+    parameters = _points(
+        table_4_1,
+        **{
+            "instrument.processing.fft_size": 8192, "instrument.laser.power": 30.0,
+            "instrument.processing.sample_rate": 60e6, "instrument.laser.wavelength": 1e-4,
+            "footprint.beamlets": 1, "target.range": np.array([100.0]),
+            "target.radial_velocity": 300.0, ESTIMATOR + "kind": "maximum_likelihood",
+        },
+    )  # fmt: skip
+    found = _drawn(parameters, 300, (*EFFECTS, "range_walk"))
+    assert abs(found["range_bias"]) < 5 * found["range_bias_error"] + 1e-3
+    assert found["range_bias_error"] < 2e-3
+
+
 @pytest.mark.parametrize("effects", [EFFECTS, (*EFFECTS, "speckle")])
 def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})

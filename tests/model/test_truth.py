@@ -233,7 +233,7 @@ def test_the_record_is_what_a_balanced_detector_makes_of_two_optical_fields(
         return np.sqrt(power) * np.exp(2j * np.pi * (first * time + sign * 2e12 * time**2 / 2))
 
     echo = 2.0 * 0.1 * np.pi * 0.0125**2 / (2 * np.pi * 700.0**2)
-    oscillator, received = field(1e-3, t), 0.5 * field(echo, t - delay)
+    oscillator, received = field(1e-3, t), np.sqrt(0.5) * field(echo, t - delay)
     one, other = (oscillator + received) / np.sqrt(2), (oscillator - received) / np.sqrt(2)
     voltage = 7e3 * 1.1 * 3.0 * (np.abs(one) ** 2 - np.abs(other) ** 2)
     record = truth.analytic_record(prepared(scene), 0, segment, 0).real

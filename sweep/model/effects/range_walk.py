@@ -96,14 +96,21 @@ def bound(block: "Block") -> Change | None:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """The drift of the beat, in the record of the two chirps."""
+    """The drift of the beat, in the record of the two chirps.
+
+    At t its frequency is that of the range R - 2 v_r t; in the middle of the record it peaks.
+    """
     values = {
         "chirp_rate": shots.chirp_rate,
         "radial_velocity": shots.radial_velocity,
         "start": shots.acquisition_delay,
         "duration": shots.record_duration,
     }
-    return replace(shots, phase_errors=(*shots.phase_errors, PhaseError(phase, values)))
+    return replace(
+        shots,
+        phase_errors=(*shots.phase_errors, PhaseError(phase, values)),
+        walk=2 * shots.acquisition_delay + shots.record_duration,
+    )
 
 
 EFFECT = Effect(
