@@ -38,33 +38,10 @@ HERMITE = 15
 REACH = 7.0
 """Standard deviations on either side over which more nodes step evenly; 3e-12 is beyond."""
 
-COUNTS = np.array(
-    [
-        2,
-        3,
-        4,
-        5,
-        6,
-        7,
-        9,
-        11,
-        15,
-        22,
-        33,
-        49,
-        73,
-        109,
-        163,
-        244,
-        366,
-        549,
-        823,
-        1234,
-        1851,
-        2776,
-        4096,
-    ]
-)
+COUNTS = np.array([
+    2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
+    4096,
+])  # fmt: skip
 """Numbers of nodes to choose from; wide steps, as points of different numbers go apart."""
 
 LINES = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])

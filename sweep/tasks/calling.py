@@ -81,10 +81,7 @@ class Calling:
         return Called(flags[place] & ~self._absent(block), errors[place])
 
     def _absent(self, block: int) -> np.ndarray:
-        """Flags of random effects that points have nothing of, whatever their tiles have.
-
-        A smooth target is no limit of rough ones: without speckle beamlets add as powers.
-        """
+        """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
         from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.catalogue import EFFECTS as ALL
 
@@ -92,8 +89,7 @@ class Calling:
         parameters = DEFAULTS | grid.parameters(block)
         flags = np.zeros(grid.block_size(block), np.uint32)
         for k, effect in enumerate(ALL):
-            if effect.is_random and self._modes[effect.name] == "auto":
-                flags |= np.where(effect.absent(parameters), np.uint32(1 << k), np.uint32(0))
+            flags |= np.where(effect.absent(parameters), np.uint32(1 << k), np.uint32(0))
         return flags
 
     def of_point(self, point: int) -> tuple[str, ...]:

@@ -11,17 +11,8 @@ import numpy as np
 
 from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
-from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.study import (
-    NO_COUNT,
-    NONE_FOUND,
-    Found,
-    Known,
-    Results,
-    Stop,
-    Unfinished,
-    together,
-)
+from sweep.tasks.grid import NO_COUNT, Grid, Value, canonical_rows
+from sweep.tasks.study import NONE_FOUND, Found, Known, Results, Stop, Unfinished, together
 
 if TYPE_CHECKING:
     from sweep.model.sampling import Before

@@ -48,6 +48,10 @@ def is_geometric(axis: Axis) -> bool:
     )
 
 
+#: Fill of counts; a number of draws or detections is never negative.
+NO_COUNT = -1
+
+
 def points_a_block(points: int) -> int:
     """Points that a block holds at most in a study of so many, where it does not say."""
     return max(BLOCK_POINTS, -(-points // MOST_BLOCKS))

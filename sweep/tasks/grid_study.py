@@ -11,8 +11,8 @@ import numpy as np
 from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
 from sweep.tasks.earlier import Earlier
 from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
-from sweep.tasks.grid import Grid
-from sweep.tasks.study import NO_COUNT, ArrayLayout, Known, Results, Stop
+from sweep.tasks.grid import NO_COUNT, Grid
+from sweep.tasks.study import ArrayLayout, Known, Results, Stop
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
@@ -176,12 +176,10 @@ class GridStudy:
         called = self.calling.of_block(block)
         known = self.earlier.known(block, called) if self.earlier else Known()
         results = evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
-        extent = self.grid.extent(block)
-        for name in self._names:
-            if name not in results:  # all of its points are beyond the model
-                layout = self._output(name)
-                room = extent + layout.shape[len(extent) :]
-                results[name] = np.full(room, layout.fill, layout.dtype)
+        for layout in map(self._output, set(self._names) - set(results)):
+            # all of its points are beyond the model
+            room = self.grid.extent(block) + layout.shape[len(self.grid.shape) :]
+            results[layout.name] = np.full(room, layout.fill, layout.dtype)
         return results
 
     def compile(self) -> None:

@@ -49,11 +49,7 @@ def spectra(
 
     modes, key = spec.modes(), draw_keys(spec, parameters, 1)
     arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}
-    effects = [
-        e.name for e in EFFECTS
-        if modes[e.name] != "off"
-        and not (e.is_random and modes[e.name] == "auto" and e.absent(arrays).all())
-    ]  # fmt: skip
+    effects = [e.name for e in EFFECTS if modes[e.name] != "off" and not e.absent(arrays).all()]
     numbers, random = np.arange(first, first + draws), bool(random_effects(effects))
     stretches = realise(
         parameters, effects, keys=key, first_draw=first, draws=draws if random else 1

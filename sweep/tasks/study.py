@@ -11,9 +11,6 @@ import numpy as np
 
 Results = dict[str, np.ndarray]
 
-#: Fill of counts; a number of draws or detections is never negative.
-NO_COUNT = -1
-
 
 class Found(NamedTuple):
     """Results of some points of a block."""

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from small import small
+from small import STUDY, small
 
 from sweep.model import footprint, modulation
 from sweep.model.chain import nodes, prepare
@@ -108,3 +108,32 @@ def test_bare_shots_hold_nothing_of_any_effect():
     assert bare.phase_errors == () and bare.gaussian_width is None
     assert not bare.image and not bare.leakage and bare.incoherent
     assert set(bare.noise_sources) == {"local_oscillator_shot", "detector", "amplifier"}
+
+
+def test_forced_effects_without_their_parameters_are_not_in_the_graph(calls):
+    """Line widths, accelerations and chirp errors of 0: alone, and beside points that have some."""
+    names = ("line_width", "acceleration", "chirp_nonlinearity", "quantisation")
+    forced = small(axes=MOON, effects=dict.fromkeys(names, "on"))
+    assert not evaluated(forced) & set(names)
+    assert calls["line_width"] == calls["acceleration"] == calls["chirp_nonlinearity"] == 0
+    axes = {"target.acceleration": ["0 m/s^2", "1 m/s^2"]}
+    flags = GridStudy(small(axes=axes, effects={"acceleration": "on"})).evaluate(0)["effects"]
+    assert [bool(flag >> NAMES.index("acceleration") & 1) for flag in flags] == [False, True]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+def test_noise_that_is_there_is_in_the_snr_whatever_pd_is(tolerance):
+    laser = STUDY["instrument"]["laser"] | {"relative_intensity_noise": "1e-12 1/Hz"}
+    receiver = STUDY["instrument"]["receiver"] | {"common_mode_rejection": "20 dB"}
+    instrument = STUDY["instrument"] | {"laser": laser, "receiver": receiver}
+    near = {"axes": {}, "target": STUDY["target"] | {"range": "100 m"}}
+    near["accuracy"] = {"tolerance": tolerance}
+    noisy = GridStudy(small(instrument=instrument, **near)).evaluate(0)
+    quiet = GridStudy(small(**near)).evaluate(0)
+    assert quiet["pd_up"] == noisy["pd_up"] == 1
+    # (Re P_lo)^2 RIN B_e / 100 of current, through the transimpedance
+    added = (1.1e-3) ** 2 * 1e-12 / 100 * 7e3**2
+    bandwidth = (noisy["noise_variance"] - quiet["noise_variance"]) / added
+    assert 1e8 < bandwidth < 1e9
+    ratio = quiet["snr_up"] / noisy["snr_up"]
+    assert ratio == pytest.approx(noisy["noise_variance"] / quiet["noise_variance"]) and ratio > 5

@@ -105,14 +105,18 @@ def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(
     every = GridStudy(small(**sections, effects=FORCED, accuracy={"tolerance": 0})).evaluate(0)
     for name in PROBABILITIES:
         assert np.abs(called[name] - every[name]).max() <= tolerance, name
-    assert 0 < called["effects_error"].max() <= tolerance
-    assert (called["effects"] != every["effects"]).any()
+    assert called["effects_error"].max() <= tolerance
+    if tolerance > 1e-5:
+        assert called["effects_error"].max() > 0
+        assert (called["effects"] != every["effects"]).any()
 
 
 def test_less_is_simulated_the_larger_the_tolerance():
     counts = [
         np.bitwise_count(
-            GridStudy(small(axes=WIDE, accuracy={"tolerance": t})).calling.of_block(0).flags
+            GridStudy(small(axes=WIDE, accuracy={"tolerance": t}, storage={"block_points": 65536}))
+            .calling.of_block(0)
+            .flags
         ).sum()
         for t in (1e-3, 1e-2, 1e-1)
     ]

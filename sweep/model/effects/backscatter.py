@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.effects import added_noise
 from sweep.model.effects.atmosphere import (
     Path,
     Profile,
@@ -34,7 +33,7 @@ from sweep.model.effects.atmosphere import (
     profile_of,
     profile_over,
 )
-from sweep.model.effects.change import Change
+from sweep.model.effects.change import Change, added_noise
 from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.span import Span
 from sweep.model.link import aperture_area
@@ -209,7 +208,7 @@ def bound(block: "Block") -> Change | None:
         beam_divergence=block["instrument.laser.beam_divergence"],
         lidar_ratio=block["atmosphere.lidar_ratio"],
     )
-    return added_noise.change(
+    return added_noise(
         least=0.0,
         largest=block.shot_noise_scale.high * light,
         noise_variance=block.noise_variance,

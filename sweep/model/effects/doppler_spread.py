@@ -61,6 +61,7 @@ EFFECT = Effect(
             about="Speed across the line of sight, positive towards the near side of the footprint",
             si_unit="m/s",
             default=0.0,
+            alone=False,
             example="100 m/s",
             at_least="-1000 km/s",
             at_most="1000 km/s",

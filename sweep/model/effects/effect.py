@@ -46,13 +46,15 @@ class Parameter:
     at_most: str | None = None
     whole: bool = False
     options: tuple[str, ...] = ()
+    alone: bool = True
+    """Whether nothing else can bring the effect."""
     category: bool = False
     """Whether points are computed together only where they share it; words always are."""
 
     @property
     def brings(self) -> bool:
         """Whether other values than the default bring the effect; else it says how it acts."""
-        return self.default in (0, "none")
+        return self.alone and self.default in (0, "none")
 
 
 class Scene(NamedTuple):

@@ -20,10 +20,6 @@ from sweep.model.effects.change import Bound
 from sweep.model.effects.effect import MODES, Effect
 from sweep.model.effects.probability_bounds import probability_changes
 
-FREE_SHARE = 0.01
-"""Share of the tolerance that what is left out of the noise may take: a number added to a shot's
-variance costs nothing to simulate, so that leaving it out gains nothing but an error."""
-
 
 class Plan(NamedTuple):
     """What is simulated in each tile, effect by effect."""
@@ -58,7 +54,7 @@ def plan(
         The tiles.
     modes : mapping, optional
         Name to ``auto`` (by default), ``on`` or ``off``. An effect that the scene has nothing of
-        is left out in ``auto``. With one that is off go those that are within it.
+        is left out, even if it is on. With one that is off go those that are within it.
     tolerance : float
         On the sum of the changes by all that is left out, 0..1: of pd in the three segments
         together, of log10 of a false alarm's probability, of a relative magnitude.
@@ -116,7 +112,7 @@ class Choice(NamedTuple):
     open: np.ndarray
     """Whether it is neither on nor off, (effects,) bool."""
     free: np.ndarray
-    """Whether it costs nothing, (effects,) bool."""
+    """Whether it costs nothing, as a number added to the noise does, (effects,) bool."""
     parents: np.ndarray
     """Of each, what it is within; -1 for none."""
     on: np.ndarray
@@ -203,7 +199,7 @@ def choose(change, there, choice, tolerance, kept, error):
 
     The smallest are left out first, as long as their sum is within what the tolerance leaves; an
     effect never before those within it, last ones first where they are alike. Those that cost
-    nothing have a share of it alone. ``there`` says of which effects the scene has anything.
+    nothing are never left out. ``there`` says of which effects the scene has anything.
     """
     choosable, free, parents, on, off, needs = choice
     key, order = np.empty(len(change)), np.empty(len(change), np.int64)
@@ -215,7 +211,7 @@ def choose(change, there, choice, tolerance, kept, error):
         number = _put_in_order(change[:, t], there & choosable, parents, key, order)
         _keep(change[:, t], order[:number], free, room, kept[:, t])
         for row in on:
-            kept[row, t] = True
+            kept[row, t] = there[row]
         for m in range(len(needs)):
             kept[needs[m, 1], t] |= kept[needs[m, 0], t]
         error[t] = 0.0
@@ -245,15 +241,10 @@ def _put_in_order(change, rows, parents, key, order):
 @njit(cache=True, error_model="numpy")
 def _keep(change, order, free, room, kept):
     """Mark all but the smallest of some rows that fit into the room."""
-    total, unpaid = 0.0, 0.0
+    total = 0.0
     for row in order:
-        if free[row]:
-            unpaid += change[row]
-            if not unpaid <= FREE_SHARE * room:
-                kept[row] = True
-                continue
-        total += change[row]
-        kept[row] = not total <= room
+        total += 0.0 if free[row] else change[row]
+        kept[row] = free[row] or not total <= room
 
 
 @njit(cache=True, error_model="numpy")

@@ -96,10 +96,7 @@ def bound(block: "Block") -> Change | None:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """The drift of the beat, in the record of the two chirps.
-
-    At t its frequency is that of the range R - 2 v_r t; in the middle of the record it peaks.
-    """
+    """The drift of the beat, in the record of the two chirps: at t that of R - 2 v_r t."""
     values = {
         "chirp_rate": shots.chirp_rate,
         "radial_velocity": shots.radial_velocity,

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model import receiver
-from sweep.model.effects import added_noise
-from sweep.model.effects.change import Change
+from sweep.model.effects.change import Change, added_noise
 from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.span import monotone
 from sweep.model.preparation import Shots
@@ -74,7 +73,7 @@ def bound(block: "Block") -> Change | None:
         },
     )
     variance = current * block.noise_scale
-    return added_noise.change(
+    return added_noise(
         least=variance.low, largest=variance.high, noise_variance=block.noise_variance
     )
 

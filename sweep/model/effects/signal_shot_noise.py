@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects import added_noise
-from sweep.model.effects.change import Change
+from sweep.model.effects.change import Change, added_noise
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.effects.span import Span
 from sweep.model.preparation import Shots
@@ -26,7 +25,7 @@ def bound(block: "Block") -> Change:
     """Change by the echo's shot noise, which the threshold does not follow."""
     more = Span.hull(1.0, block.echo_ratio)
     variance = block.echo_scale.times(block.echo, more, block.shot_noise_scale)
-    return added_noise.change(
+    return added_noise(
         least=variance.low,
         largest=variance.high,
         noise_variance=block.noise_variance,

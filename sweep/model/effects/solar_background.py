@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model import noise
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects import added_noise
-from sweep.model.effects.change import Change
+from sweep.model.effects.change import Change, added_noise
 from sweep.model.effects.effect import Effect, Parameter, Scene
 from sweep.model.effects.span import Span, monotone
 from sweep.model.preparation import Shots
@@ -49,7 +48,7 @@ def bound(block: "Block") -> Change | None:
         **{name: block[path] for name, path in _SCATTERING.items()},
     )
     variance = light * block.shot_noise_scale
-    return added_noise.change(least=0.0, largest=variance.high, noise_variance=block.noise_variance)
+    return added_noise(least=0.0, largest=variance.high, noise_variance=block.noise_variance)
 
 
 _DISTANCE, _ELEVATION = "target.sun_distance", "target.sun_elevation"
