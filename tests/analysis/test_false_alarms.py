@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
 
-from sweep.analysis import cuts, leakage, tables
+from sweep.analysis import cuts, tables
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import Points
 
@@ -90,7 +90,7 @@ def leaked(ranges, up, down, **further):
     variables = {name: ([*further, "range"], np.asarray(v, float)) for name, v in values.items()}
     dataset = xr.Dataset(variables, {"range": ("range", ranges, {"units": "m"})})
     spec = study({"target.range": [f"{x} m" for x in ranges]})
-    (found,) = leakage.leakage([(Points.of(dataset.chunk(**further)), "range")], spec)
+    (found,) = tables.leakage([(Points.of(dataset.chunk(**further)), "range")], spec)
     return found
 
 

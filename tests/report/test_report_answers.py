@@ -6,7 +6,7 @@ from reported import EXPERIMENTS, GRID
 
 from sweep.analysis import labels
 from sweep.analysis.figures import Study
-from sweep.report import detector, lines, reach
+from sweep.report import detector, lines, writing
 from sweep.report.page import Table
 from sweep.spec import Slices, Spec
 from sweep.tasks import driver
@@ -53,29 +53,29 @@ def band(chart, line):
     return low[::-1], high
 
 
-@pytest.mark.parametrize("choice,answer", reach.ANSWERS.items())
+@pytest.mark.parametrize("choice,answer", writing.ANSWERS.items())
 def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, choice, answer):
     study = Study.of(grid_store)
-    chart = reach.chart(study)
-    expected = study.dataset.sweep.maximum_range(reach.PD)[answer].compute() / 1000
+    chart = writing.chart(study)
+    expected = study.dataset.sweep.maximum_range(writing.PD)[answer].compute() / 1000
     assert expected.notnull().any()
     for power in (1, 3):
         line = drawn_lines(chart, answer=choice)[f"power {power} W"]
         assert list(line.x) == [20, 50, 80]
         np.testing.assert_allclose(line.y, expected.sel(power=power), rtol=1e-6)
     assert chart.figure.layout.yaxis.title.text == "maximum range (km)"
-    assert f"pd of {reach.PD:g}" in chart.heading
+    assert f"pd of {writing.PD:g}" in chart.heading
 
 
 def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     axes = {"target.range": {"step": ["500 m", "12 km", "500 m"]}}
     target = GRID["target"] | {"grazing_angle": "50 deg"}
     study = made(tmp_path, GRID | {"axes": axes, "target": target, "figures": []})
-    table = reach.chart(study)
+    table = writing.chart(study)
     assert isinstance(table, Table)
-    answer = study.dataset.sweep.maximum_range(reach.PD).compute()
+    answer = study.dataset.sweep.maximum_range(writing.PD).compute()
     assert list(table.frame["maximum range (km)"] * 1000) == [
-        pytest.approx(float(answer[name])) for name in reach.ANSWERS.values()
+        pytest.approx(float(answer[name])) for name in writing.ANSWERS.values()
     ]
     assert set(table.frame["which is"]) == {"found"}
 
@@ -89,18 +89,18 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
     study = made(tmp_path, GRID | {"axes": axes, "figures": []})
-    chart = reach.chart(study)
+    chart = writing.chart(study)
     options = [control.options for control in chart.controls if control.name == "part"]
     assert options == [["grazing angle 30°", "grazing angle 85°"]]
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
-    expected = steep.sweep.maximum_range(reach.PD).unbroken / 1000
-    (line,) = drawn_lines(chart, part="grazing angle 85°", answer=reach.KEPT).values()
+    expected = steep.sweep.maximum_range(writing.PD).unbroken / 1000
+    (line,) = drawn_lines(chart, part="grazing angle 85°", answer=writing.KEPT).values()
     np.testing.assert_allclose(line.y, expected, rtol=1e-6)
     target = GRID["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
     power = {"instrument.laser.power": ["1 W", "3 W"]}
     (tmp_path / "powers").mkdir()
     powers = made(tmp_path / "powers", GRID | {"axes": power, "target": target, "figures": []})
-    assert reach.chart(powers) is None
+    assert writing.chart(powers) is None
 
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
@@ -119,9 +119,9 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
 
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
-    chart = reach.chart(drawn)
-    expected = drawn.dataset.sweep.maximum_range(reach.PD).compute() / 1000
-    (line,) = drawn_lines(chart, answer=reach.KEPT).values()
+    chart = writing.chart(drawn)
+    expected = drawn.dataset.sweep.maximum_range(writing.PD).compute() / 1000
+    (line,) = drawn_lines(chart, answer=writing.KEPT).values()
     low, high = band(chart, line)
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()
