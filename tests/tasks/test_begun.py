@@ -6,10 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small import STUDY, quiet, receipts, small, tree
 
 from sweep.model import sampling, spectra_sampling
+from sweep.storage.objects import ObjectPath
 from sweep.tasks import begun, worker
 from sweep.tasks.begun import Begun
 from sweep.tasks.driver import extend, resume, run
@@ -18,6 +20,7 @@ from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.packing import pack
 from sweep.tasks.progress import Lines, Silent
 from sweep.tasks.status import status
+from sweep.tasks.study import Found, Known
 from sweep.tasks.verify import verify
 
 QUICK = {**STUDY["instrument"], "laser": {**STUDY["instrument"]["laser"], "power": "0.1 W"}}
@@ -230,6 +233,24 @@ def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved
     saved.clear()
     assert quiet_resume(store).complete
     assert saved[0] < 0.5 and tree(store) == whole("fixed") and left(store) == []
+
+
+@pytest.mark.parametrize("place", [Path, lambda path: ObjectPath("memory://bucket", str(path))])
+def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(place, tmp_path):
+    store = place(tmp_path / "store.zarr")
+    part = Found(np.array([4, 2]), {"pd_up": np.array([0.5, np.nan]), "n": np.array([[1], [2]])})
+    assert begun.read(store, "one", 7) == Begun() and begun.begun_points(store, "one") == {}
+    for points in (0.5, 0.25):  # less than there is takes no place
+        begun.write(store, "one", 7, Begun(Known(begun=part), points, 1.5))
+    found = begun.read(store, "one", 7)
+    assert (found.points, found.seconds) == (0.5, 1.5) and not found.known.done.points.size
+    np.testing.assert_array_equal(found.known.begun.points, part.points)
+    for name, values in part.results.items():
+        np.testing.assert_array_equal(found.known.begun.results[name], values)
+    assert begun.begun_points(store, "one") == {7: 0.5} and begun.begun_points(store, "two") == {}
+    begun.discard(store, 7)
+    begun.discard(store, 7)
+    assert begun.begun_points(store, "one") == {}
 
 
 def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
