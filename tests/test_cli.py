@@ -536,3 +536,13 @@ def test_a_study_is_extended_by_the_file_of_a_larger_one(here):
     (here / "larger.yaml").write_text(STUDY.replace("[1 W, 3 W]", "[1 W, 3 W, 5 W]"))
     done = sweep("extend", "results/small.zarr", "larger.yaml", "--scheduler", "none")
     assert done.exit_code == 0 and "results/small.zarr: 120 of 120 points" in done.stdout
+
+
+@pytest.mark.parametrize("command", ["status x.zarr", "plan x.yaml", "figures x.zarr"])
+def test_a_folder_that_was_removed_ends_in_a_line(tmp_path, monkeypatch, command):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    told = CliRunner().invoke(main, command.split(), catch_exceptions=False)
+    assert told.exit_code == 2
+    assert told.output == "the current folder was removed: go to another\n"

@@ -75,13 +75,13 @@ def panels(
 def empty(message: str) -> Sheet:
     """A sheet that says why there is nothing on it."""
     figure = sheet(8.0, 2.0)
-    figure.text(0.5, 0.5, message, ha="center", va="center", color="0.3")
+    figure.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
     return figure
 
 
 def title(figure: Sheet, text: str) -> None:
-    """Title of a whole sheet."""
-    figure.suptitle(text, fontsize=11, fontweight="bold")
+    """Title of a whole sheet, as it is written: a dollar in it is no formula."""
+    figure.suptitle(text, fontsize=11, fontweight="bold", parse_math=False)
 
 
 def caption(figure: Sheet, text: str) -> None:
@@ -89,8 +89,9 @@ def caption(figure: Sheet, text: str) -> None:
     if text:
         characters = int(figure.get_figwidth() * 15)
         figure.supxlabel(
-            "\n".join(textwrap.wrap(text, characters)), fontsize=8, color="0.25", x=0.02, ha="left"
-        )
+            "\n".join(textwrap.wrap(text, characters)), fontsize=8, color="0.25", x=0.02,
+            ha="left", parse_math=False,
+        )  # fmt: skip
 
 
 def save(figure: Sheet, path: Path) -> Path:

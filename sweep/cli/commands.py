@@ -52,6 +52,11 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; what is not a mistake of the user's keeps its traceback."""
         try:
+            Path.cwd()
+        except FileNotFoundError:
+            click.echo("the current folder was removed: go to another", err=True)
+            ctx.exit(MISTAKE)
+        try:
             return super().invoke(ctx)
         except (click.exceptions.Exit, click.ClickException, click.Abort):
             raise

@@ -26,6 +26,8 @@ LARGEST_FILE = 1_000_000
 DEEPEST = 30
 MOST_NODES = 200_000
 
+_MOST_DIGITS = 4000
+"""Of a number: Python reads no more, unless it is asked to."""
 _DECIMAL = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
 _NO_FILE = "check the path, which is relative to the file that names it"
 _NO_YAML = "look at the brackets, quotes, colons and indentation there and above"
@@ -222,7 +224,8 @@ class _Walk:
             return None
         if kind == "bool":
             return node.value.lower() in ("yes", "true", "on")
-        if kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
+        short = len(node.value) <= _MOST_DIGITS
+        if short and kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
             return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
         return node.value
 
@@ -275,10 +278,12 @@ def plain(data: Any, location: Location = ()) -> Any:
     Raises
     ------
     SpecError
-        Where it is nested too deeply.
+        Where it is nested too deeply, or a number is too long to be read.
     """
     if len(location) > DEEPEST:
         raise SpecError([Mistake(dotted(location), "is nested too deeply")])
+    if isinstance(data, int) and data.bit_length() > _MOST_DIGITS:
+        raise SpecError([Mistake(dotted(location), "is a number of too many digits")])
     if isinstance(data, Mapping):
         return {str(key): plain(value, (*location, str(key))) for key, value in data.items()}
     if isinstance(data, list | tuple):

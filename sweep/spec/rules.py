@@ -244,8 +244,8 @@ class Text(Rule):
         What to write where it doesn't.
     """
 
-    pattern: str = r"[\s\S]{0,5000}"
-    remedy: str = "write at most 5000 characters"
+    pattern: str = r"[^\x00-\x08\x0b-\x1f\x7f-\x9f]{0,5000}"
+    remedy: str = "write at most 5000 characters that can be printed"
 
     def read(self, written: object) -> str:
         """The text."""

@@ -16,8 +16,10 @@ from sweep.storage.sealing import body_of
 
 RECEIPTS = "receipts.jsonl"
 
-_HEAD = re.compile(rb'\{"block":(\d+),"(?:points":(\d+)(?:,"bytes":(\d+))?|withdrawn")')
-_TIME = re.compile(rb'"time":([\d.]+)$')
+_HEAD = re.compile(
+    rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
+)
+_TIME = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
 _WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
 
 

@@ -4,6 +4,7 @@ import xarray as xr
 from drawn_files import shows
 from drawn_studies import POWERS, SURFACE, stored, study
 from matplotlib.collections import PolyCollection
+from matplotlib.text import Text
 
 from sweep.analysis import canvas, slices
 from sweep.analysis.defaults import default_figures
@@ -164,3 +165,14 @@ def test_each_value_of_by_has_its_line_in_the_order_of_the_study():
     texts = [text.get_text() for text in panel.get_legend().get_texts()]
     assert texts == ["power 5 W", "power 1 W", "power 3 W"]
     assert [line.get_ydata()[0] for line in panel.lines] == [1.0, 0.5, 0.1]
+
+
+@pytest.mark.parametrize("text", [r"$\frac{1}{$", "costs $5 or $6"])
+def test_a_dollar_in_a_title_is_a_dollar(tmp_path, text):
+    sheets = canvas.sheet(4.0, 2.0), canvas.empty(text)
+    canvas.title(sheets[0], text)
+    canvas.caption(sheets[0], text)
+    shown = [found for sheet in sheets for found in sheet.findobj(Text) if found.get_text() == text]
+    assert len(shown) == 3 and not any(found.get_parse_math() for found in shown)
+    for sheet in sheets:
+        canvas.save(sheet, tmp_path / "sheet.png")

@@ -175,3 +175,29 @@ def test_whatever_stands_in_a_file_it_loads_or_lists_mistakes(tmp_path_factory, 
     path.write_text(text)
     with pytest.raises(SpecError):
         load(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (f"seed: {'9' * 5000}", r"seed: must be .*you wrote '999"),
+        (r'title: "\e[2Jred"', r"title: .*'\\x1b\[2Jred'.*can be printed"),
+        (r'question: "a\u009bb"', r"question: .*can be printed"),
+    ],
+    ids=["digits", "title", "question"],
+)
+def test_endless_numbers_and_control_characters_are_refused_in_words(tmp_path, line, said):
+    from sweep.spec import SpecError, load
+
+    file = tmp_path / "odd.yaml"
+    file.write_text(line)
+    with pytest.raises(SpecError, match=said) as refusal:
+        load(file)
+    assert "\x1b" not in str(refusal.value) and "\x9b" not in str(refusal.value)
+
+
+def test_an_endless_integer_of_pythons_is_refused_in_words():
+    from sweep.spec import Spec, SpecError
+
+    with pytest.raises(SpecError, match="seed: is a number of too many digits"):
+        Spec.from_mapping({"seed": 10**5000})

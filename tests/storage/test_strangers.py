@@ -15,6 +15,7 @@ from small import small
 import sweep
 from sweep.cli import main
 from sweep.storage.opening import NotAStoreError
+from sweep.storage.sealing import closed
 from sweep.tasks import store
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
@@ -222,3 +223,11 @@ def test_resuming_writes_through_no_link_out_of_a_store(theirs, tmp_path, place)
     told = CliRunner().invoke(main, command, catch_exceptions=False)
     assert told.exit_code == 2 and "\n" not in told.output.strip()
     assert os.listdir(outside) == before
+
+
+@pytest.mark.parametrize("body", [b"[1", b'{"block":', b'{"a":' + b"[" * 10**5, b'"x'])
+def test_a_log_whose_lines_have_digests_but_no_records_is_read_as_damaged(theirs, body):
+    for name in ("receipts.jsonl", "sessions.jsonl"):
+        (theirs / ".sweep" / name).write_bytes(closed(body))
+    assert sweep.open(theirs).attrs["blocks_committed"] == 0
+    assert status(theirs).blocks_done == 0
