@@ -317,6 +317,33 @@ def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
     assert any_ == pytest.approx(2**14 * 1e-9, rel=1e-4)
 
 
+def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
+    """By its points, its bytes, and the time that it takes; a plan says so, too."""
+    from sweep.cli import telling
+
+    text = STUDY.replace("number: 40", "number: 1000000").replace(
+        "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 1000000}"
+    )
+    (here / "huge.yaml").write_text(text.replace("storage: {block_points: 8}", ""))
+    refused(sweep("run", "huge.yaml"), "1,000,000,000,000 points", "TB", "--yes")
+    assert sweep("run", "huge.yaml").stderr.count("\n") == 1 and not (here / "results").exists()
+    assert "takes --yes: 1,000,000,000,000 points" in sweep("plan", "huge.yaml").stdout
+    begun = []
+    monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
+    assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
+    monkeypatch.setattr(telling, "MEASURED", 10)
+    assert sweep("run", "small.yaml").exit_code == 0 and len(begun) == 2
+    monkeypatch.setattr(telling, "MOST_SECONDS", 1e-9)
+    refused(sweep("run", "small.yaml"), "of one core: say --yes to begin it")
+
+
+def test_no_effect_costs_more_than_its_points(here):
+    from sweep.tasks.effects_table import effects_table
+
+    costs = [row.cost for row in effects_table(Spec.from_mapping(yaml.safe_load(STUDY))).rows]
+    assert max(cost for cost in costs if cost == cost) <= 1
+
+
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
     here, monkeypatch
 ):

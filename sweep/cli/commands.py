@@ -22,7 +22,9 @@ from sweep.cli.options import (
 )
 from sweep.cli.telling import (
     INCOMPLETE,
+    MISTAKE,
     alarms_told,
+    ask_before,
     conclude,
     conclude_accuracy,
     effects_of,
@@ -33,8 +35,6 @@ from sweep.cli.telling import (
     warn_of_alarms,
 )
 from sweep.storage.locations import Location
-
-MISTAKE = 2
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
@@ -123,9 +123,12 @@ def main() -> None:
     is_flag=True,
     help="Replace a store that is there, once the new one is complete; on disk only.",
 )
+@click.option("--yes", is_flag=True, help="Begin a very large study without a question.")
 @computing
-def run(spec: Path, store: Location | None, overwrite: bool, **how: Any) -> None:
+def run(spec: Path, store: Location | None, overwrite: bool, yes: bool, **how: Any) -> None:
     """Compute the study SPEC into a Zarr store.
+
+    More than 1e9 points, 1 TB of results or 30 days of one core begin only after a question.
 
     A table at the end says how probable detection is; where the study draws, another says at how
     many points that is known within accuracy.tolerance, and how many draws the worst one needs.
@@ -141,6 +144,7 @@ def run(spec: Path, store: Location | None, overwrite: bool, **how: Any) -> None
     from sweep.tasks import driver
 
     study, path = load(spec), store or _default_store(spec)
+    ask_before(study, path, yes=yes)
     warn_before(study, path)
     outcome = driver.run(study, store=path, overwrite=overwrite, **how)
     conclude(outcome, shown(path))
@@ -185,7 +189,7 @@ def plan(spec: Path, workers: int | None) -> None:
 
     The time comes from about a second of computing points of the study itself. Of each effect the
     table says at how many points and where it is simulated, how much it may change pd, log10
-    pfa or |X| (a bound), and the time that it takes a point there.
+    pfa or |X| (a bound), and the share of a point's time that it takes there.
     """
     from sweep.spec import SceneSpec, load
     from sweep.tasks.progress import working

@@ -16,16 +16,19 @@ if TYPE_CHECKING:
     from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.session import Outcome
 
-INCOMPLETE = 3
+MISTAKE, INCOMPLETE = 2, 3
 
 MANY_ALARMS = 0.01
 """Probability of a false alarm in a shot beyond which a study is warned of."""
 
+MOST_POINTS, MOST_BYTES, MOST_SECONDS = 10**9, 10**12, 30 * 86400.0
+"""Size of a study, and its time on one core [s], beyond which a run asks before it begins."""
+
+MEASURED = 10**7
+"""Points times draws beyond which a run measures the time that it takes, before it begins."""
+
 LEAST_WORDS, BETWEEN = 14, 3
 """Characters of a table: a column of sentences at the least, and between columns."""
-
-LOOKED_AT = 1024
-"""Shots of each scanner whose effects are planned before a run."""
 
 
 def conclude(outcome: Outcome, store: Location) -> None:
@@ -235,6 +238,7 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
     bound = "at most about" if study.draws.adaptive else "about"
     yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
+    yield from _question(p.points, p.bytes, p.points * p.seconds_a_point)
 
 
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
@@ -261,6 +265,8 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
     yield "bytes", f"{in_bytes(p.bytes)} before compression"
     yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
+    shots = sum(s.shots for s in p.scanners) * p.draws * p.places
+    yield from _question(shots, p.bytes, p.seconds * p.workers)
 
 
 def tell_effects(table: EffectsTable) -> None:
@@ -276,6 +282,58 @@ def tell_effects(table: EffectsTable) -> None:
         f"the tolerance is {table.tolerance:g}."
     )
     warn(table)
+
+
+def ask_before(study: Spec | SceneSpec, store: Location, *, yes: bool) -> None:
+    """Ask before a study begins that is larger than most; leave where that is declined."""
+    if yes or not (why := _excess(*_size(study, store))):
+        return
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        click.echo(f"This study takes {why}: say --yes to begin it.", err=True)
+        sys.exit(MISTAKE)
+    click.confirm(f"This study takes {why}. Begin it?", abort=True, err=True)
+
+
+def _size(study: Spec | SceneSpec, store: Location) -> tuple[int, int, float]:
+    """Points and bytes of a study, and its seconds on one core where it has many draws."""
+    from sweep.spec import SceneSpec
+    from sweep.tasks import plan
+    from sweep.tasks.flight_study import FlightStudy
+    from sweep.tasks.grid import Grid
+    from sweep.tasks.grid_study import output_names
+
+    if isinstance(study, SceneSpec):
+        points = FlightStudy(study, store.absolute()).points
+        if not MEASURED < points <= MOST_POINTS:
+            return points, 0, 0.0
+        flight = plan.scene_plan(study, store=store)
+        return points, flight.bytes, flight.seconds * flight.workers
+    points = Grid(study).points
+    size = points * plan.point_bytes(study, output_names(study))
+    many = points * max(1, study.draws.number, study.draws.limit) > MEASURED
+    if not many or _excess(points, size, 0.0):
+        return points, size, 0.0
+    return points, size, points * plan.plan(study).seconds_a_point
+
+
+def _excess(points: int, size: int, seconds: float) -> str:
+    """What of a study is beyond the usual, in words."""
+    from sweep.tasks.progress import duration
+
+    return ", ".join(
+        text
+        for value, most, text in (
+            (points, MOST_POINTS, f"{points:,} points"),
+            (size, MOST_BYTES, in_bytes(size)),
+            (seconds, MOST_SECONDS, f"about {duration(seconds)} of one core"),
+        )
+        if value > most
+    )
+
+
+def _question(points: int, size: int, seconds: float) -> Iterator[tuple[str, str]]:
+    if why := _excess(points, size, seconds):
+        yield "question", f"sweep run asks first, or takes --yes: {why}"
 
 
 def alarms_told(study: Spec | SceneSpec) -> str:
@@ -319,7 +377,7 @@ def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) 
     if isinstance(study, SceneSpec):
         from sweep.tasks.flight_study import FlightStudy
 
-        return flight_effects_table(FlightStudy(study, store.absolute()), LOOKED_AT)
+        return flight_effects_table(FlightStudy(study, store.absolute()))
     return effects_table(study, costs=costs)
 
 
@@ -330,13 +388,17 @@ def warn(table: EffectsTable) -> None:
 
 
 def _effect_cells(row: EffectRow) -> list[str]:
-    cost, forced = row.seconds_a_point, "" if row.mode == "auto" else f" ({row.mode})"
+    cost, forced = row.cost, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + forced,
         f"{100 * row.share:.3g} %",
-        f"{1e6 * cost:.2g} us" if cost == cost else "-",
+        f"{100 * cost:.2g} %" if cost == cost else "-",
         f"{row.bound:.2g}",
-        "everywhere" if row.share == 1 else row.where or f"nowhere; most at {row.at}",
+        "nowhere, but forced on"
+        if row.bound == 0 and row.mode == "on"
+        else "everywhere"
+        if row.share == 1
+        else row.where or f"nowhere; most at {row.at}",
     ]
 
 

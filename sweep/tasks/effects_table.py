@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks.calling import Calling
+from sweep.tasks.calling import TILE_SHOTS, Calling
 from sweep.tasks.grid import Grid
 from sweep.tasks.plan import timed
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
 MOST_TILES = 4096
+
+#: Tiles of a flight that are looked at, of each scanner.
+FLIGHT_TILES = 16
 
 #: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
 #: which the best counts.
@@ -36,7 +39,7 @@ class EffectRow:
     where: str  # the part of the study that holds these
     bound: float  # largest change that it may make anywhere: of pd, log10 pfa or a magnitude
     at: str  # where that is
-    seconds_a_point: float  # what it costs where it is simulated; nan where it is not
+    cost: float  # share of a point's time that it takes where it is simulated; nan where it is not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,24 +98,22 @@ def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
     )  # fmt: skip
 
 
-def flight_effects_table(study: FlightStudy, shots: int) -> EffectsTable:
+def flight_effects_table(study: FlightStudy) -> EffectsTable:
     """Effects of a study of a scene, at the first place along its axes.
 
     Parameters
     ----------
     study
         The study.
-    shots
-        Shots of each scanner that are looked at, about, spread over the flight in whole cycles.
     """
     from sweep.scenes.eyepoint_arrays import from_arrays
 
     plans, times, weights, total = [], [], [], 0
     for eyepoints in study.eyepoint_studies():
-        index = eyepoints.spread(max(1, shots // eyepoints.shots_a_cycle))
-        seen = from_arrays(eyepoints.see(index), eyepoints.weight)
+        index = eyepoints.tiles(FLIGHT_TILES)
+        seen = from_arrays(eyepoints.cast(index), eyepoints.weight)
         part = study.scanners[eyepoints.scanner].part(0)
-        planned = study.planned(part, seen, index // eyepoints.shots_a_cycle)
+        planned = study.planned(part, seen, index // TILE_SHOTS)
         total += eyepoints.points
         if planned is not None:
             plans.append(planned.plan)
@@ -159,7 +160,7 @@ def _rows(
             where=where(called) if called.any() else "",
             bound=float(changes.max()),
             at=where(np.arange(changes.size) == changes.argmax()),
-            seconds_a_point=cost(effect.name, called) if called.any() else math.nan,
+            cost=cost(effect.name, called) if called.any() else math.nan,
         )
         for effect, called, changes in zip(EFFECTS, kept, change, strict=True)
     )
@@ -193,17 +194,16 @@ def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
 
 
 def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
-    """Time a point that an effect takes on one core [s], from points with it and without."""
+    """Share of the time of points that an effect takes, from points with it and without."""
     chosen = tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]
-    spent = 0.0
-    total = 0
+    spent = total = 0.0
     for tile in chosen.tolist():
         numbers, names = _some_points(calling, tile)
         best = {}
         for effects in (names, tuple(n for n in names if n != name)):
             best[effects] = min(_timed(spec, calling, numbers, effects) for _ in range(ROUNDS))
         spent += best[names] - min(best.values())
-        total += len(numbers)
+        total += best[names]
     return spent / total
 
 

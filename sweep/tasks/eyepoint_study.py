@@ -15,6 +15,7 @@ import numpy as np
 from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, SceneOutput
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
+from sweep.tasks.calling import TILE_SHOTS
 from sweep.tasks.grid_study import described
 from sweep.tasks.study import ArrayLayout, Results
 
@@ -181,9 +182,16 @@ class EyepointStudy:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def spread(self, cycles: int) -> np.ndarray:
-        """Numbers of the shots of some cycles, spread over the flight."""
-        first = np.unique(np.linspace(0, self.cycles - 1, cycles).astype(np.int64))
+    def tiles(self, number: int) -> np.ndarray:
+        """Numbers of the shots of some tiles, as the study plans them, spread over the flight."""
+        last = (self.points - 1) // TILE_SHOTS
+        first = np.unique(np.linspace(0, last, number).astype(np.int64)) * TILE_SHOTS
+        shots = (first[:, None] + np.arange(TILE_SHOTS)).ravel()
+        return np.asarray(shots[shots < self.points])
+
+    def spread(self, tiles: int) -> np.ndarray:
+        """Numbers of the shots of whole cycles that hold some tiles, spread over the flight."""
+        first = np.unique(self.tiles(tiles) // self.shots_a_cycle)
         return np.asarray(
             (first[:, None] * self.shots_a_cycle + np.arange(self.shots_a_cycle)).ravel()
         )

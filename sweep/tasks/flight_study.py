@@ -172,7 +172,7 @@ class FlightStudy:
         """Point cloud, statistics and navigation of a block."""
         stretches, part = self.part(block)
         begin, own, shots, around = self._in_tiles(stretches, part)
-        called = self.call(part, around, first=begin).some(own)
+        called = self.call(part, around, begin + np.arange(len(around.time))).some(own)
         shots = {name: values[own] for name, values in shots.items()}
         results = shots | self._reader(part.scanner).cycles(*stretches.cycle_range(part))
         results |= {"effects": called.flags, "effects_error": called.error}
@@ -193,14 +193,15 @@ class FlightStudy:
         for stretches in self._stretches:
             part = stretches.part(0)
             shots, eyepoints = self._reader(part.scanner).shots(0, stretches.shots_a_cycle)
-            called = self.call(part, eyepoints)
-            self.look(part, shots, eyepoints, called, np.arange(stretches.shots_a_cycle))
+            numbers = np.arange(stretches.shots_a_cycle)
+            called = self.call(part, eyepoints, numbers)
+            self.look(part, shots, eyepoints, called, numbers)
 
     def called(self, block: int) -> Called:
         """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
         stretches, part = self.part(block)
         begin, own, _, around = self._in_tiles(stretches, part)
-        return self.call(part, around, first=begin).some(own)
+        return self.call(part, around, begin + np.arange(len(around.time))).some(own)
 
     def _in_tiles(self, stretches: Stretches, part: Part) -> tuple[int, slice, Results, Eyepoints]:
         """Number of the first shot of a block's tiles, its own among these, and what they see."""
@@ -211,10 +212,10 @@ class FlightStudy:
         shots, eyepoints = self._reader(part.scanner).shots(begin, end)
         return begin, slice(first - begin, stop - begin), shots, eyepoints
 
-    def call(self, part: Part, eyepoints: Eyepoints, *, first: int = 0) -> Called:
-        """What is simulated of shots, the first of this number."""
-        number = len(eyepoints.time)
-        planned = self.planned(part, eyepoints, (first + np.arange(number)) // TILE_SHOTS)
+    def call(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Called:
+        """What is simulated of shots of these numbers, rising."""
+        number = len(numbers)
+        planned = self.planned(part, eyepoints, numbers // TILE_SHOTS)
         nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
         return nothing if planned is None else planned.called(number)
 

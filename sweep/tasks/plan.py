@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 MEASURING = 1.0
 PLACES = 16
 
-#: Time that measuring a scanner may take [s], about, and the shots to begin with.
+#: Time that measuring a scanner may take [s], about.
 MEASURING_SCANNER = 0.5
-FIRST_SHOTS = 64
 
 #: Draws of a point while measuring.
 MOST_DRAWS = 1000
@@ -106,16 +105,22 @@ def measured(spec: Spec, grid: Grid) -> float:
     points are drawn until their accuracy is met, those that are not after few draws are taken to
     reach their limit.
     """
+    from numba.core.event import install_recorder
+
     compile_kernels(spec, grid)
     calling = Calling(spec, grid)
     rows, begun = 1, time.perf_counter()
     while True:  # once at the least, however long this process has been held up
         points, left_out = 0, 0.0
         round_begun = time.perf_counter()
-        for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
-            more, seconds = _evaluate_some(spec, calling, int(block), rows)
-            points, left_out = points + more, left_out + seconds
+        with install_recorder("numba:compile") as compiled:
+            for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
+                more, seconds = _evaluate_some(spec, calling, int(block), rows)
+                points, left_out = points + more, left_out + seconds
         now = time.perf_counter()
+        if compiled.buffer:  # a round that compiles tells nothing of those that do not
+            begun = now
+            continue
         taken = now - round_begun
         if points >= grid.points or taken > MEASURING / 4 or now - begun > MEASURING / 2:
             return (taken + left_out) / points
@@ -250,28 +255,32 @@ def scene_plan(spec: SceneSpec, *, store: Location, workers: int | None = None) 
 
 
 def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    from numba.core.event import install_recorder
+
     from sweep.scenes.eyepoint_arrays import from_arrays
 
     part = study.scanners[eyepoints.scanner].part(0)
     first_draw, end = study.scanners[eyepoints.scanner].draw_range(part)
     weight = eyepoints.weight
 
-    def timed(cycles: int) -> tuple[float, float]:
-        begun = time.perf_counter()
-        numbers = eyepoints.spread(cycles)
-        seen = eyepoints.see(numbers)
-        cast = time.perf_counter()
-        shots = from_arrays(seen, weight)
-        study.look(part, seen, shots, study.call(part, shots), numbers)
-        return cast - begun, time.perf_counter() - cast
+    def measured(tiles: int) -> tuple[int, float, float]:
+        """Number of shots, and what casting and looking take [s], compiling apart."""
+        with install_recorder("numba:compile") as compiled:
+            begun = time.perf_counter()
+            numbers = eyepoints.spread(tiles)
+            seen = eyepoints.see(numbers)
+            cast = time.perf_counter()
+            shots = from_arrays(seen, weight)
+            called = study.call(part, shots, numbers)
+            study.look(part, seen, shots, called, numbers)
+            looked = time.perf_counter()
+        return measured(tiles) if compiled.buffer else (len(numbers), cast - begun, looked - cast)
 
-    timed(1)  # compiles what there is to compile
-    cycles = max(1, FIRST_SHOTS // eyepoints.shots_a_cycle)
-    casting, looking = timed(min(cycles, eyepoints.cycles))
-    while casting + looking < MEASURING_SCANNER / 4 and cycles < eyepoints.cycles:
-        cycles *= 4
-        casting, looking = timed(min(cycles, eyepoints.cycles))
-    shots = min(cycles, eyepoints.cycles) * eyepoints.shots_a_cycle
+    tiles = 1
+    shots, casting, looking = measured(tiles)
+    while casting + looking < MEASURING_SCANNER / 4 and shots < eyepoints.points:
+        tiles *= 4
+        shots, casting, looking = measured(tiles)
     return ScannerPlan(
         name=eyepoints.scanner,
         cycles=eyepoints.cycles,

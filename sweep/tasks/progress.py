@@ -301,10 +301,13 @@ def amount(points: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in words: `45 s`, `3 min 20 s`, `5 h 02 min`."""
+    """A time in words: `45 s`, `3 min 20 s`, `5 h 02 min`, `12 days`, `5,950 years`."""
     whole = int(seconds + 0.5)
     if whole < 60:
         return f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    if whole < 2 * 86400:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    days = seconds / 86400
+    return f"{days:,.0f} days" if days < 2 * 365 else f"{days / 365.25:,.0f} years"

@@ -57,7 +57,7 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
     stretches = study.scanners[eyepoints.scanner]
     for *axes, draws in np.ndindex(*stretches.along[:-1]):
         part = Part(eyepoints.scanner, tuple(axes), draws, 0)
-        called = study.call(part, shots)
+        called = study.call(part, shots, np.arange(len(shots.time)))
         assert np.isfinite(called.error).all() and (called.error >= 0).all(), "effects_error"
         found = study.look(part, seen, shots, called, numbers)
         architecture = study.parameters_at(part)["instrument.receiver.architecture"]

@@ -19,7 +19,6 @@ def swiftly() -> Iterator[None]:
     with (
         mock.patch.object(plan, "MEASURING", 1e-3),
         mock.patch.object(plan, "MEASURING_SCANNER", 1e-3),
-        mock.patch.object(plan, "FIRST_SHOTS", 1),
         mock.patch.object(scene_map, "NODES", 24),
         mock.patch.object(effects_table, "COST_POINTS", 1),
         mock.patch.object(effects_table, "COST_TILES", 1),

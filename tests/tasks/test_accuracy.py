@@ -350,7 +350,7 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
 
     shots = caster.see(tiles.index)
     eyepoints = from_arrays(shots, caster.weight)
-    called = study.call(tiles.part, eyepoints)
+    called = study.call(tiles.part, eyepoints, np.arange(len(tiles.index)))
     assert len(tiles.index) <= TILE_SHOTS
     found = study.look(tiles.part, shots, eyepoints, called, tiles.index)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
