@@ -6,7 +6,7 @@ import errno
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -35,6 +35,9 @@ from sweep.cli.telling import (
     warn_of_alarms,
 )
 from sweep.storage.locations import Location
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
@@ -395,3 +398,132 @@ def schema() -> None:
     from sweep.spec import json_schema
 
     click.echo(json.dumps(json_schema(), indent=2))
+
+
+@main.command()
+@click.argument("store", type=StorePath())
+@click.argument("spec", type=LocalPath(exists=True, dir_okay=False), required=False)
+@click.option(
+    "--set",
+    "fields",
+    multiple=True,
+    metavar="FIELD=VALUE",
+    help="A field of the larger study, as it would stand in a file; as often as needed.",
+)
+@click.option(
+    "--store",
+    "to",
+    type=StorePath(),
+    help="Where the larger store goes; the old one then stays [in its place].",
+)
+@click.option(
+    "--overwrite",
+    is_flag=True,
+    help="Begin anew where one was begun; with --store, replace what is there.",
+)
+@computing
+def extend(
+    store: Location,
+    spec: Path | None,
+    fields: tuple[str, ...],
+    to: Location | None,
+    overwrite: bool,
+    **how: Any,
+) -> None:
+    """Extend STORE to a larger study, and compute only what is new.
+
+    The larger study is the one in the file SPEC, or the one in STORE with fields --set anew: more
+    values on an axis, a new axis, more draws, a tighter tolerance, more scanners of a flight. What
+    STORE has of it is taken from there; what comes out is, byte for byte, the larger study run at
+    once.
+
+    The larger store is made beside STORE and takes its place once it is complete. Until then
+    nothing in STORE changes; sweep extend, or sweep resume STORE, goes on after an interruption.
+
+    \b
+      sweep extend results/range_angle.zarr experiments/range_angle.yaml
+      sweep extend results/range_angle.zarr --set 'axes.target.reflectance=[0.05, 0.1, 0.2]'
+      sweep extend results/speckled_target.zarr --set draws.limit=1e7 --workers 8
+      sweep extend results/gale_crater_descent.zarr --set draws.number=200 --workers 8
+      sweep extend s3://bucket/a.zarr larger.yaml --store s3://bucket/b.zarr
+    """  # noqa: D301
+    from sweep.spec import load
+    from sweep.spec.loading import written
+    from sweep.tasks import driver
+
+    if spec is None and not fields:
+        raise click.UsageError("name the larger study, or what is to change in it with --set")
+    outcome = driver.extend(
+        store,
+        load(spec) if spec else None,
+        changes=written(assignments(fields, "--set", "draws.limit=1e6")) if fields else None,
+        to=to,
+        overwrite=overwrite,
+        **how,
+    )
+    conclude(outcome, shown(to or store))
+
+
+def declared(place: Location) -> Spec:
+    """The study of a flat target in a spec's file or in a store.
+
+    Raises
+    ------
+    UsageError
+        Where it flies over a scene.
+    """
+    from sweep.spec import Spec, load
+    from sweep.tasks.studies import read
+
+    is_file = isinstance(place, Path) and not place.is_dir()
+    study = load(str(place)) if is_file else read(place)[1].spec
+    if not isinstance(study, Spec):
+        raise click.UsageError(f"{place} is a study of a scene: spectra are those of a flat target")
+    return study
+
+
+@main.command()
+@click.argument("study", type=StorePath())
+@click.option(
+    "--at",
+    "at",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A parameter's value; as often as needed. Axes that are not named take their first value.",
+)
+@click.option("--draws", type=click.IntRange(min=1), default=1, help="Number of draws [1].")
+@click.option("--first", type=click.IntRange(min=0), default=0, help="Number of the first [0].")
+@click.option(
+    "-o",
+    "--output",
+    type=LocalPath(),
+    required=True,
+    help="File to write: .zarr (opens with xarray) or .npz (with numpy).",
+)
+@click.option("--overwrite", is_flag=True, help="Put the new file in the place of an old one.")
+def spectra(
+    study: Location, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
+) -> None:
+    """Write spectra of a shot of STUDY, a spec or a store, with noise in every bin.
+
+    For trying detectors and estimators of one's own: complex spectra, draw by draw, with
+    frequencies, noise level, threshold, window, and what is true: lines, range and velocity.
+    The draws are those that a study with draws.method: spectra looks at.
+
+    \b
+      sweep spectra experiments/cfar.yaml --at range=2km --draws 100 -o spectra.npz
+      sweep spectra results/cfar.zarr --at range=2km --at window=hann -o spectra.zarr
+      sweep spectra s3://bucket/cfar.zarr --at range=2km -o spectra.npz
+    """  # noqa: D301
+    from sweep.analysis.shot_figure import chosen
+    from sweep.tasks.progress import working
+    from sweep.tasks.spectra_export import spectra as drawn
+    from sweep.tasks.spectra_export import write
+
+    spec = declared(study)
+    _, parameters = chosen(spec, assignments(at))[0]
+    with working("drawing spectra"):
+        dataset = drawn(spec, parameters, draws=draws, first=first)
+        write(dataset, output, overwrite=overwrite)
+    sizes = ", ".join(f"{size:,} {name}" for name, size in dataset.spectrum.sizes.items())
+    click.echo(f"{output}: {sizes}")

@@ -320,15 +320,10 @@ def _excess(points: int, size: int, seconds: float) -> str:
     """What of a study is beyond the usual, in words."""
     from sweep.tasks.progress import duration
 
-    return ", ".join(
-        text
-        for value, most, text in (
-            (points, MOST_POINTS, f"{points:,} points"),
-            (size, MOST_BYTES, in_bytes(size)),
-            (seconds, MOST_SECONDS, f"about {duration(seconds)} of one core"),
-        )
-        if value > most
-    )
+    told = [f"{points:,} points"] if points > MOST_POINTS else []
+    told += [in_bytes(size)] if size > MOST_BYTES else []
+    told += [f"about {duration(seconds)} of one core"] if seconds > MOST_SECONDS else []
+    return ", ".join(told)
 
 
 def _question(points: int, size: int, seconds: float) -> Iterator[tuple[str, str]]:
