@@ -129,3 +129,13 @@ def test_the_walk_sees_what_it_must():
     """A rule that looks at nothing would pass: the walk finds the package and its imports."""
     assert len(MODULES) > 30
     assert "sweep.model.preparation" in _imports(PACKAGE / "model" / "shot.py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=_module_name)
+def test_stores_are_opened_by_their_checked_document_alone(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        called = node.func.attr if isinstance(node, ast.Call) and hasattr(node.func, "attr") else ""
+        if called in {"open_zarr", "open_datatree", "open_dataset", "open_consolidated"}:
+            assert any(key.arg is None and key.value.id == "CHECKED" for key in node.keywords)
+        if called in {"open_group", "open_array"}:
+            assert _module_name(path) in {"sweep.storage.opening", "sweep.tasks.packing"}
