@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -29,14 +30,12 @@ class Material(Part):
         Numeric(about="Fraction of light scattered back", example="0.1", at_least="0", at_most="1"),
     ]
     reflectance_law: Annotated[str, Choice(about="How it scatters", options=LAWS)] = "lambert"
-    roughness: Annotated[
-        float,
-        of.length("Standard deviation of the height within a spot", "1 mm", at_least="0 m"),
-    ] = 0.0
 
 
 OPTICAL = tuple(Material.model_fields)
 """Fields that rays know nothing of."""
+
+_SCALE = of.number("Metres to a unit of the file's heights", "0.5", at_least="1e-9", at_most="1e9")
 
 _RELIEF_SLOPE = of.number(
     "Standard deviation of height differences over the baseline, divided by it",
@@ -227,6 +226,7 @@ class RasterGround(Ground):
     kind: Literal["raster"]
     file: Annotated[str, File(about="The raster, whatever rasterio reads", digest=raster_digest)]
     band: Annotated[int, of.count("Band that holds the heights", "1")] = 1
+    scale: Annotated[float, _SCALE] = 1.0
     window: Annotated[
         tuple[float, ...] | None,
         Several(
@@ -251,17 +251,18 @@ class RasterGround(Ground):
 
     def survey(self, files: Files) -> Terrain:
         """Heights of the raster."""
-        return read_raster(
+        terrain = read_raster(
             files.path(self.file, raster_digest),
             band=self.band,
             window=self.window,  # type: ignore[arg-type]
             metres_per_degree=self.metres_per_degree,  # type: ignore[arg-type]
             pixel=self.pixel,
         )
+        return replace(terrain, heights=terrain.heights * self.scale)
 
 
 class ArrayGround(PlacedGround):
-    """Heights of a NumPy file [m]."""
+    """Heights of a NumPy file."""
 
     kind: Literal["array"]
     file: Annotated[str, File(about="The file, .npy or .npz")]
@@ -277,17 +278,16 @@ class ArrayGround(PlacedGround):
     ]
     name: Annotated[str | None, Text(about="Array of an .npz that holds the heights")] = None
     no_data: Annotated[float | None, of.number("Value for a missing height", "-9999")] = None
+    scale: Annotated[float, _SCALE] = 1.0
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the file."""
         from sweep.scenes.grids import read_array
 
-        return read_array(
-            files.path(self.file),
-            spacing=(self.spacing[0], self.spacing[1]),
-            name=self.name,
-            no_data=self.no_data,
-        )
+        spacing, missing = (self.spacing[0], self.spacing[1]), self.no_data
+        path = files.path(self.file)
+        terrain = read_array(path, spacing=spacing, name=self.name, no_data=missing)
+        return replace(terrain, heights=terrain.heights * self.scale)
 
 
 class ImageGround(PlacedGround):

@@ -40,7 +40,7 @@ class World(NamedTuple):
 def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
     """Surfaces of a scene in the order of their numbers."""
     return tuple(
-        Surface(name, material.reflectance, material.reflectance_law, material.roughness)
+        Surface(name, material.reflectance, material.reflectance_law)
         for key, thing in scene.objects.items()
         for name, material in materials(key, thing)
     )

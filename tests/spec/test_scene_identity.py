@@ -70,7 +70,6 @@ SAME_GEOMETRY = {
     "question": "Why?",
     "scene.objects.ground.reflectance": 0.2,
     "scene.objects.forest.leaf.reflectance": 0.1,
-    "scene.objects.forest.trunk.roughness": "1 mm",
     "scene.objects.rocks.reflectance_law": "thesis",
     "scene.solar_irradiance": "0.1 W/m^2/nm",
     "instrument.telescope.aperture": "50 mm",

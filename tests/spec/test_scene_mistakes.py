@@ -80,6 +80,7 @@ FIELDS = [
     ("footprint.pattern", "line", "stands for a plane alone"),
     ("draws.number", 0, "must be at least 1"),
     ("draws.batch", 3, "is no field; the fields here are number, method, returns"),
+    ("scene.objects.ground.roughness", "1 mm", "is no field"),
     ("draws.returns", 0, "must be at least 1"),
     ("navigation.test_level", 0.6, "must be at most 0.5"),
     ("navigation.relief", 3, "needs a unit"),

@@ -82,8 +82,8 @@ def ramp(rows=41, columns=61, pixel=2.0, base=-4400.0):
 
 
 def raster_study(tmp_path, **changes):
-    write_raster(tmp_path / "ground.tif", ramp())
-    ground = {"kind": "raster", "file": "ground.tif", "reflectance": 0.1}
+    write_raster(tmp_path / "ground.tif", 2 * ramp())  # in half metres
+    ground = {"kind": "raster", "file": "ground.tif", "reflectance": 0.1, "scale": 0.5}
     return written({"scene.objects.ground": ground} | changes)
 
 
@@ -120,11 +120,12 @@ def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
 
     monkeypatch.setenv("HOME", str(tmp_path))
 
-    np.save(tmp_path / "grid.npy", ramp(base=0.0))
+    np.save(tmp_path / "grid.npy", 2 * ramp(base=0.0))  # in half metres
     levels = np.zeros((5, 5), np.uint8)
     levels[0] = 255  # the northern row
     Image.fromarray(levels).save(tmp_path / "grid.png")
     array = {"kind": "array", "file": "grid.npy", "spacing": ["2 m", "-2 m"], "reflectance": 1}
+    array["scale"] = 0.5
     image = {
         "kind": "image",
         "file": "~/grid.png",
