@@ -1,0 +1,229 @@
+"""Answers of a version, frozen: some 20,000 points and shots, to hold another version against.
+
+    python benchmarks/frozen_answers.py write FILE.npz     # with the version that is installed
+    python benchmarks/frozen_answers.py compare FILE.npz   # what differs from it, and by how much
+
+Points are drawn from every shipped experiment and from random instruments whose echoes lie near DC
+and Nyquist, under every effect on the record; flights are whole. The tolerance is 1e-9, so that two
+versions agree up to rounding wherever both are right. Only `sweep.load`, `run`, `open` and
+`open_scene` are used: the script runs with any version. `--points` says how many of each, and names
+of studies look at those alone. `make frozen` does all of it.
+"""
+
+import argparse
+import contextlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import sweep
+
+ROOT = Path(__file__).parents[1]
+EXPERIMENTS = ROOT / "experiments"
+TOLERANCE = 1e-9
+SEED = 2029
+FEW_DRAWS = 20
+"""Draws of each point of a study that has some."""
+LEFT_OUT = ("scan_pattern_comparison", "gale_crater_descent")
+"""A million shots; ground from a file that the project does not have."""
+ALLOWED = 1e-6
+"""Difference beyond which a point is counted."""
+WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
+NEAR = 40.0
+"""Bins from DC or Nyquist within which random echoes lie."""
+C = 299792458.0
+
+
+def grid(written: dict[str, Any], points: int, rng: np.random.Generator) -> dict[str, Any]:
+    """A study of so many points of a grid, drawn with replacement: one axis that varies all."""
+    axes = written.get("axes", {})
+    if not axes:
+        return written
+    spec = loaded(written)
+    drawn = [
+        {
+            member.path: spelled(member, int(place))
+            for axis in spec.axes
+            for place in [rng.integers(axis.size)]
+            for member in axis.members
+        }
+        for _ in range(points)
+    ]
+    return written | {"axes": {"sample": {"zip": drawn}}}
+
+
+def spelled(member: Any, place: int) -> str:
+    """A value of an axis as a spec has it."""
+    value = member.display[place]
+    return str(value) if isinstance(value, str) else f"{float(value)!r} {member.units}".strip()
+
+
+def loaded(written: dict[str, Any]) -> Any:
+    """A study from plain data."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "study.yaml"
+        file.write_text(yaml.safe_dump(written, sort_keys=False))
+        return sweep.load(file)
+
+
+def named(written: Any) -> Any:
+    """The same with keys that YAML reads as true (`on`) as they were written."""
+    if isinstance(written, list):
+        return [named(each) for each in written]
+    if not isinstance(written, dict):
+        return written
+    return {"on" if key is True else key: named(value) for key, value in written.items()}
+
+
+def experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every shipped experiment, exact and thinned."""
+    for file in sorted(EXPERIMENTS.glob("*.yaml")):
+        if file.stem in LEFT_OUT:
+            continue
+        written = named(yaml.safe_load(file.read_text()))
+        instrument = written["instrument"]
+        if isinstance(instrument, str):
+            instrument = {"file": instrument}
+        instrument["file"] = str(EXPERIMENTS / instrument["file"])
+        written["instrument"] = instrument
+        written["accuracy"] = {"tolerance": TOLERANCE}
+        if "draws" in written:
+            few = {k: v for k, v in written["draws"].items() if k not in ("limit", "number")}
+            written["draws"] = few | {"number": FEW_DRAWS}
+        written.pop("figures", None)
+        written.pop("storage", None)
+        few_points = points // 10 if "draws" in written else points
+        yield file.stem, grid(written, few_points, np.random.default_rng(SEED))
+
+
+def random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Instruments whose up-chirp echo lies near DC or Nyquist, by window and phases."""
+    rng = np.random.default_rng(SEED)
+    for window in WINDOWS:
+        for phases, beamlets in (("coherent", 1), ("coherent", 37), ("incoherent", 37)):
+            name = f"random_{window}_{phases}_{beamlets}"
+            drawn = [instrument(rng) for _ in range(points // (3 * len(WINDOWS)))]
+            yield (
+                name,
+                {
+                    "title": name,
+                    "instrument": {
+                        "file": str(EXPERIMENTS / "instruments" / "table_4_1.yaml"),
+                        "processing": {
+                            "window": window,
+                            "fft_size": "2^12",
+                            "sample_rate": "100 MHz",
+                        },
+                    },
+                    "target": {"reflectance": 0.1},
+                    "footprint": {"phases": phases, "beamlets": beamlets},
+                    "accuracy": {"tolerance": TOLERANCE},
+                    "effects": {"image": "on", "leakage": "on", "footprint": "on"},
+                    "axes": {"sample": {"zip": drawn}},
+                },
+            )
+
+
+def instrument(rng: np.random.Generator) -> dict[str, str]:
+    """One instrument and target."""
+    duration, bandwidth, wavelength = 2**12 / 100e6, rng.uniform(0.2e9, 1e9), 1.55e-6
+    bins = rng.uniform(-NEAR, NEAR) + (2**11 if rng.random() < 0.5 else 0)
+    velocity, beat = rng.uniform(2, 30), abs(bins) / duration
+    distance = (beat + 2 * velocity / wavelength) * C * duration / (2 * bandwidth)
+    return {
+        "instrument.chirp.bandwidth": f"{bandwidth!r} Hz",
+        "instrument.chirp.duration": f"{duration!r} s",
+        "instrument.laser.power": f"{10 ** rng.uniform(-3, 0)!r} W",
+        "instrument.laser.line_width": f"{10 ** rng.uniform(1, 4)!r} Hz",
+        "instrument.chirp.quadratic_error": f"{rng.uniform(-2e5, 2e5)!r} Hz",
+        "instrument.processing.tnr": f"{rng.uniform(2, 10)!r}",
+        "target.range": f"{distance!r} m",
+        "target.grazing_angle": f"{rng.uniform(30, 90)!r} deg",
+        "target.radial_velocity": f"{velocity!r} m/s",
+        "target.acceleration": f"{rng.uniform(-100, 100)!r} m/s^2",
+    }
+
+
+def answers(name: str, written: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Every number that a study's store has."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = Path(folder) / "frozen.zarr"
+        outcome = sweep.run(loaded(written), store=str(store), scheduler="none", progress=False)
+        if not outcome.complete:
+            sys.exit(f"{name}: {outcome.stopped or outcome.failures}")
+        parts = {"": sweep.open(store)} if "scene" not in written else flown(store)
+        return {
+            f"{name}/{group}{key}": values
+            for group, part in parts.items()
+            for key, variable in part.data_vars.items()
+            if (values := variable.values).dtype.kind in "fiu"
+        }
+
+
+def flown(store: Path) -> dict[str, Any]:
+    """Groups of a flight's store."""
+    tree = sweep.open_scene(store)
+    return {f"{node.path.strip('/')}/": node.to_dataset() for node in tree.subtree}
+
+
+def differences(frozen: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Absolute differences of values within 1, relative ones beyond; inf where one is nan."""
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(now - frozen) / np.maximum(1.0, np.abs(frozen))
+    apart = np.where(frozen == now, 0.0, apart)  # infinities
+    odd = np.isnan(frozen) != np.isnan(now)
+    return np.where(odd, np.inf, np.nan_to_num(apart, nan=0.0, posinf=np.inf))
+
+
+def compare(frozen: dict[str, np.ndarray], now: dict[str, np.ndarray]) -> int:
+    """Print what differs; the number of variables that do by more than is allowed."""
+    count = 0
+    for key in sorted(frozen):
+        if key not in now or frozen[key].shape != now[key].shape:
+            print(f"{key}: {'is of another shape' if key in now else 'is gone'}")
+            count += 1
+            continue
+        apart = differences(frozen[key].astype(float), now[key].astype(float)).ravel()
+        if apart.size and apart.max() > ALLOWED:
+            beyond, place = int(np.count_nonzero(apart > ALLOWED)), int(apart.argmax())
+            old, new = frozen[key].ravel()[place], now[key].ravel()[place]
+            print(f"{key}: {beyond} of {apart.size} beyond {ALLOWED:g}, most {apart.max():.1e} "
+                  f"at {place}: {old:.9g} -> {new:.9g}")  # fmt: skip
+            count += 1
+    return count
+
+
+def main() -> int:
+    """Write or compare; 1 where something differs."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("what", choices=("write", "compare"))
+    parser.add_argument("file", type=Path)
+    parser.add_argument("studies", nargs="*", help="names of studies, default all")
+    parser.add_argument("--points", type=int, default=1000)
+    asked = parser.parse_args()
+    found: dict[str, np.ndarray] = {}
+    for name, written in (*experiments(asked.points), *random_instruments(2 * asked.points)):
+        if asked.studies and name not in asked.studies:
+            continue
+        with contextlib.suppress(BrokenPipeError):
+            print(f"{name} ...", file=sys.stderr, flush=True)
+        found |= answers(name, written)
+    if asked.what == "write":
+        np.savez_compressed(asked.file, **found)
+        print(f"{len(found)} arrays, {sum(values.size for values in found.values())} numbers")
+        return 0
+    frozen = dict(np.load(asked.file))
+    if asked.studies:
+        frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] in asked.studies}
+    differing = compare(frozen, found)
+    print(f"{len(frozen)} arrays held against {asked.file.name}: {differing} differ")
+    return int(differing > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
