@@ -219,7 +219,8 @@ def test_studies_are_compared_where_they_meet_whatever_their_units_and_order(tmp
     found = ours.sweep.compare(other).compute()
     assert dict(found.sizes) == {"range": 2, "grazing_angle": 1}
     assert found.range.values.tolist() == [1.0, 9.0]
-    assert np.abs(found.pd_shot).max() < 1e-9  # the same 1 W
+    # the same 1 W; what effects are left out may differ, as each is planned for other neighbours
+    assert np.abs(found.pd_shot).max() < 1e-6
     assert found.pd_shot_agrees.all()
     stronger = ours.sweep.compare(other.sweep.sel(power="3 W")).compute()
     assert (stronger.snr_up > 0).all() and not stronger.pd_shot_agrees.all()
