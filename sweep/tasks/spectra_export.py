@@ -169,17 +169,14 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
             raise StoreError(f"{path} is there already: --overwrite puts the new one in its place")
         if not _is_written_here(path):
             raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another --output")
-    try:
-        with draft(path.resolve(), replace=overwrite) as made:
-            if path.suffix == ".zarr":
-                dataset.to_zarr(made, mode="w", zarr_format=3, consolidated=False)
-                return
-            arrays = {str(name): value.values for name, value in dataset.variables.items()}
-            arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
-            with open(made, "wb") as file:  # by a name, numpy would give it a suffix
-                np.savez_compressed(file, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
-    except OSError as error:
-        raise StoreError(f"{path} can't be written: {error.strerror or error}") from error
+    with draft(path.resolve(), replace=overwrite) as made:
+        if path.suffix == ".zarr":
+            dataset.to_zarr(made, mode="w", zarr_format=3, consolidated=False)
+            return
+        arrays = {str(name): value.values for name, value in dataset.variables.items()}
+        arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
+        with open(made, "wb") as file:  # by a name, numpy would give it a suffix
+            np.savez_compressed(file, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
 
 
 def _is_written_here(path: Path) -> bool:

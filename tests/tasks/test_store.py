@@ -139,7 +139,7 @@ def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
 
 def test_a_store_is_never_made_in_the_place_of_something_else(path, study):
     before = everything(path)
-    with pytest.raises(StoreError, match="can't be made"):
+    with pytest.raises(StoreError, match="is there already"):
         store.create(path, study)
     assert everything(path) == before
     assert [child.name for child in path.parent.iterdir()] == [path.name]

@@ -122,7 +122,7 @@ def put_at_points(table, beam, law, out):
     for i in range(table.shape[1]):
         point = table[:, i]
         out[:, :, i] = 0.0
-        for moving in range(2 if point[3] != 0.0 else 1):
+        for moving in range(2 if point[2] != 0.0 or point[3] != 0.0 else 1):
             _put_rays(point, beam, law, moving == 1, rays)
             for s in range(3):
                 _put_terms(1.0 - s, point, point[9 + s], rays, terms)
