@@ -321,13 +321,13 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
     """By its points, its bytes, and the time that it takes; a plan says so, too."""
     from sweep.cli import telling
 
-    text = STUDY.replace("number: 40", "number: 1000000").replace(
-        "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 1000000}"
+    text = STUDY.replace("number: 40", "number: 100000").replace(
+        "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100000}"
     )
     (here / "huge.yaml").write_text(text.replace("storage: {block_points: 8}", ""))
-    refused(sweep("run", "huge.yaml"), "1,000,000,000,000 points", "TB", "--yes")
+    refused(sweep("run", "huge.yaml"), "10,000,000,000 points", "TB", "--yes")
     assert sweep("run", "huge.yaml").stderr.count("\n") == 1 and not (here / "results").exists()
-    assert "takes --yes: 1,000,000,000,000 points" in sweep("plan", "huge.yaml").stdout
+    assert "takes --yes: 10,000,000,000 points" in sweep("plan", "huge.yaml").stdout
     begun = []
     monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
     assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
