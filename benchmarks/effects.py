@@ -1,6 +1,6 @@
 """All effects on against those that are called for: what it changes, what it saves.
 
-Run with `make effects`, some ten minutes: every experiment in the repository, whole, with each
+Run with `make effects`, some three minutes: every experiment in the repository, whole, with each
 effect forced on, and with effects on demand at three tolerances. All in one process, one variant
 of an experiment after the other; quote the ratios. Writes docs/effects_table.md.
 """
