@@ -94,7 +94,8 @@ class Pool:
         return self._place.terms
 
     @property
-    def _is_plain(self) -> bool:
+    def is_plain(self) -> bool:
+        """Whether blocks are computed in a plain loop, without workers."""
         return self._place.client is None and self._place.scheduler == cluster.NONE
 
     def connect(self) -> None:
@@ -105,7 +106,7 @@ class Pool:
         ClusterError
             Where there is no scheduler or worker to be had.
         """
-        if not self._is_plain:
+        if not self.is_plain:
             self._connected()
 
     def answers(
@@ -118,7 +119,7 @@ class Pool:
         ClusterError
             Where there is no scheduler or worker to be had.
         """
-        if self._is_plain:
+        if self.is_plain:
             if self._place.performance_report is not None:
                 self._say("no performance report: a plain loop has no scheduler to tell of it")
             return plain(job, todo, stopping, seen)

@@ -260,7 +260,8 @@ class Session:
             try:
                 compiling = threading.Thread(target=self._compile, daemon=True)
                 job = Job(str(self._path), self._study.id, versions.model(), self._pool.terms)
-                with working("loading the model", self._progress):
+                what = "loading the model" + ("" if self._pool.is_plain else ", reaching workers")
+                with working(what, self._progress):
                     compiling.start()  # beside the workers' start, which is mostly waiting
                     answers = self._pool.answers(
                         job, todo, lambda: self._interrupts.stopping, self._is_seen

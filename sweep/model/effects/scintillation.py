@@ -47,11 +47,6 @@ _HUGE = 1e9
 _LEAST_SPREAD = 1e-5
 
 
-def index(legs: Sequence[LogVariances]) -> np.ndarray:
-    """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
-    return np.expm1(sum(leg.large + leg.small for leg in legs))
-
-
 def factors(
     distribution: str, legs: Sequence[LogVariances], realisation: Realisation
 ) -> np.ndarray:

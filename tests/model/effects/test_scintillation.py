@@ -16,7 +16,6 @@ from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.scintillation import (
     bound,
     factors,
-    index,
     mean_pd_bound,
     steepest,
 )
@@ -36,6 +35,11 @@ from sweep.model.shot import evaluate
 
 WAVENUMBER = 2 * np.pi / 1.55e-6
 EVEN = Turbulence(uniform=1e-14)
+
+
+def index(legs):
+    """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
+    return np.expm1(sum(each.large + each.small for each in legs))
 
 
 def leg(large, small=0.0):
