@@ -29,7 +29,7 @@ NOT_IN_THE_MODEL = {
 }  # fmt: skip
 """Pure physics: arrays in, arrays out."""
 
-LARGEST_HOUSE = {"lines": 60_851, "modules": 380, "compiled functions": 445}
+LARGEST_HOUSE = {"lines": 60_845, "modules": 363, "compiled functions": 442}
 """What `make size` may come to of sweep/."""
 LARGEST_MODULE = 600
 LARGEST_FUNCTION = 50
