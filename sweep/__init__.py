@@ -32,7 +32,7 @@ __all__ = ["__version__", *_HOMES]
 
 
 def _is_writable(folder: Path) -> bool:
-    """Whether files can be put into a folder, which may be still to be made."""
+    """Tell whether files can be put into a folder, which may be still to be made."""
     while not folder.exists():
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)

@@ -163,7 +163,7 @@ def _settle(left: Path, made: re.Match[str]) -> None:
 
 
 def _is_made(draft: Path, made: re.Match[str]) -> bool:
-    """Whether the process that makes a draft may still be at it."""
+    """Tell whether the process that makes a draft may still be at it."""
     import psutil
 
     begun = draft.stat().st_mtime

@@ -95,7 +95,7 @@ class Pool:
 
     @property
     def is_plain(self) -> bool:
-        """Whether blocks are computed in a plain loop, without workers."""
+        """Tell whether blocks are computed in a plain loop, without workers."""
         return self._place.client is None and self._place.scheduler == cluster.NONE
 
     def connect(self) -> None:

@@ -180,7 +180,7 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
 
 
 def _is_written_here(path: Path) -> bool:
-    """Whether a file or folder is what `write` makes, by the names in it."""
+    """Tell whether a file or folder is what `write` makes, by the names in it."""
     names = {*TOLD, "attributes"}
     try:
         if path.suffix == ".npz":

@@ -348,7 +348,7 @@ def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
 
 
 def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
-    """Whether a block that a worker has written is here, too: it is, but in another place.
+    """Tell whether a block that a worker has written is here, too: it is, but in another place.
 
     It is known by its size, or by its digest where it is `read`. An object store shows what is
     written, whole, to everyone at once: one object tells.

@@ -51,10 +51,10 @@ class Stop:
     at: float = float("inf")
     """By `time.monotonic`."""
     told: bool = False
-    """Whether it was over when asked."""
+    """Tell whether it was over when asked."""
 
     def __call__(self) -> bool:
-        """Whether the time is over."""
+        """Tell whether the time is over."""
         self.told = self.told or time.monotonic() >= self.at
         return self.told
 

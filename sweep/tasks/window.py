@@ -202,7 +202,7 @@ class Window:
 
     @property
     def _waits(self) -> bool:
-        """Whether all workers so far are left out, and others are still to come."""
+        """Tell whether all workers so far are left out, and others are still to come."""
         return bool(self._unfit) and not self._fit()
 
     def _fill(self, *, sending: bool) -> None:

@@ -160,7 +160,7 @@ def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
 
 
 def _alike(one: Setting, other: Setting) -> bool:
-    """Whether two marks are too close for a name each."""
+    """Tell whether two marks are too close for a name each."""
     apart = np.log(one.seconds / other.seconds), np.log(_place(one) / _place(other))
     return abs(apart[0]) < 0.25 and abs(apart[1]) < 1.2
 

@@ -47,7 +47,7 @@ class Parameter:
     whole: bool = False
     options: tuple[str, ...] = ()
     alone: bool = True
-    """Whether nothing else can bring the effect."""
+    """Tell whether nothing else can bring the effect."""
     category: bool = False
     """Whether points are computed together only where they share it; words always are."""
 

@@ -112,7 +112,7 @@ class Choice(NamedTuple):
     open: np.ndarray
     """Whether it is neither on nor off, (effects,) bool."""
     free: np.ndarray
-    """Whether it costs nothing, as a number added to the noise does, (effects,) bool."""
+    """Tell whether it costs nothing, as a number added to the noise does, (effects,) bool."""
     parents: np.ndarray
     """Of each, what it is within; -1 for none."""
     on: np.ndarray
