@@ -33,7 +33,7 @@ def installed(tmp_path_factory):
 
 
 def kept(installed, temporary):
-    """Where kernels are kept, without a home."""
+    """Places of compiled kernels, without a home."""
     nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), os.devnull)
     environment = {name: value for name, value in os.environ.items() if "NUMBA" not in name}
     done = subprocess.run(

@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {"lines": 60_845, "modules": 363, "compiled functions": 442}
-"""What `make size` may come to of sweep/."""
+"""Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600
 LARGEST_FUNCTION = 50
 

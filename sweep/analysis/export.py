@@ -88,7 +88,7 @@ class PointTable:
             yield rows
 
     def number(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return sum(
             int((self.recording.read("flags", part, self.draw) > 0).sum())
             for part in self.recording.stretches()

@@ -1,4 +1,4 @@
-"""How places and values are written on the command line, and options that several commands have."""
+"""Places and values as the command line takes them, and options that several commands share."""
 
 from __future__ import annotations
 

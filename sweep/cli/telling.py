@@ -317,7 +317,7 @@ def _size(study: Spec | SceneSpec, store: Location) -> tuple[int, int, float]:
 
 
 def _excess(points: int, size: int, seconds: float) -> str:
-    """What of a study is beyond the usual, in words."""
+    """Sizes of a study beyond the usual, in words."""
     from sweep.tasks.progress import duration
 
     told = [f"{points:,} points"] if points > MOST_POINTS else []

@@ -175,7 +175,7 @@ def _of_lines(
 
 
 def _of_one_line(window_name: str, spread: Spread) -> np.ndarray:
-    """What a line misses of squares in powers, over the power of a line on a bin, (n,).
+    """Error of one line of nodes by squares, over the power of a line on a bin, (n,).
 
     As much again is for what the fewest nodes along the slope miss of them.
     """
@@ -209,7 +209,7 @@ def _errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _boundless(spread: ArrayLike, number: int) -> np.ndarray:
-    """What stands for errors without a bound, 1 or more: the nodes' distance [bins]."""
+    """Stand-in for errors without a bound, 1 or more: the nodes' distance [bins]."""
     return np.maximum(1.0, 2 * REACH * np.asarray(spread) / number)
 
 

@@ -184,7 +184,7 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _spread(p: Mapping[str, np.ndarray], size: int) -> quadrature.Spread:
-    """How far the lines of up, Doppler and down segment lie apart [bins of fs/L]."""
+    """Spread of the lines of up, Doppler and down segment [bins of fs/L]."""
     angle, along = p["target.grazing_angle"], np.asarray(p["target.radial_velocity"], float)
     divergence = np.asarray(p[LASER + "beam_divergence"], float)
     across = np.asarray(p["target.transverse_velocity"], float)

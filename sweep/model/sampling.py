@@ -64,7 +64,7 @@ class Before(NamedTuple):
 
 
 class Drawn(ABC):
-    """What has been drawn of n points so far, added up, to be drawn on.
+    """Sums over the draws of n points so far, to be continued.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def real(location: Location) -> Location:
 
 
 def beside(path: Path) -> Path:
-    """Where a store is made that is to take the place of another once it is complete."""
+    """Place of a store that is to replace another once it is complete."""
     return path.with_name(f".{path.name}{NEXT}")
 
 
@@ -137,7 +137,7 @@ def settle(location: Location) -> None:
 
 
 def stamp(location: Location) -> tuple[int, ...] | None:
-    """What tells the store at a place from any other that was or will be there.
+    """Identity of the store at a place, unlike any other that was or will be there.
 
     None where there is no such thing: its metadata are then the only way to know.
     """

@@ -22,7 +22,7 @@ PREFIX = "begun-"
 
 
 class Begun(NamedTuple):
-    """What there is of a block."""
+    """The saved part of a block."""
 
     known: Known = Known()
     points: float = 0.0
@@ -52,7 +52,7 @@ def write(path: Location, study_id: str, block: int, begun: Begun) -> None:
 
 
 def read(path: Location, study_id: str, block: int) -> Begun:
-    """What there is of a block of a study."""
+    """The saved part of a block of a study."""
     try:
         line, _, content = _file(path, block).read_bytes().partition(b"\n")
     except (FileNotFoundError, NotADirectoryError):

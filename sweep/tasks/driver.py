@@ -383,7 +383,7 @@ def _succeed(path: Path, *, durable: bool) -> None:
 
 
 def _facts(spec: Declared) -> dict[str, str]:
-    """Where the files of a study are, for the recipe of its store."""
+    """Places of a study's files, for the recipe of its store."""
     base = getattr(spec, "base", None)
     return {} if base is None else {"base": str(base.absolute())}
 

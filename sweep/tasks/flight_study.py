@@ -213,7 +213,7 @@ class FlightStudy:
         return begin, slice(first - begin, stop - begin), shots, eyepoints
 
     def call(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Called:
-        """What is simulated of shots of these numbers, rising."""
+        """Effects simulated at shots of these numbers, rising."""
         number = len(numbers)
         planned = self.planned(part, eyepoints, numbers // TILE_SHOTS)
         nothing = Called(np.zeros(number, np.uint32), np.zeros(number))

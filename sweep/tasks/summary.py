@@ -88,7 +88,7 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
 
 
 def beyond_model(store: str | Location) -> tuple[int, str]:
-    """How many points are beyond the model, of those that are looked at, and why the first is."""
+    """Number of points beyond the model, of those that are looked at; the reason for the first."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
@@ -104,7 +104,7 @@ def beyond_model(store: str | Location) -> tuple[int, str]:
 
 
 def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
-    """Why the model does not hold for a point of a block."""
+    """Reason that the model does not hold for a point of a block."""
     ((_, names),) = study.calling.of_block(block).some(point).groups()
     try:
         parameters = select(study.grid.parameters(block), point)
@@ -193,7 +193,7 @@ def pieces(
 
 @dataclass
 class SceneRow:
-    """What came back to a scanner at one place along the axes, in the blocks that are committed."""
+    """Echoes of a scanner at one place along the axes, in the blocks that are committed."""
 
     part: str
     shots: int = 0  # times draws

@@ -74,7 +74,7 @@ LARGER = {"axes.instrument.laser.power": ["1 W", "3 W", "4 W"]}
 
 @dataclass(frozen=True)
 class Kill:
-    """Who dies, or stands still, and when: as a block, or a change by its number, is reached."""
+    """A victim and its moment: a block, or a change by its number."""
 
     victim: str
     moment: str
@@ -540,7 +540,7 @@ def prepare() -> None:
 
 
 def undisturbed_stores(directory: Path) -> dict[str, Path]:
-    """What each command makes where nobody disturbs it."""
+    """Stores that commands make undisturbed."""
 
     def make() -> None:
         run(small(), store=made["run"], scheduler="none", progress=False)

@@ -23,7 +23,7 @@ from sweep.tasks.status import status
 
 
 class Payload:
-    """What leaves a file where it is unpickled."""
+    """An object that leaves a file where it is unpickled."""
 
     def __init__(self, mark):
         self.mark = mark

@@ -1,4 +1,4 @@
-"""What a run says, and does, whose cluster has no worker, a silent one or an unfit one."""
+"""Runs whose cluster has no worker, a silent one or an unfit one."""
 
 import asyncio
 import errno

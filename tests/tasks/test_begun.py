@@ -219,7 +219,7 @@ def emptied(file):
 
 
 def anothers(file):
-    """What is saved of the same block of another study."""
+    """A saved piece of the same block of another study."""
     interrupted(drawn(number=600), file.parents[2] / "other.zarr")
     file.write_bytes((file.parents[2] / "other.zarr" / ".sweep" / file.name).read_bytes())
 

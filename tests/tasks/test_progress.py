@@ -1,4 +1,4 @@
-"""What is said while nothing else is to be seen: nobody waits in silence, and it is true."""
+"""Messages while nothing else is to be seen: truthful, and never late."""
 
 import time
 

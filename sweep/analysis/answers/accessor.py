@@ -119,7 +119,7 @@ def _errors(
 
 
 def _walks(dataset: xr.Dataset) -> xr.DataArray:
-    """Where range walk is simulated, which moves the peak off the beat at the record's start."""
+    """Mask of points with range walk, which moves the peak off the beat at the record's start."""
     attributes = dataset["effects"].attrs
     masks = dict(zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True))
     return (dataset["effects"] & int(masks["range_walk"])) > 0
