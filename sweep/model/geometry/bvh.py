@@ -1,10 +1,16 @@
-"""Bounding volume hierarchy: triangles sorted into nested boxes, eight to a node.
+"""Nearest triangles of bundles of rays: a tree of boxes, eight to a node, and its walk.
 
-The boxes are float32, rounded outwards and widened a little, so that no rounding of a ray's test
-against a triangle can hit what its box missed; the triangles themselves stay float64. The build
-(surface area heuristic over bins of the centroids) uses no threads and no randomness: the same
-mesh gives the same tree on any machine. Traversal is in
-:mod:`sweep.model.geometry.bvh_traversal`.
+What a ray hits is a property of the ray and the mesh alone: of the triangles hit the nearest
+counts, and of equally near ones the first in the mesh. The order of the rays, their grouping and
+the tree's shape change no bit of it.
+
+A triangle counts as hit where the three edge functions of the sheared triangle (Woop, Benthin
+and Wald, JCGT 2 (1), 2013) have no opposite signs. Each is a difference of two products that the
+neighbour across the edge forms with the sign reversed, and rounding is monotone, so a difference
+can round to zero but not to the wrong sign: between triangles that share an edge or a vertex
+there is no crack. This holds as long as no fused multiply-add contracts the difference, so there
+is no fastmath here. The boxes are float32, rounded outwards and widened a little, so that no
+rounding of that test can hit what its box missed; the triangles themselves stay float64.
 """
 
 from typing import NamedTuple
@@ -15,24 +21,39 @@ from numba import njit
 WIDTH = 8
 """Children of a node: one vector of float64 with AVX-512, two with AVX2."""
 
-LARGEST_LEAF = 4
+LEAF = 2
 """Triangles in a leaf at most; fewer than WIDTH, so that start and count share one integer."""
 
-_BINS = 16
 _SLACK = 2.0**-30
 """Widening of the boxes in units of the largest coordinate: far above what rounding moves a hit
 sideways (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and below float32."""
 
+_FAR = np.float32(3e38)
+"""Where the box of nothing begins, and minus this where it ends."""
+
+_STACK = 8 * 16
+"""Entries that the deepest tree can leave behind: seven a level."""
+
+_TINY = 1e-200
+"""Direction components below this count as possibly zero, so that their reciprocal is finite."""
+
+_ENTRY_SLACK = 1.0 + 1e-14
+"""Above the rounding of a box's entry and exit, which is some 5e-16 of them."""
+
+_TIE_SLACK = 1.0 + 1e-12
+"""Above the rounding of a hit's distance: a box is left out only if it cannot hold a tie."""
+
+_LARGEST_FRONT = 128
+"""Triangles tested against a whole bundle before its rays are better walked one by one."""
+
 
 class Tree(NamedTuple):
-    """Wide bounding volume hierarchy over the triangles of one mesh."""
+    """Nested boxes over the triangles of one mesh, the root last."""
 
     bounds: np.ndarray
     """(nodes, 6, 8) float32 [m]: low x, y, z, high x, y, z of each child's box."""
     children: np.ndarray
     """(nodes, 8) int32: index of a node, or -1 - (8 start + count) for triangles of `faces`."""
-    number: np.ndarray
-    """(nodes,) int32: children of the node, 1..8."""
     faces: np.ndarray
     """(m, 3) int32: vertices of each triangle, in the order of the leaves."""
     order: np.ndarray
@@ -42,7 +63,7 @@ class Tree(NamedTuple):
 
 
 def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
-    """Bounding volume hierarchy of a mesh.
+    """Tree of a mesh: leaves along Hilbert's curve, eight neighbours to a node, level by level.
 
     Parameters
     ----------
@@ -58,200 +79,264 @@ def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     """
     if len(faces) == 0:
         raise ValueError("a mesh without triangles has no hierarchy: no ray could hit it")
+    corners = [vertices[faces[:, k]] for k in range(3)]
+    low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
     slack = _SLACK * float(np.abs(vertices).max())
-    boxes = _triangle_boxes(vertices, faces, slack)
-    order = np.arange(len(faces), dtype=np.int32)
-    bounds, children, number = _build_nodes(boxes, order)
-    leaf_vertices, leaf_faces = _in_order_of_use(vertices, faces, order)
-    return Tree(bounds, children, number, leaf_faces, order, leaf_vertices)
+    boxes = np.full((len(faces) + 1, 6), _FAR)  # the last for no triangle
+    boxes[:-1, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
+    boxes[:-1, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
+    leaves = _in_leaves(low + high)
+    boxes = boxes[leaves].reshape(-1, LEAF, 6).min(axis=1)
+    is_triangle = leaves < len(faces)
+    count = is_triangle.reshape(-1, LEAF).sum(axis=1)
+    bounds, children = _nodes(boxes, -1 - (8 * (np.cumsum(count) - count) + count))
+    order = leaves[is_triangle].astype(np.int32)
+    used = faces[order].ravel()
+    first = np.full(len(vertices), used.size)
+    first[used[::-1]] = np.arange(used.size)[::-1]
+    by_use = np.argsort(first)  # a leaf's triangles lie together in memory
+    new = np.empty(len(vertices), np.int32)
+    new[by_use] = np.arange(len(vertices))
+    return Tree(bounds, children, new[used].reshape(-1, 3), order, vertices[by_use])
 
 
-def _in_order_of_use(
-    vertices: np.ndarray, faces: np.ndarray, order: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces renumbered so that a leaf's triangles lie together in memory."""
-    leaf_faces = np.ascontiguousarray(faces[order], dtype=np.int32)
-    kept = _renumber(leaf_faces, len(vertices))
-    return np.ascontiguousarray(vertices[kept], dtype=np.float64), leaf_faces
+def _nodes(boxes: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds and children of all nodes, from boxes (low, -high) of leaves and links to these."""
+    bounds: list[np.ndarray] = []
+    children: list[np.ndarray] = []
+    before = 0
+    while before == 0 or len(boxes) > 1:
+        number = -(-len(boxes) // WIDTH)
+        lacking = number * WIDTH - len(boxes)
+        wide = np.append(boxes, np.full((lacking, 6), _FAR), axis=0).reshape(number, WIDTH, 6)
+        links = np.append(links, np.full(lacking, -1))  # leaves without triangles
+        bounds.append(np.concatenate([wide[..., :3], -wide[..., 3:]], axis=-1).swapaxes(1, 2))
+        children.append(links.reshape(number, WIDTH))
+        boxes, links = wide.min(axis=1), before + np.arange(number)
+        before += number
+    return np.concatenate(bounds), np.concatenate(children).astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
-def _renumber(faces, n_vertices):
-    """Vertices in the order of first use; `faces` is rewritten to index them."""
-    new = np.full(n_vertices, -1, dtype=np.int32)
-    kept = np.empty(n_vertices, dtype=np.int32)
-    used = 0
-    for i in range(faces.shape[0]):
-        for k in range(3):
-            old = faces[i, k]
-            if new[old] < 0:
-                new[old] = used
-                kept[used] = old
-                used += 1
-            faces[i, k] = new[old]
-    return kept[:used]
+def _in_leaves(centre: np.ndarray) -> np.ndarray:
+    """Triangles in the order of full leaves, as many as a power of two; m for none."""
+    m, size = len(centre), LEAF
+    while size < m:
+        size *= 2
+    which = np.arange(size) * m // size
+    order = np.arange(size)
+    _halve(centre[which], order)
+    which[1:][np.diff(which) == 0] = m  # a place too many, beside the triangle before
+    return np.asarray(which[order])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _triangle_boxes(vertices, faces, slack):
-    """Boxes (m, 6) of the triangles, float32, widened by `slack` and rounded outwards."""
-    boxes = np.empty((faces.shape[0], 6), dtype=np.float32)
-    below, above = np.float32(-np.inf), np.float32(np.inf)
-    for i in range(faces.shape[0]):
-        for k in range(3):
-            a, b, c = vertices[faces[i, 0], k], vertices[faces[i, 1], k], vertices[faces[i, 2], k]
-            boxes[i, k] = np.nextafter(np.float32(min(a, b, c) - slack), below)
-            boxes[i, k + 3] = np.nextafter(np.float32(max(a, b, c) + slack), above)
-    return boxes
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _build_nodes(boxes, order):
-    """Nodes over all triangles, the root first; sorts `order` into leaves."""
-    most = max(1, boxes.shape[0])
-    bounds = np.empty((most, 6, WIDTH), dtype=np.float32)
-    children = np.full((most, WIDTH), -1, dtype=np.int32)
-    number = np.zeros(most, dtype=np.int32)
-    starts, ends = np.empty(WIDTH, dtype=np.int64), np.empty(WIDTH, dtype=np.int64)
-    box = np.empty((WIDTH, 6), dtype=np.float32)
-    stack = [(0, 0, boxes.shape[0])]
-    used = 1
-    while len(stack) > 0:
-        node, start, end = stack.pop()
-        n = _divide(boxes, order, start, end, starts, ends, box)
-        number[node] = n
-        for c in range(n):
-            for k in range(6):
-                bounds[node, k, c] = box[c, k]
-            count = ends[c] - starts[c]
-            if count <= LARGEST_LEAF:
-                children[node, c] = -1 - (8 * starts[c] + count)
-            else:
-                children[node, c] = used
-                stack.append((used, starts[c], ends[c]))
-                used += 1
-        for c in range(n, WIDTH):
+def _halve(points, order):
+    """Sort `order` of points (n, 3) so that each half is on one side, and each half of that."""
+    size = order.size
+    while size > LEAF:
+        for start in range(0, order.size, size):
+            axis, widest = 0, -1.0
             for k in range(3):
-                bounds[node, k, c] = 3e38
-                bounds[node, k + 3, c] = -3e38
-    return bounds[:used].copy(), children[:used].copy(), number[:used].copy()
+                least = most = points[order[start], k]
+                for i in range(start + 1, start + size):
+                    least = min(least, points[order[i], k])
+                    most = max(most, points[order[i], k])
+                if most - least > widest:
+                    axis, widest = k, most - least
+            first, last, middle = start, start + size - 1, start + size // 2
+            while first < last:  # Hoare's selection: all before the middle are no larger
+                pivot = points[order[(first + last) // 2], axis]
+                i, j = first, last
+                while i <= j:
+                    while points[order[i], axis] < pivot:
+                        i += 1
+                    while points[order[j], axis] > pivot:
+                        j -= 1
+                    if i <= j:
+                        order[i], order[j] = order[j], order[i]
+                        i, j = i + 1, j - 1
+                if middle <= j:
+                    last = j
+                elif middle >= i:
+                    first = i
+                else:
+                    break
+        size //= 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _larger(a, b):
+    """Larger of two numbers: one instruction, where max() would also look for nan."""
+    return a if a > b else b
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _smaller(a, b):
+    """Smaller of two numbers, likewise."""
+    return a if a < b else b
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _divide(boxes, order, start, end, starts, ends, box):
-    """Up to WIDTH ranges of triangles, the largest box split first; the number of ranges."""
-    starts[0], ends[0] = start, end
-    _enclose(boxes, order, start, end, box[0])
-    n = 1
-    while n < WIDTH:
-        largest, area = -1, np.float32(-1.0)
-        for c in range(n):
-            if ends[c] - starts[c] > LARGEST_LEAF and _half_area(box[c]) > area:
-                largest, area = c, _half_area(box[c])
-        if largest < 0:
-            break
-        middle = _split(boxes, order, starts[largest], ends[largest])
-        starts[n], ends[n] = middle, ends[largest]
-        ends[largest] = middle
-        _enclose(boxes, order, starts[largest], middle, box[largest])
-        _enclose(boxes, order, middle, ends[n], box[n])
-        n += 1
-    return n
+def nearest(tree, origins, directions, distance, face):
+    """Nearest triangle of each ray of each bundle that lies nearer than what is known.
+
+    A bundle, rays from one origin in neighbouring directions, walks the tree once: a box is
+    entered where the interval of the directions may reach it, and a leaf's triangles are tested
+    against all rays together. Where they spread too far, each ray walks alone.
+
+    Parameters
+    ----------
+    tree : Tree
+    origins : (n, 3) float64
+        In the tree's frame [m]. A ray is what lies at distance > 0.
+    directions : (n, b, 3) float64
+    distance : (n, b) float64
+        Nearest distance known before (inf: none), in lengths of the direction; replaced where a
+        triangle is nearer.
+    face : (n, b) int64
+        Triangle's index in the mesh where `distance` was replaced, else left as it is.
+    """
+    room = np.empty((3, directions.shape[1])), np.empty((3, 6)), np.empty(WIDTH)
+    stack = np.empty(_STACK, np.int64), np.empty(_STACK)
+    for i in range(origins.shape[0]):
+        o, d = origins[i], directions[i]
+        if not _walk(tree, o, d, distance[i], face[i], room, stack, _LARGEST_FRONT):
+            for b in range(d.shape[0]):
+                one = slice(b, b + 1)
+                _walk(tree, o, d[one], distance[i, one], face[i, one], room, stack, 1 << 62)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _enclose(boxes, order, start, end, result):
-    """Smallest box around a range of triangles."""
-    _empty(result)
-    for i in range(start, end):
-        _widen(result, boxes[order[i]])
+def _walk(tree, o, d, distance, face, room, stack, budget):
+    """Nearest triangles of all rays of a bundle in one walk; False where it was given up.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _empty(box):
-    for k in range(3):
-        box[k] = np.float32(np.inf)
-        box[k + 3] = np.float32(-np.inf)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _widen(box, other):
-    for k in range(3):
-        box[k] = min(box[k], other[k])
-        box[k + 3] = max(box[k + 3], other[k + 3])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _half_area(box):
-    x, y, z = box[3] - box[0], box[4] - box[1], box[5] - box[2]
-    return x * y + y * z + z * x
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _split(boxes, order, start, end):
-    """Where the range is best divided; sorts `order` about it, each half non-empty."""
-    low, scale = np.empty(3), np.empty(3)
-    for k in range(3):
-        least, most = np.inf, -np.inf
-        for i in range(start, end):
-            centre = _centre(boxes, order[i], k)
-            least, most = min(least, centre), max(most, centre)
-        low[k] = least
-        scale[k] = _BINS * (1.0 - 1e-6) / (most - least) if most > least else 0.0
-    axis, cut = _cheapest_cut(boxes, order, start, end, low, scale)
+    Given up with all triangles tested so far accounted for, so that single walks may go on.
+    """
+    bounds, children, faces, order, vertices = tree
+    shears, planes, entered = room
+    waiting, entry = stack
+    axis = _set_up(d, shears, planes)
     if axis < 0:
-        return (start + end) // 2
-    i, j = start, end - 1
-    while i <= j:
-        if int((_centre(boxes, order[i], axis) - low[axis]) * scale[axis]) < cut:
-            i += 1
-        else:
-            order[i], order[j] = order[j], order[i]
-            j -= 1
-    return i
+        return False
+    kx, ky = (axis + 1) % 3, (axis + 2) % 3
+    ox, oy, oz = o[kx], o[ky], o[axis]
+    farthest = distance.max() * _TIE_SLACK
+    waiting[0], entry[0], top = children.shape[0] - 1, 0.0, 1
+    while top > 0:
+        top -= 1
+        node = waiting[top]
+        if entry[top] > farthest:
+            continue
+        if node >= 0:
+            _enter(bounds, node, o[0], o[1], o[2], planes, farthest, entered)
+            base = top
+            for c in range(WIDTH):  # those that may be entered, the nearest last
+                if entered[c] < np.inf:
+                    k = top
+                    while k > base and entry[k - 1] < entered[c]:
+                        waiting[k], entry[k] = waiting[k - 1], entry[k - 1]
+                        k -= 1
+                    waiting[k], entry[k] = children[node, c], entered[c]
+                    top += 1
+            continue
+        start, count = (-1 - node) >> 3, (-1 - node) & 7
+        for j in range(start, start + count):
+            p, q, r = faces[j, 0], faces[j, 1], faces[j, 2]
+            _test(
+                (vertices[p, kx] - ox, vertices[p, ky] - oy, vertices[p, axis] - oz),
+                (vertices[q, kx] - ox, vertices[q, ky] - oy, vertices[q, axis] - oz),
+                (vertices[r, kx] - ox, vertices[r, ky] - oy, vertices[r, axis] - oz),
+                order[j], shears, distance, face,
+            )  # fmt: skip
+        farthest = distance.max() * _TIE_SLACK
+        budget -= count
+        if budget < 0:
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _centre(boxes, i, k):
-    return 0.5 * (np.float64(boxes[i, k]) + np.float64(boxes[i, k + 3]))
+def _set_up(d, shears, planes):
+    """Axis of the largest component of all directions (b, 3), -1 where they differ; what it makes.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _cheapest_cut(boxes, order, start, end, low, scale):
-    """Axis and bin before which to cut; axis -1 where all centroids coincide."""
-    count = np.zeros((3, _BINS), dtype=np.int64)
-    box = np.empty((3, _BINS, 6), dtype=np.float32)
+    Parameters
+    ----------
+    shears : (3, >= b)
+        Written: directions over that component, the other two axes in cyclic order, and 1 over it.
+    planes : (3, 6)
+        Written: constants of the box test across each axis for directions between `low` and
+        `high` along it. The rays o + t d can reach between the box's lower and upper plane only
+        if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
+        by the sign of its factor. The factors' reciprocals, and what is added to make the two
+        bounds idle from below, and from above.
+    """
+    axis = -1
+    for b in range(d.shape[0]):
+        x, y, z = abs(d[b, 0]), abs(d[b, 1]), abs(d[b, 2])
+        own = 0 if x >= y and x >= z else (1 if y >= z else 2)
+        if b > 0 and own != axis:
+            return -1
+        axis = own
+    for b in range(d.shape[0]):
+        inverse = 1.0 / d[b, axis]
+        shears[0, b] = d[b, (axis + 1) % 3] * inverse
+        shears[1, b] = d[b, (axis + 2) % 3] * inverse
+        shears[2, b] = inverse
     for k in range(3):
-        for b in range(_BINS):
-            _empty(box[k, b])
-    for i in range(start, end):
-        p = order[i]
-        for k in range(3):
-            b = int((_centre(boxes, p, k) - low[k]) * scale[k])
-            count[k, b] += 1
-            _widen(box[k, b], boxes[p])
-    best_axis, best_cut, best_cost = -1, 0, np.inf
-    above = np.empty(_BINS)
-    for k in range(3):
-        if scale[k] > 0.0:
-            _costs(count[k, ::-1], box[k, ::-1], above)
-            below_costs = np.empty(_BINS)
-            _costs(count[k], box[k], below_costs)
-            for cut in range(1, _BINS):
-                cost = below_costs[cut - 1] + above[_BINS - 1 - cut]
-                if cost < best_cost:
-                    best_axis, best_cut, best_cost = k, cut, cost
-    return best_axis, best_cut
+        low = high = d[0, k]
+        for b in range(1, d.shape[0]):
+            low, high = _smaller(low, d[b, k]), _larger(high, d[b, k])
+        least = -_TINY if abs(low) < _TINY else low
+        most = _TINY if abs(high) < _TINY else high
+        planes[k, 0], planes[k, 1] = 1.0 / most, 1.0 / least
+        planes[k, 2] = 0.0 if most > 0.0 else -np.inf
+        planes[k, 3] = 0.0 if least < 0.0 else -np.inf
+        planes[k, 4] = 0.0 if most < 0.0 else np.inf
+        planes[k, 5] = 0.0 if least > 0.0 else np.inf
+    return axis
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _costs(count, box, costs):
-    """Triangles times half area of bins 0..b, for each b; inf while there is no triangle."""
-    total = 0
-    around = np.empty(6, dtype=np.float32)
-    _empty(around)
-    for b in range(_BINS):
-        total += count[b]
-        if count[b] > 0:
-            _widen(around, box[b])
-        costs[b] = total * np.float64(_half_area(around)) if total > 0 else np.inf
+def _enter(bounds, node, ox, oy, oz, planes, limit, entry):
+    """Least distance at which the rays may enter each child's box; inf where they cannot."""
+    # Numbers, not an array: the compiler could not know that `entry` is no part of it.
+    rx, sx, bx, cx, fx, gx = planes[0]
+    ry, sy, by, cy, fy, gy = planes[1]
+    rz, sz, bz, cz, fz, gz = planes[2]
+    for c in range(entry.size):  # a number known when compiling would not be vectorised
+        x0, x1 = (bounds[node, 0, c] - ox) * rx, (bounds[node, 3, c] - ox) * sx
+        y0, y1 = (bounds[node, 1, c] - oy) * ry, (bounds[node, 4, c] - oy) * sy
+        z0, z1 = (bounds[node, 2, c] - oz) * rz, (bounds[node, 5, c] - oz) * sz
+        near_x, far_x = _larger(x0 + bx, x1 + cx), _smaller(x0 + fx, x1 + gx)
+        near_y, far_y = _larger(y0 + by, y1 + cy), _smaller(y0 + fy, y1 + gy)
+        near_z, far_z = _larger(z0 + bz, z1 + cz), _smaller(z0 + fz, z1 + gz)
+        near = _larger(_larger(near_x, near_y), _larger(near_z, 0.0))
+        far = _smaller(_smaller(far_x, far_y), far_z) * _ENTRY_SLACK
+        entry[c] = near if near <= _smaller(far, limit) else np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _test(a, b, c, index, shears, distance, face):
+    """Test one triangle against all rays of a bundle; keeps the nearer hits.
+
+    A hit's distance is a weighted mean of the corners' depths: between them, however flat the
+    ray lies.
+    """
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
+    for i in range(distance.size):
+        sx, sy, inverse = shears[0, i], shears[1, i], shears[2, i]
+        pax, pay = ax - sx * az, ay - sy * az
+        pbx, pby = bx - sx * bz, by - sy * bz
+        pcx, pcy = cx - sx * cz, cy - sy * cz
+        u = pcx * pby - pcy * pbx
+        v = pax * pcy - pay * pcx
+        w = pbx * pay - pby * pax
+        least = _smaller(u, _smaller(v, w))
+        most = _larger(u, _larger(v, w))
+        t = (u * az + v * bz + w * cz) / (u + v + w) * inverse
+        t = t if ((least >= 0.0) | (most <= 0.0)) & (t > 0.0) else np.inf
+        closer = (t < distance[i]) | ((t == distance[i]) & (index < face[i]))
+        distance[i] = t if closer else distance[i]
+        face[i] = index if closer else face[i]

@@ -6,7 +6,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.ray_plane import areas_vanish
+from sweep.model.geometry.ray_plane import normals
+
+_CLEAR = 1e-12
+"""Normal over the product of two edges above which no rounding can have made it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +131,7 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     points, corners, merged, unused = _compact(points, corners)
     origin = _round_centre(points)
     points -= origin
-    has_area = ~areas_vanish(points, corners)
+    has_area = _have_area(points, corners)
     first = np.zeros(len(corners), dtype=bool)
     first[np.flatnonzero(has_area)[_first_of_duplicates(corners[has_area])]] = True
     _require_faces(int(first.sum()), len(has_data))
@@ -221,6 +224,18 @@ def _round_centre(vertices: np.ndarray) -> np.ndarray:
     step = 2.0 ** np.ceil(np.log2(extent / 1024.0))
     middle = np.round((0.5 * low + 0.5 * high) / step) * step
     return np.where(np.abs(middle) > extent, middle, 0.0)
+
+
+def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether the corners of each face (m, 3) are apart and not in one line, exactly."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    b, c = b - a, c - a
+    longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
+    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _CLEAR * longest)
+    doubtful = np.flatnonzero(~has_area)
+    exact, _ = normals(vertices[faces[doubtful]].transpose(1, 2, 0))
+    has_area[doubtful] = exact.any(axis=0)
+    return has_area
 
 
 def _first_of_duplicates(faces: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Rays cast at rigid bodies: what each hits first, how far off and how steeply.
 
 Coordinates are taken relative to a mesh's own origin exactly, the nearest triangle is found by
-tests that leave no crack between neighbours (:mod:`sweep.model.geometry.ray_triangle`), and its
+tests that leave no crack between neighbours (:mod:`sweep.model.geometry.bvh`), and its
 plane is met in twice float64's precision (:mod:`sweep.model.geometry.ray_plane`): a range is the
 exact one of the numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body
 that moves is met in its own frame, so its mesh is never rebuilt.
@@ -13,15 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry import quaternion
-from sweep.model.geometry.bvh import build
-from sweep.model.geometry.bvh_traversal import nearest_of_bundles, nearest_of_rays
+from sweep.model.geometry import quaternion, ray_plane
+from sweep.model.geometry.bvh import build, nearest
 from sweep.model.geometry.mesh import Mesh
-from sweep.model.geometry.ray_hits import are_units, first_hits, put_surfaces, take_nearer
-from sweep.model.geometry.ray_ranges import finish_bundles, finish_rays, to_body, turn_to_body
 
 _UNIT_TOLERANCE = 1e-9
-_STILL = (np.eye(3)[None], np.zeros((1, 3)))
+
+_AT_ONCE = 4096
+"""Rays that are looked at together: so many that what is made of them stays at hand."""
 
 
 class Pose(NamedTuple):
@@ -119,18 +118,13 @@ class Caster:
         ValueError
             Shapes do not fit, a number is not finite, or a direction is not of length 1.
         """
-        start, along = _rays(origins, directions, 2)
-        n = len(start)
-        frames = self._frames(origin_offset, poses, n)
-        distance, face, body = _nothing_yet((n,))
-        for number, frame in enumerate(frames):
-            o, d = _in_frame(frame, start, along[:, None])
-            found = np.full(n, -1)
-            nearest_of_rays(self._trees[number], o, np.ascontiguousarray(d[:, 0]), distance, found)
-            take_nearer(found, number, face, body)
-        result = np.full(n, np.inf), np.zeros(n), np.full(n, np.nan), np.full((n, 3), np.nan)
-        self._finish(frames, start, along[:, None], np.zeros_like(face), face, body, result)
-        return Hits(face, result[0], result[2], result[3], self._surface(face, body), body)
+        directions = np.asarray(directions, dtype=np.float64)
+        found = self.bundle(
+            origins, directions[..., None, :], origin_offset=origin_offset, poses=poses
+        )
+        alone = found.face, found.cos_incidence, found.surface, found.body
+        face, cos_incidence, surface, body = (values[:, 0] for values in alone)
+        return Hits(face, found.range, cos_incidence, found.normal, surface, body)
 
     def bundle(
         self,
@@ -156,18 +150,70 @@ class Caster:
         ValueError
             As in `cast`.
         """
-        start, along = _rays(origins, directions, 3)
+        start, along = _rays(origins, directions)
         frames = self._frames(origin_offset, poses, len(start))
-        distance, face, body = _nothing_yet(along.shape[:2])
+        face, body = self._first_hits(frames, start, along)
+        hit = face >= 0
+        reference = np.where(hit.any(axis=1), hit.argmax(axis=1), -1)
+        n, rows = len(start), np.flatnonzero(reference >= 0)
+        high, low, normal = np.full(n, np.inf), np.zeros(n), np.full((n, 3), np.nan)
+        centre = rows, reference[rows]
+        met = self._met(frames, start, along, centre, (face[centre], body[centre]))
+        high[rows], low[rows], normal[rows], cosine = met
+        normal[rows[cosine > 0]] *= -1.0  # towards the ray's origin
+        # On one facet  t_b - t_0 = -t_0 n.delta / (n.d_b),  delta = d_b - d_0: nothing is lost.
+        (x, y, z), d = normal.T[:, :, None], np.moveaxis(along, 2, 0)
+        delta = d - d[:, np.arange(n), reference][:, :, None]
+        cos_incidence = x * d[0] + y * d[1] + z * d[2]
+        with np.errstate(invalid="ignore"):  # nothing is hit
+            offset = -high[:, None] * (x * delta[0] + y * delta[1] + z * delta[2]) / cos_incidence
+        other = face != face[np.arange(n), reference][:, None]
+        other |= body != body[np.arange(n), reference][:, None]
+        offset[other] = cos_incidence[other] = np.nan
+        others = np.nonzero(other & hit)
+        met = self._met(frames, start, along, others, (face[others], body[others]))
+        offset[others] = (met[0] - high[others[0]]) + (met[1] - low[others[0]])
+        cos_incidence[others] = met[3]
+        surface = np.full(face.shape, -1, dtype=np.int16)
+        for number, mesh in enumerate(self.meshes):
+            here = body == number
+            surface[here] = mesh.surface[face[here]]
+        return Bundle(
+            high, reference, normal, offset, hit, np.abs(cos_incidence), surface, face, body
+        )
+
+    def _first_hits(self, frames, origins, directions):
+        """Triangle and body that each beamlet hits first, (n, b)."""
+        shape = directions.shape[:2]
+        distance, face, body = np.full(shape, np.inf), np.full(shape, -1), np.full(shape, -1)
         for number, frame in enumerate(frames):
-            o, d = _in_frame(frame, start, along)
-            found = np.full(face.shape, -1)
-            nearest_of_bundles(self._trees[number], o, d, distance, found)
-            take_nearer(found.reshape(-1), number, face.reshape(-1), body.reshape(-1))
-        return self._relative(frames, start, along, face, body)
+            found = np.full(shape, -1)
+            nearest(self._trees[number], *frame.rounded(origins, directions), distance, found)
+            nearer = found >= 0
+            face[nearer], body[nearer] = found[nearer], number
+        return face, body.astype(np.int16)
+
+    def _met(self, frames, origins, directions, rays, hit):
+        """Ranges of facets that rays meet, high and low [m], normals (m, 3), cosines to these.
+
+        Parameters
+        ----------
+        rays : ((m,), (m,)) int64
+            Bundle and beamlet of each ray.
+        hit : ((m,), (m,)) int
+            Its triangle and body.
+        """
+        found = np.empty((6, len(rays[0])))
+        for number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
+            places = np.flatnonzero(hit[1] == number)
+            for first in range(0, len(places), _AT_ONCE):
+                some = places[first : first + _AT_ONCE]
+                i, b = rays[0][some], rays[1][some]
+                found[:, some] = _met_on(mesh, frame, i, origins[i], directions[i, b], hit[0][some])
+        return found[0], found[1], found[2:5].T, found[5]
 
     def _frames(self, offset, poses, n):
-        """(shift, rotation, position, anchor, fixed) of each body; see `body_origin`."""
+        """Frame of each body."""
         shift = np.zeros(3) if offset is None else np.array(offset, dtype=np.float64)
         if shift.shape != (3,) or not np.isfinite(shift).all():
             raise ValueError("an offset of origins is three finite coordinates")
@@ -175,53 +221,83 @@ class Caster:
         if len(poses) != len(self.meshes):
             raise ValueError(f"{len(self.meshes)} bodies need as many poses, not {len(poses)}")
         return [
-            (shift, *(_STILL if pose is None else _turned(pose, n)), mesh.origin, pose is None)
+            _Frame(shift, mesh.origin, *((None, None) if pose is None else _turned(pose, n)))
             for mesh, pose in zip(self.meshes, poses, strict=True)
         ]
 
-    def _finish(self, frames, origins, directions, beamlet, face, body, result):
-        """Fill ranges, cosines and normals of one beamlet of each bundle in, body by body."""
-        for number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
-            rays = np.flatnonzero(body == number)
-            finish_rays(
-                (mesh.vertices, mesh.faces), frame, rays, beamlet, origins, directions, face,
-                result,
-            )  # fmt: skip
 
-    def _relative(self, frames, origins, directions, face, body):
-        """Bundle of known hits: the reference beamlets first, then all relative to them."""
-        n, rows = len(origins), np.arange(len(origins))
-        reference = np.empty(n, np.int64)
-        first_hits(face, reference)
-        high, low, cosine = np.full(n, np.inf), np.zeros(n), np.full(n, np.nan)
-        normal = np.full((n, 3), np.nan)
-        at = face[rows, reference], body[rows, reference]
-        self._finish(frames, origins, directions, reference, *at, (high, low, cosine, normal))
-        result = np.full(face.shape, np.nan), np.full(face.shape, np.nan)
-        for number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
-            finish_bundles(
-                (mesh.vertices, mesh.faces), frame, number, origins, directions,
-                (face, body), (reference, high, low, normal), result,
-            )  # fmt: skip
-        surface = self._surface(face, body)
-        return Bundle(high, reference, normal, result[0], face >= 0, result[1], surface, face, body)
+class _Frame(NamedTuple):
+    """Frame of a mesh, for n rays or bundles."""
 
-    def _surface(self, face, body):
-        """Surface of each triangle hit, -1 for a miss."""
-        surface = np.full(face.shape, -1, dtype=np.int16)
-        for number, mesh in enumerate(self.meshes):
-            put_surfaces(
-                mesh.surface, number, face.reshape(-1), body.reshape(-1), surface.reshape(-1)
-            )
-        return surface
+    shift: np.ndarray
+    """(3,): what is added to origins to give world coordinates [m]."""
+    anchor: np.ndarray
+    """(3,): the mesh's own origin in the body's frame [m]."""
+    rotation: np.ndarray | None
+    """(n, 3, 3): x_world = rotation x_body + position; None: the body's frame is the world's."""
+    position: np.ndarray | None
+    """(n, 3) [m]."""
+
+    def origins(self, origins, rows):
+        """Origins of rays (m, 3) by their places (m,) as a vector of pairs (3, m)."""
+        x, anchor = ray_plane.exact(origins.T), self.anchor[:, None]
+        if self.rotation is None:
+            return ray_plane.add(x, ray_plane.two_sum(self.shift[:, None], -anchor))
+        away = ray_plane.two_sum(self.shift[:, None], -self.position[rows].T)
+        return ray_plane.less(self._back(ray_plane.add(x, away), rows), ray_plane.exact(anchor))
+
+    def directions(self, directions, rows):
+        """Directions of rays, likewise."""
+        d = ray_plane.exact(directions.T)
+        return d if self.rotation is None else self._back(d, rows)
+
+    def _back(self, v, rows):
+        turns = self.rotation[rows].transpose(1, 2, 0)
+        return ray_plane.dot((v[0][:, None], v[1][:, None]), ray_plane.exact(turns))
+
+    def rounded(self, origins, directions):
+        """Origins (n, 3) and directions (n, b, 3) in the mesh's frame, rounded to float64."""
+        n, b = directions.shape[:2]
+        o = self.origins(origins, np.arange(n))[0].T
+        if self.rotation is not None:
+            d, rows = directions.reshape(-1, 3), np.repeat(np.arange(n), b)
+            parts = [slice(k, k + _AT_ONCE) for k in range(0, n * b, _AT_ONCE)]
+            turned = [self.directions(d[part], rows[part])[0].T for part in parts]
+            directions = np.concatenate([*turned, np.empty((0, 3))]).reshape(directions.shape)
+        return np.ascontiguousarray(o), directions
+
+    def out(self, v, rows):
+        """Vectors (3, m) in the world's frame."""
+        if self.rotation is None:
+            return v
+        x, y, z = self.rotation[rows].transpose(2, 1, 0)
+        return x * v[0] + y * v[1] + z * v[2]
 
 
-def _rays(origins, directions, dimensions):
+def _met_on(mesh, frame, bundle, origins, directions, face):
+    """What `_met` says, of rays that meet one body, (6, m)."""
+    is_new = np.ones(len(bundle), bool)  # the ray before may have met the same facet
+    is_new[1:] = (np.diff(bundle) != 0) | (np.diff(face) != 0)
+    first, of = np.flatnonzero(is_new), np.cumsum(is_new) - 1
+    corners = mesh.vertices[mesh.faces[face[first]]].transpose(1, 2, 0)
+    o = frame.origins(origins[first], bundle[first])
+    n = ray_plane.normals(corners)
+    height = ray_plane.dot(n, ray_plane.less(ray_plane.exact(corners[0]), o))
+    length = np.sqrt(n[0][0] * n[0][0] + n[0][1] * n[0][1] + n[0][2] * n[0][2])
+    unit = frame.out(n[0] / length, bundle[first])[:, of]
+    n, height, o = (tuple(part[..., of] for part in pair) for pair in (n, height, o))
+    d = frame.directions(directions, bundle)
+    high, low = ray_plane.distances(corners[..., of], n, height, o, d)
+    x, y, z = unit * directions.T
+    return np.concatenate([[high, low], unit, [x + y + z]])
+
+
+def _rays(origins, directions):
     """Origins and directions as contiguous float64, checked."""
     origins = np.ascontiguousarray(origins, dtype=np.float64)
     directions = np.ascontiguousarray(directions, dtype=np.float64)
     shape = (len(origins), *directions.shape[1:-1], 3)
-    if origins.ndim != 2 or directions.ndim != dimensions or directions.shape != shape:
+    if origins.ndim != 2 or directions.ndim != 3 or directions.shape != shape:
         raise ValueError(
             f"origins {origins.shape} and directions {directions.shape} do not fit each other"
         )
@@ -229,30 +305,14 @@ def _rays(origins, directions, dimensions):
         raise ValueError("a ray has an origin of three coordinates; a bundle, at least one beamlet")
     if not np.isfinite(origins).all():
         raise ValueError("a ray's origin is finite")
-    if not are_units(directions.reshape(-1, 3), _UNIT_TOLERANCE):
+    length = np.einsum("nbk,nbk->nb", directions, directions)
+    if not (np.abs(length - 1.0) < 2.0 * _UNIT_TOLERANCE).all():
         raise ValueError("a ray's direction is a vector of length 1")
     return origins, directions
 
 
-def _nothing_yet(shape):
-    """Distances, faces and bodies before any ray is cast."""
-    return np.full(shape, np.inf), np.full(shape, -1), np.full(shape, -1, dtype=np.int16)
-
-
-def _in_frame(frame, origins, directions):
-    """Origins (n, 3) and directions (n, b, 3) in a mesh's frame."""
-    _, rotation, _, _, fixed = frame
-    o = np.empty_like(origins)
-    to_body(origins, *frame, o)
-    if fixed:
-        return o, directions
-    d = np.empty_like(directions)
-    turn_to_body(directions, rotation, d)
-    return o, d
-
-
 def _turned(pose, n):
-    """Rotation matrices (1 or n, 3, 3) and positions (1 or n, 3) of a pose."""
+    """Rotation matrices (n, 3, 3) and positions (n, 3) of a pose."""
     attitude = np.atleast_2d(quaternion.normalise(pose.attitude))
     position = np.atleast_2d(np.asarray(pose.position, dtype=np.float64))
     count = max(len(attitude), len(position))
@@ -261,7 +321,5 @@ def _turned(pose, n):
     if not np.isfinite(position).all():
         raise ValueError("a body's position is finite")
     columns = quaternion.rotate(attitude[:, None], np.eye(3))
-    rotation = np.broadcast_to(np.swapaxes(columns, 1, 2), (count, 3, 3))
-    return np.ascontiguousarray(rotation), np.ascontiguousarray(
-        np.broadcast_to(position, (count, 3))
-    )
+    rotation = np.broadcast_to(np.swapaxes(columns, 1, 2), (n, 3, 3))
+    return rotation, np.broadcast_to(position, (n, 3))
