@@ -3,28 +3,29 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 KERNELS := .venv/.kernels
+TIMED := .ci/timed
 
-.PHONY: demo test test-fast test-all lint size stability fuzz chaos bench effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install demo test test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
+	$(TIMED) "install" $(MAKE) --no-print-directory install
+	touch $@
+
+install:
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --requirement requirements.lock
 	$(BIN)/pip install --quiet --no-deps --editable .
-	touch $@
 
 demo: $(READY)
 	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
 	$(BIN)/sweep figures results/quickstart.zarr
 
 test: $(READY)
-	$(MAKE) --jobs 3 --output-sync lint $(KERNELS)
-	$(BIN)/pytest -n auto --dist worksteal --durations 12
-
-test-fast: $(READY)
-	$(MAKE) --jobs 2 --output-sync $(KERNELS)
-	$(BIN)/pytest -n auto --dist worksteal -m 'not slow and not long'
+	$(TIMED) "lint" $(MAKE) --no-print-directory lint
+	$(TIMED) "compiling" $(MAKE) --no-print-directory --jobs 2 --output-sync $(KERNELS)
+	$(TIMED) "tests" $(BIN)/pytest -n auto --dist worksteal --durations 12
 
 test-all: $(READY)
 	$(MAKE) --jobs 2 --output-sync $(KERNELS)
@@ -75,6 +76,10 @@ scaling: $(READY)
 
 effects: $(READY)
 	$(BIN)/python benchmarks/effects.py
+
+# Time a point against model 19, ratios of one run on one machine.
+side-by-side: $(READY)
+	$(BIN)/python benchmarks/side_by_side.py
 
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py

@@ -491,7 +491,6 @@ def test_the_package_offers_load_run_and_resume(here):
         _ = package.nothing
 
 
-@pytest.mark.long
 def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
     (here / "long.yaml").write_text(STUDY.replace("number: 40", "number: 4000"))
     command = [sys.executable, "-c", "from sweep.cli import main; main()"]

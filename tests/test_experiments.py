@@ -16,8 +16,23 @@ from sweep.spec.reading import read_document
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
 SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
+OF_EACH_KIND = (
+    "quickstart", "single_shot_45deg", "speckled_target", "cfar", "threshold",
+    "morpheus_three_beam", "forest_scan", "scan_pattern_comparison",
+)  # fmt: skip
+"""Run each time; `make test-all` has all."""
+
 KEPT = 4
 """Values kept of a plain axis; zipped axes keep the first of every run of equal grazing angle."""
+
+
+def _shown(paths):
+    return [
+        pytest.param(
+            path, id=path.stem, marks=[] if path.stem in OF_EACH_KIND else [pytest.mark.slow]
+        )
+        for path in paths
+    ]
 
 
 def _written(member, kept):
@@ -44,8 +59,7 @@ def _thinned(spec):
     return Spec.from_mapping(mapping | {"axes": axes})
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", _shown(GRIDS))
 def test_experiment_runs_to_store_and_figures(path, tmp_path):
     spec = sweep.load(path)
     assert spec.question
@@ -83,8 +97,7 @@ def _lightened(path):
     return SceneSpec.from_mapping(mapping | few, base=path.parent)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", _shown(SCENES))
 def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
     spec = _lightened(path)
     assert spec.question and spec.figures

@@ -47,7 +47,6 @@ def kept(installed, temporary):
     return folder.name
 
 
-@pytest.mark.long
 def test_without_a_folder_of_its_own_kernels_are_kept_in_a_temporary_one(installed, tmp_path):
     mine = f"sweep-kernels-{os.getuid()}"
     assert kept(installed, tmp_path) == kept(installed, tmp_path) == mine

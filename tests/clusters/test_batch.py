@@ -139,7 +139,6 @@ def played_pbs(here, monkeypatch):
         subprocess.run([programs / "qdel", pid.stem.removeprefix("job-")], check=True)
 
 
-@pytest.mark.long
 def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
     from dask import config
 

@@ -160,7 +160,6 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-@pytest.mark.long
 def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, monkeypatch):
     files = certificates.make(tmp_path / "tls", 1)
     monkeypatch.setattr(kubernetes, "PORT", free_port())

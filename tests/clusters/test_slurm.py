@@ -22,11 +22,11 @@ pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109},
-    "draws": {"number": 1_000_000, "method": "noise", "batch": 1000},
-    "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 40}},
+    "draws": {"number": 500_000, "method": "noise", "batch": 1000},
+    "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 20}},
     "storage": {"block_points": 1},
 }
-BLOCKS = 40
+BLOCKS = 20
 WAIT = 120.0
 
 
@@ -83,7 +83,6 @@ def workers(store) -> set[bytes]:
     return read_receipts(store, BLOCKS, since=0.0).workers
 
 
-@pytest.mark.long
 def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environment):
     store = here / "slow.zarr"
     asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
@@ -108,7 +107,6 @@ def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environm
     assert tree(store) == tree(here / "plain.zarr")
 
 
-@pytest.mark.long
 def test_jobs_that_the_batch_system_refuses_are_told_at_once(here, environment):
     cluster = yaml.safe_load((here / "slurm.yaml").read_text())
     cluster["job"]["queue"] = "absent"

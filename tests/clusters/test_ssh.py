@@ -94,7 +94,6 @@ def server(directory: Path):
         loop.close()
 
 
-@pytest.mark.long
 def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
     files = certificates.make(tmp_path / "tls", 1)
     with server(tmp_path) as (port, commands):

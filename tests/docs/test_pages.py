@@ -63,7 +63,6 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
         assert language != "text" or before == "python"
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "page",
     [
@@ -102,7 +101,6 @@ def test_links_lead_to_files_that_are_there(page):
         assert re.match(r"https?:", link) or (page.parent / link).exists(), link
 
 
-@pytest.mark.long
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")

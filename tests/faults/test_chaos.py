@@ -5,10 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 
-
-@pytest.mark.long
 def test_killed_studies_end_as_if_nobody_had_disturbed_them():
     script = Path(__file__).with_name("chaos.py")  # forks, which a process with threads should not
     command = [sys.executable, str(script), "--kills", "10", "--seed", "20"]

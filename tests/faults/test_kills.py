@@ -1,4 +1,7 @@
-"""Processes killed in the midst of a study, and what resuming makes of it."""
+"""Processes killed in the midst of a study, what is said of it, and what resuming makes of it.
+
+`chaos.py` kills clients, workers, nannies and schedulers in more ways.
+"""
 
 import os
 import signal
@@ -128,45 +131,6 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     assert tree(store) == undisturbed
 
 
-@pytest.mark.long
-def test_the_client_killed_with_its_workers(tmp_path, undisturbed):
-    store = tmp_path / "small.zarr"
-    with client_process(tmp_path) as client:
-        wait_for(lambda: len(receipts(store)) >= 3)
-        os.kill(client.pid, signal.SIGKILL)
-        client.wait()
-    finish(tmp_path, undisturbed)
-
-
-@pytest.mark.long
-def test_the_client_killed_while_its_cluster_lives_on(tmp_path, undisturbed):
-    store = tmp_path / "small.zarr"
-    with dask_cluster(tmp_path) as (scheduler, _, _):
-        with client_process(tmp_path, scheduler) as client:
-            wait_for(lambda: len(receipts(store)) >= 3)
-            os.kill(client.pid, signal.SIGKILL)
-            client.wait()
-        finish(tmp_path, undisturbed)
-
-
-@pytest.mark.long
-def test_a_worker_killed_its_blocks_go_to_the_other_one(tmp_path, undisturbed):
-    store, log = tmp_path / "small.zarr", tmp_path / "log"
-    with (
-        dask_cluster(tmp_path) as (scheduler, _, workers),
-        client_process(tmp_path, scheduler) as client,
-    ):
-        wait_for(lambda: len(receipts(store)) >= 3)
-        os.kill(workers[0].pid, signal.SIGKILL)
-        committed = receipts(store)
-        client.communicate()
-        assert client.returncode == 0
-    assert sorted(receipts(store)) == list(range(BLOCKS))
-    assert tree(store) == undisturbed
-    assert all(Counter(evaluated(log))[block] == 1 for block in committed)
-
-
-@pytest.mark.long
 def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with (
@@ -226,7 +190,6 @@ def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp
     assert tree(store) == undisturbed
 
 
-@pytest.mark.long
 def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:

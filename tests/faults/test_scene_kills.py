@@ -38,8 +38,7 @@ def plain(tmp_path_factory):
     return tree(store.parent)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("stage", ["casting", "looking"])
+@pytest.mark.parametrize("stage", [pytest.param("casting", marks=pytest.mark.slow), "looking"])
 def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()

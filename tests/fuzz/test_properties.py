@@ -52,12 +52,17 @@ def steady(written, *paths):
     return mended(written)
 
 
-def results_of(written):
-    """Results of a study of one block; studies that are refused are passed over."""
+def spec_of(written):
+    """The study; those that are refused are passed over."""
     try:
-        results = GridStudy(Spec.from_mapping(written)).evaluate(0)
+        return Spec.from_mapping(written)
     except SpecError:
         assume(False)
+
+
+def results_of(written):
+    """Results of a study of one block."""
+    results = GridStudy(spec_of(written)).evaluate(0)
     assume(not np.isnan(results["pd_shot"]).any())  # what is beyond the model
     return results
 
@@ -85,7 +90,7 @@ def test_more_light_is_never_worse(path, factors, written):
     breaks it, which so is left out.
     """
     written = steady(written, *CLIPPING)
-    base = Spec.from_mapping(written).parameters()[path] if path != "target.reflectance" else 1
+    base = spec_of(written).parameters()[path] if path != "target.reflectance" else 1
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
     results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
     for name in SIGNAL:

@@ -74,7 +74,6 @@ def wandering(generator, degree, size):
     return lambda x: np.polynomial.polynomial.polyval(x, c)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", ["hann", "hamming", "rectangular", "flattop"])
 @pytest.mark.parametrize("padding", [1, 2])
 @given(

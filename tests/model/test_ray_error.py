@@ -152,7 +152,6 @@ def _by_hand(seen, parameters, number):
     return np.maximum(errors, of_magnitude)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("number", [19, 109])
 @pytest.mark.parametrize("power", [6e-5, 0.006, 1.0])
 def test_it_is_what_the_formula_gives(table_4_1, number, power):

@@ -144,7 +144,6 @@ def test_far_sidelobes_of_a_line_keep_their_digits(name):
 # Few lines for many
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("tolerance", [0.0, 3e-9, 1e-5])
 @pytest.mark.parametrize("centre", [0.0, -0.31, 0.49])
 def test_equivalent_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, tolerance):

@@ -390,7 +390,6 @@ EVERYTHING = written(
 )
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("junk", [None, True, -1, "x", [], {}, [[]], {"kind": "x"}, 1e300])
 def test_no_junk_anywhere_gets_past_as_a_traceback(junk):
     for path in places(EVERYTHING):

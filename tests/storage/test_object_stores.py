@@ -53,7 +53,6 @@ def troubled(number, method, path):
     return {3: ERROR, 7: SLOW, 12: ERROR, 17: DROP}.get(number % 20, PASS)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("workers", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_the_bytes_are_those_of_a_store_on_disk_whatever_the_network_does(
     faults, place, undisturbed, workers
@@ -95,7 +94,6 @@ def test_a_store_is_extended_into_another_place(memory, tmp_path):
     assert remote_tree(there) == tree(here) == expected
 
 
-@pytest.mark.long
 def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed, tmp_path):
     script = tmp_path / "client.py"
     script.write_text(
@@ -137,7 +135,6 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
         child.wait()
 
 
-@pytest.mark.long
 def test_a_store_that_goes_away_ends_a_run_in_words_and_is_resumed(
     faults, place, undisturbed, monkeypatch
 ):
@@ -235,7 +232,6 @@ def test_what_is_somebody_elses_is_not_written_over(memory):
     assert theirs.read_bytes() == b"dear"
 
 
-@pytest.mark.long
 def test_a_creation_cut_short_looks_like_no_store_and_is_cleared(
     faults, place, undisturbed, monkeypatch
 ):

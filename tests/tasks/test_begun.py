@@ -173,7 +173,6 @@ quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
 """
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["fixed", "spectra"])
 def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     kind, whole, saved, tmp_path, monkeypatch

@@ -95,7 +95,6 @@ def test_what_is_simulated_does_not_depend_on_blocks():
         assert whole(few, name).tobytes() == whole(many, name).tobytes(), name
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(tolerance, phases):

@@ -28,17 +28,15 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
     assert sorted(receipts(undisturbed)) == list(range(12))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "place",
     [
-        {"workers": 1},
+        pytest.param({"workers": 1}, marks=pytest.mark.slow),
         {"workers": 2},
         pytest.param({"workers": 4}, marks=pytest.mark.slow),
         {"workers": 2, "processes": False},
-        {"workers": 4, "processes": False},
     ],
-    ids=["1 process", "2 processes", "4 processes", "2 threads", "4 threads"],
+    ids=["1 process", "2 processes", "4 processes", "2 threads"],
 )
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
     undisturbed, tmp_path, place
@@ -221,7 +219,6 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     assert tree(path) == tree(undisturbed)
 
 
-@pytest.mark.long
 def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
     path = tmp_path / "small.zarr"
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):

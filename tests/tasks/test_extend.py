@@ -79,7 +79,6 @@ MORE = {
 }  # fmt: skip
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("axes, new", MORE.values(), ids=MORE)
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, axes, new
@@ -139,7 +138,6 @@ def see_that_it_extends(here, pair):
     shutil.rmtree(here)
 
 
-@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(pair=studies())
 def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
@@ -153,11 +151,9 @@ def test_many_grids_extended_to_larger_ones(tmp_path_factory, pair):
     see_that_it_extends(tmp_path_factory.mktemp("many"), pair)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("processes", [True, False], ids=["processes", "threads"])
-def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed, processes):
+def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed):
     store, spec = copied(undisturbed, tmp_path), small(axes=MORE["in between"][0])
-    outcome = extend(store, spec, workers=2, processes=processes, progress=False)
+    outcome = extend(store, spec, workers=2, progress=False)
     assert outcome.complete and tree(store) == at_once(spec, tmp_path)
 
 
@@ -225,10 +221,17 @@ MORE_DRAWS = {
 }
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("before, after, accuracy, tighter", MORE_DRAWS.values(), ids=MORE_DRAWS)
-@pytest.mark.parametrize("method", ["probabilities", "noise"])
-@pytest.mark.parametrize("scene", [{}, ROUGH], ids=["noise alone", "speckle"])
+@pytest.mark.parametrize(
+    "method, scene",
+    [
+        ("probabilities", ROUGH),
+        ("noise", {}),
+        pytest.param("probabilities", {}, marks=pytest.mark.slow),
+        pytest.param("noise", ROUGH, marks=pytest.mark.slow),
+    ],
+    ids=["probabilities, speckle", "noise alone", "probabilities alone", "noise, speckle"],
+)
 def test_more_draws_go_on_from_those_that_are_there(
     tmp_path, drawn, scene, method, before, after, accuracy, tighter
 ):
@@ -482,11 +485,18 @@ MOMENTS = (
 )  # fmt: skip
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
-    "how, again", [("extend", "extend"), ("extend", "resume"), ("overwrite", "resume")]
+    "moment, how, again",
+    [
+        pytest.param(
+            moment, how, again, marks=[] if place % 3 == number % 3 else [pytest.mark.slow]
+        )
+        for number, moment in enumerate(MOMENTS)
+        for place, (how, again) in enumerate(
+            [("extend", "extend"), ("extend", "resume"), ("overwrite", "resume")]
+        )
+    ],
 )
-@pytest.mark.parametrize("moment", MOMENTS)
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
     tmp_path, undisturbed, computed, moment, how, again
 ):

@@ -124,7 +124,6 @@ MORE = {
 """What is larger, and draws of every shot that are new, over all places along the axes."""
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("changes, new", MORE.values(), ids=MORE)
 def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
     spec = flight(**changes)

@@ -31,7 +31,6 @@ def endless(block, log):
     return evaluate
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
     path, log = tmp_path / "small.zarr", tmp_path / "log"

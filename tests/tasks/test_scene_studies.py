@@ -88,7 +88,6 @@ def test_rays_are_counted_as_they_are_cast(undisturbed):
         assert eyepoints.n_blocks > 1
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("place", [{"workers": 2, "processes": False}, {"workers": 2}])
 def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monkeypatch, place):
     if place.get("processes", True):  # worker processes cut eyepoints as they are installed
@@ -100,7 +99,6 @@ def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monk
         assert tree(here) == tree(there)
 
 
-@pytest.mark.long
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
         "from small_flights import small_scene; from sweep.tasks.driver import run;"

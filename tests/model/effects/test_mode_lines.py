@@ -36,7 +36,6 @@ def factor_of(found, x):
     return (found.weight[..., None] * np.exp(1j * np.pi * turns)).sum(axis=1)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("tolerance", [1e-9, 1e-6, 1e-3])
 @given(st.floats(-9, 1))
 def test_lines_make_up_the_phase_factor_to_the_tolerance(tolerance, exponent):

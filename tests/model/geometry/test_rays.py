@@ -157,7 +157,6 @@ def closed():
     return vertices, faces, Caster(mesh)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("offset", [[0.0, 0.0, 0.0], [4e6, -3e6, 2e6]])
 def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale, offset):
     """From 2 km off, steeply and at 20 degrees of grazing angle; worst phase 2e-6 rad."""
