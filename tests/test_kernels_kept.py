@@ -13,8 +13,8 @@ import sweep
 
 CODE = """
 import numba, numpy, os, numba.core.config
-from sweep.model.geometry.quaternion import rotate
-rotate(numpy.eye(4)[:1], numpy.ones((1, 3)))
+from sweep.model.geometry.bvh import build
+build(numpy.eye(3), numpy.array([[0, 1, 2]]))
 assert os.environ["NUMBA_CACHE_DIR"] == numba.core.config.CACHE_DIR
 print(numba.core.config.CACHE_DIR)
 """

@@ -6,22 +6,18 @@ radiometric studies [T 3.2].
 """
 
 from collections.abc import Collection, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model import reflectance
 from sweep.model.chain import prepare_cast
-from sweep.model.compiling import borrowing, inlined
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.atmosphere import PATH_ELEVATION
 from sweep.model.effects.catalogue import CORE
 from sweep.model.footprint import beamlets
-from sweep.model.geometry.beamlet_rays import beamlet_rays
-from sweep.model.geometry.jitter import PointingJitter
 from sweep.model.geometry.platform import Flight, State
+from sweep.model.geometry.pointing import PointingJitter, beamlet_rays
 from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
 from sweep.model.geometry.scanner import Scanner
@@ -31,10 +27,6 @@ from sweep.model.preparation import Parameters, Shots
 
 HEIGHT = "atmosphere.target_height"
 SUNLIGHT = "target.solar_irradiance"
-
-_RAYS = 512
-"""Rays of shots that are looked at together: so many that what is made of them stays at hand."""
-_LAMBERT = reflectance.LAWS.index("lambert")
 
 
 class Eyepoints(NamedTuple):
@@ -152,8 +144,9 @@ def _radial_velocity(
     A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
     turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
     """
-    closing = np.empty(rays.shape[:2])
-    _project(rays, state.velocity, bundle.surface, closing)
+    x, y, z = state.velocity.T[:, :, None]
+    along = rays[..., 0] * x + rays[..., 2] * z + rays[..., 1] * y
+    closing = np.where(bundle.valid, along, np.nan)
     for body, motion in enumerate(moving):
         if motion is None:
             continue
@@ -165,17 +158,6 @@ def _radial_velocity(
         receding = (rays * surface).sum(axis=-1)
         closing = np.where(bundle.body == body, closing - receding, closing)
     return closing
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _project(rays, velocity, surface, closing):
-    """Products of rays with the instrument's velocity, (n, b); nan for a miss."""
-    for i in range(rays.shape[0]):
-        x, y, z = velocity[i, 0], velocity[i, 1], velocity[i, 2]
-        for b in range(rays.shape[1]):
-            # x and z first: the order that results have had, bit for bit
-            along = rays[i, b, 0] * x + rays[i, b, 2] * z + rays[i, b, 1] * y
-            closing[i, b] = along if surface[i, b] >= 0 else np.nan
 
 
 def prepare_eyepoints(
@@ -254,28 +236,6 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
         Offset, Doppler and echo as of :class:`sweep.model.ground.Footprints`.
     (n, beamlets) bool ndarray
         Whether a beamlet meets another surface than the reference beamlet.
-    """
-    rays, materials = _to_look_at(eyepoints, surfaces)
-    shape = eyepoints.offset.shape
-    sent, relative, doppler, echo = np.empty((4, *shape))
-    beside = np.empty(shape, np.bool_)
-    flat = tuple(values.reshape(-1) for values in (sent, relative, doppler, echo, beside))
-    _look(rays, materials, np.empty(materials[0].size), flat)
-    return sent.sum(axis=1), relative, doppler, echo, beside
-
-
-def _to_look_at(
-    eyepoints: Eyepoints, surfaces: Sequence[Surface]
-) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """What :func:`_look_at` needs of shots, one after the other, and of surfaces.
-
-    Returns
-    -------
-    tuple of ndarray
-        Ranges (n,); offsets, velocities, cosines and surface numbers of rays, (n beamlets,) each.
-    tuple of ndarray
-        Weights of the beamlets of as many shots as are looked at together; reflectance and law of
-        each surface.
 
     Raises
     ------
@@ -284,117 +244,19 @@ def _to_look_at(
     """
     if not eyepoints.seen.all():
         raise ValueError("a shot that sees nothing has no radiometry: leave it out")
-    if eyepoints.surface.max(initial=-1) >= len(surfaces):
+    surface = eyepoints.surface
+    if surface.max(initial=-1) >= len(surfaces):
         raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
-    rays = (
-        eyepoints.range, eyepoints.offset, eyepoints.velocity_offset, eyepoints.cos_incidence,
-        eyepoints.surface,
-    )  # fmt: skip
-    together = max(_RAYS // len(eyepoints.weight), 1)
-    weight = np.tile(eyepoints.weight, together)
-    bright, laws = _materials(tuple(surfaces))
-    return tuple(np.ascontiguousarray(v).reshape(-1) for v in rays), (weight, bright, laws)
-
-
-@lru_cache(maxsize=16)
-def _materials(surfaces: tuple[Surface, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance and number of the law of surfaces."""
-    bright = np.array([surface.reflectance for surface in surfaces])
-    return bright, np.array([reflectance.LAWS.index(surface.law) for surface in surfaces])
-
-
-@borrowing(nogil=True)
-def _look(rays, materials, room, found):
-    """Fill in what :func:`_footprints` says, of rays one after the other."""
-    ranges, offset = rays[0], rays[1]
-    beamlets = offset.size // max(ranges.size, 1)
-    group = room.size // beamlets
-    sent, relative, doppler, echo, beside = found
-    for first in range(0, ranges.size, group):
-        stop = min(first + group, ranges.size)
-        some = slice(first * beamlets, stop * beamlets)
-        here = sent[some], relative[some], doppler[some], echo[some], beside[some]
-        _look_at(first, stop, rays, materials, room, here)
-
-
-@inlined(nogil=True)
-def _look_at(first, stop, rays, materials, room, found):
-    """What some footprints send back, and from where, ray by ray.
-
-    All rays of shots are taken at once, however few each has, as the machine's vectors like it.
-    """
-    ranges, offset, velocity, cosine, surface = rays
-    weight, bright, laws = materials
-    sent, relative, _, echo, _ = found
-    beamlets = sent.size // (stop - first)
-    some = slice(first * beamlets, stop * beamlets)
-    offset, velocity, cosine, surface = offset[some], velocity[some], cosine[some], surface[some]
-    for i in range(first, stop):
-        for j in range((i - first) * beamlets, (i - first + 1) * beamlets):
-            room[j] = ranges[i]
-    if _is_one(surface):
-        axis = surface[0]
-        _look_alike((room, offset, velocity, cosine), weight, bright[axis], laws[axis], found)
-    else:
-        _look_each(beamlets, (room, offset, velocity, cosine, surface), materials, found)
-    for j in range(sent.size):  # by itself, as the machine's vectors take it
-        echo[j] /= (1 + relative[j]) * (1 + relative[j])
-
-
-@inlined(nogil=True)
-def _look_alike(rays, weight, reflected, law, found):
-    """The same of footprints that lie on one surface, in loops short enough for vectors."""
-    ranges, offset, velocity, cosine = rays
-    sent, relative, doppler, echo, beside = found
-    for j in range(sent.size):
-        beside[j] = False
-    for j in range(sent.size):
-        relative[j] = offset[j] / ranges[j]
-    for j in range(sent.size):
-        doppler[j] = 2 * velocity[j] / SPEED_OF_LIGHT
-    for j in range(sent.size):
-        sent[j] = weight[j] * reflected
-    if law == _LAMBERT:
-        for j in range(sent.size):
-            echo[j] = sent[j] * reflectance.backscatter_of(_LAMBERT, cosine[j])
-    else:
-        even = reflectance.backscatter_of(law, 1.0)
-        for j in range(sent.size):
-            echo[j] = sent[j] * even
-
-
-@borrowing(nogil=True)
-def _look_each(beamlets, rays, materials, found):
-    """The same of footprints on several surfaces, or with beamlets that miss, ray by ray."""
-    ranges, offset, velocity, cosine, surface = rays
-    weight, bright, laws = materials
-    sent, relative, doppler, echo, beside = found
-    for start in range(0, surface.size, beamlets):
-        axis = _first_seen(surface[start : start + beamlets])
-        for j in range(start, start + beamlets):
-            s = surface[j]
-            hit = s >= 0
-            beside[j] = hit and s != axis
-            relative[j] = offset[j] / ranges[j] if hit else 0.0
-            doppler[j] = 2 * velocity[j] / SPEED_OF_LIGHT if hit else 0.0
-            sent[j] = weight[j] * bright[s] if hit else 0.0
-            back = reflectance.backscatter_of(laws[s], cosine[j]) if hit else 0.0
-            echo[j] = sent[j] * back
-
-
-@inlined(nogil=True)
-def _is_one(surface):
-    """Whether all beamlets meet one and the same surface."""
-    different = 0
-    for b in range(surface.size):
-        different |= surface[b] ^ surface[0]
-    return different == 0 and surface[0] >= 0
-
-
-@inlined(nogil=True)
-def _first_seen(surface):
-    """Surface that the first beamlet meets that meets any; -1 for none."""
-    for b in range(surface.size):
-        if surface[b] >= 0:
-            return surface[b]
-    return -1
+    hit = surface >= 0
+    relative = np.where(hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
+    doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
+    bright = np.array([each.reflectance for each in surfaces])
+    sent = np.where(hit, eyepoints.weight * bright[surface], 0.0)
+    back = np.zeros_like(sent)
+    for law in {each.law for each in surfaces}:
+        by_law = np.array([each.law == law for each in surfaces])[surface]
+        scattered = reflectance.backscatter(law, eyepoints.cos_incidence)
+        np.copyto(back, scattered, where=hit & by_law)
+    echo = sent * back / ((1 + relative) * (1 + relative))
+    axis = surface[np.arange(len(surface)), eyepoints.reference]
+    return sent.sum(axis=1), relative, doppler, echo, hit & (surface != axis[:, None])

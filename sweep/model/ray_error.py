@@ -15,8 +15,7 @@ ray has hit, and takes smooth ground for rougher than it is, for 19 rays most of
 are off by more than 1e-6 (scan pattern comparison, gale crater descent, forest scan and square high
 descent, powers adding, 1,000 shots or more of each, against 8,017 or 16,021 rays) it is less than
 half of that in the forest alone, for one in a thousand, whatever the number of rays; its median is
-7 to 60 times as much for 19 rays, 2 to 10 times from 61 on. It takes 0.4, 0.7 and 2 us a shot for
-19, 37 and 109 rays.
+7 to 60 times as much for 19 rays, 2 to 10 times from 61 on.
 """
 
 import math
@@ -24,16 +23,16 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from sweep.model.compiling import inlined, owning
-from sweep.model.elementary import borrowed
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import beamlets
 from sweep.model.ground import Footprints
-from sweep.model.lanes import dot
-from sweep.model.lines import segment_lines
 from sweep.model.preparation import Shots
-from sweep.model.segments import SIGNS
 from sweep.model.window import samples
+
+_SIGNS = 1.0, 0.0, -1.0
+"""Of the segments' chirps."""
 
 _REACH, _STEPS, _SAMPLES = 4, 1024, 1024
 """Bins of fs/L up to which a line's power is known, steps of each, samples of the window."""
@@ -43,9 +42,6 @@ _NEIGHBOURS = 1.3
 
 _QUARTIC = 37
 """Rays from which on the polynomials are of the fourth degree, and leave enough to tell from."""
-
-_FEW = 20
-"""Places up to which the roughness is a product with one matrix."""
 
 _FAR = 15.0
 """Standard deviations from the threshold at which nothing changes: e^-112."""
@@ -72,8 +68,6 @@ class Rule(NamedTuple):
     pair_weight: np.ndarray
     """(m,): sum of the products of their beamlets' power fractions, made larger for what the
     polynomials have taken of the roughness too: k of h."""
-    at_once: np.ndarray
-    """(h, m): all of that for few places as one matrix, from them to what pairs add; or empty."""
 
 
 def ray_error(
@@ -94,14 +88,71 @@ def ray_error(
     bins, magnitude : (n, 3) ndarray
         Bin of each segment's peak, -1 or nan for none, and |X| there.
     """
-    out = np.empty(shots.size)
-    _errors(
-        shots.point_table(), (shots.fft_size, shots.window.length), shots.segments,
-        footprints.row, (footprints.offset, footprints.doppler, footprints.echo),
-        (bins, magnitude), _lobe(shots.window.name),
-        folded(footprints.echo.shape[1]), out,
+    threshold, deviation = shots.threshold, shots.line_deviation
+    change, largest = np.zeros((2, shots.size))
+    rule = folded(footprints.echo.shape[1])
+    for s in range(3):
+        there = bins[:, s] >= 0 if shots.segments[s] else np.zeros(shots.size, bool)
+        a, b = magnitude[:, s] / deviation, np.broadcast_to(threshold / deviation, shots.size)
+        # The down-chirp's lines lie as those of the up-chirp, and Doppler's closer together,
+        # which makes them smoother: one magnitude tells of all.
+        tells = there if s == 0 else there & ~(bins[:, 0] >= 0)
+        matters = (tells & (_in_magnitude(a, 1.0) >= _NOTHING)) | (_change(a, b, 1.0) >= _NOTHING)
+        some = np.flatnonzero(there & matters)
+        relative = np.empty(some.size)
+        _roughness(_in_bin(shots, footprints, s, some, bins[some, s]), rule, relative)
+        change[some] += _change(a[some], b[some], relative)
+        largest[some] = np.maximum(
+            largest[some], np.where(tells[some], _in_magnitude(a[some], relative), 0.0)
+        )
+    return np.minimum(np.maximum(change, largest), 1.0)
+
+
+def _change(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
+    """Most that Q_1(a, b) changes as a's square changes by a share of itself.
+
+    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the nearest to b that a comes.
+    """
+    away = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
+    most = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * away**2)
+    return np.where(away > _FAR, 0.0, np.minimum(most, 1.0))
+
+
+def _in_magnitude(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
+    """Change of a over itself, or 1 if that is larger, as its square changes by a share."""
+    return np.asarray(0.5 * relative * np.minimum(a, 1.0))
+
+
+def _in_bin(
+    shots: Shots, footprints: Footprints, s: int, some: np.ndarray, k: np.ndarray
+) -> np.ndarray:
+    """Powers, in one scale, that bins k (m,) of a segment have of some shots' lines, (m, b)."""
+    columns = (
+        shots.range, shots.beta, shots.chirp_rate, shots.sample_rate, shots.carriers[s],
+        shots.detector_bandwidth, shots.amplifier_bandwidth,
     )  # fmt: skip
-    return out
+    far, beta, rate, sample_rate, carrier, detector, amplifier = (
+        np.broadcast_to(column, shots.size)[some, None] for column in columns
+    )
+    row = footprints.row[some]
+    offset, doppler = footprints.offset[row], footprints.doppler[row]
+    # to the bin's precision: phases, which need far more, are none of a power's
+    metres = far * (1 + offset)
+    beat = carrier * (beta + doppler)
+    beat -= _SIGNS[s] * rate * (2 / SPEED_OF_LIGHT) * metres * (1 + beta + doppler)
+    size = shots.fft_size
+    place = beat * (size / sample_rate)
+    axis = carrier * beta - _SIGNS[s] * rate * (2 / SPEED_OF_LIGHT) * far * (1 + beta)
+    axis = axis * (size / sample_rate)
+    turns = np.floor(axis / size + 0.5) * size
+    place = np.abs(np.where(axis < turns, -1.0, 1.0) * (place - turns) - k[:, None])
+    lobe = _lobe(shots.window.name)
+    place *= shots.window.length / size * _STEPS
+    low = np.minimum(place, lobe.size - 2.0).astype(np.int64)
+    part = np.minimum(place - low, 1.0)
+    power = footprints.echo[row] * (lobe[low] + (lobe[low + 1] - lobe[low]) * part)
+    p, q = 1 - beat * beat / (detector * amplifier), beat * (1 / detector + 1 / amplifier)
+    return np.asarray(power / (p * p + q * q))
 
 
 @lru_cache(maxsize=16)
@@ -126,19 +177,7 @@ def folded(number: int) -> Rule:
     product: np.ndarray = np.bincount(which.ravel(), weight[near[:, 0]] * weight[near[:, 1]])
     smooth = _smooth(offsets[:, first], share, 4 if number >= _QUARTIC else 2)
     product = product * (first.size / (first.size - len(smooth)))
-    rule = Rule(
-        first, opposite[first], 1 / share, smooth, share * smooth, pairs, product, np.empty((0, 0))
-    )
-    return rule._replace(at_once=_at_once(rule)) if first.size <= _FEW else rule
-
-
-def _at_once(rule: Rule) -> np.ndarray:
-    """The steps of :func:`_roughness` on each place alone, (h, m)."""
-    rest = np.eye(rule.first.size)
-    for smooth, weighted in zip(rule.smooth, rule.weighted, strict=True):
-        rest -= (rest * weighted).sum(axis=1)[:, None] * smooth
-    apart = rest[:, rule.pairs[:, 0]] - rest[:, rule.pairs[:, 1]]
-    return np.ascontiguousarray(apart * np.sqrt(rule.pair_weight))
+    return Rule(first, opposite[first], 1 / share, smooth, share * smooth, pairs, product)
 
 
 def _smooth(offsets: np.ndarray, share: np.ndarray, degree: int) -> np.ndarray:
@@ -164,99 +203,27 @@ def _lobe(window_name: str) -> np.ndarray:
     return np.asarray((transform / w.sum()) ** 2)
 
 
-@owning(nogil=True)
-def _errors(points, sizes, segments, row, footprint, peaks, lobe, rule, out):
-    """Errors of all points, (n,)."""
-    offset, doppler, echo = (
-        borrowed(footprint[0]), borrowed(footprint[1]), borrowed(footprint[2])
-    )  # fmt: skip
-    bins, magnitude = peaks
-    lobe = borrowed(lobe)
-    rule = (
-        borrowed(rule[0]), borrowed(rule[1]), borrowed(rule[2]), borrowed(rule[3]),
-        borrowed(rule[4]), borrowed(rule[5]), borrowed(rule[6]), borrowed(rule[7]),
-    )  # fmt: skip
-    delta, power, nothing = np.empty((3, echo.shape[1]))
-    ones, apart = np.ones(echo.shape[1]), np.empty(rule[6].size)
-    rest, p, no_phases = np.empty(rule[0].size), np.empty(points.shape[0]), np.empty(0)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _roughness(power, rule, out):
+    """Errors (m,) of sums of powers (m, b), over the sums, no more than 1: see the module."""
+    first, second, per_share, smooth, weighted, pairs, pair_weight = rule
+    rest = np.empty(first.size)
     for i in range(out.size):
-        p[:] = points[:, i]
-        at, total, largest = row[i], 0.0, 0.0
-        for s in range(3):
-            if not (segments[s] and bins[i, s] >= 0):
-                continue
-            a, b = magnitude[i, s] / p[13], p[11] / p[13]
-            # The down-chirp's lines lie as those of the up-chirp, and Doppler's closer together,
-            # which makes them smoother: one magnitude tells of all.
-            of_magnitude = _in_magnitude(a, 1.0) if s == 0 or not bins[i, 0] >= 0 else 0.0
-            if of_magnitude < _NOTHING and _change(a, b, 1.0) < _NOTHING:
-                continue
-            origin = segment_lines(
-                (SIGNS[s], p[9] if s == 2 else p[8]), (p[2], p[0], p[1], p[3]), (p[4], p[5]),
-                (p[6], sizes[0], sizes[1], p[7]), offset[at], doppler[at], ones, no_phases,
-                delta, power, nothing, True,
-            )  # fmt: skip
-            _in_bin(delta, bins[i, s] - origin, sizes[1] / sizes[0], lobe, echo[at], power)
-            relative = min(_roughness(power, rule, rest, apart), 1.0)
-            total += _change(a, b, relative)
-            largest = max(largest, _in_magnitude(a, relative))
-        out[i] = min(max(total, largest), 1.0)
-
-
-@inlined()
-def _change(a, b, relative):
-    """Most that Q_1(a, b) changes as a's square changes by a share of itself.
-
-    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the nearest to b that a comes.
-    """
-    away = max(abs(a - b) - 0.5 * relative * a, 0.0)
-    if away > _FAR:
-        return 0.0
-    return min(0.5 * relative * math.sqrt(a * b / (2 * math.pi)) * math.exp(-0.5 * away**2), 1.0)
-
-
-@inlined()
-def _in_magnitude(a, relative):
-    """Change of a over itself, or 1 if that is larger, as its square changes by a share."""
-    return 0.5 * relative * min(a, 1.0)
-
-
-@inlined()
-def _in_bin(delta, k, ratio, lobe, echo, power):
-    """Powers of lines, as a bin has them, from those of lines of an echo of 1."""
-    for b in range(delta.size):
-        place = abs(delta[b] - k) * ratio * _STEPS
-        low = int(min(place, lobe.size - 2.0))
-        part = min(place - low, 1.0)
-        power[b] *= echo[b] * (lobe[low] + (lobe[low + 1] - lobe[low]) * part)
-
-
-@inlined()
-def _roughness(power, rule, rest, apart):
-    """Error of the sum of powers, over the sum: see the module."""
-    first, second, per_share, smooth, weighted, pairs, pair_weight, at_once = rule
-    whole = 0.0
-    for f in range(first.size):
-        both = power[first[f]] + (power[second[f]] if second[f] != first[f] else 0.0)
-        whole += both
-        rest[f] = both * per_share[f]
-    if not whole > 0.0:
-        return 1.0
-    if at_once.shape[0]:
-        apart[:] = 0.0
+        whole = 0.0
         for f in range(first.size):
-            for k in range(apart.size):
-                apart[k] += at_once[f, k] * rest[f]
-        return math.sqrt(dot(apart, apart, apart.size)) / whole
-    per_whole = 1.0 / whole
-    for f in range(first.size):
-        rest[f] *= per_whole
-    for j in range(smooth.shape[0]):  # orthonormal: one after the other is all at once
-        part = dot(weighted[j], rest, first.size)
-        for f in range(first.size):
-            rest[f] -= part * smooth[j, f]
-    for k in range(pair_weight.size):
-        apart[k] = rest[pairs[k, 0]] - rest[pairs[k, 1]]
-    for k in range(pair_weight.size):
-        apart[k] *= apart[k]
-    return math.sqrt(dot(pair_weight, apart, pair_weight.size))
+            both = power[i, first[f]]
+            if second[f] != first[f]:
+                both += power[i, second[f]]
+            whole += both
+            rest[f] = both * per_share[f]
+        for j in range(smooth.shape[0]):  # orthonormal: one after the other is all at once
+            part = 0.0
+            for f in range(first.size):
+                part += weighted[j, f] * rest[f]
+            for f in range(first.size):
+                rest[f] -= part * smooth[j, f]
+        total = 0.0
+        for k in range(pair_weight.size):
+            apart = rest[pairs[k, 0]] - rest[pairs[k, 1]]
+            total += pair_weight[k] * apart * apart
+        out[i] = min(math.sqrt(total) / whole, 1.0) if whole > 0.0 else 1.0

@@ -11,7 +11,7 @@ from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES
 from sweep.model.effects.flags import flags_of, names_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.beams import cone
-from sweep.model.geometry.jitter import PointingJitter
+from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.geometry.surfaces import Surface
 from sweep.model.groups import groups

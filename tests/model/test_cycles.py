@@ -10,7 +10,7 @@ from sweep.model.clouds import cloud
 from sweep.model.cycles import solve
 from sweep.model.geometry.attitude import Fixed
 from sweep.model.geometry.beams import cone, corners, squares
-from sweep.model.geometry.jitter import PointingJitter
+from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.geometry.surfaces import Surface
 from sweep.model.navigation_screening import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD

@@ -8,7 +8,7 @@ from small_scenes import DOWN, flight, observed
 
 from sweep.model.geometry.attitude import Nadir
 from sweep.model.geometry.beams import cone, corners
-from sweep.model.geometry.jitter import PointingJitter
+from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle
 
 SHOTS = 20_000

@@ -6,7 +6,6 @@ All functions broadcast over leading dimensions. `multiply(p, q)` turns by q fir
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 _SMALL = 1e-4
 """Half angle [rad] under which sin(x)/x is its series, good to 1e-18 there."""
@@ -50,42 +49,8 @@ def normalise(q: np.ndarray) -> np.ndarray:
 def rotate(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Vectors turned by unit quaternions: body to world, (..., 3)."""
     q, vector = np.asarray(q, float), np.asarray(vector, float)
-    shape = np.broadcast_shapes(q.shape[:-1], vector.shape[:-1])
-    result = np.empty((*shape, 3))
-    turns, vectors = (
-        np.ascontiguousarray(np.broadcast_to(a, (*shape, k))).reshape(-1, k)
-        for a, k in ((q, 4), (vector, 3))
-    )
-    _rotate_rows(turns, vectors, result.reshape(-1, 3))
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _rotate_rows(q, vector, result):
-    for i in range(q.shape[0]):
-        turn = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
-        v = rotated(turn, (vector[i, 0], vector[i, 1], vector[i, 2]))
-        result[i, 0], result[i, 1], result[i, 2] = v
-
-
-@njit(cache=True, nogil=True)
-def rotated(q, v):
-    """:func:`rotate` of one vector, compiled: v + w t + axis x t, t = 2 axis x v."""
-    w, axis = q[0], (q[1], q[2], q[3])
-    x, y, z = cross(axis, v)
-    twice = 2 * x, 2 * y, 2 * z
-    further = cross(axis, twice)
-    return (
-        v[0] + w * twice[0] + further[0],
-        v[1] + w * twice[1] + further[1],
-        v[2] + w * twice[2] + further[2],
-    )
-
-
-@njit(cache=True, nogil=True)
-def cross(a, b):
-    """Vector product of two vectors of three numbers, compiled."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    twice = 2 * np.cross(q[..., 1:], vector)
+    return np.asarray(vector + q[..., :1] * twice + np.cross(q[..., 1:], twice))
 
 
 def from_rotation_vector(vector: np.ndarray) -> np.ndarray:

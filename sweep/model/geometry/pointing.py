@@ -1,19 +1,64 @@
-"""Pointing errors, from standard normal draws that are given, or drawn by the shot's number."""
+"""Rays of a beam's beamlets, and pointing errors by the shot's number."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from sweep.model.geometry.quaternion import cross, from_rotation_vector, multiply
+from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
 from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair, point_keys
 
 DOMAIN = "sweep.jitter"
 """Domain of the random key, so that no other use of the same seed meets its numbers."""
+
+
+def beamlet_rays(
+    attitude: np.ndarray, axis: np.ndarray, across: np.ndarray, along: np.ndarray, sigma: float
+) -> np.ndarray:
+    """Unit vectors of every beamlet in the world frame, (n, b, 3).
+
+    Parameters
+    ----------
+    attitude : (n, 4) ndarray
+        Unit quaternions, body to world.
+    axis : (n, 3) ndarray
+        Unit vectors along the beams, in the body frame.
+    across, along : (b,) ndarray
+        Tangents of the angles off the axis towards the two vectors of :func:`transverse_of`, in
+        units of `sigma`.
+    sigma : float
+        Standard deviation of the beam on each axis [rad].
+    """
+    vectors = rotate(attitude[:, None], np.stack([*transverse_of(axis), axis], axis=1))
+    first, second, centre = np.moveaxis(vectors, 0, 2)[..., None]
+    rays = [
+        c + (f * (across * sigma) + s * (along * sigma))
+        for f, s, c in zip(first, second, centre, strict=True)
+    ]
+    length = np.sqrt(rays[0] * rays[0] + rays[1] * rays[1] + rays[2] * rays[2])
+    return np.stack([ray / length for ray in rays], axis=-1)
+
+
+def transverse_of(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across directions (n, 3): (first, second, direction) is right-handed.
+
+    For a beam near -z the first lies near x. A smooth function of the direction but along -x
+    and x, where no beam of a downward-looking instrument points.
+    """
+    second = np.cross(u, [1.0, 0.0, 0.0])
+    length = _length(second)
+    second = np.where(length < 1e-6, [0.0, 1.0, 0.0], second / np.maximum(length, 1e-6))
+    first = np.cross(second, u)
+    first /= _length(first)
+    return first, np.cross(u, first)
+
+
+def _length(v: np.ndarray) -> np.ndarray:
+    x, y, z = v[..., :1], v[..., 1:2], v[..., 2:]
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 class PointingJitter(NamedTuple):
@@ -60,27 +105,3 @@ def jitter_attitude(
     """
     turn = np.asarray(draws, float) * np.asarray(sigma, float)
     return multiply(attitude, from_rotation_vector(turn))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def transverse_of(u):
-    """Two unit vectors across a direction, so that (first, second, direction) is right-handed.
-
-    For a beam near -z the first lies near x. A smooth function of the direction but along -x
-    and x, where no beam of a downward-looking instrument points.
-    """
-    second = cross(u, (1.0, 0.0, 0.0))
-    second = (0.0, 1.0, 0.0) if _length(second) < 1e-6 else _unit(second)
-    first = _unit(cross(second, u))
-    return first, cross(u, first)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _length(v):
-    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _unit(v):
-    length = _length(v)
-    return v[0] / length, v[1] / length, v[2] / length
