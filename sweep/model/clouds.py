@@ -15,13 +15,13 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from sweep.model import chances
 from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.surfaces import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
+from sweep.model.marcum import at_least_one
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.ray_error import ray_error
 from sweep.model.returns import Returns, draw_returns
@@ -144,7 +144,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     """Probabilities before any draw, (n,) each."""
     up, doppler, down = found.pd[:, :, 0].T
     one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]
-    noise = chances.at_least_one(one, shots.counted_bins(found.exempted[:, [0, 2]]))
+    noise = at_least_one(one, shots.counted_bins(found.exempted[:, [0, 2]]))
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)
     above = found.magnitude[:, 0] >= shots.threshold[:, None]

@@ -11,41 +11,31 @@ when to stop.
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
 
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from sweep.model import chances, philox
+from sweep.model import philox
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
+from sweep.model.marcum import at_least_one
 from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import DRAW_OUTPUTS
+from sweep.model.philox import (
+    STREAM_DETECTION,
+    STREAM_FALSE_ALARM,
+    STREAM_NOISE,
+    STREAM_NOISE_MAXIMUM,
+)
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import inspect_bins, workspace
 
 METHODS = ("probabilities", "noise")
 
-_DETECTION = np.array(
-    [philox.STREAM_DETECTION_UP, philox.STREAM_DETECTION_DOPPLER, philox.STREAM_DETECTION_DOWN]
-)
-_FALSE_ALARM = np.array(
-    [
-        philox.STREAM_FALSE_ALARM_UP,
-        philox.STREAM_FALSE_ALARM_DOPPLER,
-        philox.STREAM_FALSE_ALARM_DOWN,
-    ]
-)
-_NOISE = np.array([philox.STREAM_NOISE_UP, philox.STREAM_NOISE_DOPPLER, philox.STREAM_NOISE_DOWN])
-_MAXIMUM = np.array(
-    [
-        philox.STREAM_NOISE_MAXIMUM_UP,
-        philox.STREAM_NOISE_MAXIMUM_DOPPLER,
-        philox.STREAM_NOISE_MAXIMUM_DOWN,
-    ]
-)
+BINS = 1 << 22
+"""Bins of which memory holds spectra at once."""
 
 
 class Rows(NamedTuple):
@@ -137,7 +127,8 @@ def count_by_chance(
     counts : (names, points, batches) ndarray
         As of :func:`no_counts`.
     """
-    _draw_probabilities(rows, ends, *_chances(outputs), _DETECTION, _FALSE_ALARM, counts)
+    size, chances = rows.point.size, np.array(_chances(outputs))
+    _count(rows, ends, np.zeros((2, size)), chances, False, Seen.nothing(size), counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
@@ -145,12 +136,13 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
 
     Parameters are those of :func:`count_by_chance`.
     """
-    for stretch in stretches(shots):
-        _draw_noise(
-            Rows(*(column[stretch.part] for column in rows)), ends, stretch.points, stretch.row,
-            stretch.scene, shots.segments, choices(shots), _base_count(shots), shots.kernel(),
-            workspace(stretch.lines, shots.fft_size), _NOISE, _MAXIMUM, counts,
-        )  # fmt: skip
+    levels = noise_levels(shots)
+    one = np.exp(-0.5 * levels[0] ** 2)
+    for part, seen in seen_spectra(shots):
+        others = at_least_one(one[part], seen.others.T)
+        chances = np.array([np.zeros_like(others), others])  # in C order
+        some = Rows(*(column[part] for column in rows))
+        _count(some, ends, levels[:, part].copy(), chances, True, seen, counts)
 
 
 def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -165,93 +157,116 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     return np.nan_to_num(found), np.stack([up, np.zeros_like(up), down])
 
 
-def _base_count(shots: Shots) -> tuple[float, bool]:
-    """Bins counted before exemption, and whether exempt bins are taken off."""
-    return float(shots.counted_bins(np.zeros(()))), shots.bins_counted != "all"
+def noise_levels(shots: Shots) -> np.ndarray:
+    """Threshold and noise under the lines, over the noise of any other bin, (2, n)."""
+    levels = np.stack([shots.threshold, shots.line_deviation]) / shots.bin_deviation
+    return np.ascontiguousarray(np.broadcast_to(levels, (2, shots.size)))
 
 
-@njit(cache=True)
-def _tally(counts, i, batch, found, alarm):
-    """Adds one draw to the counts, in the order of DRAW_OUTPUTS."""
-    counts[0, i, batch] += found[0]
-    counts[1, i, batch] += found[2]
-    counts[2, i, batch] += found[1]
-    counts[3, i, batch] += found[0] & found[2]
-    counts[4, i, batch] += alarm[0]
-    counts[5, i, batch] += alarm[2]
-    counts[6, i, batch] += alarm[0] & alarm[2]
+class Seen(NamedTuple):
+    """What spectra without noise hold, by point and segment (m, 3), for noise to be added to."""
+
+    low: np.ndarray
+    """int64: first of the bins that hold signal, from which they are numbered."""
+    peak: np.ndarray
+    """int64: number of the largest."""
+    ratio: np.ndarray
+    """Its |X| / sigma; nan for a segment that does not exist."""
+    others: np.ndarray
+    """Bins that count for false alarms and hold noise alone."""
+    stretch: np.ndarray
+    """(m, 3, 2) int64: first of the bins below, and after the last; none without leakage."""
+    aside: np.ndarray
+    """int64: numbers of bins of leaked signal, that may raise a false alarm by themselves."""
+    leaked: np.ndarray
+    """|X| / sigma of them."""
+
+    @classmethod
+    def nothing(cls, points: int, bins: int = 0) -> "Seen":
+        """No spectra, for what is drawn against probabilities; with room for so many bins."""
+        low, peak = np.zeros((2, points, 3), np.int64)
+        ratio, others = np.full((points, 3), np.nan), np.zeros((points, 3))
+        stretch, aside = np.zeros((points, 3, 2), np.int64), np.empty(bins, np.int64)
+        return cls(low, peak, ratio, others, stretch, aside, np.empty(bins))
 
 
-@njit(cache=True, nogil=True)
-def _draw_probabilities(rows, ends, found, alarm, found_stream, alarm_stream, counts):
-    """Uniform numbers against the probabilities of each segment."""
-    hit, false = np.zeros(3, np.int64), np.zeros(3, np.int64)
+def seen_spectra(shots: Shots) -> Iterator[tuple[slice, Seen]]:
+    """Points of some shots, and their spectra; as many at once as memory holds."""
+    bins = 3 * (shots.fft_size // 2 + 1)
+    for stretch in stretches(shots):
+        work = workspace(stretch.lines, shots.fft_size)
+        step = max(1, BINS // bins)
+        for first in range(0, stretch.row.size, step):
+            last = min(first + step, stretch.row.size)
+            seen = Seen.nothing(last - first, (last - first) * bins)
+            _look(
+                (first, last), stretch.points, stretch.row, stretch.scene, shots.segments,
+                choices(shots), shots.kernel(), work, seen,
+            )  # fmt: skip
+            left = shots.counted_bins(seen.others) - np.diff(seen.stretch)[..., 0]
+            part = slice(stretch.part.start + first, stretch.part.start + last)
+            yield part, seen._replace(others=np.maximum(left, 0.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(span, points, row, scene, segments, choices, kernel, work, seen):
+    """Fills what is seen of the points of a span; in place of the others the exempt bins."""
+    room, exempt, _ = work
+    number = 0
+    for i in range(span[0], span[1]):
+        p, place = points[:, i].copy(), i - span[0]
+        for s in range(3):
+            if not segments[s]:
+                continue
+            low, count, peak, exempted, _ = inspect_bins(
+                s, p, scene, (row[i], i), choices, kernel, room, exempt
+            )
+            seen.low[place, s], seen.peak[place, s] = low, peak
+            seen.ratio[place, s], seen.others[place, s] = room[0, peak] / p[10], exempted
+            seen.stretch[place, s, 0] = number
+            for k in range(count if choices[2] else 0):  # else none but the peak is looked at
+                ratio = room[0, k] / p[10]
+                if k != peak and not exempt[k] and ratio >= p[12]:
+                    seen.aside[number], seen.leaked[number] = k, ratio
+                    number += 1
+            seen.stretch[place, s, 1] = number
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count(rows, ends, levels, chances, noisy, seen, counts):
+    """Draws of each row into counts (names, points, batches), in the order of DRAW_OUTPUTS.
+
+    ``levels`` (2, m) are threshold and noise under the lines, over the noise of any other bin;
+    ``chances`` (2, 3, m) those of a detection, of no meaning in noise, and of a false alarm in
+    bins that are not looked at one by one.
+    """
+    hit, alarm = np.zeros(3, np.bool_), np.zeros(3, np.bool_)
     for j in range(rows.point.size):
-        a, b = rows.keys[j]
-        batch = 0
+        a, b = rows.keys[j, 0], rows.keys[j, 1]
+        beta, under_lines = levels[0, j], levels[1, j]
+        i, batch = rows.point[j], 0
         for number in range(rows.first[j], rows.last[j]):
             while number >= ends[batch + 1]:
                 batch += 1
             for s in range(3):
-                hit[s] = philox.uniform(a, b, number, found_stream[s], 0) < found[s, j]
-                false[s] = philox.uniform(a, b, number, alarm_stream[s], 0) < alarm[s, j]
-            _tally(counts, rows.point[j], batch, hit, false)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _draw_noise(
-    rows, ends, points, row, scene, segments, choices, counted, kernel, work, noise, maximum,
-    counts,
-):  # fmt: skip
-    """Noise in every bin: drawn where signal is, by its largest value elsewhere."""
-    room, exempt, _ = work
-    draws = (rows.last - rows.first).max()
-    hit, false = np.zeros((draws, 3), np.int64), np.zeros((draws, 3), np.int64)
-    for j in range(points.shape[1]):
-        p, first = points[:, j].copy(), rows.first[j]
-        sigma, level = p[10], p[11]
-        floor = p[12] if choices[2] else np.inf  # no bin but the detection is looked at
-        for s in range(3):
-            if not segments[s]:
-                continue
-            _, count, peak, exempted, _ = inspect_bins(
-                s, p, scene, (row[j], j), choices, kernel, room, exempt
-            )
-            others = counted[0] - (exempted if counted[1] else 0.0)
-            signals = room[0, :count] / sigma
-            for d in range(rows.last[j] - first):
-                hit[d, s], false[d, s] = _look(
-                    rows.keys[j], first + d, noise[s], maximum[s], signals, exempt, peak, floor,
-                    (level / sigma, p[13] / sigma), others,
-                )  # fmt: skip
-        batch = 0
-        for d in range(rows.last[j] - first):
-            while first + d >= ends[batch + 1]:
-                batch += 1
-            _tally(counts, rows.point[j], batch, hit[d], false[d])
-
-
-@njit(cache=True, error_model="numpy")
-def _look(key, number, stream, maximum_stream, signals, exempt, peak, floor, levels, others):
-    """Whether one draw of noise lifts the peak over the threshold, and any other bin.
-
-    ``levels`` are the threshold and the noise under the lines, over the noise of any other bin.
-    """
-    a, b = key
-    beta, under_lines = levels
-    found, alarm = False, False
-    for i in range(signals.size):
-        if i != peak and (exempt[i] or signals[i] < floor):
-            continue
-        re, im = philox.normal_pair(a, b, number, stream, i)
-        if i == peak:
-            re, im = re * under_lines, im * under_lines
-        crosses = (signals[i] + re) ** 2 + im**2 >= beta * beta
-        if i == peak:
-            found = crosses
-        else:
-            alarm |= crosses
-            others -= 1.0
-    quiet = chances.at_least_one_scalar(math.exp(-0.5 * beta * beta), max(others, 0.0))
-    alarm |= philox.uniform(a, b, number, maximum_stream, 0) < quiet
-    return found, alarm
+                if noisy:
+                    re, im = philox.normal_pair(a, b, number, STREAM_NOISE[s], seen.peak[j, s])
+                    re, im = seen.ratio[j, s] + re * under_lines, im * under_lines
+                    hit[s] = re**2 + im**2 >= beta * beta
+                else:
+                    found = philox.uniform(a, b, number, STREAM_DETECTION[s], 0)
+                    hit[s] = found < chances[0, s, j]
+                alarm[s] = False
+                if chances[1, s, j] > 0.0:
+                    stream = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
+                    alarm[s] = philox.uniform(a, b, number, stream, 0) < chances[1, s, j]
+                for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
+                    re, im = philox.normal_pair(a, b, number, STREAM_NOISE[s], seen.aside[k])
+                    alarm[s] |= (seen.leaked[k] + re) ** 2 + im**2 >= beta * beta
+            counts[0, i, batch] += hit[0]
+            counts[1, i, batch] += hit[2]
+            counts[2, i, batch] += hit[1]
+            counts[3, i, batch] += hit[0] & hit[2]
+            counts[4, i, batch] += alarm[0]
+            counts[5, i, batch] += alarm[2]
+            counts[6, i, batch] += alarm[0] & alarm[2]

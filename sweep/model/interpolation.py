@@ -25,13 +25,14 @@ whole record without a window; three magnitudes of a windowed spectrum do not re
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.polynomial import Chebyshev
 
-from sweep.model.spectrum import bin_magnitudes, tangents
 from sweep.model.window import Window, samples
 
 _STEPS = 2048
@@ -39,6 +40,9 @@ _STEPS = 2048
 
 _WIDENED, _NARROW = 129, 0.05
 """Places at which a spread [bins] of lines is tried."""
+
+_DEGREE = 32
+"""Of the polynomial that a lone tone's bins within 2 are."""
 
 _VANISHING = 0.25
 """Height of the neighbours of a tone on a bin under which the larger of them is used alone."""
@@ -63,7 +67,9 @@ class Interpolator(NamedTuple):
     error: np.ndarray
     """(m,): standard error [bins] by |delta| where the centre bin's magnitude is sigma."""
     mixing: tuple[float, float, float, float]
-    """What makes the noise of three adjacent bins of independent numbers (:func:`noise_triple`)."""
+    """What makes the noise of three adjacent bins, in one quadrature, of independent numbers z for
+    the middle one, the one above and the one below: above m0 z0 + m1 z1, below m0 z0 + m2 z1 +
+    m3 z2."""
     widening: np.ndarray
     """(m,): shift [bins] by |delta| over the variance [bins^2] of lines that add as powers."""
 
@@ -107,23 +113,32 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     return tables._replace(widening=_widening(window, fft_size, tables))
 
 
-def _tone(window: Window, fft_size: int, delta: np.ndarray) -> np.ndarray:
-    """Magnitudes of three bins around lone tones delta bins past the middle one, (3, m).
+def phasors(cycles: float, number: int) -> np.ndarray:
+    """exp(-2 pi i cycles n) of n = 0 .. number - 1: products of as few exponentials as will do."""
+    step = math.isqrt(number) + 1
+    angle = -2j * np.pi * cycles * np.arange(step)
+    return np.multiply.outer(np.exp(step * angle), np.exp(angle)).ravel()[:number]
 
-    The tone lies midway between DC and Nyquist, where its image adds 1e-10 of its power or less.
+
+@lru_cache(maxsize=32)
+def lone_tone(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Function of the distance, -2..2 bins, from a lone tone to a bin: the complex bin.
+
+    With the phase of half a record taken off it is real for a symmetric window. A polynomial, as
+    it turns by one cycle at the most: to 1e-14 of the largest bin.
     """
-    w = window
-    shape = (w.coefficients, w.numerator, w.poles, w.edge, w.table)
-    room, one, none = np.empty((5, 3)), np.ones(1), np.zeros(1)
-    origin = fft_size // 4
-    tone = np.empty((3, delta.size))
-    for i, d in enumerate(delta):
-        bin_magnitudes(
-            origin - 1, origin + 1, origin, np.array([d]), one, none, 1, (fft_size, w.length),
-            shape, True, tangents(fft_size), room[0], room[1], room[2:],
-        )  # fmt: skip
-        tone[:, i] = room[0]
-    return tone
+    w, middle = samples(window.name, window.length), window.length / 2
+
+    def at(distances: np.ndarray) -> np.ndarray:
+        each = [(w * phasors(y / fft_size, w.size)).sum() for y in distances]
+        return np.array(each) * np.exp(2j * np.pi * middle / fft_size * distances)
+
+    return Chebyshev.interpolate(at, _DEGREE, domain=[-2, 2])
+
+
+def _tone(window: Window, fft_size: int, delta: np.ndarray) -> np.ndarray:
+    """Magnitudes of three bins around lone tones delta bins past the middle one, (3, m)."""
+    return np.abs(lone_tone(window, fft_size)(np.array([[-1.0], [0.0], [1.0]]) - delta))
 
 
 def _least_squares(
@@ -158,8 +173,7 @@ def _widening(window: Window, fft_size: int, tables: Interpolator) -> np.ndarray
         delta = place + step * _NARROW
         tone = _tone(window, fft_size, np.abs(delta))
         power += weight * np.where(delta < 0, tone[::-1], tone) ** 2
-    known = tuple(tables)
-    found = np.array([sub_bin(a, b, c, known) for a, b, c in np.sqrt(power).T])
+    found = np.array([sub_bin(a, b, c, tables) for a, b, c in np.sqrt(power).T])
     every = np.linspace(0.0, 1.0, _STEPS + 1)
     return np.interp(every, place, np.abs(found - place)) / _NARROW**2
 
@@ -174,16 +188,16 @@ def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
 @njit(cache=True, error_model="numpy")
 def sub_bin(below, centre, above, tables):
     """Tone's distance [bins, -1..1] past the centre bin, from the magnitudes of three bins."""
-    measure, low, step, position, weight = tables[:5]
+    position, weight = tables.position, tables.weight
     larger, lesser = max(below, above), min(below, above)
     if not larger > 0.0:
         return 0.0
-    if measure == THREE_BINS:
+    if tables.measure == THREE_BINS:
         value = (larger - lesser) / (lesser + 2.0 * centre + larger)
     else:
         value = larger / (centre + larger)
-    delta = _at(position, (value - low) / step)
-    if measure == THREE_BINS and centre > 0.0:
+    delta = _at(position, (value - tables.low) / tables.step)
+    if tables.measure == THREE_BINS and centre > 0.0:
         place = delta * (position.size - 1)
         change = lesser * _at(weight[0], place) + larger * _at(weight[2], place)
         delta = min(max(delta + _at(weight[1], place) + change / centre, -1.0), 1.0)
@@ -204,10 +218,9 @@ def sub_bin_error(delta, ratio, tables):
 
     ``ratio`` is the centre bin's magnitude over the noise sigma per quadrature.
     """
-    error = tables[5]
     if not ratio > 0.0:
         return 0.5
-    return min(_at(error, abs(delta) * (error.size - 1)) / ratio, 0.5)
+    return min(_at(tables.error, abs(delta) * (tables.error.size - 1)) / ratio, 0.5)
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,17 +231,5 @@ def spread_error(delta, spread, power, tables):
     """
     if not power:
         return spread
-    widening = tables[7]
-    shift = _at(widening, abs(delta) * (widening.size - 1)) * spread * spread
-    return min(shift, spread)
-
-
-@njit(cache=True, error_model="numpy")
-def noise_triple(centre, below, above, tables):
-    """One quadrature of the noise of bins -1, 0, +1, correlated as the window correlates it.
-
-    Of three independent standard normal numbers; the middle bin's is the first of them.
-    """
-    near, rest, across, own = tables[6]
-    upper = near * centre + rest * above
-    return near * centre + across * above + own * below, centre, upper
+    place = abs(delta) * (tables.widening.size - 1)
+    return min(_at(tables.widening, place) * spread * spread, spread)

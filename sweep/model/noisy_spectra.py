@@ -15,22 +15,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import fft
 
-from sweep.model import philox
 from sweep.model.cramer_rao import beat_deviation
 from sweep.model.interpolation import interpolator, sub_bin
+from sweep.model.philox import STREAM_RECORD, normals
 from sweep.model.preparation import Shots
 from sweep.model.processing import Setting, main_lobe, taper
 from sweep.model.spectra import segment_spectrum
-
-STREAMS = (
-    philox.STREAM_RECORD_UP,
-    philox.STREAM_RECORD_DOPPLER,
-    philox.STREAM_RECORD_DOWN,
-)
-"""By segment: up, Doppler, down."""
 
 
 class Signal(NamedTuple):
@@ -76,7 +68,7 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
     k = int(np.clip(np.argmax(magnitude), 1, half - 1))
     if not magnitude[k] > 0:
         return Signal(magnitude.astype(complex), k, 1, 0, float(k), 0.0)
-    tables = tuple(interpolator(window, shots.fft_size))
+    tables = interpolator(window, shots.fft_size)
     place = k + sub_bin(magnitude[k - 1], magnitude[k], magnitude[k + 1], tables)
     high = np.flatnonzero(magnitude >= 0.5 * magnitude[k])
     beside = math.ceil(main_lobe(window) * shots.fft_size / window.length)
@@ -115,8 +107,7 @@ def noise_of(
     Where noise stands under the lines only (:attr:`Shots.pedestal`), the bins that the signal
     occupies have more of it.
     """
-    record = np.empty(shots.window.length)
-    _fill(key[0], key[1], draw, STREAMS[segment], record)
+    record = normals(key, draw, STREAM_RECORD[segment], shots.window.length)
     record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
     noise = np.asarray(fft.rfft(record, shots.fft_size))
@@ -134,12 +125,3 @@ def noisy_spectra(
     for row, draw in enumerate(draws):
         spectra[row] = signal.spectrum + noise_of(shots, i, segment, signal, key, int(draw))
     return spectra
-
-
-@njit(cache=True, nogil=True)
-def _fill(key0, key1, draw, stream, out):
-    """Standard normal numbers, by pairs, into a record."""
-    for pair in range(out.size // 2):
-        out[2 * pair], out[2 * pair + 1] = philox.normal_pair(key0, key1, draw, stream, pair)
-    if out.size % 2:
-        out[-1], _ = philox.normal_pair(key0, key1, draw, stream, out.size // 2)

@@ -22,10 +22,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.readings import best_reading
-from sweep.model.segments import SIGNS
-from sweep.model.waveform import FOLD_PENALTY
+from sweep.model.waveform import FOLD_PENALTY, READINGS, reading
 
 TOLERANCE = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
@@ -60,8 +57,11 @@ Doppler peak within the tolerance.
 """
 
 
+_reading = njit(cache=True, error_model="numpy")(reading)
+
+
 @njit(cache=True, error_model="numpy")
-def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs, work):
+def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs):
     """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
 
     Parameters
@@ -69,175 +69,100 @@ def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs, work):
     up, doppler, down : (any,) float64
         Positions of the peaks [bins], strongest first.
     at_start, fft_size, tolerance : float
-        As of :func:`best_reading`; N; mismatch [bins] up to which a Doppler peak confirms a pair.
+        As of :func:`confirm`; N; mismatch [bins] up to which a Doppler peak confirms a pair.
     pairs : (>= min(ups, downs), 4) int64
         Result: index of up, Doppler (-1 where unconfirmed) and down peak, and reading.
-    work : tuple
-        :func:`workspace`.
 
     Returns
     -------
     confirmed, number : int
         Confirmed pairs; all pairs.
     """
-    cost, via, partner, sums = work
+    cost, via = np.empty((up.size, down.size)), np.empty((up.size, down.size, 2), np.int64)
     for i in range(up.size):
         for j in range(down.size):
-            cost[i, j] = _confirm(up[i], doppler, down[j], at_start, fft_size, tolerance, via[i, j])
-    chosen = partner[0]
-    _match(cost, up.size, down.size, partner, sums)
+            cost[i, j], via[i, j, 0], via[i, j, 1] = confirm(
+                up[i], doppler, down[j], at_start, fft_size, tolerance
+            )
+    chosen, used = _match(cost)
     number = 0
     for i in range(up.size):
-        if chosen[i] >= 0:
-            pairs[number, 0], pairs[number, 2] = i, chosen[i]
-            pairs[number, 1], pairs[number, 3] = via[i, chosen[i]]
+        j = chosen[i]
+        if j >= 0:
+            pairs[number, 0], pairs[number, 2] = i, j
+            pairs[number, 1], pairs[number, 3] = via[i, j, 0], via[i, j, 1]
             number += 1
-    confirmed = number
-    j = -1
+    confirmed, j = number, 0
     for i in range(up.size):
-        if chosen[i] < 0:
-            j = _next_free(chosen[: up.size], j, down.size)
-            if j == down.size:
-                break
-            _confirm(up[i], doppler, down[j], at_start, fft_size, np.inf, via[i, j])
-            code = via[i, j, 1] if doppler.size else ASSUMED
-            pairs[number, 0], pairs[number, 1], pairs[number, 2], pairs[number, 3] = i, -1, j, code
-            number += 1
+        while j < down.size and used[j]:
+            j += 1
+        if chosen[i] < 0 and j < down.size:
+            _, _, code = confirm(up[i], doppler, down[j], at_start, fft_size, np.inf)
+            pairs[number, 0], pairs[number, 1], pairs[number, 2] = i, -1, j
+            pairs[number, 3] = code if doppler.size else ASSUMED
+            number, j = number + 1, j + 1
     return confirmed, number
 
 
 @njit(cache=True, error_model="numpy")
-def _confirm(up, doppler, down, at_start, fft_size, tolerance, via):
-    """Least cost of a pair over all Doppler peaks; that peak and its reading into ``via``."""
-    least = np.inf
-    via[0], via[1] = -1, -1
-    for k in range(doppler.size):
-        code, cost = best_reading(up, doppler[k], down, at_start, fft_size, FOLD_PENALTY, tolerance)
-        if cost < least:
-            least, via[0], via[1] = cost, k, code
-    return least
+def confirm(up, doppler, down, at_start, fft_size, tolerance):
+    """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
-
-@njit(cache=True, error_model="numpy")
-def _next_free(chosen, j, downs):
-    """First down peak after j that no up peak has chosen; ``downs`` where none is left."""
-    j += 1
-    while j < downs:
-        taken = False
-        for i in range(chosen.size):
-            taken |= chosen[i] == j
-        if not taken:
-            return j
-        j += 1
-    return downs
-
-
-@njit(cache=True, error_model="numpy")
-def _match(cost, ups, downs, partner, sums):
-    """Partner of each up peak (or -1) in partner[0]: most pairs, then least cost.
-
-    A search in depth over the pairs of finite cost, cut where it can't beat the best so far.
-    """
-    best, choice, used = partner[0], partner[1], partner[2]
-    if ups == 0:
-        return
-    for j in range(downs):
-        used[j] = 0
-    level, least = 0, np.inf
-    choice[0], sums[0] = -1, 0.0
-    while level >= 0:
-        j = choice[level]
-        if 0 <= j < downs:
-            used[j] = 0
-        j = _next_open(cost, used, level, j, downs)
-        if j > downs:
-            level -= 1
-            continue
-        choice[level] = j
-        sums[level + 1] = sums[level] + (cost[level, j] if j < downs else _UNPAIRED)
-        if j < downs:
-            used[j] = 1
-        if sums[level + 1] >= least:
-            continue
-        if level + 1 < ups:
-            level += 1
-            choice[level] = -1
-            continue
-        least = sums[ups]
-        for i in range(ups):
-            best[i] = choice[i] if choice[i] < downs else -1
-
-
-@njit(cache=True, error_model="numpy")
-def _next_open(cost, used, level, j, downs):
-    """Next down peak after j that may be paired with an up peak; ``downs`` means none."""
-    j += 1
-    while j < downs and (used[j] or not math.isfinite(cost[level, j])):
-        j += 1
-    return j
-
-
-def workspace(peaks: int) -> tuple[np.ndarray, ...]:
-    """Scratch of :func:`pair_peaks` for up to so many peaks in each segment."""
-    return (
-        np.empty((peaks, peaks)),
-        np.empty((peaks, peaks, 2), np.int64),
-        np.empty((3, peaks), np.int64),
-        np.empty(peaks + 1),
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def common_beamlet(spans, centres, lines, amplitude):
-    """Beamlet whose lines lie within all spans, next to the centres; whether spans hold any line.
-
-    Parameters
-    ----------
-    spans : (3, 2) float64
-        First and last bin of the peaks of the three segments; -inf to inf for one without.
-    centres : (3,) float64
-        Positions of the peaks [bins]; without meaning where there is none.
-    lines : (3, b) float64
-        Where each beamlet's line appears [bins].
-    amplitude : (b,) float64
-        Beamlets of amplitude 0 do not count.
+    ``at_start`` is the Doppler segment's carrier over that at mid-chirp, which the chirps see.
 
     Returns
     -------
-    beamlet : int
-        -1 for none.
-    filled : bool
-        Whether each of the three spans holds a line.
+    cost : float
+        Mismatch and penalties [bins]; inf where none comes within the tolerance.
+    peak, code : int
+        The Doppler peak and the reading; -1 for none.
     """
-    found, nearest = -1, np.inf
-    holds = 0
-    for b in range(amplitude.size):
-        if not amplitude[b] > 0.0:
-            continue
-        distance = 0.0
-        for s in range(3):
-            if spans[s, 0] - 1.0 <= lines[s, b] <= spans[s, 1] + 1.0:
-                holds |= 1 << s
-                if spans[s, 1] < np.inf:
-                    distance += abs(lines[s, b] - centres[s])
-            else:
-                distance = np.inf
-        if distance < nearest:
-            found, nearest = b, distance
-    return found, holds == 7
+    least, peak, best = np.inf, -1, -1
+    for k in range(doppler.size):
+        for code in range(READINGS):
+            shift, _ = _reading(code, up, down, fft_size)
+            place = fft_size - doppler[k] if code & 4 else doppler[k]
+            mismatch = abs(abs(shift) * at_start - place)
+            folds = (code >> 3 & 1) + (code >> 2 & 1) + (code >> 1 & 1)
+            cost = mismatch + folds * FOLD_PENALTY
+            if cost < least and mismatch <= tolerance:
+                least, peak, best = cost, k, code
+    return least, peak, best
 
 
 @njit(cache=True, error_model="numpy")
-def beamlet_lines(p, fft_size, footprint, row, lines):
-    """Where each beamlet's line appears in the three spectra [bins, 0..N/2], into lines (3, b).
+def _match(cost):
+    """Down peak of each up peak, or -1, and which are used: most pairs, then least cost.
 
-    Parameters as of :func:`sweep.model.segments.segment_spectrum`.
+    A search in depth over the pairs of finite cost, cut where it can't beat the best so far.
     """
-    rate = p[2] * (2.0 / SPEED_OF_LIGHT)
-    offset, doppler = footprint[0][row], footprint[1][row]
-    for s in range(3):
-        carrier = p[9] if s == 2 else p[8]
-        for b in range(offset.size):
-            beta = p[1] + doppler[b]
-            beat = carrier * beta - SIGNS[s] * rate * p[0] * (1.0 + offset[b]) * (1.0 + beta)
-            lines[s, b] = abs(beat / p[6] - math.floor(beat / p[6] + 0.5)) * fft_size
+    ups, downs = cost.shape
+    best, choice = np.full(ups, -1), np.full(ups, -1)
+    used, sums = np.zeros(downs, np.bool_), np.zeros(ups + 1)
+    level, least = 0 if ups else -1, np.inf
+    while level >= 0:
+        j = choice[level]
+        if 0 <= j < downs:
+            used[j] = False
+        j += 1
+        while j < downs and (used[j] or not math.isfinite(cost[level, j])):
+            j += 1
+        choice[level] = j  # without a partner where all are tried
+        if j > downs:
+            choice[level] = -1
+            level -= 1
+            continue
+        sums[level + 1] = sums[level] + (cost[level, j] if j < downs else _UNPAIRED)
+        if j < downs:
+            used[j] = True
+        if sums[level + 1] < least:
+            if level + 1 < ups:
+                level += 1
+                continue
+            least = sums[ups]
+            for i in range(ups):
+                best[i] = choice[i] if choice[i] < downs else -1
+    for i in range(ups):
+        if best[i] >= 0:
+            used[best[i]] = True
+    return best, used

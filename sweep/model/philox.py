@@ -13,86 +13,54 @@ import hashlib
 import math
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
-# Streams, one per physical cause. The numbers are part of every stored draw: add, never change.
-STREAM_DETECTION_UP = 1
-STREAM_DETECTION_DOWN = 2
-STREAM_DETECTION_DOPPLER = 3
-STREAM_FALSE_ALARM_UP = 4
-STREAM_FALSE_ALARM_DOWN = 5
-STREAM_FALSE_ALARM_DOPPLER = 6
-STREAM_NOISE_UP = 7
-STREAM_NOISE_DOWN = 8
-STREAM_NOISE_DOPPLER = 9
-STREAM_NOISE_MAXIMUM_UP = 10
-STREAM_NOISE_MAXIMUM_DOWN = 11
-STREAM_NOISE_MAXIMUM_DOPPLER = 12
+# Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
+# part of every stored draw: add, never change.
+STREAM_DETECTION = (1, 3, 2)
+STREAM_FALSE_ALARM = (4, 6, 5)
+STREAM_NOISE = (7, 9, 8)
+STREAM_NOISE_MAXIMUM = (10, 12, 11)
 STREAM_FOOTPRINT_PHASE = 13
 STREAM_SPECKLE = 14
 STREAM_LASER_PHASE = 15
 STREAM_POINTING_JITTER = 16
 STREAM_SCINTILLATION = 17
-STREAM_RECORD_UP = 18
-STREAM_RECORD_DOWN = 19
-STREAM_RECORD_DOPPLER = 20
+STREAM_RECORD = (18, 20, 19)
 
-_MULTIPLIER_0 = np.uint64(0xD2E7470EE14C6C93)
-_MULTIPLIER_1 = np.uint64(0xCA5A826395121157)
+_MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
+_M0, _M1 = (np.uint64(m) for m in _MULTIPLIERS)
+_LOW0, _LOW1 = (np.uint64(m & 0xFFFFFFFF) for m in _MULTIPLIERS)
+_HIGH0, _HIGH1 = (np.uint64(m >> 32) for m in _MULTIPLIERS)
 _WEYL_0 = np.uint64(0x9E3779B97F4A7C15)
 _WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
-_SHIFT = np.uint64(12)
-
-
-@intrinsic
-def _multiply_wide(typingctx, a, b):  # type: ignore[no-untyped-def]  # a numba intrinsic
-    """(high, low) words of the 128-bit product of two uint64: one machine instruction."""
-    signature = types.UniTuple(types.uint64, 2)(types.uint64, types.uint64)
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        wide, word = ir.IntType(128), ir.IntType(64)
-        product = builder.mul(builder.zext(args[0], wide), builder.zext(args[1], wide))
-        high = builder.trunc(builder.lshr(product, ir.Constant(wide, 64)), word)
-        words = (high, builder.trunc(product, word))
-        return context.make_tuple(builder, sig.return_type, words)
-
-    return signature, codegen
-
-
-@njit(cache=True)
-def philox4x64(key0, key1, c0, c1, c2, c3):
-    """Four uint64 of Philox4x64-10 for a key of two and a counter of four 64-bit words.
-
-    ``numpy.random.Philox(key=key, counter=c)`` adds 1 to its counter before its first output, so
-    its first four raw outputs are this function at ``c + 1``.
-    """
-    k0, k1 = np.uint64(key0), np.uint64(key1)
-    x0, x1, x2, x3 = np.uint64(c0), np.uint64(c1), np.uint64(c2), np.uint64(c3)
-    for _ in range(10):
-        high0, low0 = _multiply_wide(_MULTIPLIER_0, x0)
-        high1, low1 = _multiply_wide(_MULTIPLIER_1, x2)
-        x0, x1, x2, x3 = high1 ^ x1 ^ k0, low1, high0 ^ x3 ^ k1, low0
-        k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
-    return x0, x1, x2, x3
-
-
-@njit(cache=True)
-def _open_unit(bits):
-    """Centre of one of 2^52 equal cells of (0, 1), by the upper 52 bits of a uint64.
-
-    With 53 bits the last centre would round to 1; so 0 and 1 are both impossible, and u and
-    1-u, both exact, are equally likely.
-    """
-    return (np.float64(bits >> _SHIFT) + 0.5) * 2.0**-52
+_HALF_WORD = np.uint64(0xFFFFFFFF)
+_32, _12 = np.uint64(32), np.uint64(12)
 
 
 @njit(cache=True)
 def uniform4(key0, key1, draw, stream, block):
-    """The four uniforms in (0, 1) of indices 4 block .. 4 block + 3, for the price of one."""
-    r0, r1, r2, r3 = philox4x64(key0, key1, block, 0, draw, stream)
-    return _open_unit(r0), _open_unit(r1), _open_unit(r2), _open_unit(r3)
+    """The four uniforms in (0, 1) of indices 4 block .. 4 block + 3, for the price of one.
+
+    Centres of 2^52 equal cells, by the upper 52 bits of each word: with 53 bits the last centre
+    would round to 1; so 0 and 1 are both impossible, and u and 1-u, both exact, equally likely.
+    """
+    k0, k1 = np.uint64(key0), np.uint64(key1)
+    x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
+    for _ in range(10):
+        # High words of the 128-bit products with the multipliers, by halves of words.
+        low, high = x0 & _HALF_WORD, x0 >> _32
+        middle = _LOW0 * high + (_LOW0 * low >> _32)
+        product0 = _HIGH0 * high + (middle >> _32) + (_HIGH0 * low + (middle & _HALF_WORD) >> _32)
+        low, high = x2 & _HALF_WORD, x2 >> _32
+        middle = _LOW1 * high + (_LOW1 * low >> _32)
+        product1 = _HIGH1 * high + (middle >> _32) + (_HIGH1 * low + (middle & _HALF_WORD) >> _32)
+        x0, x1, x2, x3 = product1 ^ x1 ^ k0, _M1 * x2, product0 ^ x3 ^ k1, _M0 * x0
+        k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
+    return (
+        (np.float64(x0 >> _12) + 0.5) * 2.0**-52, (np.float64(x1 >> _12) + 0.5) * 2.0**-52,
+        (np.float64(x2 >> _12) + 0.5) * 2.0**-52, (np.float64(x3 >> _12) + 0.5) * 2.0**-52,
+    )  # fmt: skip
 
 
 @njit(cache=True)
@@ -115,12 +83,7 @@ def uniform(key0, key1, draw, stream, index):
     float
         Within [2^-53, 1 - 2^-53]: a chance below 1.1e-16 can not be drawn by comparison.
     """
-    place = np.uint64(index)
-    u0, u1, u2, u3 = uniform4(key0, key1, draw, stream, place >> np.uint64(2))
-    lane = place & np.uint64(3)
-    if lane < np.uint64(2):
-        return u0 if lane == np.uint64(0) else u1
-    return u2 if lane == np.uint64(2) else u3
+    return uniform4(key0, key1, draw, stream, index >> 2)[index & 3]
 
 
 @njit(cache=True)
@@ -131,13 +94,21 @@ def normal_pair(key0, key1, draw, stream, index):
     real and imaginary part, sigma times this pair is one bin's noise (sigma per quadrature).
     Their magnitude reaches sqrt(2 ln 2^53) = 8.57 at most. Parameters as of `uniform`.
     """
-    place = np.uint64(index)
-    u0, u1, u2, u3 = uniform4(key0, key1, draw, stream, place >> np.uint64(1))
-    if place & np.uint64(1):
+    u0, u1, u2, u3 = uniform4(key0, key1, draw, stream, index >> 1)
+    if index & 1:
         u0, u1 = u2, u3
     radius = math.sqrt(-2.0 * math.log(u0))
     angle = 2.0 * math.pi * u1
     return radius * math.cos(angle), radius * math.sin(angle)
+
+
+def normals(key: np.ndarray, draw: int, stream: int, number: int) -> np.ndarray:
+    """The first so many numbers of `normal_pair`, but for a last bit or two."""
+    before = (int(stream) << 192) + (int(draw) << 128) - 1  # numpy counts before it draws
+    generator = np.random.Philox(key=int(key[0]) + (int(key[1]) << 64), counter=before)
+    uniforms = ((generator.random_raw(number + number % 2) >> _12) + 0.5) * 2.0**-52
+    radius, angle = np.sqrt(-2.0 * np.log(uniforms[::2])), 2.0 * np.pi * uniforms[1::2]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).ravel()[:number]
 
 
 def point_keys(rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:

@@ -33,11 +33,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.draws import METHODS
-from sweep.model.groups import FIRST, LAST, Groups, groups
-from sweep.model.interpolation import interpolator, spread_error
-from sweep.model.modulation import choices, stretches
+from sweep.model.draws import METHODS, Seen, noise_levels, seen_spectra
+from sweep.model.groups import BIN, FIRST, LAST, Groups, groups
+from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
+from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
     FALSE_ALARM,
     MISPAIRED,
@@ -46,28 +47,23 @@ from sweep.model.pairing import (
     TOLERANCE,
     TRUE,
     UNCONFIRMED,
-    beamlet_lines,
-    common_beamlet,
     pair_peaks,
 )
-from sweep.model.pairing import workspace as pairing_workspace
-from sweep.model.peaks import (
-    ABSENT,
-    ERROR,
-    FALSE,
-    FINE,
-    RATIO,
-    STREAMS,
-    WHOLE,
-    alarm_chance,
-    draw_by_chance,
-    draw_in_noise,
+from sweep.model.philox import (
+    STREAM_DETECTION,
+    STREAM_FALSE_ALARM,
+    STREAM_NOISE,
+    STREAM_NOISE_MAXIMUM,
 )
 from sweep.model.preparation import Shots
-from sweep.model.readings import resolve_reading
-from sweep.model.segments import inspect_bins, workspace
 
 __all__ = ["Groups", "Returns", "draw_returns", "groups"]
+
+WHOLE, FINE, ERROR, RATIO = range(4)
+"""Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
+
+FALSE, ABSENT = -1, -2
+"""In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
 
 
 class Returns(NamedTuple):
@@ -140,200 +136,373 @@ def draw_returns(
     if method not in METHODS:
         raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
     n, _, most = found.bin.shape
-    values = np.full((n, draws, most, 10), np.nan)
-    flags, beamlet = np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32)
-    group = np.full((n, draws, most, 3), -1, np.int8)
-    bins = np.stack([found.bin, found.first, found.last])
-    chirp = np.array(np.broadcast_arrays(shots.bandwidth, shots.duration, shots.range)[:2], float)
-    counted = float(shots.counted_bins(np.zeros(()))), shots.bins_counted != "all"
-    for stretch in stretches(shots):
-        part = stretch.part
+    drawn = Drawn(
+        np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
+        np.full((n, draws, most, 3), ABSENT, np.int8),
+        np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
+    )  # fmt: skip
+    noisy, known = method == "noise", _known(shots, found)
+    one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
+    how = How(
+        int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
+        float(tolerance),
+    )  # fmt: skip
+    tables = interpolator(shots.window, shots.fft_size)
+    counted = np.nan_to_num(shots.counted_bins(found.exempted))
+    nothing = slice(0, n), Seen.nothing(n)._replace(others=counted)
+    for part, seen in seen_spectra(shots) if noisy else [nothing]:
+        some = Known(*(column[part] for column in known))
+        quiet = 1 - at_least_one(one[part], seen.others)
+        alarm = 1 - quiet if noisy else 1 - quiet * (1 - some.alarm)
         _draw(
-            keys[part], int(first_draw), (stretch.points, chirp[:, part].copy(), stretch.row),
-            stretch.scene, (shots.segments, choices(shots), method == "noise", float(tolerance)),
-            counted, shots.kernel(), tuple(interpolator(shots.window, shots.fft_size)),
-            (bins[:, part].copy(), found.pd[part], found.neighbours[part], found.exempted[part],
-             found.leakage[part]),
-            STREAMS, (np.empty((most + 1, 4), np.int64), pairing_workspace(most + 1)),
-            workspace(stretch.lines, shots.fft_size),
-            (values[part], flags[part], beamlet[part], group[part]),
+            keys[part], how, some._replace(alarm=alarm), seen, tables,
+            Drawn(*(column[part] for column in drawn)),
         )  # fmt: skip
+    return _measured(shots, found, drawn)
+
+
+class How(NamedTuple):
+    """The way in which draws are taken."""
+
+    first_draw: int
+    noisy: bool
+    powers: bool
+    """Whether lines add as powers."""
+    doppler: bool
+    """Whether there is a Doppler segment."""
+    half: int
+    """N/2."""
+    tolerance: float
+
+
+class Known(NamedTuple):
+    """What is known of n points, by segment, before any draw."""
+
+    bins: np.ndarray
+    """(n, 3, 3, most) int64: BIN, FIRST and LAST of the groups; -1 for none."""
+    pd: np.ndarray
+    """(n, 3, most)"""
+    magnitude: np.ndarray
+    """(n, 3, most, 3): of the strongest bin and its neighbours [V]."""
+    spread: np.ndarray
+    """(n, 3, most): standard deviation [bins] of the lines in a group, weighted by power."""
+    lines: np.ndarray
+    """(n, 3, beamlets): where each beamlet's line appears [bins, 0..N/2]."""
+    amplitude: np.ndarray
+    """(n, beamlets)"""
+    levels: np.ndarray
+    """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
+    alarm: np.ndarray
+    """(n, 3): chance of a false alarm in bins that are not drawn one by one."""
+    at_start: np.ndarray
+    """(n,): as of :func:`sweep.model.pairing.confirm`."""
+
+
+class Drawn(NamedTuple):
+    """What draws of n points come to."""
+
+    peaks: np.ndarray
+    """(n, draws, most, 2, 4): up and down peak of each return."""
+    code: np.ndarray
+    """(n, draws, most) int64: reading; -1 where there is no return."""
+    group: np.ndarray
+    """(n, draws, most, 3) int8: group of the up, Doppler and down peak, FALSE or ABSENT."""
+    flags: np.ndarray
+    beamlet: np.ndarray
+
+
+def _known(shots: Shots, found: Groups) -> Known:
+    n = shots.size
+    lines, amplitude = beamlet_lines(shots), shots.amplitude[shots.row]
+    bins = np.stack([found.bin, found.first, found.last], axis=2)
+    apart = lines[:, :, None] - found.bin[..., None]
+    inside = (lines[:, :, None] >= found.first[..., None] - 1) & (
+        lines[:, :, None] <= found.last[..., None] + 1
+    )
+    weight = np.where(inside, amplitude[:, None, None] ** 2, 0.0)
+    total = weight.sum(axis=-1)
+    total[total == 0] = 1.0
+    mean = (weight * apart).sum(axis=-1) / total
+    square = (weight * apart**2).sum(axis=-1) / total
+    carrier = shots.carriers[0]
+    return Known(
+        bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
+        amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
+        np.broadcast_to(carrier / (carrier + shots.bandwidth / 2), n).copy(),
+    )  # fmt: skip
+
+
+def beamlet_lines(shots: Shots) -> np.ndarray:
+    """Where each beamlet's line appears in the three spectra [bins, 0..N/2], (n, 3, beamlets)."""
+    distance = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
+    distance = distance * _columns(shots, shots.range), 1 + shots.offset[shots.row]
+    beta = _columns(shots, shots.beta) + shots.doppler[shots.row]
+    lines = np.empty((shots.size, 3, beta.shape[1]))
+    for s, (sign, carrier) in enumerate(zip(waveform.SIGNS, shots.carriers, strict=True)):
+        beat = _columns(shots, carrier) * beta - sign * distance[0] * distance[1] * (1 + beta)
+        turns = beat / _columns(shots, shots.sample_rate)
+        lines[:, s] = abs(turns - np.floor(turns + 0.5)) * shots.fft_size
+    return lines
+
+
+def _velocities(shots: Shots) -> np.ndarray:
+    """Radial velocity [m/s] of each beamlet, (n, beamlets)."""
+    doppler = SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
+    return np.asarray(_columns(shots, shots.radial_velocity) + doppler)
+
+
+def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndarray:
+    """One value a point, with so many dimensions behind it."""
+    return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
+
+
+def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
+    """What pairs of peaks report, and which of them misread their common beamlet."""
+    carrier, bandwidth, duration, rate, deepest, walk = (
+        _columns(shots, column, 3)
+        for column in (
+            shots.carriers[0], shots.bandwidth, shots.duration, shots.sample_rate, shots.range,
+            shots.walk,
+        )
+    )  # fmt: skip
+    width = rate / shots.fft_size
+    up, down = (drawn.peaks[..., side, : FINE + 1] * width for side in range(2))
+    f_d, f_r = np.full((2, *up.shape), np.nan)
+    for code in np.unique(drawn.code[drawn.code >= 0]):
+        there = (drawn.code == code)[..., None]
+        f_d, f_r = (
+            np.where(there, new, old)
+            for new, old in zip(waveform.reading(code, up, down, rate), (f_d, f_r), strict=True)
+        )
+    distance, velocity = waveform.measured(f_d, f_r, carrier, bandwidth, duration)
+    metre = (SPEED_OF_LIGHT / 4 * width / (bandwidth / duration))[..., 0]
+    speed = (SPEED_OF_LIGHT / 4 * width / (carrier + bandwidth / 2))[..., 0]
+    variance = (drawn.peaks[..., ERROR] ** 2).sum(axis=-1)
+    whole, fine = np.sqrt(variance + 1 / 6), np.sqrt(variance)
+    point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
+    sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
+    reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
+    offset, truth = shots.offset[shots.row], _velocities(shots)
+    seen = np.maximum(drawn.beamlet, 0)
+    off = distance[..., FINE] - deepest[..., 0] * (1 + offset[point, seen])
+    right = abs(off) <= reach * metre
+    right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
+    signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
+    pd = found.pd[point, 0, group[..., 0]] * found.pd[point, 2, group[..., 2]]
+    misread = (drawn.flags & TRUE > 0) & ~right
     # What the ground came nearer by within the record, which the measured velocity tells.
-    walk = np.broadcast_to(shots.walk, n)[:, None, None]
-    values[..., FINE] += values[..., 2 + FINE] * walk
-    columns = [values[..., k] for k in range(values.shape[-1])]
-    return Returns._make([*columns, flags, beamlet, group])
-
-
-_inlined = njit(cache=True, error_model="numpy", inline="always")
-"""Written into its caller: a call would count each of its many arrays in and out, draw by draw."""
+    distance[..., FINE] += velocity[..., FINE] * walk[..., 0]
+    return Returns(
+        distance[..., WHOLE], distance[..., FINE], velocity[..., WHOLE], velocity[..., FINE],
+        metre * whole, metre * fine, speed * whole, speed * fine,
+        drawn.peaks[..., RATIO].min(axis=-1) ** 2 / 2, np.where(signal, pd, np.nan),
+        np.where(misread, drawn.flags ^ (TRUE | MISREAD), drawn.flags), drawn.beamlet,
+        np.maximum(drawn.group, FALSE),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(
-    keys, first_draw, shots, scene, how, counted, kernel, tables, found, streams, work, spectra, out
-):  # fmt: skip
-    """All draws of all points: peaks of the three segments, then what they report."""
-    points, chirp, row = shots
-    footprint = scene[0]
-    segments, choices, noisy, tolerance = how
-    power = choices[0]
-    half, beamlets = kernel[0][0] // 2, footprint[0].shape[1]
-    draws, most = out[1].shape[1], out[1].shape[2]
-    room, exempt, _ = spectra
-    peaks = np.zeros((3, draws, most + 1, 4))
-    which, number = np.empty((3, draws, most + 1), np.int64), np.empty((3, draws), np.int64)
-    lines, spread = np.empty((3, beamlets)), np.empty(most)
-    for i in range(points.shape[1]):
-        p = points[:, i].copy()
-        beamlet_lines(p, 2 * half, footprint, row[i], lines)
-        for s in range(3):
-            if not segments[s]:
-                number[s], which[s, :, 0] = 1, ABSENT
-                continue
-            listed = found[0][:, i, s], found[1][i, s], found[2][i, s]
-            others = counted[0] - (found[3][i, s] if counted[1] else 0.0)
-            run = 0, room[0, :0], exempt, p[12]
-            if noisy:
-                run = _run(s, p, scene, (row[i], i), choices, kernel, room, exempt)
-            _draw_segment(
-                (keys[i], first_draw, streams[s]), listed,
-                (p[10], p[11] / p[10], p[13] / p[10]), others,
-                found[4][i, s], noisy, run, tables, half, peaks[s], which[s], number[s],
-            )  # fmt: skip
-            _spread_lines(listed[0], lines[s], footprint[2][row[i]], spread)
-            _widen(peaks[s], which[s], number[s], spread, power or not segments[1], tables)
-        optics = p[8], chirp[0, i], chirp[1, i], p[6], p[6] / (2 * half)
-        aims = p[0], p[1], footprint[0][row[i]], footprint[1][row[i]], footprint[2][row[i]], lines
+def _draw(keys, how, known, seen, tables, out):
+    """All draws of all points: peaks of the three segments, and which make returns."""
+    n, draws, most = out.flags.shape
+    peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
+    number, pairs = np.empty(3, np.int64), np.empty((most + 1, 4), np.int64)
+    for i in range(n):
         for d in range(draws):
-            _report(
-                peaks[:, d], which[:, d], number[:, d], found[0][:, i], found[1][i], half, optics,
-                aims, tolerance, work, out[0][i, d], out[1][i, d], out[2][i, d], out[3][i, d],
+            address = keys[i, 0], keys[i, 1], how.first_draw + d
+            for s in range(3):
+                if s == 1 and not how.doppler:
+                    number[s], which[s, 0] = 1, ABSENT
+                else:
+                    number[s] = draw_peaks(
+                        address, (i, s), how, known, seen, tables, peaks[s], which[s]
+                    )
+            confirmed, count = pair_peaks(
+                peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
+                peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.tolerance,
+                pairs,
             )  # fmt: skip
+            for r in range(min(count, most)):
+                u, k, v, out.code[i, d, r] = pairs[r]
+                group, centres = out.group[i, d, r], np.zeros(3)
+                group[0], group[2] = which[0, u], which[2, v]
+                centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
+                if k >= 0:
+                    group[1], centres[1] = which[1, k], peaks[1, k, FINE]
+                out.peaks[i, d, r, 0], out.peaks[i, d, r, 1] = peaks[0, u], peaks[2, v]
+                flag, out.beamlet[i, d, r] = judge(
+                    group, centres, known.bins[i], known.lines[i], known.amplitude[i]
+                )
+                out.flags[i, d, r] = flag | (UNCONFIRMED if r >= confirmed else 0)
 
 
-@_inlined
-def _run(segment, p, scene, at, choices, kernel, room, exempt):
-    """Bins that hold a segment's signal, as :func:`sweep.model.peaks.draw_in_noise` takes them."""
-    low, count, _, _, _ = inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
-    floor = p[12] if choices[2] else np.inf  # no bin but the groups is looked at
-    return low, room[0, :count] / p[10], exempt, floor
+@njit(cache=True, error_model="numpy")
+def draw_peaks(address, at, how, known, seen, tables, peaks, which):
+    """Peaks of one segment in one draw: which groups are detected, where, and one false peak.
 
+    Parameters
+    ----------
+    address : (uint64, uint64, int)
+        Key of the point, number of the draw.
+    at : (int, int)
+        Point and segment.
+    how, known, seen, tables
+        :class:`How`, :class:`Known`, :class:`sweep.model.draws.Seen`, and the interpolator.
+    peaks, which : (most + 1, 4) float64, (most + 1,) int64
+        Result: peaks by their fields, and their groups.
 
-@_inlined
-def _draw_segment(
-    source, listed, noise, others, leakage, noisy, run, tables, half, peaks, which, number
-):
-    """A segment's peaks in all draws of a point."""
-    key, first_draw, streams = source
-    alarm = alarm_chance(noise[1], others, leakage)
-    for d in range(number.size):
-        address = key[0], key[1], first_draw + d
-        if noisy:
-            number[d] = draw_in_noise(
-                address, streams, listed, noise, others, run, tables, half, peaks[d], which[d]
-            )
+    Returns
+    -------
+    int
+        Number of peaks.
+    """
+    (a, b, draw), (i, s) = address, at
+    sigma, beta, under_lines = known.levels[i]
+    bins, count = known.bins[i, s], 0
+    for g in range(bins.shape[1]):
+        if bins[BIN, g] < 0:
+            break
+        if how.noisy:
+            there = look(address, at, g, how, known, seen, tables, peaks[count])
         else:
-            number[d] = draw_by_chance(
-                address, streams, listed, noise, others, alarm, tables, half, peaks[d], which[d]
-            )
+            there = philox.uniform(a, b, draw, STREAM_DETECTION[s], g) < known.pd[i, s, g]
+            if there:
+                m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
+                delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
+                error = sub_bin_error(delta, ratio / under_lines, tables)
+                normal, _ = philox.normal_pair(a, b, draw, STREAM_NOISE[s], g)
+                fine = bins[BIN, g] + delta + error * normal
+                put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
+        if there:
+            which[count] = g
+            count += 1
+    place, largest = -1, beta
+    for n in range(seen.stretch[i, s, 0], seen.stretch[i, s, 1]):
+        re, im = philox.normal_pair(a, b, draw, STREAM_NOISE[s], seen.aside[n])
+        ratio = math.hypot(seen.leaked[n] + re, im)
+        if ratio >= largest:
+            place, largest = seen.low[i, s] + seen.aside[n], ratio
+    stream = STREAM_NOISE_MAXIMUM[s] if how.noisy else STREAM_FALSE_ALARM[s]
+    chance = philox.uniform(a, b, draw, stream, 0)
+    if chance < known.alarm[i, s]:
+        ratio = max(largest_of(seen.others[i, s], chance), beta)
+        if place < 0 or ratio > largest:
+            place = free_bin(philox.uniform(a, b, draw, stream, 1), bins, how.half)
+            largest = ratio
+    if place >= 0:
+        error = sub_bin_error(0.0, largest, tables)
+        put(peaks[count], place, place, error, largest, 0.0, how, tables)
+        which[count] = FALSE
+        count += 1
+    return count
 
 
-@_inlined
-def _spread_lines(bins, lines, amplitude, spread):
-    """Standard deviation [bins] of the lines in each group of a segment, weighted by power."""
-    for g in range(spread.size):
-        total = first = second = 0.0
-        for b in range(lines.size):
-            apart = lines[b] - bins[0, g]
-            if bins[FIRST, g] - 1.0 <= lines[b] <= bins[LAST, g] + 1.0:
-                weight = amplitude[b] * amplitude[b]
-                total += weight
-                first += weight * apart
-                second += weight * apart * apart
-        mean = first / total if total > 0.0 else 0.0
-        spread[g] = math.sqrt(max(second / total - mean * mean, 0.0)) if total > 0.0 else 0.0
+@njit(cache=True, error_model="numpy")
+def look(address, at, g, how, known, seen, tables, peak):
+    """Whether a group's strongest bin crosses with its noise; the peak of three bins as found."""
+    (a, b, draw), (i, s) = address, at
+    sigma, beta, under_lines = known.levels[i]
+    centre, m, stream = known.bins[i, s, BIN, g], known.magnitude[i, s, g] / sigma, STREAM_NOISE[s]
+    k = centre - seen.low[i, s]
+    re, im = philox.normal_pair(a, b, draw, stream, k)
+    re, im = re * under_lines, im * under_lines
+    if (m[1] + re) ** 2 + im**2 < beta * beta:
+        return False
+    # Neighbours are exempt from false alarms, so their bins' own numbers are free.
+    re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
+    re_above, im_above = philox.normal_pair(a, b, draw, stream, k + 1)
+    re_below, im_below = re_below * under_lines, im_below * under_lines
+    re_above, im_above = re_above * under_lines, im_above * under_lines
+    near, rest, across, own = tables.mixing
+    below = math.hypot(
+        m[0] + (near * re + across * re_above + own * re_below),
+        near * im + across * im_above + own * im_below,
+    )
+    middle = math.hypot(m[1] + re, im)
+    above = math.hypot(m[2] + (near * re + rest * re_above), near * im + rest * im_above)
+    delta = sub_bin(below, middle, above, tables)
+    shift = 0
+    if max(below, above) > middle:
+        shift = 1 if above > below else -1
+    error, ratio = sub_bin_error(delta, middle / under_lines, tables), max(below, middle, above)
+    put(peak, centre + shift, centre + delta, error, ratio, known.spread[i, s, g], how, tables)
+    return True
 
 
-@_inlined
-def _widen(peaks, which, number, spread, power, tables):
-    """Adds to the errors of a segment's true peaks, in all draws, what the lines' spread does."""
-    for d in range(number.size):
-        for k in range(number[d]):
-            if which[d, k] >= 0:
-                peak = peaks[d, k]
-                delta = peak[FINE] - peak[WHOLE]
-                error = spread_error(delta, spread[which[d, k]], power, tables)
-                peak[ERROR] = math.hypot(peak[ERROR], error)
+@njit(cache=True, error_model="numpy")
+def put(peak, whole, fine, error, ratio, spread, how, tables):
+    """A peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist."""
+    whole, fine, end = abs(whole), abs(fine), 2 * how.half
+    peak[WHOLE] = end - whole if whole > how.half else whole
+    peak[FINE] = end - fine if fine > how.half else fine
+    wide = spread_error(peak[FINE] - peak[WHOLE], spread, how.powers or not how.doppler, tables)
+    peak[ERROR], peak[RATIO] = math.hypot(error, wide), ratio
 
 
-@_inlined
-def _report(
-    peaks, which, number, bins, pd, half, optics, aims, tolerance, work,
-    values, flags, beamlet, group,
-):  # fmt: skip
-    """Pairs one draw's peaks; values, flags, beamlets and groups of its returns."""
-    pairs, scratch = work
-    fine = peaks[:, :, FINE]
-    confirmed, count = pair_peaks(
-        fine[0, : number[0]], fine[1, : number[1]], fine[2, : number[2]],
-        optics[0] / (optics[0] + optics[1] / 2.0), 2.0 * half, tolerance, pairs, scratch,
-    )  # fmt: skip
-    for r in range(min(count, flags.size)):
-        u, k, d, code = pairs[r]
-        up, down = peaks[0, u], peaks[2, d]
-        _measure(up, down, code, optics, values[r])
-        group[r, 0], group[r, 2] = which[0, u], which[2, d]
-        group[r, 1] = which[1, k] if k >= 0 else ABSENT
-        if group[r, 0] >= 0 and group[r, 2] >= 0:
-            values[r, 9] = pd[0, group[r, 0]] * pd[2, group[r, 2]]
-        flags[r], beamlet[r] = _judge(
-            group[r], (up[FINE], fine[1, max(k, 0)], down[FINE]), bins, optics, aims, values[r]
-        )
-        if r >= confirmed:
-            flags[r] |= UNCONFIRMED
-        for s in range(3):
-            group[r, s] = max(group[r, s], -1)
+@njit(cache=True, error_model="numpy")
+def largest_of(number, chance):
+    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance."""
+    if not number > 0.0:
+        return 0.0
+    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
 
 
-@_inlined
-def _measure(up, down, code, optics, values):
-    """Range and velocity by whole and by fine positions, their standard errors, and the SNR."""
-    carrier, bandwidth, duration, sample_rate, bin_width = optics
-    for field in (WHOLE, FINE):
-        values[field], values[2 + field] = resolve_reading(
-            code, up[field] * bin_width, down[field] * bin_width, carrier, bandwidth, duration,
-            sample_rate,
-        )  # fmt: skip
-    variance = up[ERROR] ** 2 + down[ERROR] ** 2
-    metre = SPEED_OF_LIGHT / 4.0 * bin_width / (bandwidth / duration)
-    speed = SPEED_OF_LIGHT / 4.0 * bin_width / (carrier + bandwidth / 2.0)
-    values[4], values[5] = metre * math.sqrt(variance + 1.0 / 6.0), metre * math.sqrt(variance)
-    values[6], values[7] = speed * math.sqrt(variance + 1.0 / 6.0), speed * math.sqrt(variance)
-    values[8] = min(up[RATIO], down[RATIO]) ** 2 / 2.0
+@njit(cache=True, error_model="numpy")
+def free_bin(chance, bins, half):
+    """Bin of 1..N/2 outside the groups and the bins beside them, uniformly by a chance."""
+    spans, number, free = np.empty((bins.shape[1], 2), np.int64), 0, half
+    while number < bins.shape[1] and bins[BIN, number] >= 0:
+        first = max(bins[FIRST, number] - 1, 1)
+        end = max(min(bins[LAST, number] + 2, half + 1), first)
+        place = number
+        while place > 0 and spans[place - 1, 0] > first:
+            spans[place] = spans[place - 1]
+            place -= 1
+        spans[place, 0], spans[place, 1] = first, end
+        number += 1
+    for g in range(number):  # disjoint
+        before = spans[g - 1, 1] if g else 1
+        spans[g, 0] = max(spans[g, 0], before)
+        spans[g, 1] = max(spans[g, 1], spans[g, 0])
+        free -= spans[g, 1] - spans[g, 0]
+    place = 1 + int(chance * free)
+    for g in range(number):
+        if place >= spans[g, 0]:
+            place += spans[g, 1] - spans[g, 0]
+    return min(place, half)
 
 
-@_inlined
-def _judge(group, centres, bins, optics, aims, values):
-    """What a return is in truth, and the beamlet that it has seen."""
+@njit(cache=True, error_model="numpy")
+def judge(group, centres, bins, lines, amplitude):
+    """What a return is, but for its reading; and the beamlet next to its peaks that all hold.
+
+    Parameters
+    ----------
+    group, centres : (3,)
+        Groups and positions [bins] of the peaks of the three segments.
+    bins : (3, 3, most) int64
+        As of :class:`Known`, at one point; and so are the last two.
+    lines, amplitude : (3, beamlets), (beamlets,)
+        Beamlets of amplitude 0 do not count.
+    """
     if group[0] == FALSE or group[1] == FALSE or group[2] == FALSE:
         return FALSE_ALARM, -1
-    range_0, beta, offset, doppler, amplitude, lines = aims
-    carrier, bandwidth, duration, _, bin_width = optics
-    spans = np.empty((3, 2))
-    width = 4.0
-    for s in range(3):
-        spans[s, 0], spans[s, 1] = -np.inf, np.inf
-        if group[s] >= 0:
-            spans[s, 0], spans[s, 1] = bins[FIRST, s, group[s]], bins[LAST, s, group[s]]
-            width += spans[s, 1] - spans[s, 0]
-    b, filled = common_beamlet(spans, centres, lines, amplitude)
-    if not filled:
+    found, nearest, holds = -1, np.inf, 0
+    for b in range(amplitude.size):
+        if not amplitude[b] > 0.0:
+            continue
+        distance = 0.0
+        for s in range(3):
+            g = group[s]
+            if g < 0:
+                holds |= 1 << s
+            elif bins[s, FIRST, g] - 1.0 <= lines[s, b] <= bins[s, LAST, g] + 1.0:
+                holds |= 1 << s
+                distance += abs(lines[s, b] - centres[s])
+            else:
+                distance = np.inf
+        if distance < nearest:
+            found, nearest = b, distance
+    if holds != 7:
         return SIDELOBE, -1
-    if b < 0:
-        return MISPAIRED, -1
-    metre = SPEED_OF_LIGHT / 2.0 * bin_width / (bandwidth / duration)
-    speed = SPEED_OF_LIGHT / 2.0 * bin_width / (carrier + bandwidth / 2.0)
-    near = abs(values[1] - range_0 * (1.0 + offset[b])) <= width * metre
-    alike = abs(values[3] - SPEED_OF_LIGHT / 2.0 * (beta + doppler[b])) <= width * speed
-    return TRUE if near and alike else MISREAD, b
+    return (TRUE if found >= 0 else MISPAIRED), found

@@ -7,9 +7,10 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
-from sweep.model import chances, waveform
+from sweep.model import waveform
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
+from sweep.model.marcum import log_at_least_one
 from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots
@@ -120,8 +121,8 @@ def _false_alarms(shots: Shots, exempted: np.ndarray) -> dict[str, np.ndarray]:
     """False alarms of noise alone: per bin, per (up-chirp) segment, per shot, with log10."""
     log_bin = -0.5 * (shots.threshold / shots.bin_deviation) ** 2
     counted = shots.counted_bins(exempted)
-    log_up = chances.log_at_least_one(log_bin, counted[0])
-    log_down = chances.log_at_least_one(log_bin, counted[2])
+    log_up = log_at_least_one(log_bin, counted[0])
+    log_down = log_at_least_one(log_bin, counted[2])
     logs = {"bin": log_bin, "segment": log_up, "shot": log_up + log_down}
     return {f"pfa_{name}": np.exp(value) for name, value in logs.items()} | {
         f"log10_pfa_{name}": value / np.log(10) for name, value in logs.items()

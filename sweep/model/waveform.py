@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.readings import resolve_each
 
 SEGMENTS = ("up", "doppler", "down")
 SIGNS = (1, 0, -1)
@@ -80,6 +79,30 @@ def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
 FOLD_PENALTY = 4.0
 """Bins of mismatch that a reading without folds may have before one with a fold is preferred."""
 
+READINGS = 16
+
+
+def reading(code, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
+    """(f_d, f_r): signed Doppler and range beat by one of the readings, in the unit given.
+
+    The bits of ``code`` are, from the highest, folds of up, Doppler and down peak, and whether
+    half sum and half difference are exchanged: in the order in which readings are tried.
+    """
+    u = sample_rate - up if code & 8 else up
+    d = sample_rate - down if code & 2 else down
+    half_sum, half_difference = (u + d) / 2.0, abs(d - u) / 2.0
+    shift, beat = (half_difference, half_sum) if code & 1 else (half_sum, half_difference)
+    return np.copysign(shift, d - u), beat
+
+
+def measured(  # type: ignore[no-untyped-def]  # of arrays, or compiled
+    f_d, f_r, carrier, bandwidth, duration
+):
+    """(range [m], radial velocity [m/s]) of a Doppler frequency and a range beat [Hz]."""
+    beta = f_d / (carrier + bandwidth / 2.0)
+    delay = (f_r - bandwidth * beta / 2.0) / (bandwidth / duration * (1.0 + beta))
+    return SPEED_OF_LIGHT * delay / 2.0, SPEED_OF_LIGHT * beta / 2.0
+
 
 def resolve(
     *,
@@ -102,12 +125,15 @@ def resolve(
     PHYSICS section 2 gives the unfolded readings. That half sum and half difference belong to
     the carrier and to the range at mid-chirp is put right here.
     """
-    values = (
-        up, doppler, down, carrier, bandwidth, duration, sample_rate, FOLD_PENALTY * bin_width,
-    )  # fmt: skip
-    columns = np.empty((len(values), *np.broadcast(*values).shape))
-    for number, value in enumerate(values):
-        columns[number, ...] = value
-    found = np.empty((2, *columns.shape[1:]))
-    resolve_each(columns.reshape(len(values), -1), found.reshape(2, -1))
-    return Resolution(*found)
+    at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
+    least, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())
+    for code in range(READINGS):
+        shift, beat = reading(code, up, down, sample_rate)
+        peak = sample_rate - doppler if code & 4 else doppler
+        folds = (code >> 3 & 1) + (code >> 2 & 1) + (code >> 1 & 1)
+        cost = abs(abs(shift) * at_start - peak) + folds * (FOLD_PENALTY * bin_width)
+        better = cost < least
+        least, f_d, f_r = (
+            np.where(better, new, old) for new, old in ((cost, least), (shift, f_d), (beat, f_r))
+        )
+    return Resolution(*measured(f_d, f_r, carrier, bandwidth, duration))

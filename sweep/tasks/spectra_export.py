@@ -140,17 +140,11 @@ def _dataset(
 
 def _lines(shots: Shots, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the beamlets' lines appear [Hz], (segments, lines), and their amplitudes [V]."""
-    from sweep.model.pairing import beamlet_lines
+    from sweep.model.returns import beamlet_lines
 
-    row = int(shots.row[-1])
-    amplitude = shots.amplitude[row]
-    lines = np.empty((3, amplitude.size))
-    beamlet_lines(
-        np.ascontiguousarray(shots.point_table()[:, -1]), shots.fft_size, shots.footprint, row,
-        lines,
-    )  # fmt: skip
+    lines = beamlet_lines(shots)[-1, list(shots.segments)]
     scale = np.broadcast_to(shots.beat_scale, shots.size)[-1]
-    return lines[shots.segments] * width, amplitude * scale
+    return lines * width, shots.amplitude[int(shots.row[-1])] * scale
 
 
 def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from scipy.special import i0e
 
 from sweep.model.marcum import (
+    at_least_one,
     excess_crossing,
+    log_at_least_one,
     marcum_q1,
     marcum_q1_pair,
-    marcum_q1_scalar,
 )
 
 REFERENCE = Path(__file__).parents[2] / "../shared/reference/marcum_q1.csv"
@@ -21,6 +22,7 @@ ACCURACY = 2e-15  # what the docstrings promise
 SMALLEST = mp.mpf("1e-305")  # below, float64 itself runs out of digits
 
 SMALLEST_STEP = mp.mpf("5e-324")
+CHANCES_ACCURACY = 1e-15
 
 LEVELS = [1e-8, 0.3, 1.19, 1.21, 5.4, 5.5, 31.0, 1e4]
 HARD_POINTS = [
@@ -44,6 +46,7 @@ EXCESS_POINTS = [
 ]
 without_deadline = settings(deadline=None)  # the first call may compile
 amplitudes = st.floats(0.0, 60.0)
+tries = st.one_of(st.sampled_from([0.5, 1.0, 2.0, 65536.0, 131072.0]), st.floats(1e-3, 1e9))
 
 
 def gauss(function, edges):
@@ -75,17 +78,16 @@ def rice_tails(a, b):
 
 
 def worst_error(values, q, p):
-    """Worst relative error of (q, p, log_q, log_p) among those that float64 can hold."""
-    logs = [mp.log(q) if q < 0.5 else mp.log1p(-p), mp.log(p) if p < 0.5 else mp.log1p(-q)]
+    """Worst relative error of (q, p) among those that float64 can hold."""
     return max(
         float(abs(mp.mpf(float(value)) / exact - 1))
-        for value, exact in zip(values, [q, p, *logs], strict=True)
+        for value, exact in zip(values, [q, p], strict=True)
         if abs(exact) > SMALLEST
     )
 
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="the reference points are not at hand")
-def test_all_four_values_agree_with_thirty_digit_reference_points():
+def test_both_tails_agree_with_thirty_digit_reference_points():
     with REFERENCE.open() as lines, mp.workdps(40):
         rows = list(csv.DictReader(lines))
         found = marcum_q1([float(r["a"]) for r in rows], [float(r["b"]) for r in rows])
@@ -95,39 +97,29 @@ def test_all_four_values_agree_with_thirty_digit_reference_points():
 
 
 @pytest.mark.parametrize(("a", "b"), HARD_POINTS)
-def test_all_four_values_agree_with_the_integral_of_the_rice_density(a, b):
+def test_both_tails_agree_with_the_integral_of_the_rice_density(a, b):
     # The density holds exp(-ab) I0(ab), which takes as many further digits as ab has.
     with mp.workdps(25 if a * b < 1e5 else 42):
-        assert worst_error(marcum_q1_scalar(a, b), *rice_tails(a, b)) < ACCURACY
-
-
-@pytest.mark.parametrize(("a", "b"), [(0.0, 40.0), (10.0, 60.0), (60.0, 10.0), (1e4, 2e4)])
-def test_logarithms_stay_finite_where_the_probability_underflows(a, b):
-    q, p, log_q, log_p = marcum_q1_scalar(a, b)
-    assert min(q, p) < 1e-300
-    assert -1e9 < min(log_q, log_p) < -690
-    assert max(q, p) == 1.0
+        assert worst_error(marcum_q1_pair(a, b), *rice_tails(a, b)) < ACCURACY
 
 
 @given(st.floats(0.0, 38.0))
 @without_deadline
 def test_without_signal_the_crossing_probability_is_that_of_rayleigh_noise(b):
-    q, p, log_q, _ = marcum_q1_scalar(0.0, b)
+    q, p = marcum_q1_pair(0.0, b)
     with mp.workdps(30):
         half = mp.mpf(b) ** 2 / 2
-        for value, exact in ((q, mp.exp(-half)), (p, -mp.expm1(-half)), (log_q, -half)):
+        for value, exact in ((q, mp.exp(-half)), (p, -mp.expm1(-half))):
             assert abs(value - exact) <= ACCURACY * abs(exact) + SMALLEST_STEP
 
 
 @given(amplitudes, amplitudes)
 @without_deadline
 def test_both_tails_are_probabilities_that_sum_to_one(a, b):
-    q, p, log_q, log_p = marcum_q1_scalar(a, b)
+    q, p = marcum_q1_pair(a, b)
     assert 0.0 <= q <= 1.0
     assert 0.0 <= p <= 1.0
     assert abs(q + p - 1.0) <= 2.3e-16
-    assert log_q <= 0.0
-    assert log_p <= 0.0
 
 
 @given(amplitudes, amplitudes, amplitudes)
@@ -135,17 +127,13 @@ def test_both_tails_are_probabilities_that_sum_to_one(a, b):
 def test_crossing_grows_with_the_signal_and_shrinks_with_the_threshold(a, b, c):
     low, high = sorted((a, c))
     slack = 2 * ACCURACY
-    weak, strong = marcum_q1_scalar(low, b), marcum_q1_scalar(high, b)
+    weak, strong = marcum_q1_pair(low, b), marcum_q1_pair(high, b)
     assert strong[0] >= weak[0] * (1 - slack)
     assert strong[1] <= weak[1] * (1 + slack)
-    assert strong[2] >= weak[2] * (1 + slack)
-    assert strong[3] <= weak[3] * (1 - slack)
     low, high = sorted((b, c))
-    lax, strict = marcum_q1_scalar(a, low), marcum_q1_scalar(a, high)
+    lax, strict = marcum_q1_pair(a, low), marcum_q1_pair(a, high)
     assert strict[0] <= lax[0] * (1 + slack)
     assert strict[1] >= lax[1] * (1 - slack)
-    assert strict[2] <= lax[2] * (1 - slack)
-    assert strict[3] >= lax[3] * (1 + slack)
 
 
 @given(amplitudes, amplitudes)
@@ -154,35 +142,34 @@ def test_exchange_of_signal_and_threshold_gives_the_bessel_function(a, b):
     # Q1(a,b) + Q1(b,a) = 1 + exp(-(a^2+b^2)/2) I0(ab), with 1 - Q1(b,a) taken to the right. The
     # right side is only as good as exp(-(a-b)^2/2) with a rounded square, and i0e.
     a, b = sorted((a, b))
-    q = marcum_q1_scalar(a, b)[0]
-    p = marcum_q1_scalar(b, a)[1]
+    q = marcum_q1_pair(a, b)[0]
+    p = marcum_q1_pair(b, a)[1]
     half = 0.5 * (b - a) ** 2
     right = math.exp(-half) * i0e(a * b)
     assert abs((q - p) - right) <= (2 * ACCURACY + 3e-16 * half) * (q + right) + 1e-307
 
 
 def test_limits_at_zero_and_infinity():
-    assert marcum_q1_scalar(5.0, 0.0) == (1.0, 0.0, 0.0, -math.inf)
-    assert marcum_q1_scalar(math.inf, 5.0) == (1.0, 0.0, 0.0, -math.inf)
-    assert marcum_q1_scalar(math.inf, 0.0) == (1.0, 0.0, 0.0, -math.inf)
-    assert marcum_q1_scalar(5.0, math.inf) == (0.0, 1.0, -math.inf, 0.0)
-    assert marcum_q1_scalar(0.0, math.inf) == (0.0, 1.0, -math.inf, 0.0)
+    assert marcum_q1_pair(5.0, 0.0) == (1.0, 0.0)
+    assert marcum_q1_pair(math.inf, 5.0) == (1.0, 0.0)
+    assert marcum_q1_pair(math.inf, 0.0) == (1.0, 0.0)
+    assert marcum_q1_pair(5.0, math.inf) == (0.0, 1.0)
+    assert marcum_q1_pair(0.0, math.inf) == (0.0, 1.0)
     assert excess_crossing(0.0, math.inf) == 0.0
     assert excess_crossing(math.inf, 3.0) == pytest.approx(-math.expm1(-4.5), rel=1e-15)
 
 
 def test_huge_arguments_neither_overflow_nor_lose_the_half():
-    assert marcum_q1_scalar(1e200, 1e200)[:2] == (0.5, 0.5)
-    assert marcum_q1_scalar(1e200, 1.1e200) == (0.0, 1.0, -math.inf, 0.0)
-    assert marcum_q1_scalar(1e150, 1e-150)[:2] == (1.0, 0.0)
-    assert marcum_q1_scalar(1e-300, 1e300)[:2] == (0.0, 1.0)
+    assert marcum_q1_pair(1e200, 1e200) == (0.5, 0.5)
+    assert marcum_q1_pair(1e200, 1.1e200) == (0.0, 1.0)
+    assert marcum_q1_pair(1e150, 1e-150) == (1.0, 0.0)
+    assert marcum_q1_pair(1e-300, 1e300) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize(("a", "b"), [(-1.0, 1.0), (1.0, -1e-9), (math.nan, 1.0), (1.0, math.nan)])
 def test_arguments_outside_the_domain_are_refused(a, b):
     with pytest.raises(ValueError, match="a >= 0"):
         marcum_q1(a, b)
-    assert all(math.isnan(value) for value in marcum_q1_scalar(a, b))
     assert all(math.isnan(value) for value in marcum_q1_pair(a, b))
     assert math.isnan(excess_crossing(a, b))
 
@@ -197,12 +184,10 @@ def test_arrays_broadcast_and_equal_the_scalar_forms():
     a, b = np.linspace(0.0, 12.0, 7)[:, None], np.linspace(0.1, 9.0, 5)
     found = marcum_q1(a, b)
     assert found.q.shape == (7, 5)
-    assert marcum_q1(1.0, 2.0).log_p.shape == ()
+    assert marcum_q1(1.0, 2.0).p.shape == ()
     for i in range(7):
         for j in range(5):
-            values = marcum_q1_scalar(a[i, 0], b[j])
-            assert tuple(v[i, j] for v in found) == values
-            assert marcum_q1_pair(a[i, 0], b[j]) == values[:2]
+            assert tuple(v[i, j] for v in found) == marcum_q1_pair(a[i, 0], b[j])
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.4, 1.0), (2.0, 2.5), (4.0, 6.55), (8.0, 6.55)])
@@ -244,5 +229,93 @@ def test_excess_crossing_of_a_faint_signal_is_its_power_times_the_noise_density(
 @given(st.floats(0.0, 12.0), st.floats(0.0, 20.0))
 @without_deadline
 def test_excess_and_noise_crossing_add_up_to_the_crossing(a, b):
-    q, noise = marcum_q1_scalar(a, b)[0], marcum_q1_scalar(0.0, b)[0]
+    q, noise = marcum_q1_pair(a, b)[0], marcum_q1_pair(0.0, b)[0]
     assert excess_crossing(a, b) + noise == pytest.approx(q, rel=3 * ACCURACY)
+
+
+# At least one among many
+
+
+def exact_log(p, n):
+    """ln(1 - (1-p)^n), naively but with 400 digits, and the condition number of (1-p)^n in p."""
+    none = (1 - p) ** mp.mpf(n)
+    return mp.log(1 - none), n * p / (1 - p)
+
+
+@given(st.floats(1e-300, 1.0), tries)
+@without_deadline
+def test_chance_of_one_among_many_keeps_its_digits_at_any_size(p, n):
+    with mp.workdps(400):
+        exact = 1 - (1 - mp.mpf(p)) ** mp.mpf(n)
+        assert abs(at_least_one(p, n) - exact) <= CHANCES_ACCURACY * exact
+
+
+@given(st.floats(-300.0, -1e-9), tries)
+@without_deadline
+def test_logarithm_agrees_with_400_naive_digits(log_p, n):
+    with mp.workdps(400):
+        exact, condition = exact_log(mp.exp(mp.mpf(log_p)), n)
+        # Near certainty ln p itself determines the result no better than this.
+        tolerance = CHANCES_ACCURACY if condition < 1 else (2 + condition) * 5e-16
+        error = abs(log_at_least_one(log_p, n) - exact)
+        assert error <= tolerance * abs(exact) + SMALLEST_STEP
+
+
+@pytest.mark.parametrize("log_p", [-599.9, -600.1, -744.0, -750.0, -1e5, -1e9])
+@pytest.mark.parametrize("n", [1, 3, 131072, 1e15])
+def test_logarithm_of_chances_below_float64_is_right(log_p, n):
+    # mpmath's exponents have no bounds, so the same definition is good here; p n < 1e-245.
+    with mp.workdps(60):
+        p = mp.exp(mp.mpf(log_p))
+        exact = mp.log(-mp.expm1(n * mp.log1p(-p)))
+        assert abs(log_at_least_one(log_p, n) - exact) <= CHANCES_ACCURACY * abs(exact)
+
+
+@pytest.mark.parametrize("p", [1e-21, 1e-5, 0.3, 0.5, 0.8, 1 - 1e-12])
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_few_tries_agree_with_the_sum_over_how_many_succeed(p, n):
+    binomial = math.fsum(math.comb(n, k) * p**k * (1 - p) ** (n - k) for k in range(1, n + 1))
+    assert at_least_one(p, n) == pytest.approx(binomial, rel=4e-15)
+
+
+@given(st.floats(-50.0, -1e-6))
+@without_deadline
+def test_one_try_changes_nothing(log_p):
+    assert log_at_least_one(log_p, 1.0) == pytest.approx(log_p, rel=CHANCES_ACCURACY)
+
+
+@given(st.floats(1e-25, 0.5), st.floats(1.0, 1e6), st.floats(1.0, 1e6))
+@without_deadline
+def test_tries_in_two_lots_are_the_tries_in_one(p, first, second):
+    one, other = at_least_one(p, first), at_least_one(p, second)
+    both = at_least_one(p, first + second)
+    assert both == pytest.approx(one + other * (1 - one), rel=4 * CHANCES_ACCURACY)
+
+
+def test_certainty_impossibility_and_no_tries():
+    assert at_least_one([0.0, 1.0, 1.0, 0.5], [5, 3, 0, 0]).tolist() == [0.0, 1.0, 0.0, 0.0]
+    found = log_at_least_one([-math.inf, 0.0, 0.0, -1.0], [5, 3, 0, 0])
+    assert found.tolist() == [-math.inf, 0.0, -math.inf, -math.inf]
+
+
+def test_arrays_broadcast():
+    p, n = np.array([[1e-20], [0.1]]), np.array([1.0, 2.0, 3.0])
+    chance, log_chance = at_least_one(p, n), log_at_least_one(np.log(p), n)
+    assert chance.shape == log_chance.shape == (2, 3)
+    np.testing.assert_allclose(chance[0], [1e-20, 2e-20, 3e-20], rtol=1e-15)
+    np.testing.assert_allclose(chance[1], [0.1, 0.19, 0.271], rtol=1e-15)
+    np.testing.assert_allclose(log_chance, np.log(chance), rtol=1e-14)
+
+
+def test_impossible_arguments_are_refused():
+    for p in (-1e-9, 1.1, math.nan):
+        with pytest.raises(ValueError, match=r"within 0\.\.1"):
+            at_least_one(p, 3)
+    for log_p in (1e-9, math.nan):
+        with pytest.raises(ValueError, match="at most 0"):
+            log_at_least_one(log_p, 3)
+    for n in (-1, math.inf, math.nan):
+        with pytest.raises(ValueError, match="number of tries"):
+            at_least_one(0.5, n)
+        with pytest.raises(ValueError, match="number of tries"):
+            log_at_least_one(-1.0, n)

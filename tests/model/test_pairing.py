@@ -8,16 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import waveform
-from sweep.model.chain import prepare
-from sweep.model.pairing import (
-    ASSUMED,
-    TOLERANCE,
-    beamlet_lines,
-    common_beamlet,
-    pair_peaks,
-    workspace,
-)
-from sweep.model.readings import best_reading, resolve_reading
+from sweep.model.pairing import ASSUMED, TOLERANCE, confirm, pair_peaks
 
 N, FS = 2**17, 600e6
 WIDTH = FS / N
@@ -46,12 +37,19 @@ def _pair(up, doppler, down, tolerance=TOLERANCE):
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
     pairs = np.full((room, 4), -9)
-    confirmed, number = pair_peaks(*lists, AT_START, float(N), tolerance, pairs, workspace(room))
+    confirmed, number = pair_peaks(*lists, AT_START, float(N), tolerance, pairs)
     return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
 
 
 def _reported(up, down, code):
-    return resolve_reading(code, float(up) * WIDTH, float(down) * WIDTH, *OPTICS.values(), FS)
+    beats = waveform.reading(code, up * WIDTH, down * WIDTH, FS)
+    return waveform.measured(*beats, *OPTICS.values())
+
+
+def _confirmed(up, doppler, down, tolerance):
+    """(reading, cost) of one triple [bins]."""
+    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), tolerance)
+    return code, cost
 
 
 def _scene(*targets):
@@ -87,8 +85,8 @@ def _resolved_plainly(up, doppler, down, *, carrier, bandwidth, duration, width)
     return 299792458.0 * delay / 2, 299792458.0 * beta / 2
 
 
-@pytest.mark.parametrize(("width", "readings"), [(WIDTH, 6), (1e-3 * WIDTH, 9)])
-def test_one_triple_is_resolved_as_by_plain_arrays_to_the_last_bit(width, readings):
+@pytest.mark.parametrize("width", [WIDTH, 1e-3 * WIDTH])
+def test_one_triple_is_resolved_as_by_plain_arrays_to_the_last_bit(width):
     """Targets of all signs and folds, and peaks anywhere; narrow bins make folds cheap.
 
     The other seven readings are mirror images of these and never better.
@@ -102,26 +100,27 @@ def test_one_triple_is_resolved_as_by_plain_arrays_to_the_last_bit(width, readin
         bin_width=np.array(width), **{k: np.array(v) for k, v in OPTICS.items()},
     )  # fmt: skip
     np.testing.assert_array_equal(resolved, _resolved_plainly(*peaks, **OPTICS, width=width))
-    codes = {best_reading(*p, AT_START, FS, 64 * width, np.inf)[0] for p in peaks.T}
-    assert len(codes) >= readings
+    bins = peaks.T / FS * N
+    assert len({_confirmed(*p, np.inf)[0] for p in bins}) >= 6
     assert (np.sign(resolved.radial_velocity) == 1).any()
     assert (np.sign(resolved.radial_velocity) == -1).any()
 
 
 def test_a_tolerance_takes_the_cheapest_reading_among_those_within_it():
     up, doppler, down = _beats(9000.0, 170.0)  # the down beat lies past Nyquist
-    code, cost = best_reading(up, doppler, down, AT_START, float(N), 64.0, 3.0)
+    up, doppler, down = float(up), float(doppler), float(down)
+    code, cost = _confirmed(up, doppler, down, 3.0)
     assert code & 0b1110 == 0b0010
-    assert 64.0 <= cost < 64.5
-    assert best_reading(up, doppler + 4000.0, down, AT_START, float(N), 64.0, 3.0) == (-1, np.inf)
-    assert best_reading(up, doppler + 4000.0, down, AT_START, float(N), 64.0, np.inf)[0] >= 0
+    assert waveform.FOLD_PENALTY <= cost < waveform.FOLD_PENALTY + 0.5
+    assert _confirmed(up, doppler + 4000.0, down, 3.0) == (-1, np.inf)
+    assert _confirmed(up, doppler + 4000.0, down, np.inf)[0] >= 0
 
 
 def test_a_peak_confirms_others_by_chance_as_rarely_as_stated():
     """1.5e-3 at most for peaks anywhere: below it by 5 sigma of 40,000 triples, and not nothing."""
     generator = np.random.default_rng(2)
     triples = generator.uniform(0, N / 2, (40_000, 3))
-    hits = sum(best_reading(*t, AT_START, float(N), 64.0, TOLERANCE)[0] >= 0 for t in triples)
+    hits = sum(_confirmed(*t, TOLERANCE)[0] >= 0 for t in triples)
     stated = 16 * 2 * TOLERANCE / (N / 2)
     assert stated == pytest.approx(1.5e-3, rel=0.03)
     assert 0.1 * stated < hits / 40_000 <= stated + 5 * np.sqrt(stated / 40_000)
@@ -217,8 +216,7 @@ def test_no_other_pairing_has_more_confirmed_pairs_or_less_mismatch(seed, ups, d
     tolerance = 60.0
 
     def mismatch(u, d):
-        options = [best_reading(u, p, d, AT_START, float(N), 64.0, tolerance) for p in doppler]
-        return min(cost for _, cost in options)
+        return min(_confirmed(u, p, d, tolerance)[1] for p in doppler)
 
     cost = np.array([[mismatch(u, d) for d in down] for u in up])
     best = (0, 0.0)
@@ -232,36 +230,3 @@ def test_no_other_pairing_has_more_confirmed_pairs_or_less_mismatch(seed, ups, d
     assert sum(cost[u, d] for u, _, d, _ in pairs[:confirmed]) == pytest.approx(best[1])
     assert len(pairs) == min(ups, downs)
     assert len({p[0] for p in pairs}) == len({p[2] for p in pairs}) == len(pairs)
-
-
-# Truth
-
-
-def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
-    ((_, shots),) = prepare(
-        table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
-    )
-    doppler = np.linspace(-1e-9, 1e-9, 7)[None]
-    lines = np.empty((3, 7))
-    footprint = shots.offset, doppler, shots.amplitude
-    beamlet_lines(shots.point_table()[:, 0].copy(), N, footprint, 0, lines)
-    for b in range(7):
-        velocity = -170.0 + doppler[0, b] * 299792458.0 / 2
-        expected = _beats(8000.0 * (1 + shots.offset[0, b]), velocity)
-        np.testing.assert_allclose(lines[:, b], np.ravel(expected), atol=1e-6)
-    assert np.ptp(lines[0]) > 0.1
-
-
-def test_the_common_beamlet_lies_in_all_spans_and_nearest_to_the_peaks():
-    lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
-    spans = np.array([[9.0, 12.0], [4.0, 6.0], [29.0, 32.0]])
-    centres = (10.9, 5.0, 31.2)
-    everything = np.array([[-np.inf, np.inf]] * 3)
-    assert common_beamlet(spans, centres, lines, np.ones(3)) == (1, True)
-    assert common_beamlet(spans, centres, lines, np.array([1.0, 0.0, 1.0])) == (0, True)
-    apart = np.array([[9.0, 12.0], [4.0, 6.0], [69.0, 71.0]])
-    assert common_beamlet(apart, centres, lines, np.ones(3)) == (-1, True)
-    empty = np.array([[9.0, 12.0], [4.0, 6.0], [90.0, 91.0]])
-    assert common_beamlet(empty, centres, lines, np.ones(3)) == (-1, False)
-    no_doppler = np.array([spans[0], everything[1], spans[2]])
-    assert common_beamlet(no_doppler, centres, lines, np.ones(3)) == (1, True)

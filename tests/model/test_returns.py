@@ -6,14 +6,25 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from sweep.model import philox, truth
+from sweep.model import philox, truth, waveform
 from sweep.model.chain import prepare
-from sweep.model.draws import draw
+from sweep.model.draws import Seen, draw
 from sweep.model.effects.catalogue import CORE
 from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
-from sweep.model.peaks import RATIO, WHOLE, _free_bin, _largest, draw_in_noise
-from sweep.model.returns import draw_returns, groups
+from sweep.model.returns import (
+    RATIO,
+    WHOLE,
+    How,
+    Known,
+    beamlet_lines,
+    draw_peaks,
+    draw_returns,
+    free_bin,
+    groups,
+    judge,
+    largest_of,
+)
 from sweep.model.shot import evaluate, find, report
 from sweep.model.window import samples, window
 
@@ -256,7 +267,7 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         taken = {k for first, last in spans for k in range(first - 1, last + 2)}
         free = sorted(set(range(1, half + 1)) - taken)
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
-        places, counts = np.unique([_free_bin(u, bins, half) for u in chances], return_counts=True)
+        places, counts = np.unique([free_bin(u, bins, half) for u in chances], return_counts=True)
         assert places.tolist() == free
         assert (counts == 20).all()
 
@@ -265,8 +276,28 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
     """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution."""
     for chance in (1e-9, 0.01, 0.7):
         for n in (1.0, 100.0, 65000.0):
-            x = _largest(chance, n)
+            x = largest_of(n, chance)
             assert -np.expm1(n * stats.rayleigh.logcdf(x)) == pytest.approx(chance, rel=1e-9)
+
+
+def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
+    """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
+    how = How(0, True, True, True, half, 3.0)
+    known = Known(
+        np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
+        np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
+        np.full((1, 3), alarm), np.ones(1),
+    )  # fmt: skip
+    seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
+    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
+    (key,) = _keys()
+
+    def drawn(number):
+        address = key[0], key[1], number
+        count = draw_peaks(address, (0, 0), how, known, seen, tables, peaks, which)
+        return peaks[0].copy() if count else None
+
+    return drawn
 
 
 def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
@@ -275,29 +306,12 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
     A true hypothesis gives a p-value below 1e-6 once in a million seeds.
     """
     beta, half, n = 3.0, 2000, 1900.0
-    bins = np.full((3, 1), -1)
-    listed = bins, np.full(1, np.nan), np.full((1, 3), np.nan)
-    run = 0, np.zeros(0), np.zeros(1, bool), 0.1
-    tables = tuple(interpolator(window("hann", 4000), 4000))
-    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
-    streams = np.array([1, 4, 7, 10])
-    (key,) = _keys()
-    drawn = []
-    for d in range(4000):
-        number = draw_in_noise(
-            (key[0], key[1], d),
-            streams,
-            listed,
-            (1.0, beta, 1.0),
-            n,
-            run,
-            tables,
-            half,
-            peaks,
-            which,
-        )
-        drawn += [peaks[0].copy()] if number else []
-    drawn = np.array(drawn)
+    one = np.exp(-(beta**2) / 2)
+    noise = _up_in_noise(
+        -1, np.full(3, np.nan), (1.0, beta, 1.0), interpolator(window("hann", 4000), 4000), half,
+        others=n, alarm=-np.expm1(n * np.log1p(-one)),
+    )  # fmt: skip
+    drawn = np.array([peak for peak in map(noise, range(4000)) if peak is not None])
     quiet = stats.rayleigh.cdf(beta) ** n
     assert abs(len(drawn) - 4000 * (1 - quiet)) < 5 * np.sqrt(4000 * quiet) + 1
 
@@ -319,18 +333,10 @@ def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
     noise = np.random.default_rng(4).standard_normal((DRAWS, 2 * length)).view(complex)
     bins = np.abs((tone + sigma / np.sqrt(shape.energy) * noise) @ basis)
     expected = np.mean(bins.argmax(axis=1) == 2)
-    tables = tuple(interpolator(shape, length))
-    listed = np.full((3, 1), 16), np.ones(1), np.abs(tone @ basis)[None]
-    run = 14, np.zeros(5), np.ones(5, bool), 0.1
-    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
-    (key,) = _keys()
-    moved = 0
-    for d in range(DRAWS):
-        draw_in_noise(
-            (key[0], key[1], d), np.array([1, 4, 7, 10]), listed, (sigma, 5.0, 1.0), 0.0, run,
-            tables, 32, peaks, which,
-        )  # fmt: skip
-        moved += peaks[0, WHOLE] == 17
+    noise = _up_in_noise(
+        16, np.abs(tone @ basis), (sigma, 5.0, 1.0), interpolator(shape, length), 32, low=14
+    )
+    moved = sum(noise(d)[WHOLE] == 17 for d in range(DRAWS))
     assert 0.1 < expected < 0.4
     assert abs(moved / DRAWS - expected) < 5 * np.sqrt(2 * expected * (1 - expected) / DRAWS)
 
@@ -410,6 +416,44 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < high
     noise_alone = RANGE_BIN / np.sqrt(2 * np.median(got.snr[..., 0][good]))
     assert np.median(stated) > 2 * noise_alone / np.sqrt(2)
+
+
+# Truth
+
+
+def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
+    shots = _prepared(
+        table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
+    )
+    shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
+    velocity = -170.0 + shots.doppler[0] * LIGHT / 2
+    lines = beamlet_lines(shots)[0]
+    for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.carriers, strict=True)):
+        beats = waveform.beat_frequency(
+            sign, carrier=carrier, chirp_rate=2e12, range=8000.0 * (1 + shots.offset[0]),
+            radial_velocity=velocity,
+        )  # fmt: skip
+        expected = waveform.fold(beats, np.array(600e6)) / 600e6 * 2**17
+        np.testing.assert_allclose(lines[s], expected, atol=1e-6)
+    assert np.ptp(lines[0]) > 0.1
+
+
+def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
+    lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
+    bins = np.array([  # strongest, first and last of two groups in each segment
+        [[10, 10], [9, 9], [12, 12]], [[5, 5], [4, 4], [6, 6]], [[30, 70], [29, 69], [32, 71]],
+    ])  # fmt: skip
+    nowhere = bins + np.array([0, 0, 20])[:, None, None]
+    centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
+    lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
+    assert judge(all_three, centres, bins, lines, lit) == (TRUE, 1)
+    assert judge(all_three, centres, bins, lines, dim) == (TRUE, 0)
+    apart = np.array([0, 0, 1], np.int8)
+    assert judge(apart, centres, bins, lines, lit) == (MISPAIRED, -1)
+    assert judge(all_three, centres, nowhere, lines, lit) == (SIDELOBE, -1)
+    no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
+    assert judge(no_doppler, centres, bins, lines, lit) == (TRUE, 1)
+    assert judge(noise, centres, bins, lines, lit) == (FALSE_ALARM, -1)
 
 
 # Flags

@@ -4,8 +4,8 @@ import mpmath as mp
 import numpy as np
 from cases import EPS, Family
 
-from sweep.model.chances import at_least_one, log_at_least_one
 from sweep.model.crossings import any_crossing
+from sweep.model.marcum import at_least_one, log_at_least_one
 
 FAMILY = Family(
     "Many small chances",

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pd_changes import pd_change
 
-from sweep.model.chances import log_at_least_one
 from sweep.model.effects.block import Block
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.change import Change
@@ -17,7 +16,7 @@ from sweep.model.effects.effect import Effect
 from sweep.model.effects.planning import plan
 from sweep.model.effects.probability_bounds import pd_change_within, probability_changes
 from sweep.model.effects.span import Span
-from sweep.model.marcum import marcum_q1
+from sweep.model.marcum import log_at_least_one, marcum_q1
 
 TILES = 40
 
