@@ -24,8 +24,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sweep.model.navigation import Altitude, Velocity, altitude, velocity
-from sweep.model.navigation_fit import LEAST_SINE
+from sweep.model.navigation import LEAST_SINE, Altitude, Velocity, altitude, velocity
 from sweep.model.pairing import UNCONFIRMED
 from sweep.model.scene_outputs import NAVIGATION
 

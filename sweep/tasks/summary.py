@@ -252,7 +252,7 @@ def _scene_rows(
 
 
 def _scene_row(path: Location, stretches: Stretches, part: str, done: list[Part]) -> SceneRow:
-    from sweep.model.navigation_screening import EXCLUDED
+    from sweep.model.navigation import EXCLUDED
     from sweep.model.pairing import TRUE
 
     arrays: Any = open_group(path)[stretches.scanner]

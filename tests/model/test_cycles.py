@@ -13,7 +13,7 @@ from sweep.model.geometry.beams import cone, corners, squares
 from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.geometry.surfaces import Surface
-from sweep.model.navigation_screening import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
 from sweep.model.scene_outputs import NAVIGATION
 from sweep.spec.scene_sections import Navigation

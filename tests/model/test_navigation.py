@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
 from sweep.model.geometry.beams import cone, corners, squares
-from sweep.model.navigation import altitude, velocity
-from sweep.model.navigation_screening import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, altitude, velocity
 
 DRAWS = 20_000
 """A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of

@@ -144,10 +144,10 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
         instrument=SCENE["instrument"] | {"telescope": {"aperture": "20 mm"}},
         title="Darker",
     )
-    bundles = []
-    monkeypatch.setattr(Caster, "bundle", lambda *a, **k: bundles.append(a))  # its map may cast
+    looks = []
+    monkeypatch.setattr("sweep.model.eyepoints.observe", lambda *a, **k: looks.append(a))
     outcome = quiet(other, tmp_path / "darker.zarr")
-    assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not bundles
+    assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not looks
     dark, bright = opened(outcome.store)["three"], opened(undisturbed.store)["three"]
     assert (dark.snr_up.isel(power=1) < bright.snr_up.isel(power=1)).all()
     assert dark.beam_range.equals(bright.beam_range)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from sweep.analysis.scenes.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
-from sweep.model.navigation_screening import EXCLUDED, SOLVED
+from sweep.model.navigation import EXCLUDED, SOLVED
 from sweep.model.navigation_tally import Tally, merge, tally
 
 VELOCITY, ALTITUDE = "velocity", "altitude"

@@ -196,7 +196,7 @@ def nearest(tree, origins, directions, distance, face):
     face : (n, b) int64
         Triangle's index in the mesh where `distance` was replaced, else left as it is.
     """
-    room = np.empty((3, directions.shape[1])), np.empty((3, 6)), np.empty(WIDTH)
+    room = np.empty((3, directions.shape[1])), np.empty((6, 3)), np.empty(WIDTH)
     stack = np.empty(_STACK, np.int64), np.empty(_STACK)
     for i in range(origins.shape[0]):
         o, d = origins[i], directions[i]
@@ -220,9 +220,14 @@ def _walk(tree, o, d, distance, face, room, stack, budget):
         return False
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
     ox, oy, oz = o[kx], o[ky], o[axis]
-    farthest = distance.max() * _TIE_SLACK
     waiting[0], entry[0], top = children.shape[0] - 1, 0.0, 1
+    farthest, is_known = 0.0, False
     while top > 0:
+        if not is_known:
+            farthest, is_known = distance[0], True
+            for i in range(1, distance.size):
+                farthest = _larger(farthest, distance[i])
+            farthest *= _TIE_SLACK
         top -= 1
         node = waiting[top]
         if entry[top] > farthest:
@@ -248,7 +253,7 @@ def _walk(tree, o, d, distance, face, room, stack, budget):
                 (vertices[r, kx] - ox, vertices[r, ky] - oy, vertices[r, axis] - oz),
                 order[j], shears, distance, face,
             )  # fmt: skip
-        farthest = distance.max() * _TIE_SLACK
+        is_known = False
         budget -= count
         if budget < 0:
             return False
@@ -263,7 +268,7 @@ def _set_up(d, shears, planes):
     ----------
     shears : (3, >= b)
         Written: directions over that component, the other two axes in cyclic order, and 1 over it.
-    planes : (3, 6)
+    planes : (6, 3)
         Written: constants of the box test across each axis for directions between `low` and
         `high` along it. The rays o + t d can reach between the box's lower and upper plane only
         if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
@@ -288,11 +293,11 @@ def _set_up(d, shears, planes):
             low, high = _smaller(low, d[b, k]), _larger(high, d[b, k])
         least = -_TINY if abs(low) < _TINY else low
         most = _TINY if abs(high) < _TINY else high
-        planes[k, 0], planes[k, 1] = 1.0 / most, 1.0 / least
-        planes[k, 2] = 0.0 if most > 0.0 else -np.inf
-        planes[k, 3] = 0.0 if least < 0.0 else -np.inf
-        planes[k, 4] = 0.0 if most < 0.0 else np.inf
-        planes[k, 5] = 0.0 if least > 0.0 else np.inf
+        planes[0, k], planes[1, k] = 1.0 / most, 1.0 / least
+        planes[2, k] = 0.0 if most > 0.0 else -np.inf
+        planes[3, k] = 0.0 if least < 0.0 else -np.inf
+        planes[4, k] = 0.0 if most < 0.0 else np.inf
+        planes[5, k] = 0.0 if least > 0.0 else np.inf
     return axis
 
 
@@ -300,9 +305,12 @@ def _set_up(d, shears, planes):
 def _enter(bounds, node, ox, oy, oz, planes, limit, entry):
     """Least distance at which the rays may enter each child's box; inf where they cannot."""
     # Numbers, not an array: the compiler could not know that `entry` is no part of it.
-    rx, sx, bx, cx, fx, gx = planes[0]
-    ry, sy, by, cy, fy, gy = planes[1]
-    rz, sz, bz, cz, fz, gz = planes[2]
+    rx, ry, rz = planes[0, 0], planes[0, 1], planes[0, 2]
+    sx, sy, sz = planes[1, 0], planes[1, 1], planes[1, 2]
+    bx, by, bz = planes[2, 0], planes[2, 1], planes[2, 2]
+    cx, cy, cz = planes[3, 0], planes[3, 1], planes[3, 2]
+    fx, fy, fz = planes[4, 0], planes[4, 1], planes[4, 2]
+    gx, gy, gz = planes[5, 0], planes[5, 1], planes[5, 2]
     for c in range(entry.size):  # a number known when compiling would not be vectorised
         x0, x1 = (bounds[node, 0, c] - ox) * rx, (bounds[node, 3, c] - ox) * sx
         y0, y1 = (bounds[node, 1, c] - oy) * ry, (bounds[node, 4, c] - oy) * sy
