@@ -15,7 +15,7 @@ import promise_drawn
 from rich.console import Console
 from rich.progress import Progress
 
-from sweep.model.resolution import RAYS as NUMBERS
+from sweep.model.accuracy import Accuracy
 from sweep.spec import SceneSpec, Spec, SpecError, load
 from sweep.tasks.accuracy.bench import Bench, Seen, Trial
 from sweep.tasks.accuracy.flight_bench import FlightBench
@@ -91,7 +91,7 @@ RAYS = f"""
 Each beamlet of a flight is a ray. Where powers add, `footprint.beamlets: auto` casts few of every
 shot, and more of those whose own tell that they are too few. Rows show how many a shot has, and
 what is left against all effects on with {FINEST_RAYS:,} rays of every shot, and with more until its
-own tell of less than {FINEST_RAYS_TOLERANCE:g}, {NUMBERS[-1]:,} at the most. A number that an
+own tell of less than {FINEST_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,} at the most. A number that an
 experiment gives by hand has a row too, with all effects on. That this is enough is seen from the
 last row of each flight: it against {MORE_RAYS:,} rays and more, at one stretch of it. A cell has
 the share of shots within the tolerance, the error that 90 % of the shots keep, and the worst. `us`

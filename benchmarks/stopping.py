@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.intervals import COUNTED, Interval, bounded_mean, half_width
 from sweep.model.marcum import marcum_q1
-from sweep.model.sampling import PIECE, Promise, looks, settle
+from sweep.model.sampling import PIECE, looks, settle
 
 PAGE = Path(__file__).parents[1] / "docs" / "draws.md"
 BEGIN, END = "<!-- written by make stopping -->\n", "<!-- up to here -->\n"
@@ -100,9 +101,9 @@ class Trials:
             interval = COUNTED[self._method](successes=successes, trials=n, confidence=CONFIDENCE)
         return half_width(mean, interval)
 
-    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+    def missed(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """By how much the tolerance is missed."""
-        return np.maximum(self.half_widths(points) - promise.tolerance, 0.0)
+        return np.maximum(self.half_widths(points) - accuracy.tolerance, 0.0)
 
 
 class Cell(NamedTuple):
@@ -119,7 +120,7 @@ def measured(pd: float, sampler: Sampler, method: str, tolerance: float, ends: s
     number = TRIALS["means" if method == "means" else "counts"]
     trials, points = Trials(number, sampler, method), np.arange(number)
     rounds = looks(BATCH, LIMIT) if ends == "shipped" else range(BATCH, LIMIT, BATCH)
-    settle(trials, points, rounds, Promise(tolerance, CONFIDENCE))
+    settle(trials, points, rounds, Accuracy(tolerance, CONFIDENCE))
     within = abs(trials.mean - pd) <= trials.half_widths(points)
     return Cell(pd, within.mean(), trials.mean.mean() - pd, trials.number.mean())
 

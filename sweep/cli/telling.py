@@ -243,7 +243,8 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
 
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a scene will take."""
-    from sweep.model.resolution import BEAMLETS, RAYS
+    from sweep.model.accuracy import Accuracy
+    from sweep.model.resolution import BEAMLETS
     from sweep.tasks.plan import scene_plan as planned
     from sweep.tasks.progress import duration
 
@@ -251,8 +252,9 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
     for report in p.reports:
         yield "scene", report
     if study.rays_by_tolerance:
-        rays = int(study.parameters()[BEAMLETS])
-        yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {RAYS[-1]:,}"
+        parameters = study.parameters()
+        rays, most = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
+        yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {most:,}"
     for s in p.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model import detection, link, noise, receiver, waveform
+from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.ground import Ground
 from sweep.model.mode_kernels import with_modes
@@ -92,15 +93,6 @@ CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
-
-LEAKAGE_SHARE = 0.5
-"""Of the tolerance on probabilities, for leakage far from the lines that is not looked for."""
-
-AUTOMATIC = -1.0
-"""Stands for an error that follows from the tolerance."""
-
-LINE_SHARE = 1.0
-"""The same, for errors of bins over sigma: all, as bounds have lines and bins at their worst."""
 
 LINE_STEPS = 3
 """Steps that take few lines for many, at the most: each may err by as much of the whole."""
@@ -377,7 +369,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     echo_scale, current_scale = _link_scales(architecture, p)
     per_ampere, per_watt, sources = receiver_noise(architecture, _receiver(p, *NOISY))
     row, offset, doppler, echo = ground.axis(size)
-    everywhere = np.zeros(size)
+    everywhere, accuracy = np.zeros(size), Accuracy.of(p)
     return Shots(
         architecture=architecture,
         window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
@@ -398,10 +390,10 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         acquisition_delay=p[PROCESSING + "acquisition_delay"],
         detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
-        leakage_floor=np.asarray(p["accuracy.leakage_floor"], float),
-        leakage_tolerance=_allowed(p, "accuracy.leakage_error", LEAKAGE_SHARE),
+        leakage_floor=np.asarray(accuracy.leakage_floor, float),
+        leakage_tolerance=accuracy.for_leakage,
         beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
-        line_tolerance=_allowed(p, "accuracy.line_error", LINE_SHARE),
+        line_tolerance=accuracy.for_lines,
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
         noise_scale=per_ampere,
@@ -413,12 +405,6 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
     )
-
-
-def _allowed(p: Mapping[str, np.ndarray], path: str, share: float) -> np.ndarray:
-    """An error as it was set, or a share of the tolerance."""
-    given = np.asarray(p[path], float)
-    return np.where(given == AUTOMATIC, share * np.asarray(p["accuracy.tolerance"], float), given)
 
 
 def relative_amplitude(architecture: str, echo: np.ndarray) -> np.ndarray:

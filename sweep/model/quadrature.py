@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.effects.lobes import Lobe, lobe
 from sweep.model.window import samples
 
@@ -46,12 +47,6 @@ COUNTS = np.array([
 
 LINES = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
 """Numbers of parallel lines of nodes to choose from."""
-
-MOST = int(COUNTS[-1])
-"""Nodes of all lines together, at the most."""
-
-ONE_LINE = 0.1
-"""Of the tolerance, what one line may miss across the slope without that more are looked at."""
 
 _FLOOR = 1e-10
 """Error of even steps, for what lies beyond their reach."""
@@ -102,7 +97,7 @@ class Spread(NamedTuple):
 
 
 def nodes_needed(
-    window_name: str, spread: Spread, tolerance: np.ndarray
+    window_name: str, spread: Spread, tolerance: np.ndarray, accuracy: Accuracy
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes with which the largest bin's power is within a tolerance, or as near as any are.
 
@@ -114,6 +109,8 @@ def nodes_needed(
         Of n points.
     tolerance : (n,) ndarray
         On the largest bin's power, over that power itself, wherever the lines lie.
+    accuracy : Accuracy
+        Says how many nodes all lines together may have, and when several lines are tried.
 
     Returns
     -------
@@ -127,12 +124,16 @@ def nodes_needed(
     spreads, errors, least = _errors(window_name)
     place = np.searchsorted(spreads, spread.deviation)  # of the next wider spread
     missed = _of_one_line(window_name, spread) / least[place]
-    rung, error = _cheapest(errors[:, place] + missed, COUNTS[:, None], tolerance)
+    counts = COUNTS[: np.searchsorted(COUNTS, accuracy.most_beamlets, "right")]
+    total = errors[: counts.size, place] + missed
+    rung, error = _cheapest(total, counts[:, None], tolerance)
     lines = np.ones(rung.shape, np.int64)
-    several = (error > tolerance) & (missed > ONE_LINE * tolerance)
+    several = (error > tolerance) & (missed > accuracy.one_line_share * tolerance)
     if several.any():
         some = Spread(*(np.asarray(values)[..., several] for values in spread))
-        rungs, further, left = _of_lines(window_name, some, tolerance[several])
+        rungs, further, left = _of_lines(
+            window_name, some, tolerance[several], accuracy.most_beamlets
+        )
         better = left < np.minimum(error[several], 1.0)
         some = np.flatnonzero(several)[better]
         rung[some], lines[some], error[some] = rungs[better], further[better], left[better]
@@ -149,7 +150,7 @@ def _cheapest(
 
 
 def _of_lines(
-    window_name: str, spread: Spread, tolerance: np.ndarray
+    window_name: str, spread: Spread, tolerance: np.ndarray, most: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row of :data:`COUNTS`, lines and error for spreads that one line of nodes misses."""
     spreads, errors, least = _errors(window_name)
@@ -169,7 +170,7 @@ def _of_lines(
         missed = np.maximum(missed, here / largest)
     total = off[:, None] + missed
     cost = COUNTS[:, None] * LINES
-    total = np.where((cost <= MOST)[..., None], total, np.inf).reshape(-1, curve.size)
+    total = np.where((cost <= most)[..., None], total, np.inf).reshape(-1, curve.size)
     best, error = _cheapest(total, cost.reshape(-1, 1), tolerance)
     return best // LINES.size, LINES[best % LINES.size], error
 

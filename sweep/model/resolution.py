@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from sweep.model import detection, ground, quadrature
+from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.line_spread import range_to_bins, velocity_to_bins
 from sweep.model.effects.plane_geometry import plane_range_moments, plane_velocity_moments
 from sweep.model.preparation import (
-    AUTOMATIC,
     BEAMLETS_ERROR,
     CHIRP,
     LASER,
@@ -38,28 +38,6 @@ from sweep.model.window import canonical_name
 
 BEAMLETS = "footprint.beamlets"
 PATTERN = "footprint.pattern"
-
-THESIS = 109
-"""Beamlets of [T 3.3.1]."""
-
-SHARE = 0.25
-"""Of the tolerance on pd, for the number of beamlets."""
-
-EFFECTS_SHARE = 0.8
-"""For effects that are left out, if beamlets are given; the rest is that of lines."""
-
-FINEST = quadrature.MOST
-
-RAYS = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
-"""Rays that may be cast for a shot of a flight: whole shells of the lattice, as only these are
-alike on opposite sides, which makes smooth ground a hundred times more exact. The fewest are those
-whose error can be told from themselves; each costs some 80 ns."""
-
-LEAST_RAYS_TOLERANCE = 1e-6
-"""Tighter tolerances call for no more rays than this one."""
-
-_FEWEST = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-"""Rays that every shot has from a tolerance on: what none of them hits no estimate knows of."""
 
 _LEAST_STEP, _MOST_STEP = 2, 10
 """Times as many rays at the least, and at the most, as have told that they are too few."""
@@ -99,39 +77,42 @@ def resolved_categories(
 
 def finest(words: Mapping[str, Any]) -> tuple[int, str]:
     """Most beamlets that points with these words may be given, and their pattern."""
-    return (FINEST, "line") if is_open(words) else (THESIS, ground.pattern(words))
+    if is_open(words):
+        return Accuracy.most_beamlets, "line"
+    return Accuracy.thesis_beamlets, ground.pattern(words)
 
 
-def rays_needed(words: Mapping[str, Any], tolerance: float) -> int:
+def rays_needed(words: Mapping[str, Any], accuracy: Accuracy) -> int:
     """Rays that every shot of a flight has that leaves their number to the tolerance.
 
     Parameters
     ----------
     words : mapping
         Phases and pattern of the footprint, architecture of the receiver.
-    tolerance : float
+    accuracy : Accuracy
         Of the study.
     """
     if not is_open(words):
-        return THESIS
-    return next(number for least, number in _FEWEST if tolerance >= least)
+        return accuracy.thesis_beamlets
+    tolerance = float(np.asarray(accuracy.tolerance))
+    return next(number for least, number in accuracy.fewest_rays if tolerance >= least)
 
 
-def more_rays(rays: int, error: np.ndarray, tolerance: float) -> np.ndarray:
+def more_rays(rays: int, error: np.ndarray, accuracy: Accuracy) -> np.ndarray:
     """Rays that shots are to be cast with again, (n,) int64; 0 where they have enough.
 
     Parameters
     ----------
     rays : int
-        One of :data:`RAYS`, which shots have had.
+        One of `accuracy.rays`, which shots have had.
     error : (n,) ndarray
         What these leave (:func:`sweep.model.ray_error.ray_error`), which falls about as one over
         their number; nan where nothing is seen.
-    tolerance : float
-        Of the study, above 0.
+    accuracy : Accuracy
+        Of the study.
     """
-    further = np.array([n for n in RAYS if n > _LEAST_STEP * rays], np.int64)
-    over = np.asarray(error, float) / tolerance
+    further = np.array([n for n in accuracy.rays if n > _LEAST_STEP * rays], np.int64)
+    over = np.asarray(error, float) / accuracy.for_rays
     if not further.size:
         return np.zeros(over.shape, np.int64)
     wanted = rays * np.minimum(over, _MOST_STEP if rays > _UNSURE else 1)
@@ -139,17 +120,16 @@ def more_rays(rays: int, error: np.ndarray, tolerance: float) -> np.ndarray:
     return np.where(over > 1, further[place], 0)
 
 
-def effects_tolerance(words: Mapping[str, Any], number: int, tolerance: float) -> float:
-    """What is left of a tolerance for the effects that are left out."""
-    return tolerance * (EFFECTS_SHARE - (SHARE if number == 0 and is_open(words) else 0.0))
+def effects_tolerance(words: Mapping[str, Any], number: int) -> float:
+    """What is left of a study's tolerance for the effects that are left out."""
+    counts_beamlets = number == 0 and is_open(words)
+    return float(Accuracy.of(words).for_effects(counts_beamlets=counts_beamlets))
 
 
 def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
     """Where the tolerance alone says how finely points are computed, effects apart; or a scalar."""
-    given = parameters[BEAMLETS] > np.asarray(0)
-    for path in ("accuracy.line_error", "accuracy.leakage_error"):
-        given = given & (np.asarray(parameters[path]) != AUTOMATIC)
-    return ~given
+    counts_beamlets = ~(parameters[BEAMLETS] > np.asarray(0))
+    return counts_beamlets | Accuracy.of(parameters).follows_tolerance
 
 
 def is_open(words: Mapping[str, Any]) -> bool:
@@ -164,9 +144,11 @@ def beamlets_needed(
 
     The error is that of the probabilities of detection, summed over the segments.
     """
-    per_power = _pd_for_power(p) + np.zeros(size)
-    allowed = SHARE * np.asarray(p["accuracy.tolerance"], float) / per_power
-    lines, number, error = quadrature.nodes_needed(_window(p), _spread(p, size), allowed)
+    per_power, accuracy = _pd_for_power(p) + np.zeros(size), Accuracy.of(p)
+    allowed = accuracy.for_beamlets / per_power
+    lines, number, error = quadrature.nodes_needed(
+        _window(p), _spread(p, size, accuracy.most_beamlets), allowed, accuracy
+    )
     several = np.char.add(lines.astype(str), " lines")
     return (
         lines * number,
@@ -183,7 +165,7 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(_SEGMENTS * steepest / 2)
 
 
-def _spread(p: Mapping[str, np.ndarray], size: int) -> quadrature.Spread:
+def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> quadrature.Spread:
     """Spread of the lines of up, Doppler and down segment [bins of fs/L]."""
     angle, along = p["target.grazing_angle"], np.asarray(p["target.radial_velocity"], float)
     divergence = np.asarray(p[LASER + "beam_divergence"], float)
@@ -192,7 +174,7 @@ def _spread(p: Mapping[str, np.ndarray], size: int) -> quadrature.Spread:
     bins = p[PROCESSING + "sample_rate"] / p["record"]
     rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
     shape: dict[str, Any] = {
-        "grazing_angle": angle, "beam_divergence": divergence, "number": FINEST, "pattern": "line",
+        "grazing_angle": angle, "beam_divergence": divergence, "number": most, "pattern": "line",
     }  # fmt: skip
     # Beyond the horizon the moments have no bound: there the plain one has to do.
     rms = plane_range_moments(**shape).rms

@@ -18,8 +18,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_counts
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
 from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
@@ -27,29 +27,12 @@ from sweep.model.preparation import Parameters
 from sweep.model.realisations import ROWS, Means, certain, random_effects, realise
 from sweep.model.shot import evaluate, statistics
 
-GROWTH = 1.25
-"""Draws at a look over those at the one before; the last round's surplus is half of that, about."""
 PIECE = 1 << 16
 """Draws of a point that are taken at once where nothing but noise is random."""
 LEAST = 16
 """Draws of a point that are taken at once where random effects are simulated, at the least."""
 
 COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
-
-
-class Promise(NamedTuple):
-    """How far pd may be off; scalars or one a point."""
-
-    tolerance: ArrayLike = 1e-3
-    confidence: ArrayLike = 0.95
-    interval: str = "clopper_pearson"
-    """Of counted shares, one of :data:`sweep.model.intervals.COUNTED`."""
-
-    def of(self, points: np.ndarray, size: int) -> "Promise":
-        """The promise made of some of `size` points."""
-        tolerance = np.broadcast_to(self.tolerance, (size,))[points]
-        confidence = np.broadcast_to(self.confidence, (size,))[points]
-        return Promise(tolerance, confidence, self.interval)
 
 
 class Before(NamedTuple):
@@ -94,26 +77,26 @@ class Drawn(ABC):
         """
 
     @abstractmethod
-    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+    def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """How far pd of some points may be off with the promised confidence, (4, points).
 
         By the names of PROMISED; nan for what there is not.
         """
 
-    def missed(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+    def missed(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
-        widths = self.half_widths(points, promise)
-        over = widths - promise.of(points, self.number.size).tolerance
+        widths = self.half_widths(points, accuracy)
+        over = widths - accuracy.at(points, self.number.size).tolerance
         return np.fmax.reduce(over, axis=0, initial=0.0)
 
-    def accuracy(self, promise: Promise) -> dict[str, np.ndarray]:
+    def accuracy(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """(n,) by the names of ACCURACY_OUTPUTS."""
         points = np.arange(self.number.size)
-        widths = zip(PROMISED, self.half_widths(points, promise), strict=True)
+        widths = zip(PROMISED, self.half_widths(points, accuracy), strict=True)
         return {
             "n_draws": self.number,
             **{f"{name}_half_width": width for name, width in widths},
-            "accuracy_missed": self.missed(points, promise),
+            "accuracy_missed": self.missed(points, accuracy),
         }
 
 
@@ -130,7 +113,7 @@ def looks(batch: int, limit: int) -> Iterator[int]:
     batches = 1
     while batches * batch < limit:
         yield batches * batch
-        batches = max(batches + 1, int(batches * GROWTH))
+        batches = max(batches + 1, int(batches * Accuracy.growth))
     yield limit
 
 
@@ -142,7 +125,7 @@ def simulate(
     first_draw: int = 0,
     batch_sizes: Sequence[int],
     method: str,
-    promise: Promise = Promise(),  # noqa: B008  # a tuple
+    accuracy: Accuracy = Accuracy(),  # noqa: B008  # frozen
     before: Before | None = None,
     stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
@@ -155,7 +138,7 @@ def simulate(
         are means over the same draws that are counted.
     keys, first_draw, batch_sizes, method
         As of :func:`sweep.model.draws.draw`.
-    promise : Promise
+    accuracy : Accuracy
         What half-widths are held against.
     before : Before, optional
         What was drawn before, from ``first_draw`` on.
@@ -172,7 +155,7 @@ def simulate(
     """
     sample = Sample(parameters, effects, keys=keys, method=method, before=before)
     counts = fill(sample, batch_sizes, first_draw=first_draw, before=before, stop=stop)
-    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
+    return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
 def simulate_until(
@@ -183,7 +166,7 @@ def simulate_until(
     batch: int,
     limit: int,
     method: str,
-    promise: Promise,
+    accuracy: Accuracy,
     before: Before | None = None,
     stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
@@ -191,8 +174,8 @@ def simulate_until(
 
     Parameters
     ----------
-    parameters, effects, keys, method, promise, before, stop
-        As of :func:`simulate`; what was drawn before was drawn for the same promise or a looser
+    parameters, effects, keys, method, accuracy, before, stop
+        As of :func:`simulate`; what was drawn before was drawn for the same accuracy or a looser
         one, or up to a lower limit.
     batch : int
         Draws of which a look comes after a whole number.
@@ -205,8 +188,8 @@ def simulate_until(
         As of :func:`simulate`, with all draws in one count.
     """
     sample = Sample(parameters, effects, keys=keys, method=method, before=before)
-    settle(sample, np.arange(len(keys)), looks(batch, limit), promise, stop)
-    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
+    settle(sample, np.arange(len(keys)), looks(batch, limit), accuracy, stop)
+    return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
 def fill(
@@ -246,7 +229,7 @@ def settle(
     sample: Drawn,
     points: np.ndarray,
     ends: Iterable[int],
-    promise: Promise,
+    accuracy: Accuracy,
     stop: Callable[[], bool] = never,
 ) -> None:
     """Draw points until the promise is kept of each, numbers to look at end, or told to stop.
@@ -266,7 +249,7 @@ def settle(
                 drawn = True
         looked_at = number <= last
         is_open = ~looked_at
-        is_open[looked_at] = sample.missed(points[looked_at], promise) > 0
+        is_open[looked_at] = sample.missed(points[looked_at], accuracy) > 0
         points = points[is_open]
         if not points.size:
             return
@@ -339,9 +322,9 @@ class Sample(Drawn):
             for path, v in self._parameters.items()
         }
 
-    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+    def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """As of :class:`Drawn`."""
-        confidence, n = promise.of(points, self.number.size).confidence, self.number[points]
+        confidence, n = accuracy.at(points, self.number.size).confidence, self.number[points]
         if self._means is not None:
             mean, variance, number = self._means.moments(PROMISED, points)
             interval = bounded_mean(
@@ -352,13 +335,13 @@ class Sample(Drawn):
         if self._method == "probabilities":
             return exact
         successes = self.counts[COUNT_OF][:, points]
-        interval = COUNTED[promise.interval](successes=successes, trials=n, confidence=confidence)
+        interval = COUNTED[accuracy.interval](successes=successes, trials=n, confidence=confidence)
         return exact + half_width(successes / n, interval)
 
-    def results(self, promise: Promise) -> dict[str, np.ndarray]:
+    def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """Outputs, their errors and their accuracy, (n,) each."""
         if self._means is None:
             outputs = self._outputs | certain(self._outputs)
         else:
             outputs = self._means.results() | {RUNNING: self._means.running()}
-        return outputs | self.accuracy(promise)
+        return outputs | self.accuracy(accuracy)

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.chain import prepare
 from sweep.model.intervals import COUNTED, half_width
 from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.realisations import Means, random_effects, realise
-from sweep.model.sampling import COUNT_OF, Before, Drawn, Promise, fill, looks, never, settle
+from sweep.model.sampling import COUNT_OF, Before, Drawn, fill, looks, never, settle
 from sweep.model.shot import statistics
 from sweep.model.spectra_look import DEFAULTS, VALUES, Methods, View, counted, view_of
 from sweep.model.spectra_outputs import KEPT
@@ -36,7 +37,7 @@ def simulate_spectra(
     *,
     keys: np.ndarray,
     batch_sizes: Sequence[int],
-    promise: Promise = Promise(),  # noqa: B008  # a tuple
+    accuracy: Accuracy = Accuracy(),  # noqa: B008  # frozen
     methods: Methods = Methods(),  # noqa: B008  # a tuple
     before: Before | None = None,
     stop: Callable[[], bool] = never,
@@ -45,7 +46,7 @@ def simulate_spectra(
 
     Parameters
     ----------
-    parameters, effects, keys, batch_sizes, promise, before, stop
+    parameters, effects, keys, batch_sizes, accuracy, before, stop
         As of :func:`sweep.model.sampling.simulate`; among the parameters those of :data:`DEFAULTS`.
         What was drawn before was drawn by this function, and stopped.
     methods : Methods
@@ -59,7 +60,7 @@ def simulate_spectra(
     """
     sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
     counts = fill(sample, batch_sizes, before=before, stop=stop)
-    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
+    return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
 
 
 def simulate_spectra_until(
@@ -69,15 +70,15 @@ def simulate_spectra_until(
     keys: np.ndarray,
     batch: int,
     limit: int,
-    promise: Promise,
+    accuracy: Accuracy,
     methods: Methods = Methods(),  # noqa: B008  # a tuple
     before: Before | None = None,
     stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
     """The same with as many draws as keep a promise on pd, or ``limit``; looks by ``batch``."""
     sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
-    settle(sample, np.arange(len(keys)), looks(batch, limit), promise, stop)
-    return sample.results(promise) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
+    settle(sample, np.arange(len(keys)), looks(batch, limit), accuracy, stop)
+    return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
 class SpectraSample(Drawn):
@@ -167,16 +168,16 @@ class SpectraSample(Drawn):
         shares[PROMISED.index("pd_doppler")] += np.where(there, 0.0, np.nan)
         return shares
 
-    def half_widths(self, points: np.ndarray, promise: Promise) -> np.ndarray:
+    def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """Those of the shares' intervals, as of :class:`Drawn`."""
-        confidence = promise.of(points, self.number.size).confidence
-        interval = COUNTED[promise.interval](
+        confidence = accuracy.at(points, self.number.size).confidence
+        interval = COUNTED[accuracy.interval](
             successes=self.counts[COUNT_OF][:, points], trials=self.number[points],
             confidence=confidence,
         )  # fmt: skip
         return half_width(self._shares(points), interval)
 
-    def results(self, promise: Promise) -> dict[str, np.ndarray]:
+    def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """Outputs, their accuracy and RUNNING."""
         points = np.arange(self.number.size)
         n, mean, square = (dict(zip(VALUES, part, strict=True)) for part in self._moments)
@@ -196,7 +197,7 @@ class SpectraSample(Drawn):
                     f"{name}_bound": np.sqrt(mean[f"{name}_2"]),
                 }
         running = np.concatenate([*self._moments, self._fixed.sums()]).T
-        return outputs | self.accuracy(promise) | {RUNNING: running}
+        return outputs | self.accuracy(accuracy) | {RUNNING: running}
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import Field, PrivateAttr
 
 from sweep.model import VERSION
+from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
 from sweep.spec.axes import Axis
 from sweep.spec.content import geometry_of, leaf_values
@@ -138,7 +139,7 @@ class SceneSpec(Study):
             for path, value in values_of(getattr(self, section), section).items()
             if not is_method(path)
         }
-        rays = rays_needed(parameters, self.accuracy.tolerance)
+        rays = rays_needed(parameters, Accuracy.of(parameters))
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,
             BEAMLETS: self.footprint.beamlets or rays,

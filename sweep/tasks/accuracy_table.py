@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model import resolution
+from sweep.model.accuracy import Accuracy
 from sweep.storage.locations import Location, located
 from sweep.storage.opening import open_group
 from sweep.tasks import studies
@@ -123,7 +123,7 @@ def rays_table(store: str | Location) -> list[RaysRow]:
 def _of_beamlets(path: Location, study: GridStudy) -> RaysRow:
     worst, total, most = _Worst(), 0, 0
     tolerance = np.broadcast_to(_tolerance(study.spec), study.grid.shape)
-    tolerance = np.maximum(resolution.SHARE * tolerance, resolution.LEAST_RAYS_TOLERANCE)
+    tolerance = np.maximum(Accuracy(tolerance).for_beamlets, Accuracy.least_rays_tolerance)
     names = "beamlets_error", "beamlets"
     for place, (error, number) in pieces(path, study, names, done_blocks(path, study)):
         start, number = tuple(part.start for part in place), np.nan_to_num(number)

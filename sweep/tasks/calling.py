@@ -118,7 +118,7 @@ class Calling:
 
         shared = TileLink(alike.parameters)
         number, tolerance = shared.whole(BEAMLETS), shared[TOLERANCE].low
-        return effects_tolerance(shared.words, number, float(np.ravel(tolerance)[0]))
+        return effects_tolerance(shared.words | {TOLERANCE: np.ravel(tolerance)[0]}, number)
 
 
 class ShotsPlan(NamedTuple):
@@ -198,7 +198,7 @@ class ShotsCalling:
         from sweep.model.resolution import effects_tolerance
 
         number = 0 if self._rays_by_tolerance else eyepoints.offset.shape[1]
-        return effects_tolerance(self._parameters, number, self._parameters[TOLERANCE])
+        return effects_tolerance(self._parameters, number)
 
 
 def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

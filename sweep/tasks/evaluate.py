@@ -225,15 +225,15 @@ def _drawn(
     before: Before | None,
     stop: Callable[[], bool] | None,
 ) -> Results:
-    from sweep.model.sampling import Promise, never, simulate, simulate_until
+    from sweep.model.accuracy import Accuracy
+    from sweep.model.sampling import never, simulate, simulate_until
     from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
     from sweep.tasks.user_code import methods
 
-    draws, tolerance = spec.draws, parameters["accuracy.tolerance"]
-    promise = Promise(tolerance, parameters["accuracy.confidence"], draws.interval)  # type: ignore[arg-type]
+    draws = spec.draws
     given: dict[str, Any] = {
-        "keys": draw_keys(spec, parameters, count), "promise": promise, "before": before,
-        "stop": stop or never,
+        "keys": draw_keys(spec, parameters, count), "before": before, "stop": stop or never,
+        "accuracy": Accuracy.of(parameters, interval=draws.interval),
     }  # fmt: skip
     if draws.adaptive:
         given |= {"batch": draws.batch, "limit": draws.limit}

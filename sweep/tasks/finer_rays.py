@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.resolution import RAYS, more_rays
+from sweep.model.accuracy import Accuracy
+from sweep.model.resolution import more_rays
 from sweep.tasks.eyepoint_study import CAST_BEAMLETS, EyepointStudy
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class FinerRays:
 def refine(
     rays: int,
     error: np.ndarray,
-    tolerance: float,
+    accuracy: Accuracy,
     again: Callable[[np.ndarray, int], np.ndarray],
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
@@ -56,15 +57,15 @@ def refine(
         Of each shot so far.
     error
         (n,): what they leave.
-    tolerance
+    accuracy
         Of the study.
     again
         Looks at some shots, by their places (m,), with so many rays; says what these leave, (m,).
     """
-    needed = more_rays(rays, error, tolerance)
-    for number in RAYS:  # rising, and so are the needs of each shot
+    needed = more_rays(rays, error, accuracy)
+    for number in accuracy.rays:  # rising, and so are the needs of each shot
         places = np.flatnonzero(needed == number)
         step = max(1, CAST_BEAMLETS // number)
         for start in range(0, len(places), step):
             some = places[start : start + step]
-            needed[some] = more_rays(number, again(some, number), tolerance)
+            needed[some] = more_rays(number, again(some, number), accuracy)

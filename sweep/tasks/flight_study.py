@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.resolution import LEAST_RAYS_TOLERANCE
+from sweep.model.accuracy import Accuracy
 from sweep.storage.locations import Location
 from sweep.tasks import flight_layout
 from sweep.tasks.calling import TILE_SHOTS, Called, ShotsCalling, ShotsPlan
@@ -227,7 +227,7 @@ class FlightStudy:
                 self.surfaces,
                 modes=self._modes,
                 rotating=self._rotating,
-                rays_by_tolerance=self.rays_tolerance > 0,
+                rays_by_tolerance=self.rays_accuracy is not None,
             )
         return self._calling[part.axes].plans(eyepoints, tiles)
 
@@ -280,9 +280,9 @@ class FlightStudy:
             some = rows[index]
             cloud = self._cloud(part, draws, effects)
             results = cloud(eyepoints.some(some), numbers[some], flags)
-            if self.rays_tolerance:
+            if (accuracy := self.rays_accuracy) is not None:
                 own = numbers[some], flags, eyepoints.weight.size
-                self._refine(part.scanner, own, results, cloud)
+                self._refine(part.scanner, own, accuracy, results, cloud)
             yield Patch(some, draws, results)
 
     def _cloud(
@@ -302,7 +302,7 @@ class FlightStudy:
             method=self.spec.draws.method,
             returns=int(self.spec.draws.returns),
             effects=effects,
-            estimates_rays=self.rays_tolerance > 0,
+            estimates_rays=self.rays_accuracy is not None,
         )
         keys = partial(point_keys, domain=DOMAIN, seed=int(self.spec.seed))
         return lambda seen, numbers, flags: make(
@@ -313,6 +313,7 @@ class FlightStudy:
         self,
         scanner: str,
         own: tuple[np.ndarray, np.ndarray, int],
+        accuracy: Accuracy,
         results: Results,
         cloud: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
@@ -329,7 +330,7 @@ class FlightStudy:
                 results[name][places] = values
             return finer["beamlets_error"]
 
-        refine(rays, results["beamlets_error"], self.rays_tolerance, again)
+        refine(rays, results["beamlets_error"], accuracy, again)
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
         """SI values of all parameters at a block's place along the axes, which is asked often."""
@@ -349,10 +350,9 @@ class FlightStudy:
         return self.spec.surfaces()
 
     @cached_property
-    def rays_tolerance(self) -> float:
-        """What rays may leave of a shot, where the tolerance says how many there are; else 0."""
-        by_tolerance = self.spec.rays_by_tolerance
-        return max(self.spec.accuracy.tolerance, LEAST_RAYS_TOLERANCE) if by_tolerance else 0.0
+    def rays_accuracy(self) -> Accuracy | None:
+        """Says how many rays a shot needs; None where their number is given."""
+        return Accuracy.of(self.spec.parameters()) if self.spec.rays_by_tolerance else None
 
     @cached_property
     def _modes(self) -> Mapping[str, str]:

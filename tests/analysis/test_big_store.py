@@ -66,6 +66,7 @@ def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
     assert growth(reduce, sizes, monkeypatch) < 0.3
 
 
+@pytest.mark.slow
 def test_neither_does_that_of_its_figures(big_store, tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
     monkeypatch.setattr(surface, "MOST_COLUMNS", 20)

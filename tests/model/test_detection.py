@@ -9,10 +9,10 @@ import pytest
 from scipy import integrate, stats
 
 from sweep.model import shot, truth
+from sweep.model.accuracy import AUTOMATIC
 from sweep.model.chain import prepare
 from sweep.model.detection import RAYLEIGH_DEVIATION, assess, quiet_below, threshold
 from sweep.model.marcum import excess_crossing, marcum_q1
-from sweep.model.preparation import AUTOMATIC
 from sweep.model.spectra import segment_spectrum
 from sweep.model.window import samples
 

@@ -5,9 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.footprint import beamlets
-from sweep.model.quadrature import COUNTS, MOST, Spread, gaussian_rule, nodes_needed
+from sweep.model.quadrature import COUNTS, Spread, gaussian_rule, nodes_needed
 from sweep.model.window import samples
+
+MOST = Accuracy.most_beamlets
 
 LENGTH = 128
 WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop", "kaiser(8.6)")
@@ -35,7 +38,7 @@ def needed(window, deviation, tolerance, curve=0.0):
     """Lines, nodes and error where all segments are alike."""
     s, tolerance = np.broadcast_arrays(deviation, np.asarray(tolerance, float))
     c = np.broadcast_to(curve, s.shape)
-    return nodes_needed(window, Spread(s + 10 * c, s[None], c[None]), tolerance)
+    return nodes_needed(window, Spread(s + 10 * c, s[None], c[None]), tolerance, Accuracy())
 
 
 def power_of_bins(window, offset, deviation, rule):

@@ -5,6 +5,7 @@ import pytest
 from small_scenes import flight, instrument, observed, plate
 
 from sweep.model import philox, window
+from sweep.model.accuracy import Accuracy
 from sweep.model.clouds import cloud
 from sweep.model.eyepoints import prepare_eyepoints, seen_ground
 from sweep.model.footprint import beamlets
@@ -12,7 +13,9 @@ from sweep.model.geometry.mesh import clean
 from sweep.model.geometry.surfaces import Surface
 from sweep.model.groups import groups
 from sweep.model.ray_error import folded, ray_error
-from sweep.model.resolution import RAYS, THESIS, more_rays, rays_needed
+from sweep.model.resolution import more_rays, rays_needed
+
+RAYS = Accuracy.rays
 
 INCOHERENT = {
     "footprint.phases": "incoherent",
@@ -68,7 +71,7 @@ def _cloud(seen, parameters, **keywords):
 
 
 def test_the_fewest_follow_from_the_tolerance_alone():
-    numbers = [rays_needed(INCOHERENT, t) for t in (1.0, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)]
+    numbers = [rays_needed(INCOHERENT, Accuracy(t)) for t in (1.0, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)]
     assert numbers == [19, 19, 37, 37, 109, 109] and set(numbers) < set(RAYS)
 
 
@@ -77,7 +80,7 @@ def test_shots_get_more_rays_as_theirs_tell(rays):
     """About as many as the error, which falls with their number, asks for; and no more at a time
     than an error from so few can be trusted with."""
     tolerance, over = 1e-3, np.array([0.0, 0.5, 1.0, 1.01, 3.0, 8.0, 1e3, np.nan])
-    more = more_rays(rays, tolerance * over, tolerance)
+    more = more_rays(rays, tolerance * over, Accuracy(tolerance))
     assert (more[[0, 1, 2, -1]] == 0).all()
     if rays == RAYS[-1]:
         assert (more == 0).all(), "there are no more to be had"
@@ -98,7 +101,7 @@ def test_shots_get_more_rays_as_theirs_tell(rays):
     ],
 )
 def test_where_no_number_is_enough_it_is_the_thesis_s(change):
-    assert {rays_needed(INCOHERENT | change, t) for t in (1.0, 1e-3, 0.0)} == {THESIS}
+    assert {rays_needed(INCOHERENT | change, Accuracy(t)) for t in (1.0, 1e-3, 0.0)} == {109}
 
 
 @pytest.mark.parametrize("number", RAYS)

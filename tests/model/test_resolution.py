@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sweep.model import resolution, shot
+from sweep.model import shot
+from sweep.model.accuracy import Accuracy
 from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, DEFAULTS
@@ -40,11 +41,11 @@ def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, wi
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
         found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         for name in PDS:
-            assert abs(found[name] - exact[name]).max() <= resolution.SHARE * tolerance, name
+            assert abs(found[name] - exact[name]).max() <= Accuracy.beamlets_share * tolerance, name
         for name in SNRS:
             bins, true = np.sqrt(2 * found[name]), np.sqrt(2 * exact[name])  # over sigma
             assert (abs(bins - true) / np.maximum(true, 1)).max() <= tolerance, name
-        assert (found["beamlets_error"] <= resolution.SHARE * tolerance).all()
+        assert (found["beamlets_error"] <= Accuracy.beamlets_share * tolerance).all()
         assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9
 
 
@@ -88,7 +89,7 @@ def test_a_tighter_tolerance_never_gives_a_worse_answer(table_4_1, changes):
         found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         assert found["snr_up"] == pytest.approx(exact["snr_up"], rel=max(tolerance, 1e-6))
         assert abs(found["pd_up"] - exact["pd_up"]).max() <= max(tolerance, 1e-6)
-        assert (found["beamlets_error"] <= max(resolution.SHARE * tolerance, 1e-6)).all()
+        assert (found["beamlets_error"] <= max(Accuracy.beamlets_share * tolerance, 1e-6)).all()
 
 
 def test_tighter_tolerances_of_random_scenes_come_nearer(table_4_1):
@@ -111,7 +112,7 @@ def test_tighter_tolerances_of_random_scenes_come_nearer(table_4_1):
             found = shot.evaluate(parameters | wanted)
             errors.append(max(abs(found[name][0] - exact[name][0]) for name in PDS))
             assert errors[-1] <= found["beamlets_error"][0] + 2e-9
-            assert errors[-1] <= max(resolution.SHARE * tolerance, 1e-6)
+            assert errors[-1] <= max(Accuracy.beamlets_share * tolerance, 1e-6)
         worst = max(worst, errors[0])
     assert worst > 1e-5
 

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from sweep.model import philox, realisations, sampling
+from sweep.model.accuracy import Accuracy
 from sweep.model.effects.catalogue import CORE
 from sweep.model.intervals import COUNTED, half_width
 from sweep.model.outputs import (
@@ -17,7 +18,7 @@ from sweep.model.outputs import (
     PROMISED,
     RUNNING,
 )
-from sweep.model.sampling import Promise, looks, settle, simulate, simulate_until
+from sweep.model.sampling import looks, settle, simulate, simulate_until
 from sweep.model.shot import evaluate
 
 SPECKLED = (*CORE, "speckle")
@@ -56,8 +57,8 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     effects, method, table_4_1
 ):
     """Each point against a fixed number of draws, the one at which it stopped, to the last bit."""
-    parameters, promise = scene(table_4_1), Promise(0.06, 0.9)
-    chosen = {"keys": keys(4), "method": method, "promise": promise}
+    parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
+    chosen = {"keys": keys(4), "method": method, "accuracy": accuracy}
     found = simulate_until(parameters, effects, batch=20, limit=400, **chosen)
     drawn = {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
     assert set(found) == (drawn | {RUNNING} if effects is SPECKLED else drawn)
@@ -71,8 +72,8 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
 
 
 def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_1):
-    parameters, promise = scene(table_4_1), Promise(0.06, 0.9)
-    chosen = {"keys": keys(4), "method": "probabilities", "promise": promise}
+    parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
+    chosen = {"keys": keys(4), "method": "probabilities", "accuracy": accuracy}
     found = simulate_until(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
     assert (found["accuracy_missed"] == 0).all()
     for name in PROMISED:
@@ -89,7 +90,7 @@ def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_
 @pytest.mark.parametrize("effects", [CORE, SPECKLED], ids=["noise alone", "speckle"])
 def test_neighbours_and_the_cutting_of_work_change_no_bit(effects, method, table_4_1, monkeypatch):
     parameters = scene(table_4_1)
-    chosen = {"batch": 20, "limit": 300, "method": method, "promise": Promise(0.06, 0.9)}
+    chosen = {"batch": 20, "limit": 300, "method": method, "accuracy": Accuracy(0.06, 0.9)}
     together = simulate_until(parameters, effects, keys=keys(4), **chosen)
     monkeypatch.setattr(sampling, "PIECE", 13)
     monkeypatch.setattr(realisations, "ROWS", 7)
@@ -104,7 +105,7 @@ def test_where_the_limit_comes_first_the_excess_is_told(table_4_1):
     tolerance = np.array([0.5, 0.01, 0.2, 0.01])
     found = simulate_until(
         scene(table_4_1), SPECKLED, keys=keys(4), batch=30, limit=100, method="probabilities",
-        promise=Promise(tolerance, 0.95),
+        accuracy=Accuracy(tolerance, 0.95),
     )  # fmt: skip
     widths = np.max([found[f"{name}_half_width"] for name in PROMISED], axis=0)
     np.testing.assert_array_equal(found["accuracy_missed"], np.maximum(widths - tolerance, 0))
@@ -115,7 +116,11 @@ def test_where_the_limit_comes_first_the_excess_is_told(table_4_1):
 
 @pytest.mark.parametrize("interval", COUNTED)
 def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_4_1):
-    chosen = {"keys": keys(4), "method": "noise", "promise": Promise(0.01, 0.9, interval)}
+    chosen = {
+        "keys": keys(4),
+        "method": "noise",
+        "accuracy": Accuracy(0.01, 0.9, interval=interval),
+    }
     found = simulate(scene(table_4_1), CORE, batch_sizes=[150, 50], **chosen)
     for name, count in COUNTS.items():
         k = found[count].sum(axis=1)
@@ -129,7 +134,7 @@ def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_
 def test_probabilities_that_are_known_need_no_draws(table_4_1):
     found = simulate_until(
         scene(table_4_1), CORE, keys=keys(4), batch=50, limit=10**6, method="probabilities",
-        promise=Promise(0.0),
+        accuracy=Accuracy(0.0),
     )  # fmt: skip
     assert (found["n_draws"] == 50).all() and (found["accuracy_missed"] == 0).all()
     for name in PROMISED:
@@ -143,7 +148,7 @@ def test_a_segment_that_is_not_there_keeps_no_point_open(effects, method, table_
     parameters |= {"target.pointing_jitter": 1e-6}
     found = simulate_until(
         parameters, effects, keys=keys(1), batch=40, limit=10_000, method=method,
-        promise=Promise(0.05),
+        accuracy=Accuracy(0.05),
     )  # fmt: skip
     assert np.isnan(found["pd_doppler_half_width"]) and found["accuracy_missed"] == 0
     assert found["n_draws"] < 10_000
@@ -157,7 +162,7 @@ def test_a_speckled_targets_pd_is_within_the_tolerance_as_often_as_promised(tabl
     exact = {s: np.exp(-(beta**2) / (2 + 2 * single[f"snr_{s}"])) for s in ("up", "down")}
     found = simulate_until(
         scene(table_4_1, ranges=np.full(number, 500.0)), SPECKLED, keys=keys(number), batch=4,
-        limit=10_000, method="probabilities", promise=Promise(tolerance, 0.9),
+        limit=10_000, method="probabilities", accuracy=Accuracy(tolerance, 0.9),
     )  # fmt: skip
     assert np.unique(found["n_draws"]).size > 3 and (found["accuracy_missed"] == 0).all()
     sigma = np.sqrt(0.9 * 0.1 / number)
@@ -189,8 +194,8 @@ class Coins:
         interval = COUNTED[self.method](successes=k, trials=n, confidence=0.95)
         return half_width(k / n, interval)[place]
 
-    def missed(self, points, promise):
-        return np.maximum(self.widths(points) - promise.tolerance, 0.0)
+    def missed(self, points, accuracy):
+        return np.maximum(self.widths(points) - accuracy.tolerance, 0.0)
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
@@ -204,7 +209,7 @@ def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     trials = 4000
     for pd in (0.0, 1e-4, 0.3 * tolerance, tolerance, 1.3 * tolerance, 0.2, 0.5, 0.8, 0.9999, 1.0):
         coins, points = Coins(pd, trials, method), np.arange(trials)
-        settle(coins, points, looks(10, 10**6), Promise(tolerance))
+        settle(coins, points, looks(10, 10**6), Accuracy(tolerance))
         found = coins.hits / coins.number
         within = (abs(found - pd) <= coins.widths(points) + 1e-15).mean()
         most = coins.number.max()

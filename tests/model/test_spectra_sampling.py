@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from sweep.model import philox, spectra_sampling
+from sweep.model.accuracy import Accuracy
 from sweep.model.chain import prepare
 from sweep.model.interpolation import noise_correlation
 from sweep.model.noisy_spectra import noise_of, signal_of
 from sweep.model.outputs import DRAW_OUTPUTS
-from sweep.model.sampling import Before, Promise
+from sweep.model.sampling import Before
 from sweep.model.shot import evaluate
 from sweep.model.spectra_look import DETECTOR, ESTIMATOR, Methods
 from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
@@ -141,8 +142,8 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
-    parameters, promise = _points(table_4_1), Promise(0.1, 0.95, "wilson")
-    given = {"keys": _keys(3), "promise": promise}
+    parameters, accuracy = _points(table_4_1), Accuracy(0.1, 0.95, interval="wilson")
+    given = {"keys": _keys(3), "accuracy": accuracy}
     found = simulate_spectra_until(parameters, EFFECTS, batch=20, limit=500, **given)
     assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
     again = simulate_spectra(
@@ -177,7 +178,7 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
     parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
     given = {"parameters": parameters, "effects": EFFECTS, "keys": _keys(3), **much}
-    given |= {"promise": Promise(0.1), "methods": Methods({"m:f": over_the_median})}
+    given |= {"accuracy": Accuracy(0.1), "methods": Methods({"m:f": over_the_median})}
     draw = simulate_spectra if "batch_sizes" in much else simulate_spectra_until
     whole, (found, pieces) = draw(**given), _in_pieces(draw, **given)
     assert pieces > 3

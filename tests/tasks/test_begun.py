@@ -173,7 +173,7 @@ quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize("kind", ["fixed", "spectra"])
+@pytest.mark.parametrize("kind", ["fixed", pytest.param("spectra", marks=pytest.mark.slow)])
 def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     kind, whole, saved, tmp_path, monkeypatch
 ):

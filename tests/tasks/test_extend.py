@@ -77,9 +77,16 @@ MORE = {
         36,
     ),
 }  # fmt: skip
+LIKE_OTHERS = ("appended", "prepended", "in between", "new axis")
 
 
-@pytest.mark.parametrize("axes, new", MORE.values(), ids=MORE)
+@pytest.mark.parametrize(
+    "axes, new",
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in LIKE_OTHERS))
+        for name, case in MORE.items()
+    ],
+)
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, axes, new
 ):
@@ -138,7 +145,7 @@ def see_that_it_extends(here, pair):
     shutil.rmtree(here)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(pair=studies())
 def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
     see_that_it_extends(tmp_path_factory.mktemp("any"), pair)

@@ -124,7 +124,13 @@ MORE = {
 """What is larger, and draws of every shot that are new, over all places along the axes."""
 
 
-@pytest.mark.parametrize("changes, new", MORE.values(), ids=MORE)
+@pytest.mark.parametrize(
+    "changes, new",
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in ("draws", "large blocks")))
+        for name, case in MORE.items()
+    ],
+)
 def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
     spec = flight(**changes)
     outcome = larger(here, spec)

@@ -1,6 +1,7 @@
 """Flights whose tolerance says how many rays they cast: their stores, and what they leave."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from small_flights import SCENE
 from sweep.analysis.answers.flight_comparison import compare
 from sweep.analysis.scenes.opening import open_scene
 from sweep.cli import main
-from sweep.model import resolution
-from sweep.model.resolution import RAYS, rays_needed
+from sweep.model.accuracy import Accuracy
+from sweep.model.resolution import rays_needed
 from sweep.report.asked import accuracy
 from sweep.spec import SceneSpec
 from sweep.tasks import finer_rays
@@ -21,6 +22,8 @@ from sweep.tasks.accuracy_table import rays_table
 from sweep.tasks.driver import extend
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import eyepoints_path
+
+RAYS = Accuracy.rays
 
 LASER = SCENE["instrument"]["laser"] | {"beam_divergence": "4 mrad"}
 OVER_FACETS = SCENE | {
@@ -99,7 +102,7 @@ def test_shots_have_the_rays_that_their_tolerance_needs(flown, name, tolerance):
     told, rays = found.beamlets_error.values, found.beamlets.values
     assert found.beamlets_error.dims == found.beamlets.dims == ("power", "shot")
     assert (told[rays < 8017] <= tolerance).all() and (real <= tolerance).mean() >= 0.999
-    fewest = rays_needed(facets().parameters(), tolerance)
+    fewest = rays_needed(facets().parameters(), Accuracy(tolerance))
     assert set(np.unique(rays)) <= set(RAYS) and rays.min() == fewest
     assert (rays[0] > fewest).mean() > 0.3, "of the weak laser, whose pd is undecided"
     off = real > 1e-5
@@ -132,8 +135,8 @@ def test_a_comparison_allows_what_is_told(flown):
 
 def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypatch):
     """Where the most that may be cast are too few."""
-    monkeypatch.setattr(resolution, "RAYS", (19, 37))
-    monkeypatch.setattr(finer_rays, "RAYS", (19, 37))
+    few = partial(Accuracy.of, rays=(19, 37))
+    monkeypatch.setattr(Accuracy, "of", few)
     spec = facets(1e-3, draws={"number": 1})
     store = quiet(spec, tmp_path / "most.zarr").store
     (row,) = rays_table(store)
@@ -163,7 +166,7 @@ def test_rays_are_added_until_they_are_enough():
         return rough[places] / rays
 
     latest = np.full(rough.size, 37)
-    finer_rays.refine(37, rough / 37, 1e-4, again)
+    finer_rays.refine(37, rough / 37, Accuracy(1e-4), again)
     error = rough / latest
     assert (error[latest < RAYS[-1]] <= 1e-4).all() and (latest == 37).any()
     assert (latest[error > 1e-4] == RAYS[-1]).all() and (latest < RAYS[-1]).mean() > 0.8

@@ -88,7 +88,10 @@ def test_rays_are_counted_as_they_are_cast(undisturbed):
         assert eyepoints.n_blocks > 1
 
 
-@pytest.mark.parametrize("place", [{"workers": 2, "processes": False}, {"workers": 2}])
+@pytest.mark.parametrize(
+    "place",
+    [pytest.param({"workers": 2, "processes": False}, marks=pytest.mark.slow), {"workers": 2}],
+)
 def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monkeypatch, place):
     if place.get("processes", True):  # worker processes cut eyepoints as they are installed
         monkeypatch.undo()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sweep.model.accuracy import Accuracy
 from sweep.model.effects.flags import flags_of, names_of
 from sweep.tasks.accuracy.bench import (
     NOT_IN_TRUTH,
@@ -287,15 +288,17 @@ class FlightBench:
     ) -> Seen:
         """Statistics of shots, of those that see anything; more rays are cast where they must."""
         whole = _nothing(len(called.flags))
-        tolerance, rays = rung.rays_error or study.rays_tolerance, eyepoints.weight.size
+        accuracy, rays = study.rays_accuracy, eyepoints.weight.size
+        if rung.rays_error:
+            accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
         seen = np.flatnonzero(eyepoints.seen)
         for among, names, flags in called.some(seen).together():
             index = seen[among]
-            look = partial(_look, study, tiles, names, look_of(rung), bool(tolerance))
+            look = partial(_look, study, tiles, names, look_of(rung), accuracy is not None)
             error = _put(whole, index, look(eyepoints.some(index), flags))
-            if tolerance:
+            if accuracy is not None:
                 found = whole, index, flags, error
-                self._refine(study, tiles, rays, found, tolerance, look)
+                self._refine(study, tiles, rays, found, accuracy, look)
         return whole
 
     def _refine(
@@ -304,7 +307,7 @@ class FlightBench:
         tiles: Tiles,
         rays: int,
         found: tuple[Seen, np.ndarray, np.ndarray, np.ndarray],
-        tolerance: float,
+        accuracy: Accuracy,
         look: Callable[[Eyepoints, np.ndarray], tuple[Seen, np.ndarray]],
     ) -> None:
         """As the study does where the tolerance says how many rays there are."""
@@ -321,7 +324,7 @@ class FlightBench:
             error[there] = _put(whole, some[there], look(seen.some(there), own))
             return error
 
-        refine(rays, error, tolerance, again)
+        refine(rays, error, accuracy, again)
 
 
 def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
