@@ -101,6 +101,14 @@ def test_links_lead_to_files_that_are_there(page):
         assert re.match(r"https?:", link) or (page.parent / link).exists(), link
 
 
+def test_every_module_that_the_architecture_names_is_there():
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    named = re.findall(r"\bsweep/[\w/]+\.py", page)
+    assert len(set(named)) > 40
+    assert not [name for name in named if not (REPOSITORY / name).exists()]
+    assert len(re.findall(r"^\d+\. `sweep/", page, re.M)) == 10
+
+
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")
