@@ -18,7 +18,7 @@ import numpy as np
 from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, seen_ground
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one

@@ -10,7 +10,7 @@ from sweep.model.effects.footprint_fields import FIELDS, ROOM, set_fields
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
 from sweep.model.eyepoints import HEIGHT, SUNLIGHT, Eyepoints, seen_ground
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.mesh import Surface
 
 
 def block_of(

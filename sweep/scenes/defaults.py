@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.resampling import refine
-from sweep.model.geometry.terrain import Terrain
+from sweep.model.geometry.terrain import Terrain, refine
 from sweep.scenes.degrees import metres_per_degree
 
 

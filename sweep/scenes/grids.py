@@ -116,7 +116,7 @@ def read_image(
     """Terrain of a grey image: black is low, white is high, row 0 is the northern one.
 
     Heights come in steps of one grey level: smooth them before trusting slopes
-    (`sweep.model.geometry.resampling.smooth`).
+    (`sweep.model.geometry.terrain.smooth`).
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.facets import Facets, join
+from sweep.model.geometry.mesh import Facets, join
 from sweep.model.geometry.quaternion import about, multiply, normalise
 from sweep.scenes.errors import SceneError, existing
 from sweep.units import QuantityError, read_unit

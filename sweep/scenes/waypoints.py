@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.model.geometry.attitude import Attitude, Nadir, Track
-from sweep.model.geometry.platform import Flight, Waypoints
+from sweep.model.geometry.platform import Attitude, Flight, Nadir, Track, Waypoints
 from sweep.model.geometry.quaternion import from_heading
 from sweep.scenes.errors import SceneError, existing
 from sweep.units import QuantityError, read_unit

@@ -85,8 +85,7 @@ class Craters(Part):
 
     def carved(self, terrain: Terrain) -> Terrain:
         """Terrain with the craters in it."""
-        from sweep.model.geometry.craters import carve, draw_craters
-        from sweep.model.geometry.frequency import lunar_craters
+        from sweep.model.geometry.scattered import carve, draw_craters, lunar_craters
 
         up_to = math.inf if self.equilibrium_diameter is None else self.equilibrium_diameter
         craters = draw_craters(
@@ -128,8 +127,7 @@ class Ground(Material, ABC):
         ValueError
             For a grid that can not hold what it should.
         """
-        from sweep.model.geometry.resampling import refine, smooth
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.model.geometry.terrain import Terrain, refine, smooth
 
         terrain = self.survey(files)
         if terrain.heights.size * self.factor**2 > MOST_CELLS:

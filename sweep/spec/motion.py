@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 import sweep.spec.quantities as of
-from sweep.model.geometry import attitude as laws
+from sweep.model.geometry import platform as laws
 from sweep.model.geometry import quaternion
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import Either, File, Flag, Several

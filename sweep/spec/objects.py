@@ -17,8 +17,8 @@ from sweep.spec.rules import Choice, Numeric, Text
 from sweep.spec.streams import generator
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.facets import Facets
-    from sweep.model.geometry.frequency import Law
+    from sweep.model.geometry.mesh import Facets
+    from sweep.model.geometry.scattered import Law
     from sweep.model.geometry.terrain import Terrain
     from sweep.spec.files import Files
 
@@ -115,7 +115,7 @@ class MartianRocks(Part):
 
     def law(self) -> Law:
         """Size-frequency law."""
-        from sweep.model.geometry.frequency import MartianRocks
+        from sweep.model.geometry.scattered import MartianRocks
 
         return MartianRocks(self.abundance)
 
@@ -133,7 +133,7 @@ class PowerLaw(Part):
 
     def law(self) -> Law:
         """Size-frequency law."""
-        from sweep.model.geometry.frequency import PowerLaws
+        from sweep.model.geometry.scattered import PowerLaws
 
         return PowerLaws(((self.density, self.exponent),))
 
@@ -169,7 +169,7 @@ class Boulders(Material):
         ValueError
             For too many of them, or none of the ground within the square.
         """
-        from sweep.model.geometry.boulders import Shape, draw_boulders
+        from sweep.model.geometry.scattered import Shape, draw_boulders
         from sweep.scenes.pieces import square
 
         bounds = None

@@ -8,9 +8,17 @@ import numpy as np
 from pydantic import Field
 
 import sweep.spec.quantities as of
-from sweep.model.geometry.beams import cone, corners, squares, steered
-from sweep.model.geometry.line_scan import LineScan
-from sweep.model.geometry.scanner import BeamCycle, Scanner, fixed, raster
+from sweep.model.geometry.scanner import (
+    BeamCycle,
+    LineScan,
+    Scanner,
+    cone,
+    corners,
+    fixed,
+    raster,
+    squares,
+    steered,
+)
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import Beams, Flag, Several
 from sweep.spec.rules import Choice, Numeric

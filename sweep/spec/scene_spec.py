@@ -38,10 +38,10 @@ from sweep.spec.scene_sections import Navigation, Scene, SceneDraws, SceneStorag
 from sweep.spec.study import Study
 
 if TYPE_CHECKING:
+    from sweep.model.geometry.mesh import Surface
     from sweep.model.geometry.platform import Flight
     from sweep.model.geometry.pointing import PointingJitter
     from sweep.model.geometry.scanner import Scanner
-    from sweep.model.geometry.surfaces import Surface
     from sweep.spec.world import World
 
 FILES = "files"

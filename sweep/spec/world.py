@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.geometry.facets import Facets
-from sweep.model.geometry.mesh import Mesh, merge
+from sweep.model.geometry.mesh import Facets, Mesh, Surface, merge
 from sweep.model.geometry.platform import Flight
 from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.surfaces import Surface
 from sweep.model.geometry.terrain import Terrain
 from sweep.scenes.errors import SceneError
 from sweep.spec.files import Files

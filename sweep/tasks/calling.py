@@ -15,7 +15,7 @@ from sweep.tasks.tiles import Alike, Tiles
 if TYPE_CHECKING:
     from sweep.model.effects.planning import Plan
     from sweep.model.eyepoints import Eyepoints
-    from sweep.model.geometry.surfaces import Surface
+    from sweep.model.geometry.mesh import Surface
     from sweep.spec import Spec
     from sweep.tasks.grid import Grid
 

@@ -27,7 +27,7 @@ from sweep.tasks.study import ArrayLayout, Results
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
-    from sweep.model.geometry.surfaces import Surface
+    from sweep.model.geometry.mesh import Surface
     from sweep.spec import SceneSpec
 
 #: Domain of the keys of draws; a shot's key is its number, so that the draws of a flight are the

@@ -15,8 +15,7 @@ from sweep.model.effects.gaussian_line import MOST_BINS, gaussian_shifts
 from sweep.model.effects.line_splitting import split_lines
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
-from sweep.model.geometry.resampling import smooth
-from sweep.model.geometry.terrain import Terrain
+from sweep.model.geometry.terrain import Terrain, smooth
 from sweep.model.unsupported import UnsupportedShot
 from sweep.spec import SceneSpec, Spec, SpecError
 from sweep.tasks.grid_study import GridStudy

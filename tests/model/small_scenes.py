@@ -3,9 +3,8 @@
 import numpy as np
 
 from sweep.model.eyepoints import observe
-from sweep.model.geometry.attitude import Fixed
 from sweep.model.geometry.mesh import clean
-from sweep.model.geometry.platform import ConstantAcceleration, Flight
+from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import fixed
 

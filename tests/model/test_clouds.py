@@ -10,10 +10,9 @@ from sweep.model.clouds import cloud
 from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES
 from sweep.model.effects.flags import flags_of, names_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
-from sweep.model.geometry.beams import cone
+from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.pointing import PointingJitter
-from sweep.model.geometry.scanner import BeamCycle
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.scanner import BeamCycle, cone
 from sweep.model.groups import groups
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
 from sweep.model.scene_outputs import POINTS, STATISTICS

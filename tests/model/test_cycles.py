@@ -8,11 +8,10 @@ from small_scenes import flight, instrument, observed, plate
 from sweep.model import cycles, philox
 from sweep.model.clouds import cloud
 from sweep.model.cycles import solve
-from sweep.model.geometry.attitude import Fixed
-from sweep.model.geometry.beams import cone, corners, squares
+from sweep.model.geometry.mesh import Surface
+from sweep.model.geometry.platform import Fixed
 from sweep.model.geometry.pointing import PointingJitter
-from sweep.model.geometry.scanner import BeamCycle
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.scanner import BeamCycle, cone, corners, squares
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
 from sweep.model.scene_outputs import NAVIGATION

@@ -6,13 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.footprint import beamlets
-from sweep.model.geometry.attitude import Fixed, Nadir, Spin
-from sweep.model.geometry.beams import cone, corners
-from sweep.model.geometry.mesh import clean
-from sweep.model.geometry.platform import ConstantAcceleration, Flight
+from sweep.model.geometry.mesh import Surface, clean
+from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight, Nadir, Spin
 from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import fixed
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.scanner import cone, corners, fixed
 from sweep.model.shot import evaluate, statistics
 
 LEVEL = 1.0, 0.0, 0.0, 0.0

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
-from sweep.model.geometry.beams import cone, corners, squares
+from sweep.model.geometry.scanner import cone, corners, squares
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, altitude, velocity
 
 DRAWS = 20_000

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sweep.model.geometry.beams import corners
+from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
 from sweep.model.navigation_tally import merge, tally
 

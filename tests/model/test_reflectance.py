@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.mesh import Surface
 from sweep.model.reflectance import LAWS, backscatter, backscatter_of
 
 COSINES = np.array([0.01, 0.1, 0.5, 0.9, 1.0])

@@ -12,7 +12,7 @@ from sweep.model.effects.planning import plan
 from sweep.model.effects.span import Span
 from sweep.model.effects.tile_link import TileLink
 from sweep.model.eyepoints import seen_ground
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.mesh import Surface
 from sweep.model.seen_tiles import block_of
 
 SURFACES = [Surface("ground", 0.1), Surface("table", 0.7, "lommel_seeliger")]

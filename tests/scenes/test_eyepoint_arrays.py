@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from sweep.model.eyepoints import observe
-from sweep.model.geometry.attitude import Nadir
-from sweep.model.geometry.beams import cone
 from sweep.model.geometry.mesh import clean
-from sweep.model.geometry.platform import ConstantAcceleration, Flight
+from sweep.model.geometry.platform import ConstantAcceleration, Flight, Nadir
 from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import fixed
+from sweep.model.geometry.scanner import cone, fixed
 from sweep.model.scene_outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays, to_arrays
 

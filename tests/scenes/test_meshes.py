@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from facet_areas import areas
 
+from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.quaternion import about
-from sweep.model.geometry.surfaces import Surface
 from sweep.scenes.errors import SceneError
 from sweep.scenes.meshes import Placement, read_mesh
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from sweep.model.geometry.attitude import AlongTrack
+from sweep.model.geometry.platform import AlongTrack
 from sweep.model.geometry.quaternion import about, from_heading, multiply, rotate
 from sweep.scenes.errors import SceneError
 from sweep.scenes.waypoints import read_waypoints

@@ -12,7 +12,7 @@ from sweep.analysis.scenes.recording import Recording
 from sweep.analysis.shot_spectra import Segment, Shot, simulated_shot
 from sweep.model import waveform
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
-from sweep.model.geometry.surfaces import Surface
+from sweep.model.geometry.mesh import Surface
 from sweep.model.pairing import TRUE
 
 ROOM = 8

@@ -1,12 +1,49 @@
-"""Triangle meshes: what a scene's surfaces are made of, cleaned before any ray meets them."""
+"""What scenes are made of: surfaces, soups of triangles, and meshes that rays can be cast at."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.ray_plane import normals
+from sweep.model.reflectance import LAWS
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Optical properties of one kind of surface.
+
+    Parameters
+    ----------
+    name : str
+        What it is called in a study.
+    reflectance : float
+        What its law takes as such, 0..1.
+    law : str
+        Reflectance law, one of :data:`sweep.model.reflectance.LAWS`.
+    roughness : float
+        Standard deviation of the height within a beamlet's spot [m], >= 0: against the
+        wavelength it decides on speckle.
+    """
+
+    name: str
+    reflectance: float
+    law: str = "lambert"
+    roughness: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.reflectance <= 1:
+            raise ValueError(f"{self.name}: the reflectance must lie within 0 and 1")
+        if self.law not in LAWS:
+            laws = ", ".join(LAWS)
+            raise ValueError(f"{self.name}: no reflectance law {self.law!r}: choose from {laws}")
+        if not self.roughness >= 0:
+            raise ValueError(f"{self.name}: the roughness must be at least 0 m")
+
 
 _CLEAR = 1e-12
 """Normal over the product of two edges above which no rounding can have made it."""
@@ -270,3 +307,95 @@ def _volume(mesh: Mesh) -> float:
     """Signed volume that a closed mesh encloses, positive with its normals outwards."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Facets:
+    """A soup of triangles.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64 ndarray
+        Positions relative to `origin` [m].
+    faces : (m, 3) int64 ndarray
+        Rows of `vertices`, counter-clockwise as seen from outside (or above).
+    surface : (m,) int16 ndarray
+        Index of each face's surface in the scene's list.
+    origin : (3,) float64 ndarray
+        World position of the zero of `vertices` [m]. Terrain lies millions of metres from the
+        zero of its map; a vertex that is kept apart from that offset loses no digits to it.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    surface: np.ndarray
+    origin: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        surface: int = 0,
+        origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    ) -> Facets:
+        """Facets that share one surface."""
+        faces = np.asarray(faces, np.int64).reshape(-1, 3)
+        return cls(
+            np.asarray(vertices, float).reshape(-1, 3),
+            faces,
+            np.full(len(faces), surface, np.int16),
+            np.asarray(origin, float),
+        )
+
+    @property
+    def world(self) -> np.ndarray:
+        """Vertices in the world frame [m], (n, 3); rounded to a float64 of that size."""
+        return self.vertices + self.origin
+
+    def placed(
+        self,
+        *,
+        translation: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+        rotation: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+        scale: float = 1.0,
+    ) -> Facets:
+        """Facets scaled and turned about their origin, which is then moved.
+
+        Parameters
+        ----------
+        translation : (3,) array_like
+            Added to the origin [m].
+        rotation : (4,) array_like
+            Unit quaternion (w, x, y, z).
+        scale : float
+            Size factor, > 0.
+        """
+        turned = rotate(np.asarray(rotation, float), self.vertices * scale)
+        return replace(self, vertices=turned, origin=self.origin + np.asarray(translation, float))
+
+    def mesh(self) -> tuple[Mesh, Report]:
+        """Mesh fit to be cast at, in the world frame, and what was done to make it so."""
+        mesh, report = clean(self.vertices, self.faces, self.surface)
+        return replace(mesh, origin=mesh.origin + self.origin), report
+
+
+def join(parts: Sequence[Facets]) -> Facets:
+    """All parts as one, relative to the first one's origin.
+
+    Raises
+    ------
+    ValueError
+        Where there are no parts.
+    """
+    if not parts:
+        raise ValueError("no facets to join")
+    origin = parts[0].origin
+    shifts = np.cumsum([0, *(len(part.vertices) for part in parts)])[:-1]
+    return Facets(
+        np.concatenate([part.vertices + (part.origin - origin) for part in parts]),
+        np.concatenate([part.faces + shift for part, shift in zip(parts, shifts, strict=True)]),
+        np.concatenate([part.surface for part in parts]),
+        origin,
+    )

@@ -9,49 +9,102 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.geometry.beams import steered
 
-
-class Shots(NamedTuple):
-    """Shots of a scanner.
+def cone(number: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
+    """Directions evenly round nadir, (number, 3).
 
     Parameters
     ----------
-    time : (n,) ndarray
-        Start of each measurement, from the first one of the scan [s].
-    beam : (n,) int64 ndarray
-        Number of the beam.
-    cycle : (n,) int64 ndarray
-        Number of the measurement cycle.
-    direction : (n, 3) ndarray
-        Unit vectors in the body frame.
+    number : int
+        Beams, at least 1.
+    half_angle : float
+        Angle from nadir [rad].
+    azimuth : float
+        Of the first beam, from forward towards the left [rad].
     """
+    turn = azimuth + 2 * math.pi * np.arange(number) / number
+    across = math.sin(half_angle)
+    down = np.full(number, -math.cos(half_angle))
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), down])
+
+
+def steered(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
+    """Directions of a two-axis steerer, (..., 3).
+
+    The angle of an axis is that of the beam's projection on the plane of that axis and nadir, so
+    that a grid of angles draws straight lines on level ground: ``tan = x / -z``. Both axes at
+    22.5 deg make 30.4 deg from nadir.
+
+    Parameters
+    ----------
+    angle_x, angle_y : array_like
+        Angles from nadir towards forward and towards the left [rad], under 90 deg.
+    """
+    x, y = np.broadcast_arrays(np.tan(angle_x), np.tan(angle_y))
+    vector = np.stack([x, y, np.full(x.shape, -1.0)], axis=-1)
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+def corners(angle: float) -> np.ndarray:
+    """Four directions at both axes' angles of +-`angle` [rad], counter-clockwise, (4, 3)."""
+    return steered(angle * np.array([1, -1, -1, 1]), angle * np.array([1, 1, -1, -1]))
+
+
+def stacked_angles(elements: Sequence[float]) -> np.ndarray:
+    """Angles of an axis of stacked steering elements [rad], rising, (2^n,).
+
+    Each element throws the beam to one side or the other by its angle, and the angles add: 15 and
+    7.5 deg make -22.5, -7.5, 7.5 and 22.5 deg.
+    """
+    sides = np.array([0.0])
+    for element in elements:
+        sides = np.concatenate([sides - element, sides + element])
+    return np.sort(sides)
+
+
+def squares(elements: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """All angles of a steerer with like axes, sorted into squares.
+
+    A square is what a quarter turn about nadir makes of one pair of angles. The widest comes
+    first and the narrowest last, each counter-clockwise: for the two elements of [T Fig. 5.2] the
+    corners at 22.5 deg, the two squares that are askew, and the corners at 7.5 deg.
+
+    Parameters
+    ----------
+    elements : sequence of float
+        Angle of each element of an axis [rad].
+
+    Returns
+    -------
+    (4^n, 3) ndarray, (4^n / 4, 4) int64 ndarray
+        Unit vectors, square by square, and the beams of each square.
+    """
+    angles = stacked_angles(elements)
+    if angles.min() >= 0 or len(np.unique(np.round(angles, 12))) < len(angles) or 0 in angles:
+        raise ValueError("the elements must reach as many different angles, and not nadir")
+    positive = angles[angles > 0]
+    pairs = [(x, y) for x in positive for y in positive]
+    pairs.sort(key=lambda pair: (-round(math.hypot(*np.tan(pair)), 12), -pair[0]))
+    turned = [((x, y), (-y, x), (-x, -y), (y, -x)) for x, y in pairs]
+    grid = np.array(turned).reshape(-1, 2)
+    return steered(grid[:, 0], grid[:, 1]), np.arange(len(grid)).reshape(-1, 4)
+
+
+class Shots(NamedTuple):
+    """Shots of a scanner."""
 
     time: np.ndarray
+    """(n,): start of each measurement, from the first one of the scan [s]."""
     beam: np.ndarray
+    """(n,) int64: number of the beam."""
     cycle: np.ndarray
+    """(n,) int64: number of the measurement cycle."""
     direction: np.ndarray
-
-
-class Scanner(Protocol):
-    """A scan pattern."""
-
-    @property
-    def beams(self) -> int:
-        """Number of distinct beams."""
-        ...
-
-    def number(self, duration: float) -> int:
-        """Shots that begin within a duration [s], its end included."""
-        ...
-
-    def shots(self, index: np.ndarray) -> Shots:
-        """Shots by number (n,), from 0."""
-        ...
+    """(n, 3): unit vectors in the body frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +160,7 @@ class BeamCycle:
 
     def number(self, duration: float) -> int:
         """Shots that begin within a duration [s], its end included."""
-        return int(self._begun(np.array([duration]))[0])
-
-    def _begun(self, t: np.ndarray) -> np.ndarray:
-        return shots_begun(t, rate=self.rate, each=self.beams_per_cycle, interval=self._steps[2])
+        return _begun(duration, self.rate, self.beams_per_cycle, self._steps[2])
 
     def shots(self, index: np.ndarray) -> Shots:
         """Shots by number (n,), from 0."""
@@ -120,29 +170,15 @@ class BeamCycle:
         return Shots(cycle / self.rate + place * interval, beam, cycle, vectors[beam])
 
 
-def shots_begun(t: np.ndarray, *, rate: float, each: int, interval: float) -> np.ndarray:
-    """Number of shots that have begun at times [s], (n,) int64; none before time 0.
-
-    Parameters
-    ----------
-    t : (n,) array_like
-        Times since the first shot [s].
-    rate : float
-        Cycles a second [Hz].
-    each : int
-        Shots a cycle.
-    interval : float
-        Time from one to the next within a cycle [s], >= 0.
-    """
-    t = np.asarray(t, float)
+def _begun(duration: float, rate: float, each: int, interval: float) -> int:
+    """Shots, `each` a cycle, that have begun within a duration [s]; none before time 0."""
+    if duration < 0:
+        return 0
     # A hair below a whole number is that number: times come from products that were rounded.
-    cycles = t * rate
-    whole = np.floor(cycles * (1 + 1e-12) + 1e-9)
-    within = np.maximum(cycles - whole, 0.0) / rate
-    last = np.full(t.shape, float(each))
-    if interval > 0:
-        last = np.minimum(last, np.floor(within / interval + 1e-6) + 1)
-    return np.where(t < 0, 0, whole * each + last).astype(np.int64)
+    whole = math.floor(duration * rate * (1 + 1e-12) + 1e-9)
+    within = max(duration * rate - whole, 0.0) / rate
+    last = min(each, math.floor(within / interval + 1e-6) + 1) if interval > 0 else each
+    return whole * each + last
 
 
 def fixed(
@@ -180,3 +216,73 @@ def raster(
         order[1::2] = order[1::2, ::-1]
     vectors = steered(along[:, None], across[None, :]).reshape(-1, 3)
     return BeamCycle(vectors, order.reshape(1, -1), rate)
+
+
+@dataclass(frozen=True)
+class LineScan:
+    """Beams side by side along the track, swept together from side to side.
+
+    Parameters
+    ----------
+    half_angle : float
+        Reach of the sweep to each side of nadir [rad], 0 <= . < pi/2.
+    line_rate : float
+        Lines a second [Hz]; a sweep one way is a line.
+    rate : float
+        Measurements a second of each beam [Hz].
+    along : tuple of float
+        Each beam's fixed angle from nadir towards forward [rad].
+    wave : str
+        ``triangle`` at a constant rate, or ``sine`` for a resonant mirror.
+    interval : float
+        Time from one beam of a measurement to the next [s]; 0 fires them at once.
+    """
+
+    half_angle: float
+    line_rate: float
+    rate: float
+    along: tuple[float, ...] = (0.0,)
+    wave: str = "triangle"
+    interval: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.half_angle < math.pi / 2 and self.along):
+            raise ValueError("a line scan needs a beam and a reach of 0 to 90 deg")
+        if not (self.line_rate > 0 and self.rate > 0 and math.isfinite(self.rate)):
+            raise ValueError("line rate and measurement rate must be positive")
+        if self.wave not in ("triangle", "sine"):
+            raise ValueError(f"a line scan's wave is 'triangle' or 'sine', not {self.wave!r}")
+        if not 0 <= self.interval * len(self.along) * self.rate <= 1 + 1e-9:
+            raise ValueError(f"the beams do not fit in a measurement of 1/{self.rate:g} s")
+
+    @property
+    def beams(self) -> int:
+        """Number of distinct beams."""
+        return len(self.along)
+
+    def number(self, duration: float) -> int:
+        """Shots that begin within a duration [s], its end included."""
+        return _begun(duration, self.rate, self.beams, self.interval)
+
+    def shots(self, index: np.ndarray) -> Shots:
+        """Shots by number (n,), from 0; a cycle is one measurement of all beams."""
+        cycle, beam = np.divmod(np.asarray(index, np.int64), self.beams)
+        time = cycle / self.rate + beam * self.interval
+        return Shots(time, beam, cycle, self._pointing(time, beam))
+
+    def across(self, t: np.ndarray) -> np.ndarray:
+        """Angle of the sweep from nadir towards the left [rad]; it starts at the right."""
+        lines = np.asarray(t, float) * self.line_rate
+        if self.wave == "sine":
+            return np.asarray(-self.half_angle * np.cos(math.pi * lines))
+        return np.asarray(self.half_angle * (1 - 2 * np.abs(1 - lines % 2)))
+
+    def _pointing(self, t: np.ndarray, beam: np.ndarray) -> np.ndarray:
+        along, across = np.asarray(self.along)[beam], self.across(t)
+        # The mirror turns the fan of beams about x: each keeps its angle towards forward.
+        level = np.cos(along)
+        return np.column_stack([np.sin(along), level * np.sin(across), -level * np.cos(across)])
+
+
+Scanner = BeamCycle | LineScan
+"""A scan pattern."""

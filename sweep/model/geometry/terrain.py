@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.model.geometry.facets import Facets
+from sweep.model.geometry.mesh import Facets
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,11 @@ class Terrain:
     origin: np.ndarray
 
     def __post_init__(self) -> None:
-        _check(self.heights, self.spacing)
+        z, spacing = self.heights, self.spacing
+        if np.ndim(z) != 2 or min(np.shape(z)) < 2:
+            raise ValueError(f"heights need at least 2 rows and 2 columns, not shape {np.shape(z)}")
+        if not (np.isfinite(spacing).all() and spacing[0] * spacing[1] != 0):
+            raise ValueError(f"the grid's steps must be finite and other than 0, not {spacing}")
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -60,58 +64,20 @@ class Terrain:
         """
         column = (np.asarray(x, float) - self.origin[0]) / self.spacing[0]
         row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
-        return np.asarray(on_triangles(self.heights, row, column) + self.origin[2])
+        return np.asarray(_on_triangles(self.heights, row, column) + self.origin[2])
 
     def facets(self, *, surface: int = 0) -> Facets:
-        """Triangles of the ground, facing upwards."""
-        vertices, faces = heightfield(self.heights, spacing=self.spacing)
-        return Facets.of(vertices, faces, surface=surface, origin=self.origin)
-
-
-def heightfield(
-    z: np.ndarray,
-    *,
-    spacing: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and upward-facing triangles of a grid of heights.
-
-    Parameters
-    ----------
-    z : (rows, columns) array_like
-        Heights [m]; NaN where there is none.
-    spacing : (dx, dy) of float
-        Step from column to column and from row to row [m]; either may be negative.
-
-    Returns
-    -------
-    vertices : (n, 3) float64 ndarray
-        Nodes that a triangle uses [m].
-    faces : (m, 3) int64 ndarray
-        Counter-clockwise from above.
-
-    Raises
-    ------
-    ValueError
-        For fewer than 2 x 2 nodes, or a step of 0.
-    """
-    z = np.asarray(z, float)
-    _check(z, spacing)
-    faces = _triangles(np.isfinite(z))
-    if spacing[0] * spacing[1] < 0:
-        faces = faces[:, ::-1]
-    used = np.zeros(z.size, bool)
-    used[faces.ravel()] = True
-    number = np.cumsum(used) - 1
-    row, column = np.divmod(np.flatnonzero(used), z.shape[1])
-    vertices = np.column_stack([column * spacing[0], row * spacing[1], z.ravel()[used]])
-    return vertices + 0.0, number[faces]  # never -0.0
-
-
-def _check(z: np.ndarray, spacing: tuple[float, float]) -> None:
-    if np.ndim(z) != 2 or min(np.shape(z)) < 2:
-        raise ValueError(f"heights need at least 2 rows and 2 columns, not shape {np.shape(z)}")
-    if not (np.isfinite(spacing).all() and spacing[0] * spacing[1] != 0):
-        raise ValueError(f"the grid's steps must be finite and other than 0, not {spacing}")
+        """Triangles of the ground, facing upwards, and the nodes that they use."""
+        z, (dx, dy) = self.heights, self.spacing
+        faces = _triangles(np.isfinite(z))
+        if dx * dy < 0:
+            faces = faces[:, ::-1]
+        used = np.zeros(z.size, bool)
+        used[faces.ravel()] = True
+        number = np.cumsum(used) - 1
+        row, column = np.divmod(np.flatnonzero(used), z.shape[1])
+        vertices = np.column_stack([column * dx, row * dy, z.ravel()[used]]) + 0.0  # never -0.0
+        return Facets.of(vertices, number[faces], surface=surface, origin=self.origin)
 
 
 def _triangles(present: np.ndarray) -> np.ndarray:
@@ -139,7 +105,7 @@ def _triangles(present: np.ndarray) -> np.ndarray:
     )
 
 
-def on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def _on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Height of the triangulated grid at fractional rows and columns; NaN where it has none."""
     rows, columns = z.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
@@ -154,3 +120,73 @@ def on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarr
     value = np.where(np.isnan(c) & (u + v <= 1), a + u * (b - a) + v * (d - a), value)
     inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
     return np.where(inside, value, np.nan)
+
+
+def refine(terrain: Terrain, *, factor: int) -> Terrain:
+    """Terrain with `factor` times as many steps a side, through all the given heights.
+
+    A cubic spline: slopes are continuous, so that a beam a few centimetres wide sees no facets of
+    the size of the survey's posts. Holes stay as they are: a new node has a height where all the
+    nodes around it have one.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        Grid of at least 4 x 4 nodes.
+    factor : int
+        New steps to each old one, at least 1.
+
+    Raises
+    ------
+    ValueError
+        For a factor below 1 or a grid too small for a cubic.
+    """
+    from scipy.interpolate import RectBivariateSpline
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = terrain.heights.shape
+    if factor < 1 or min(rows, columns) < 4:
+        raise ValueError("refining needs a factor of at least 1 and a grid of 4 x 4 nodes or more")
+    z, holes = terrain.heights, ~np.isfinite(terrain.heights)
+    if holes.all():
+        raise ValueError("the terrain has no heights at all")
+    if holes.any():  # each is given the height of the nearest node that has one
+        z = z[tuple(distance_transform_edt(holes, return_distances=False, return_indices=True))]
+    fine_rows = np.arange((rows - 1) * factor + 1)
+    fine_columns = np.arange((columns - 1) * factor + 1)
+    spline = RectBivariateSpline(range(rows), range(columns), z)
+    fine = spline(fine_rows / factor, fine_columns / factor)
+    near = holes[fine_rows // factor] | holes[-(-fine_rows // factor)]
+    fine[near[:, fine_columns // factor] | near[:, -(-fine_columns // factor)]] = np.nan
+    spacing = terrain.spacing[0] / factor, terrain.spacing[1] / factor
+    return Terrain(fine, spacing, terrain.origin)
+
+
+def smooth(terrain: Terrain, *, width: float) -> Terrain:
+    """Terrain blurred by a Gaussian; holes stay holes and lend nothing to their neighbours.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        Grid of heights.
+    width : float
+        Standard deviation of the Gaussian [m], >= 0.
+
+    Raises
+    ------
+    ValueError
+        For a negative width, or one beyond the ground's longer side: its memory goes by the width.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    west, south, east, north = terrain.bounds
+    side = max(east - west, north - south)
+    if not 0 <= width <= side:
+        raise ValueError(f"the smoothing width must be 0 m to the ground's {side:g} m, not {width}")
+    there = np.isfinite(terrain.heights)
+    sigma = [width / abs(step) for step in reversed(terrain.spacing)]
+    kept = np.where(there, terrain.heights, 0.0)
+    blurred = gaussian_filter(kept, sigma, mode="nearest")
+    weight = gaussian_filter(there.astype(float), sigma, mode="nearest")
+    smoothed = np.divide(blurred, weight, where=there, out=np.full_like(kept, np.nan))
+    return Terrain(smoothed, terrain.spacing, terrain.origin)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.model.geometry.facets import Facets, join
+from sweep.model.geometry.mesh import Facets, join
 from sweep.model.geometry.terrain import Terrain
 
 

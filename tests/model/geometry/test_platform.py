@@ -4,10 +4,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sweep.model.geometry import quaternion as quat
-from sweep.model.geometry.attitude import AlongTrack, Fixed, Nadir, Spin
-from sweep.model.geometry.platform import ConstantAcceleration, Flight, Waypoints, straight
+from sweep.model.geometry.platform import (
+    AlongTrack,
+    ConstantAcceleration,
+    Fixed,
+    Flight,
+    Mounted,
+    Nadir,
+    Spin,
+    Track,
+    Waypoints,
+    straight,
+)
+from sweep.model.geometry.pointing import jitter_attitude, transverse_of
 
 TIMES = np.array([0.0, 2.0, 3.5, 7.0, 8.0, 11.0])
 PLACES = np.array(
@@ -148,3 +160,192 @@ def test_the_very_end_is_on_the_path_however_it_was_rounded():
 def test_paths_that_lead_nowhere_are_refused(make):
     with pytest.raises(ValueError, match=r"path|times|waypoints"):
         make()
+
+
+FORWARD, LEFT, UP = np.eye(3)
+
+NODES_AT = np.array([0.0, 1.0, 2.5, 4.0, 6.0])
+TURNING = Waypoints(NODES_AT, [[0, 0, 90], [20, 5, 80], [45, 30, 85], [50, 60, 60], [20, 90, 40]])
+NODES = Rotation.random(5, rng=np.random.default_rng(1)).as_quat(scalar_first=True)
+
+angles = st.floats(-math.pi, math.pi)
+vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
+
+
+def unit(seed, number=20):
+    return Rotation.random(number, rng=np.random.default_rng(seed)).as_quat(scalar_first=True)
+
+
+def scipys(q):
+    return Rotation.from_quat(q, scalar_first=True)
+
+
+def same_rotation(p, q, atol=1e-12):
+    np.testing.assert_allclose(np.abs(np.sum(p * q, axis=-1)), 1, atol=atol)
+
+
+def turned(law, t):
+    motion = TURNING.motion(t)
+    return law.turn(t, motion.velocity, motion.acceleration)
+
+
+def test_products_inverses_and_turned_vectors_agree_with_scipy():
+    p, q = unit(1), unit(2)
+    v = np.random.default_rng(3).normal(size=(20, 3))
+    same_rotation(quat.multiply(p, q), (scipys(p) * scipys(q)).as_quat(scalar_first=True))
+    same_rotation(quat.conjugate(p), scipys(p).inv().as_quat(scalar_first=True))
+    np.testing.assert_allclose(quat.rotate(p, v), scipys(p).apply(v), atol=1e-14)
+    np.testing.assert_allclose(quat.rotate(p[0], v), scipys(p[0]).apply(v), atol=1e-14)
+
+
+@given(vectors)
+def test_rotation_vectors_agree_with_scipy_there_and_back(vector):
+    q = quat.from_rotation_vector(vector)
+    same_rotation(q, Rotation.from_rotvec(vector).as_quat(scalar_first=True))
+    back = quat.to_rotation_vector(q)
+    assert np.linalg.norm(back) <= math.pi + 1e-12
+    same_rotation(quat.from_rotation_vector(back), q)
+    if np.linalg.norm(vector) < 3.14:
+        np.testing.assert_allclose(back, vector, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1.9e-4, 2.1e-4, 1e-3])
+def test_small_rotation_vectors_keep_their_digits(size):
+    vector = size * np.array([0.6, 0.0, -0.8])
+    np.testing.assert_allclose(
+        quat.to_rotation_vector(quat.from_rotation_vector(vector)), vector, rtol=1e-13
+    )
+
+
+@given(angles, st.floats(-1.5, 1.5), angles)
+def test_heading_pitch_and_roll_are_turns_about_up_right_and_forward(heading, pitch, roll):
+    """Intrinsic z, -y, x: nose up for a positive pitch, left side up for a positive roll."""
+    q = quat.from_heading(heading=heading, pitch=pitch, roll=roll)
+    expected = Rotation.from_euler("ZYX", [heading, -pitch, roll])
+    same_rotation(q, expected.as_quat(scalar_first=True))
+
+
+def test_pitch_lifts_the_nose_and_roll_the_left_side():
+    assert quat.rotate(quat.from_heading(heading=0.0, pitch=0.1), FORWARD)[2] > 0.09
+    assert quat.rotate(quat.from_heading(heading=0.0, roll=0.1), LEFT)[2] > 0.09
+    assert quat.rotate(quat.from_heading(heading=0.1), FORWARD)[1] > 0.09
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        Nadir(0.3),
+        Nadir(None),
+        AlongTrack(),
+        AlongTrack(roll=0.7),
+        Spin(rate=(0.3, -0.2, 0.9), quaternion=NODES[0], time=1.0),
+        Track(NODES_AT, NODES),
+        Mounted(AlongTrack(), quat.about(1, 0.8)),
+        Fixed(NODES[1]),
+    ],
+    ids=lambda law: type(law).__name__,
+)
+def test_the_rate_is_the_derivative_of_the_attitude_in_the_world_frame(law):
+    step = 1e-5
+    t = np.linspace(0.05, 5.95, 33)
+    t = t[
+        np.abs(t[:, None] - NODES_AT).min(axis=1) > 2 * step
+    ]  # a track turns abruptly at its nodes
+    q, rate = turned(law, t)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
+    after, before = turned(law, t + step)[0], turned(law, t - step)[0]
+    change = quat.to_rotation_vector(quat.multiply(after, quat.conjugate(before)))
+    np.testing.assert_allclose(rate, change / (2 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize("law", [Nadir(), Nadir(1.2), Nadir(None)])
+def test_a_nadir_beam_points_straight_down(law):
+    q, _ = turned(law, np.linspace(0, 6, 9))
+    np.testing.assert_allclose(quat.rotate(q, -UP), [-UP] * 9, atol=1e-15)
+
+
+def test_along_track_the_nose_follows_the_velocity_and_the_wings_are_level():
+    t = np.linspace(0, 6, 25)
+    q, _ = turned(AlongTrack(), t)
+    velocity = TURNING.motion(t).velocity
+    heading = velocity / np.linalg.norm(velocity, axis=1)[:, None]
+    np.testing.assert_allclose(quat.rotate(q, FORWARD), heading, atol=1e-12)
+    np.testing.assert_allclose(quat.rotate(q, LEFT)[:, 2], 0, atol=1e-15)
+    assert (quat.rotate(q, UP)[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("law", [AlongTrack(roll=0.3), Nadir(None)])
+@pytest.mark.parametrize("power", [-1000, -700, 700])
+def test_a_movement_in_slow_motion_turns_the_same_way(law, power):
+    """Turns follow from ratios of velocity and acceleration: powers of two change no bit."""
+    t = np.linspace(0, 6, 25)
+    _, velocity, acceleration = TURNING.motion(t)[:3]
+    slow = np.ldexp(velocity, power), np.ldexp(acceleration, power)
+    for one, other in zip(law.turn(t, velocity, acceleration), law.turn(t, *slow), strict=True):
+        assert np.array_equal(one, other)
+    straight = law.turn(t, slow[0], np.zeros_like(velocity))[1]
+    assert not straight.any()
+
+
+@pytest.mark.parametrize("law", [AlongTrack(), Nadir(None)])
+def test_what_turns_at_next_to_no_speed_has_no_heading(law):
+    velocity, acceleration = np.array([[1e-320, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="has no heading to follow"):
+        law.turn(np.zeros(1), velocity, acceleration)
+
+
+def test_a_bank_lifts_the_left_wing_by_its_angle():
+    level, banked = (turned(AlongTrack(roll=r), np.array([1.0]))[0] for r in (0.0, 0.4))
+    left, lifted = quat.rotate(level, LEFT), quat.rotate(banked, LEFT)
+    assert (left * lifted).sum() == pytest.approx(math.cos(0.4))
+    assert lifted[0, 2] > 0
+
+
+def test_a_track_passes_its_nodes_and_rests_beyond_them():
+    track = Track(NODES_AT, NODES * np.array([1, -1, 1, -1, 1])[:, None])  # q and -q are one
+    zero = np.zeros((5, 3))
+    q, _ = track.turn(NODES_AT, zero, zero)
+    same_rotation(q, NODES)
+    q, rate = track.turn(np.array([-5.0, 99.0]), zero[:2], zero[:2])
+    same_rotation(q, NODES[[0, -1]])
+    assert not rate.any()
+
+
+def test_a_track_turns_at_a_constant_rate_between_nodes():
+    t = np.linspace(1.01, 2.49, 20)
+    zero = np.zeros((20, 3))
+    _, rate = Track(NODES_AT, NODES).turn(t, zero, zero)
+    np.testing.assert_allclose(rate, rate[:1].repeat(20, 0), atol=1e-12)
+    assert np.linalg.norm(rate[0]) == pytest.approx(
+        (scipys(NODES[1]).inv() * scipys(NODES[2])).magnitude() / 1.5
+    )
+
+
+def test_a_mounted_instrument_is_turned_first():
+    q, _ = turned(Mounted(Nadir(), quat.about(1, -math.pi / 4)), np.array([1.0]))
+    # Tilted about -y by 45 deg, the nadir beam looks half forward.
+    forward = quat.rotate(q, -UP)[0]
+    np.testing.assert_allclose(forward, [math.sqrt(0.5), 0, -math.sqrt(0.5)], atol=1e-12)
+
+
+@pytest.mark.parametrize("law", [Nadir(None), AlongTrack()])
+def test_a_vertical_descent_has_no_heading_to_follow(law):
+    with pytest.raises(ValueError, match="no heading"):
+        law.turn(np.zeros(1), np.array([[0.0, 0.0, -5.0]]), np.zeros((1, 3)))
+
+
+def test_jitter_turns_each_axis_by_its_own_standard_deviation():
+    """Rotation angles of given draws exactly, not statistics."""
+    q, draws = unit(8), np.random.default_rng(8).normal(size=(20, 3))
+    sigma = np.array([1e-4, 2e-4, 0.0])
+    jittered = jitter_attitude(q, sigma=sigma, draws=draws)
+    turn = (scipys(q).inv() * scipys(jittered)).as_rotvec()
+    np.testing.assert_allclose(turn, draws * sigma, atol=1e-15)
+
+
+def test_transverse_axes_complete_a_right_handed_frame():
+    u = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8], [0.0, 0.6, 0.8]])
+    first, second = transverse_of(u)
+    np.testing.assert_allclose(np.cross(first, second), u, atol=1e-15)
+    np.testing.assert_allclose((first * u).sum(axis=1), 0, atol=1e-15)
+    np.testing.assert_allclose(first[0], FORWARD, atol=1e-15)

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.geometry import beams
-from sweep.model.geometry.line_scan import LineScan
-from sweep.model.geometry.scanner import BeamCycle, fixed, raster
+from sweep.model.geometry import scanner
+from sweep.model.geometry.scanner import BeamCycle, LineScan, fixed, raster
 
 DEGREE = math.pi / 180
 NADIR = np.array([0.0, 0.0, -1.0])
@@ -22,7 +21,7 @@ def axis_angles(directions):
 
 
 def test_three_beams_stand_22_5_deg_from_nadir_and_120_deg_apart():
-    three = beams.cone(3, half_angle=22.5 * DEGREE, azimuth=0.4)
+    three = scanner.cone(3, half_angle=22.5 * DEGREE, azimuth=0.4)
     np.testing.assert_allclose(np.linalg.norm(three, axis=1), 1)
     np.testing.assert_allclose(from_nadir(three), 22.5)
     azimuth = np.unwrap(np.arctan2(three[:, 1], three[:, 0]))
@@ -34,7 +33,7 @@ def test_three_beams_stand_22_5_deg_from_nadir_and_120_deg_apart():
 
 @pytest.mark.parametrize("angle", [22.5, 7.5])
 def test_the_four_corners_draw_a_square_on_level_ground(angle):
-    corners = beams.corners(angle * DEGREE)
+    corners = scanner.corners(angle * DEGREE)
     ground = corners / -corners[:, 2:]
     side = 2 * math.tan(angle * DEGREE)
     np.testing.assert_allclose(np.linalg.norm(np.diff(ground, axis=0), axis=1), side)
@@ -42,12 +41,12 @@ def test_the_four_corners_draw_a_square_on_level_ground(angle):
 
 
 def test_stacked_elements_reach_the_four_angles_of_the_steerer():
-    reached = np.degrees(beams.stacked_angles([15 * DEGREE, 7.5 * DEGREE]))
+    reached = np.degrees(scanner.stacked_angles([15 * DEGREE, 7.5 * DEGREE]))
     np.testing.assert_allclose(reached, [-22.5, -7.5, 7.5, 22.5])
 
 
 def test_the_sixteen_angles_make_four_squares_from_the_widest_to_the_narrowest():
-    directions, patterns = beams.squares([15 * DEGREE, 7.5 * DEGREE])
+    directions, patterns = scanner.squares([15 * DEGREE, 7.5 * DEGREE])
     grid = axis_angles(directions)
     expected = {(x, y) for x in (-22.5, -7.5, 7.5, 22.5) for y in (-22.5, -7.5, 7.5, 22.5)}
     assert {tuple(pair) for pair in np.round(grid, 9)} == expected
@@ -67,11 +66,11 @@ def test_the_sixteen_angles_make_four_squares_from_the_widest_to_the_narrowest()
 
 def test_equal_elements_reach_the_same_angle_twice_and_are_refused():
     with pytest.raises(ValueError, match="different angles"):
-        beams.squares([10 * DEGREE, 10 * DEGREE])
+        scanner.squares([10 * DEGREE, 10 * DEGREE])
 
 
 def test_cycles_take_the_patterns_in_turn_at_the_measurement_rate():
-    directions, patterns = beams.squares([15 * DEGREE, 7.5 * DEGREE])
+    directions, patterns = scanner.squares([15 * DEGREE, 7.5 * DEGREE])
     scan = BeamCycle(directions, patterns, rate=20.0)
     shots = scan.shots(np.arange(40))
     np.testing.assert_array_equal(shots.cycle, np.arange(40) // 4)
@@ -82,7 +81,7 @@ def test_cycles_take_the_patterns_in_turn_at_the_measurement_rate():
 
 
 def test_fixed_telescopes_fire_at_once_and_a_steered_beam_takes_its_time():
-    three = beams.cone(3, half_angle=0.4)
+    three = scanner.cone(3, half_angle=0.4)
     at_once = fixed(three, rate=1.0).shots(np.arange(6))
     np.testing.assert_array_equal(at_once.time, [0, 0, 0, 1, 1, 1])
     in_turn = fixed(three, rate=1.0, interval=1.5e-3).shots(np.arange(6))
@@ -90,9 +89,9 @@ def test_fixed_telescopes_fire_at_once_and_a_steered_beam_takes_its_time():
 
 
 SCANS = [
-    fixed(beams.cone(3, half_angle=0.4), rate=1.0),
-    fixed(beams.corners(0.1), rate=20.0, interval=None),
-    fixed(beams.corners(0.1), rate=7.0, interval=1.5e-3),
+    fixed(scanner.cone(3, half_angle=0.4), rate=1.0),
+    fixed(scanner.corners(0.1), rate=20.0, interval=None),
+    fixed(scanner.corners(0.1), rate=7.0, interval=1.5e-3),
     LineScan(0.1, line_rate=3.0, rate=11.0, along=(1e-3, -1e-3)),
     LineScan(0.1, line_rate=3.0, rate=11.0, along=(1e-3, 0.0, -1e-3), interval=0.02),
     raster(columns=5, rows=3, half_angles=(0.2, 0.1), rate=2.0),
@@ -127,7 +126,7 @@ def test_any_stretch_of_shots_is_what_it_is_in_the_whole(scan):
 
 
 def test_a_million_shots_in_the_clock_has_not_drifted():
-    scan = fixed(beams.corners(0.1), rate=20.0, interval=None)
+    scan = fixed(scanner.corners(0.1), rate=20.0, interval=None)
     assert scan.shots(np.array([4 * 10**9])).time[0] == 10**9 / 20
 
 
@@ -183,10 +182,10 @@ def test_a_raster_of_one_direction_looks_at_nadir():
     "make",
     [
         lambda: fixed([[0, 0, 0]], rate=1.0),
-        lambda: fixed(beams.corners(0.1), rate=0.0),
-        lambda: fixed(beams.corners(0.1), rate=100.0, interval=3e-3),
-        lambda: BeamCycle(beams.corners(0.1), [[0, 4]], rate=1.0),
-        lambda: BeamCycle(beams.corners(0.1), [[]], rate=1.0),
+        lambda: fixed(scanner.corners(0.1), rate=0.0),
+        lambda: fixed(scanner.corners(0.1), rate=100.0, interval=3e-3),
+        lambda: BeamCycle(scanner.corners(0.1), [[0, 4]], rate=1.0),
+        lambda: BeamCycle(scanner.corners(0.1), [[]], rate=1.0),
         lambda: LineScan(2.0, line_rate=1.0, rate=1.0),
         lambda: LineScan(0.1, line_rate=0.0, rate=1.0),
         lambda: LineScan(0.1, line_rate=1.0, rate=1.0, wave="square"),

@@ -7,10 +7,9 @@ from facet_areas import areas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.geometry.facets import Facets, join
+from sweep.model.geometry.mesh import Facets, join
 from sweep.model.geometry.quaternion import about
-from sweep.model.geometry.resampling import refine, smooth
-from sweep.model.geometry.terrain import Terrain, heightfield
+from sweep.model.geometry.terrain import Terrain, refine, smooth
 from sweep.scenes.grids import read_image
 from sweep.scenes.raster import read_raster
 
@@ -31,6 +30,11 @@ def hilly(rows, columns, seed=1):
 
 def plan_area(vertices, faces):
     return areas(vertices * [1, 1, 0], faces).sum()
+
+
+def heightfield(z, *, spacing):
+    facets = Terrain(np.asarray(z, float), spacing, np.zeros(3)).facets()
+    return facets.vertices, facets.faces
 
 
 def normals(vertices, faces):

@@ -1,0 +1,245 @@
+import math
+
+import numpy as np
+import pytest
+from facet_areas import areas
+from scipy import integrate
+
+from sweep.model.geometry import scattered
+from sweep.model.geometry.terrain import Terrain
+
+
+def flat(size=200.0, z=0.0, origin=(0.0, 0.0, 0.0)):
+    return Terrain(np.full((2, 2), z), (size, size), np.array(origin))
+
+
+def field(law, ground, seed=1, shape=scattered.ROUND, smallest=0.2, largest=5.0):
+    facets = scattered.draw_boulders(
+        np.random.default_rng(seed), law, ground, smallest=smallest, largest=largest, shape=shape
+    )
+    each = len(scattered.half_ball(shape.subdivisions)[0])
+    return facets, facets.vertices.reshape(-1, each, 3)
+
+
+def test_numbers_of_rocks_are_the_integral_of_their_area_law():
+    """Each rock covers pi D^2/4, so that dN = dF / (pi D^2/4): by quadrature."""
+    law = scattered.MartianRocks(cover=0.1)
+    for diameter in (0.01, 0.3, 2.0, 6.0):
+        number, error = integrate.quad(
+            lambda d: law.decay * law.area_fraction(d) * 4 / (math.pi * d**2), diameter, np.inf,
+            epsabs=0, epsrel=1e-10,
+        )  # fmt: skip
+        assert law.cumulative(diameter) == pytest.approx(number, rel=1e-8, abs=2 * error)
+
+
+@pytest.mark.parametrize("cover", [0.02, 0.1, 0.4])
+def test_diameters_invert_the_cumulative_numbers(cover):
+    law = scattered.MartianRocks(cover=cover)
+    diameter = np.geomspace(1e-3, 30 / law.decay, 200)
+    np.testing.assert_allclose(law.diameter(law.cumulative(diameter)), diameter, rtol=1e-9)
+
+
+def test_a_tenth_of_cover_has_the_published_decay():
+    assert scattered.MartianRocks(cover=0.1).decay == pytest.approx(3.31)
+
+
+@pytest.mark.parametrize("smallest", [0.2, 0.5, 1.0])
+def test_counts_and_cover_of_a_field_follow_the_law(smallest):
+    """Poisson numbers, and the area of a compound Poisson sum, within 5 sigma."""
+    law, side = scattered.MartianRocks(cover=0.1), 200.0
+    _, vertices = field(law, flat(side))
+    # Each outline has the area of a circle of its diameter: the shoelace formula gives it back.
+    x, y = (vertices[:, -16:, axis] for axis in (0, 1))
+    area = 0.5 * (x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1)
+    diameter = 2 * np.sqrt(area / math.pi)
+    expected = side**2 * (law.cumulative(smallest) - law.cumulative(5.0))
+    assert abs((diameter >= smallest).sum() - expected) < 5 * math.sqrt(expected)
+    cover = side**2 * (law.area_fraction(smallest) - law.area_fraction(5.0))
+    squares, _ = integrate.quad(
+        lambda d: law.decay * law.area_fraction(d) * math.pi * d**2 / 4, smallest, 5.0
+    )
+    assert abs(area[diameter >= smallest].sum() - cover) < 5 * math.sqrt(side**2 * squares)
+
+
+def test_the_dome_faces_outwards_and_fills_half_a_ball():
+    vertices, faces = scattered.half_ball(4)
+    dome = faces[vertices[faces][:, :, 2].min(axis=1) >= 0]
+    a, b, c = vertices[dome.T]
+    # With the origin as apex, each face spans a positive volume; the sum nears 2 pi / 3.
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    assert (volumes > 0).all()
+    assert volumes.sum() == pytest.approx(2 * math.pi / 3, rel=0.01)
+    assert vertices[:, 2].max() == 1.0 and vertices[:, 2].min() == -1.0
+    skirt = faces[vertices[faces][:, :, 2].min(axis=1) < 0]
+    a, b, c = vertices[skirt.T]
+    outwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), (a + b + c) * [1, 1, 0])
+    assert (outwards > 0).all()
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 3])
+def test_the_dome_is_closed_but_for_the_bottom_of_its_skirt(level):
+    vertices, faces = scattered.half_ball(level)
+    assert len(faces) == 4 ** (level + 1) + 8 * 2**level
+    edges: dict[tuple[int, int], int] = {}
+    for face in faces:
+        for pair in zip(face, np.roll(face, -1), strict=True):
+            edges[tuple(pair)] = edges.get(tuple(pair), 0) + 1
+    assert set(edges.values()) == {1}  # no edge is run twice the same way
+    open_ = [pair for pair in edges if pair[::-1] not in edges]
+    assert len(open_) == 4 * 2**level
+    assert (vertices[np.array(open_).ravel(), 2] == -1).all()
+
+
+def test_boulders_stand_on_the_ground_as_high_as_their_shape_says():
+    origin = (3e6, 4e6, -2000.0)
+    columns = np.array([[0, 1], [0, 1]])
+    slope = Terrain(100.0 * 0.2 * columns, (100.0, 100.0), np.array(origin))
+    shape = scattered.Shape(height_ratio=0.3, elongation=1.0, subdivisions=2)
+    facets, vertices = field(scattered.MartianRocks(cover=0.2), slope, shape=shape)
+    np.testing.assert_array_equal(facets.origin, origin)
+    top = vertices[:, 0]
+    ground = slope.height_at(top[:, 0] + 3e6, top[:, 1] + 4e6) - origin[2]
+    outline = vertices[:, -16:, :2]
+    across = np.linalg.norm(outline - outline.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
+    diameter = 2 * across / math.sqrt(math.pi / (8 * math.sin(math.pi / 8)))
+    np.testing.assert_allclose(top[:, 2] - ground, 0.3 * diameter, rtol=1e-6)
+    assert len(top) > 1000
+
+
+def test_long_boulders_point_everywhere():
+    """Mean resultant of the doubled headings: sqrt(n) of a random walk."""
+    shape = scattered.Shape(elongation=2.0)
+    _, vertices = field(scattered.MartianRocks(cover=0.1), flat(), shape=shape)
+    rim = vertices[:, -16:, :2] - vertices[:, -16:, :2].mean(axis=1, keepdims=True)
+    tensor = np.einsum("nij,nik->njk", rim, rim)
+    twice = np.arctan2(2 * tensor[:, 0, 1], tensor[:, 0, 0] - tensor[:, 1, 1])
+    assert abs(np.exp(1j * twice).sum()) < 5 * math.sqrt(len(twice))
+
+
+def test_no_boulder_stands_over_a_hole():
+    z = np.zeros((21, 21))
+    z[:, 10:] = np.nan
+    ground = Terrain(z, (2.0, 2.0), np.zeros(3))
+    facets, vertices = field(scattered.MartianRocks(cover=0.2), ground)
+    assert len(facets.faces) and vertices[:, 0, 0].max() <= 18.0
+    assert (areas(facets.vertices, facets.faces) > 0).all()
+
+
+@pytest.mark.parametrize("wrong", [{"smallest": 0.0}, {"smallest": 6.0}, {"smallest": 1e-4}])
+def test_a_range_of_sizes_that_can_not_be_drawn_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"needs|too many"):
+        field(scattered.MartianRocks(cover=0.1), flat(), **wrong)
+
+
+def grid(size=201, step=1.0, origin=(0.0, 0.0, 0.0), dy=1.0):
+    return Terrain(np.zeros((size, size)), (step, dy * step), np.array(origin))
+
+
+def one(x, y, diameter, freshness=1.0):
+    return scattered.Craters(*(np.array([value]) for value in (x, y, diameter, freshness)))
+
+
+@pytest.mark.parametrize("smallest", [5.0, 20.0, 60.0])
+def test_counts_of_craters_follow_trasks_equilibrium(smallest):
+    """10^10.9 D^-2 per 10^6 km^2, D in metres, within 5 sigma of a Poisson number."""
+    x, y, diameter = scattered.scatter(
+        np.random.default_rng(1),
+        scattered.lunar_craters(),
+        bounds=(0.0, 0.0, 1000.0, 1000.0),
+        smallest=5.0,
+        largest=400.0,
+    )
+    expected = 10**10.9 / 1e6 * (smallest**-2 - 400.0**-2)
+    assert abs((diameter >= smallest).sum() - expected) < 5 * math.sqrt(expected)
+    assert (np.diff(diameter) <= 0).all()
+    assert min(x.min(), y.min()) >= 0 and max(x.max(), y.max()) <= 1000
+
+
+def test_beyond_equilibrium_counts_fall_as_craters_are_produced():
+    law = scattered.lunar_craters(equilibrium_diameter=50.0)
+    assert law.cumulative(20.0) == pytest.approx(10**-1.1 / 400)
+    assert law.cumulative(50.0) == pytest.approx(scattered.lunar_craters().cumulative(50.0))
+    slope = math.log(law.cumulative(400.0) / law.cumulative(100.0)) / math.log(4)
+    assert slope == pytest.approx(-2.8)
+    diameter = np.geomspace(1, 1000, 50)
+    np.testing.assert_allclose(law.diameter(law.cumulative(diameter)), diameter, rtol=1e-12)
+
+
+def test_a_fresh_crater_is_a_fifth_as_deep_as_it_is_wide():
+    """Pike's earlier, rounder statement of 1974: depth about 0.2 of the diameter."""
+    diameter = np.array([10.0, 100.0, 1000.0, 10_000.0])
+    np.testing.assert_allclose(scattered.fresh_depth(diameter) / diameter, 0.2, atol=0.015)
+    assert scattered.fresh_depth(1000.0) == pytest.approx(196.0)
+    assert scattered.fresh_rim_height(1000.0) == pytest.approx(36.0)
+
+
+def test_a_carved_crater_has_its_rim_its_floor_and_its_ejecta_where_they_belong():
+    ground = scattered.carve(grid(origin=(1e6, 2e6, -50.0)), one(1e6 + 100, 2e6 + 90, 60.0))
+    z = ground.heights
+    depth, rim = scattered.fresh_depth(60.0), scattered.fresh_rim_height(60.0)
+    assert np.unravel_index(z.argmin(), z.shape) == (90, 100)  # row along y, column along x
+    assert z[90, 100] == pytest.approx(rim - depth)
+    for place in ((90, 130), (90, 70), (120, 100), (60, 100)):
+        assert z[place] == pytest.approx(rim)
+    assert z.max() == pytest.approx(rim)
+    assert z[90, 160] == pytest.approx(rim * (2**-3 - 4**-3) / (1 - 4**-3))
+    assert z[0, 0] == 0.0 and ground.origin[2] == -50.0
+
+
+def test_a_crater_lies_where_it_should_on_a_grid_that_runs_southwards():
+    z = scattered.carve(grid(origin=(0.0, 200.0, 0.0), dy=-1.0), one(50.0, 170.0, 30.0)).heights
+    assert np.unravel_index(z.argmin(), z.shape) == (30, 50)
+
+
+def test_the_profile_is_continuous_at_the_rim_and_at_its_end():
+    r = np.array([30 - 1e-9, 30 + 1e-9, 120 - 1e-9, 120 + 1e-9])
+    z = scattered.profile(r, diameter=60.0, freshness=1.0)
+    assert z[0] == pytest.approx(z[1], abs=1e-7) and z[2:] == pytest.approx(0, abs=1e-7)
+
+
+def test_the_volume_dug_is_that_of_a_paraboloid():
+    depth, rim = scattered.fresh_depth(60.0), scattered.fresh_rim_height(60.0)
+
+    def dug(r):
+        return (
+            (rim - scattered.profile(np.array(r), diameter=60.0, freshness=1.0)) * 2 * math.pi * r
+        )
+
+    volume, _ = integrate.quad(dug, 0, 30)
+    assert volume == pytest.approx(math.pi * 30**2 * depth / 2, rel=1e-9)
+
+
+def test_craters_add_up_and_worn_ones_are_shallower_in_proportion():
+    both = scattered.Craters(*(np.array(v) for v in ([60, 90], [70, 95], [40, 30], [1.0, 0.3])))
+    first, second = (scattered.Craters(*(v[i : i + 1] for v in both)) for i in (0, 1))
+    expected = scattered.carve(grid(), first).heights + scattered.carve(grid(), second).heights
+    np.testing.assert_allclose(scattered.carve(grid(), both).heights, expected, atol=1e-12)
+    fresh = scattered.carve(grid(), one(90, 95, 30)).heights
+    np.testing.assert_allclose(scattered.carve(grid(), second).heights, 0.3 * fresh, atol=1e-12)
+
+
+def test_no_edge_of_the_ground_is_free_of_craters_from_beside_it():
+    """A crater centred outside throws its ejecta in: the drawn ones reach over every edge."""
+    drawn = scattered.draw_craters(
+        np.random.default_rng(4),
+        scattered.lunar_craters(),
+        bounds=(0.0, 0.0, 300.0, 300.0),
+        smallest=5.0,
+        largest=100.0,
+    )
+    assert (drawn.x < 0).any() and (drawn.x > 300).any()
+    assert (drawn.y < 0).any() and (drawn.y > 300).any()
+    assert ((drawn.x > -2 * drawn.diameter) & (drawn.y > -2 * drawn.diameter)).all()
+    assert drawn.freshness.min() >= 0.1 and drawn.freshness.max() <= 1
+    inside = (drawn.x > 0) & (drawn.x < 300) & (drawn.y > 0) & (drawn.y < 300)
+    expected = 10**-1.1 * (5.0**-2 - 100.0**-2) * 300**2
+    assert abs(inside.sum() - expected) < 5 * math.sqrt(expected)
+
+
+def test_a_crater_that_the_grid_can_not_hold_is_refused():
+    with pytest.raises(ValueError, match="under three grid steps"):
+        scattered.carve(grid(), one(50, 50, 2.5))
+
+
+def test_a_crater_beside_the_ground_changes_nothing():
+    assert not scattered.carve(grid(), one(-500.0, 900.0, 50.0)).heights.any()
