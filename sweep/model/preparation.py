@@ -366,7 +366,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         What the beams meet.
     """
     architecture = str(p[RECEIVER + "architecture"])
-    echo_scale, current_scale = _link_scales(architecture, p)
+    echo_scale, current_scale = link_scales(architecture, p)
     per_ampere, per_watt, sources = receiver_noise(architecture, _receiver(p, *NOISY))
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy = np.zeros(size), Accuracy.of(p)
@@ -417,7 +417,7 @@ def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
     return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
-def _link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Echo power [W] per backscatter of 1/sr, and the beat photocurrent [A] of that."""
     power_scale = link.echo_power_scale(
         power=p[LASER + "power"],

@@ -23,8 +23,12 @@ import numpy as np
 from sweep.model import detection, ground, quadrature
 from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.line_spread import range_to_bins, velocity_to_bins
-from sweep.model.effects.plane_geometry import plane_range_moments, plane_velocity_moments
+from sweep.model.effects.spread import (
+    plane_range_moments,
+    plane_velocity_moments,
+    range_to_bins,
+    velocity_to_bins,
+)
 from sweep.model.preparation import (
     BEAMLETS_ERROR,
     CHIRP,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model.effects.flags import flag_attributes, flags_apart, flags_of, names_of
 from sweep.tasks.study import ArrayLayout
@@ -26,6 +26,9 @@ TOLERANCE = "accuracy.tolerance"
 
 #: Shots of a flight that are planned together.
 TILE_SHOTS = 256
+
+#: Points of a grid that are looked at together; of a tile, that are looked at first.
+POINTS_AT_ONCE, FEW_POINTS = 1 << 14, 64
 
 
 class Called(NamedTuple):
@@ -66,7 +69,6 @@ class Calling:
     def __init__(self, spec: Spec, grid: Grid) -> None:
         self._modes, self.tiles = spec.modes(), Tiles(grid)
         self._known: dict[int, tuple[int, float]] = {}
-        self._tolerances: dict[int, float] = {}
 
     def of_block(self, block: int) -> Called:
         """What is simulated at the points of a block, in C order over it."""
@@ -97,28 +99,49 @@ class Calling:
         return names_of(int(self.of_block(0).flags[point]))
 
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
-        """Plans of some tiles: places among them, and the plan of these."""
-        for alike in self.tiles.alike(tiles):
-            yield alike.tiles, self._plan(alike)
+        """Plans of some tiles: places among them, and the plan of these.
+
+        A few of the points are looked at first: where these call for all that there is, the others
+        cannot call for more.
+        """
+        sides = [side for side in self.tiles.shape if side > 1]
+        few = max(int((math.prod(sides) / FEW_POINTS) ** (1 / max(len(sides), 1))), 1)
+        rest = np.arange(len(tiles))
+        for every in (few, 1) if few > 1 else (1,):
+            points = math.prod(-(-side // every) for side in sides)
+            together = max(POINTS_AT_ONCE // points, 1)
+            left = []
+            for first in range(0, len(rest), together):
+                some = rest[first : first + together]
+                for alike in self.tiles.alike(tiles[some], every):
+                    plan = self._plan(alike)
+                    settled = np.full(len(alike.tiles), every == 1) | plan.all_kept
+                    if settled.any():
+                        yield some[alike.tiles[settled]], plan.some(settled)
+                    left.append(some[alike.tiles[~settled]])
+            rest = np.concatenate(left) if left else rest[:0]
 
     def _plan(self, alike: Alike) -> Plan:
         """The plan of tiles that share words and sizes."""
-        from sweep.model.effects.block import Block
+        from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
+        from sweep.model.effects.points import Points
 
-        if alike.code not in self._tolerances:
-            self._tolerances[alike.code] = self._tolerance(alike)
-        tolerance = self._tolerances[alike.code]
-        return plan(Block.of_plane(alike.parameters), modes=self._modes, tolerance=tolerance)
+        points = Points(DEFAULTS | alike.parameters)
+        tolerance = self._tolerance(alike.parameters)
+        number, along = len(alike.tiles), tuple(range(1, len(self.tiles.shape) + 1))
 
-    def _tolerance(self, alike: Alike) -> float:
+        def tiles(values: np.ndarray) -> np.ndarray:
+            most = np.max(values, axis=along) if values.ndim else values
+            return np.broadcast_to(most, (number,))
+
+        return plan(points, tiles, self._modes, tolerance)
+
+    def _tolerance(self, parameters: Mapping[str, Any]) -> float:
         """Share of the tolerance that is for effects."""
-        from sweep.model.effects.tile_link import TileLink
         from sweep.model.resolution import BEAMLETS, effects_tolerance
 
-        shared = TileLink(alike.parameters)
-        number, tolerance = shared.whole(BEAMLETS), shared[TOLERANCE].low
-        return effects_tolerance(shared.words | {TOLERANCE: np.ravel(tolerance)[0]}, number)
+        return effects_tolerance(parameters, int(parameters[BEAMLETS]))
 
 
 class ShotsPlan(NamedTuple):
@@ -163,18 +186,8 @@ class ShotsCalling:
         rotating: bool,
         rays_by_tolerance: bool = False,
     ) -> None:
-        from sweep.model.effects.catalogue import DEFAULTS
-        from sweep.model.effects.span import Span
-        from sweep.model.effects.tile_link import TileLink
-
         self._parameters, self._surfaces, self._modes = parameters, surfaces, modes
         self._rotating, self._rays_by_tolerance = rotating, rays_by_tolerance
-        self._instrument = TileLink(
-            {
-                path: value if isinstance(value, str) else Span.of(np.asarray(value)[()])
-                for path, value in (DEFAULTS | dict(parameters)).items()
-            }
-        )
 
     def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""
@@ -187,11 +200,20 @@ class ShotsCalling:
 
     def _plan(self, eyepoints: Eyepoints, edges: np.ndarray) -> Plan:
         """The plan of tiles of shots that all see something."""
+        from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
-        from sweep.model.seen_tiles import block_of
+        from sweep.model.effects.points import Points
+        from sweep.model.effects.spread import of_rays
+        from sweep.model.eyepoints import seen_ground
 
-        block = block_of(eyepoints, self._instrument, self._surfaces, edges, self._rotating)
-        return plan(block, modes=self._modes, tolerance=self._tolerance(eyepoints))
+        shots, ground = seen_ground(eyepoints, DEFAULTS | dict(self._parameters), self._surfaces)
+        points = Points(shots, of_rays(ground), rotating=self._rotating)
+
+        def tiles(values: np.ndarray) -> np.ndarray:
+            each = np.broadcast_to(values, eyepoints.time.shape)
+            return np.maximum.reduceat(each, edges[:-1])
+
+        return plan(points, tiles, self._modes, self._tolerance(eyepoints))
 
     def _tolerance(self, eyepoints: Eyepoints) -> float:
         """What of the tolerance is for effects."""
@@ -203,22 +225,9 @@ class ShotsCalling:
 
 def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
-    edges, tile = np.empty(tiles.size + 1, np.int64), np.empty(tiles.size, np.int64)
-    return edges[: _put_stretches(tiles, edges, tile)], tile
-
-
-@njit(cache=True)
-def _put_stretches(tiles, edges, tile):
-    """Fill in edges and indices; number of edges."""
-    last = 0
-    edges[0] = 0
-    for i in range(tiles.size):
-        if i > 0 and tiles[i] != tiles[i - 1]:
-            last += 1
-            edges[last] = i
-        tile[i] = last
-    edges[last + 1] = tiles.size
-    return last + 2
+    new = np.diff(tiles) != 0
+    edges = np.concatenate([[0], np.flatnonzero(new) + 1, [tiles.size]])
+    return edges, np.concatenate([[0], np.cumsum(new)])
 
 
 def layouts(

@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sweep.tasks.grid import Grid, Value
-
-if TYPE_CHECKING:
-    from sweep.model.effects.span import Span
 
 #: Points of a tile at the most: few enough that they are much alike, enough that planning is cheap.
 TILE_POINTS = 1024
@@ -40,8 +36,9 @@ class Alike(NamedTuple):
     """The same for all tiles of the grid that share them."""
     tiles: np.ndarray
     """(m,): their numbers among those asked for."""
-    parameters: dict[str, Span | str]
-    """By dotted path: spans (m,) of numbers, and words."""
+    parameters: dict[str, Value]
+    """By dotted path: words, numbers, and arrays that broadcast over (m, *tile): tiles that the
+    grid's edge cuts have their last points several times."""
 
 
 class Tiles:
@@ -83,8 +80,11 @@ class Tiles:
         tiles, place = np.unique(numbers, return_inverse=True)
         return tiles, place.ravel()
 
-    def alike(self, tiles: np.ndarray) -> Iterator[Alike]:
-        """Spans of the parameters of some tiles, those together that share words and sizes."""
+    def alike(self, tiles: np.ndarray, every: int = 1) -> Iterator[Alike]:
+        """Parameters of the points of some tiles, those together that share words and sizes.
+
+        ``every``: of every so manieth point along each axis.
+        """
         positions = np.unravel_index(tiles, self.along) if self.along else ()
         codes = np.zeros(len(tiles), np.int64)
         for k, position in enumerate(positions):
@@ -92,9 +92,9 @@ class Tiles:
                 codes = codes * self.along[k] + position
         for code in np.unique(codes) if any(self._undivided) else codes[:1]:
             chosen = np.flatnonzero(codes == code)
-            parameters = dict(self._fixed)
+            parameters: dict[str, Value] = {**self.grid.fixed}
             for k, position in enumerate(positions):
-                parameters |= self._along(k, position[chosen])
+                parameters |= self._along(k, position[chosen], every)
             yield Alike(int(code), chosen, parameters)
 
     def points(self, tile: int) -> tuple[slice, ...]:
@@ -113,46 +113,17 @@ class Tiles:
             for path, values in self.grid.values[axis].items()
         )
 
-    def _along(self, axis: int, position: np.ndarray) -> dict[str, Span | str]:
-        from sweep.model.effects.span import Span
-
+    def _along(self, axis: int, position: np.ndarray, every: int) -> dict[str, Value]:
+        members = self.grid.values[axis]
         if self._undivided[axis]:
             first = int(position[0])
-            return {path: _span(values[first]) for path, values in self.grid.values[axis].items()}
-        return {
-            path: Span(low[position], high[position])
-            for path, (low, high) in self._extremes[axis].items()
-        }
-
-    @cached_property
-    def _fixed(self) -> dict[str, Span | str]:
-        """Parameters that all points share."""
-        return {path: _span(value) for path, value in self.grid.fixed.items()}
-
-    @cached_property
-    def _extremes(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
-        """Least and largest value of each member within each tile's stretch of its axis."""
-        extremes: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
-        for k, members in enumerate(self.grid.values):
-            starts = np.arange(0, self.grid.shape[k], self.shape[k])
-            extremes.append(
-                {
-                    path: (
-                        np.minimum.reduceat(values.astype(float), starts),
-                        np.maximum.reduceat(values.astype(float), starts),
-                    )
-                    for path, values in members.items()
-                    if values.dtype.kind not in "UO"
-                }
-            )
-        return extremes
-
-
-def _span(value: Value) -> Span | str:
-    """One value as the planner takes it."""
-    from sweep.model.effects.span import Span
-
-    return str(value) if isinstance(value, str) else Span.of(float(value))
+            return {path: values[first].item() for path, values in members.items()}
+        side, size = self.shape[axis], self.grid.shape[axis]
+        index = np.minimum(position[:, None] * side + np.arange(0, side, every), size - 1)
+        shape = [len(position), *(1,) * len(self.shape)]
+        shape[axis + 1] = index.shape[1]
+        index = index.reshape(shape)
+        return {path: values[index].astype(float) for path, values in members.items()}
 
 
 def tile_shape(sizes: tuple[int, ...], undivided: tuple[bool, ...]) -> tuple[int, ...]:

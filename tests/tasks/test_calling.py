@@ -47,7 +47,7 @@ def test_tiles_are_alike_on_all_sides_and_hold_no_two_words():
     assert tile_shape((), ()) == ()
 
 
-def test_every_point_lies_in_one_tile_whose_spans_hold_its_parameters():
+def test_every_point_lies_in_one_tile_that_has_its_parameters():
     axes = {"instrument.processing.window": ["hann", "hamming"], **WIDE}
     grid = Grid(small(axes=axes, storage={"block_points": 977}))
     tiles = Tiles(grid)
@@ -57,12 +57,29 @@ def test_every_point_lies_in_one_tile_whose_spans_hold_its_parameters():
         assert place.size == grid.block_size(block)
         for alike in tiles.alike(numbers):
             within = np.flatnonzero(np.isin(place, alike.tiles))
-            at = np.searchsorted(alike.tiles, place[within])
             window = alike.parameters["instrument.processing.window"]
             assert set(points["instrument.processing.window"][within]) == {window}
-            for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
-                span, values = alike.parameters[path], points[path][within]
-                assert (span.low[at] <= values).all() and (values <= span.high[at]).all()
+            for tile, own in enumerate(alike.tiles):
+                here = within[place[within] == own]
+                for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
+                    values = np.broadcast_to(
+                        alike.parameters[path], (len(alike.tiles), *tiles.shape)
+                    )
+                    assert np.isin(points[path][here], values[tile]).all()
+
+
+def test_few_points_tell_what_all_of_a_tile_call_for():
+    """They settle only tiles that keep all that there is."""
+    spec = small(axes=WIDE, footprint={"phases": "incoherent"}, accuracy={"tolerance": 1e-2})
+    calling = Calling(spec, Grid(spec))
+    tiles = np.arange(calling.tiles.number)
+    kept = np.zeros((len(NAMES), tiles.size), bool)
+    for chosen, plan in calling.plans(tiles):
+        kept[:, chosen] = plan.kept
+    for alike in calling.tiles.alike(tiles):
+        whole = calling._plan(alike)
+        assert (kept[:, alike.tiles] == whole.kept).all()
+    assert not kept.all(axis=1)[kept.any(axis=1)].all()
 
 
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():

@@ -10,26 +10,17 @@ are kept. Acceleration is positive when it makes the radial velocity grow (PHYSI
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.phase_bounds import (
-    Error,
-    by_segment,
-    counted,
-    error_change,
-    over_record,
-)
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.phase_sizes import over_record, phase_size
+from sweep.model.effects.points import Points, Smear
 from sweep.model.effects.range_walk import record_times
 from sweep.model.preparation import PhaseError, Shots
-from sweep.model.waveform import SIGNS
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+NAME = "acceleration"
 
 
 def phase(
@@ -74,32 +65,23 @@ def phase(
     return np.asarray(alpha * t**2 * (frequency + slope * chirped))
 
 
-@counted
-def error(block: "Block") -> Error | None:
-    """The phase that acceleration adds over a block's tiles."""
-    if not block.has("target.acceleration"):
+def smear(points: Points) -> Smear | None:
+    """The phase that acceleration adds."""
+    if not points.has("target.acceleration"):
         return None
-    alpha = block["target.acceleration"] / SPEED_OF_LIGHT
-    delay = (2 / SPEED_OF_LIGHT) * block.range
-    record = {"start": block.start, "duration": block.record_duration}
-    errors: list[Error | None] = []
-    for segment, sign in enumerate(SIGNS):
-        if not block.segment_exists[segment]:
-            errors.append(None)
-            continue
-        slope = sign * block.chirp_rate
-        terms = {
-            2: alpha * (block.carrier(segment) - slope * delay),
-            3: alpha * slope * (1 + block.beta),
-            4: alpha**2 * slope * 0.5,
-        }
-        errors.append(over_record(terms if sign else {2: terms[2]}, **record))
-    return by_segment(block, *errors)
+    alpha = points["target.acceleration"] / SPEED_OF_LIGHT
+    slope = points.signs * points.chirp_rate
+    terms = {
+        2: alpha * (points.carriers - slope * points.delay),
+        3: alpha * slope * (1 + points.beta),
+        4: alpha**2 * slope * 0.5,
+    }
+    return over_record(points, terms)
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving acceleration out can change of the detecting bins, (3, tiles)."""
-    return error_change(block, error)
+def size(points: Points) -> Size | None:
+    """What leaving acceleration out changes of the detecting bins."""
+    return phase_size(points, NAME)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -117,10 +99,11 @@ def act(shots: Shots, scene: Scene) -> Shots:
 
 
 EFFECT = Effect(
-    name="acceleration",
+    name=NAME,
     about="drift of the Doppler frequency",
     stage="record",
-    bound=bound,
+    size=size,
+    smear=smear,
     act=act,
     parameters=(
         Parameter(

@@ -21,16 +21,12 @@ Sources of the tables:
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.effects.effect import Parameter
-from sweep.model.effects.span import Span, monotone
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 _LEVEL = 1e-9
 """Difference in height [m] given to level paths, about their middle, so that there is a mean."""
@@ -203,52 +199,3 @@ def path_heights(p: Mapping[str, np.ndarray], range: np.ndarray) -> tuple[np.nda
         return target, target
     elevation = p.get(PATH_ELEVATION, p.get("target.grazing_angle"))
     return target + range * np.sin(np.asarray(elevation, float)), target
-
-
-class Path(NamedTuple):
-    """The beams' paths through the air over a block's tiles."""
-
-    range: Span
-    """Length [m]."""
-    target: Span
-    """Height of the target above the ground [m]."""
-    sine: Span
-    """Sine of the beam's angle below the horizon."""
-
-
-def path_of(block: "Block") -> Path:
-    """Paths of a block; a level one goes down by nothing."""
-    target = block["atmosphere.target_height"]
-    if block.word("atmosphere.path") == "level":
-        return Path(block.range, target, Span.of(0.0))
-    try:
-        elevation = block[PATH_ELEVATION]
-    except KeyError:  # on a plane, whose grazing angle it is
-        elevation = block.grazing_angle
-    return Path(block.range, target, Span(np.sin(elevation.low), np.sin(elevation.high)))
-
-
-def profile_over(block: "Block") -> Profile | None:
-    """Extinction over height for a block; None without an atmosphere."""
-    name = block.word("atmosphere.profile")
-    if name == "none":
-        return None
-    numbers = {
-        path: np.ravel(block[path].low)[0] for path in ("atmosphere.extinction", "atmosphere.depth")
-    }
-    return profile_of(numbers | {"atmosphere.profile": name})
-
-
-def depth_over(profile: Profile, path: Path) -> Span:
-    """Optical depths of paths, one way.
-
-    The tables of :func:`profile_of` fall with height, so that the depth of a path rises with its
-    length, and falls as its target is higher or it is steeper.
-    """
-
-    def depth(*, range: np.ndarray, target: np.ndarray, sine: np.ndarray) -> np.ndarray:
-        return optical_depth(
-            profile, start_height=target + range * sine, end_height=target, range=range
-        )
-
-    return monotone(depth, falling=("target", "sine"), **path._asdict())

@@ -19,36 +19,21 @@ Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.atmosphere import (
-    Path,
-    Profile,
-    optical_depth,
-    path_heights,
-    path_of,
-    profile_of,
-    profile_over,
-)
-from sweep.model.effects.change import Change, added_noise
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import Span
+from sweep.model.effects.atmosphere import Profile, optical_depth, path_heights, profile_of
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.link import aperture_area
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _FOLDS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
 """Where a row of the table is cut for the integral, in e-foldings of its extinction."""
 _NEAR = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Where the path is cut for the integral, in units of r_0."""
-_BRACKETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0, 64.0, np.inf)
-"""Where the path is cut for the bound, in units of r_0."""
 
 
 def power(
@@ -99,54 +84,6 @@ def power(
     return np.asarray(collected * returned / near[..., 0] / ratio[..., 0])
 
 
-def largest_power(
-    profile: Profile,
-    path: Path,
-    *,
-    laser_power: Span,
-    aperture: Span,
-    optical_efficiency: Span,
-    beam_divergence: Span,
-    lidar_ratio: Span,
-) -> np.ndarray:
-    """Largest value [W] that :func:`power` can have over tiles, from optical depths alone.
-
-    As d(T^2) = -2 alpha T^2 dr, the integral over a piece of the path is the fall of T^2 over it,
-    by 2 S, times a mean of 1/(r^2 + r_0^2), at most its value at the piece's near end. The fall is
-    largest where the air up to the piece is thinnest, and that in it densest.
-    """
-    near, far = (aperture / beam_divergence).low, path.range.high
-    near, far, *_ = (
-        v[..., None] for v in np.broadcast_arrays(near, far, path.target.low, path.sine.low)
-    )
-    r = np.minimum(np.asarray(_BRACKETS) * near, far)
-    thin, dense = (_depth_to(profile, path, r, densest=densest) for densest in (False, True))
-    fall = np.exp(-2 * thin[..., :-1]) * -np.expm1(-2 * np.maximum(np.diff(dense), 0.0))
-    returned = (fall / 2 / (r[..., :-1] ** 2 + near**2)).sum(axis=-1)
-    collected = _collected(laser_power.high, aperture.high, optical_efficiency.high)
-    return np.asarray(collected * returned / lidar_ratio.low)
-
-
-def _depth_to(profile: Profile, path: Path, r: np.ndarray, *, densest: bool) -> np.ndarray:
-    """Depth from the lidar to distances r in the densest or the thinnest air of some tiles.
-
-    Air is thinner the higher. So many metres from the lidar a beam is the lower the lower its
-    target, the flatter it is and, unless it looks up, the nearer. Beyond the end of the path that
-    is looked at the air is no denser, or no thinner, than on its target.
-    """
-    target, sine = (v.low if densest else v.high for v in (path.target, path.sine))
-    nearest = (np.asarray(sine) >= 0) == densest
-    length = np.where(nearest, path.range.low, path.range.high)
-    target, sine, length = (np.asarray(v, float)[..., None] for v in (target, sine, length))
-    within = np.minimum(r, length)
-    lidar = target + length * sine
-    depth = optical_depth(
-        profile, start_height=lidar, end_height=lidar - within * sine, range=within
-    )
-    beyond = optical_depth(profile, start_height=target, end_height=target, range=r - within)
-    return depth + beyond
-
-
 def _cut_heights(profile: Profile) -> np.ndarray:
     """Heights between which extinction is smooth and falls by a few e-foldings at most."""
     cuts = [profile.height[0]]
@@ -194,32 +131,39 @@ def act(shots: Shots, scene: Scene) -> Shots:
     return replace(shots, noise_sources=shots.noise_sources | sources)
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving backscatter out can change, (tiles,)."""
-    air = profile_over(block)
+def size(points: Points) -> Size | None:
+    """The most that backscatter can be; the threshold is set on it.
+
+    All the path with the air at its lower end, undimmed; or all the light that it takes, sent back
+    from the beam's own end.
+    """
+    air = profile_of(points.parameters)
     if air is None:
         return None
-    light = largest_power(
-        air,
-        path_of(block),
-        laser_power=block["instrument.laser.power"],
-        aperture=block["instrument.telescope.aperture"],
-        optical_efficiency=block["instrument.telescope.optical_efficiency"],
-        beam_divergence=block["instrument.laser.beam_divergence"],
-        lidar_ratio=block["atmosphere.lidar_ratio"],
+    lidar, target = path_heights(points.parameters, points.range)
+    lowest = np.minimum(lidar, target)
+    near = points["instrument.telescope.aperture"] / points["instrument.laser.beam_divergence"]
+    local = optical_depth(air, start_height=lowest, end_height=lowest, range=1.0)
+    depth = optical_depth(air, start_height=lidar, end_height=target, range=points.range)
+    even = local * np.arctan(points.range / near) / near
+    returned = np.minimum(even, -np.expm1(-2 * depth) / 2 / near**2)
+    light = (
+        returned
+        / points["atmosphere.lidar_ratio"]
+        * _collected(
+            points["instrument.laser.power"],
+            points["instrument.telescope.aperture"],
+            points["instrument.telescope.optical_efficiency"],
+        )
     )
-    return added_noise(
-        least=0.0,
-        largest=block.shot_noise_scale.high * light,
-        noise_variance=block.noise_variance,
-    )
+    return Size(noise=light * points.receiver.per_watt / points.noise_variance)
 
 
 EFFECT = Effect(
     name="backscatter",
     about="shot noise of light that the air sends back",
     stage="noise",
-    bound=bound,
+    size=size,
     act=act,
     parameters=(
         Parameter(

@@ -15,21 +15,19 @@ over time, the beat (delayed wave less local oscillator, PHYSICS section 2) gain
 about -tau e(t): nothing at no range, and the more the farther. The Doppler segment has no sweep.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.phase_bounds import Error, by_segment, counted, error_change
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size, Sized
+from sweep.model.effects.phase_sizes import phase_size
+from sweep.model.effects.points import Points, Smear
 from sweep.model.effects.range_walk import record_times
-from sweep.model.effects.span import Span
 from sweep.model.preparation import PhaseError, Shots
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+NAME = "chirp_nonlinearity"
 
 _SHAPES = ("quadratic", "cubic", "sinusoidal")
 _PEAKS = tuple(f"instrument.chirp.{shape}_error" for shape in _SHAPES)
@@ -105,50 +103,49 @@ def _integral_over_step(
     return np.asarray(h * mean)
 
 
-@counted
-def error(block: "Block") -> Error | None:
-    """The phase that the sweep's error adds over a block's tiles.
+def smear(points: Points) -> Smear | None:
+    """The phase that the sweep's error adds.
 
     That of square and cube is a polynomial in the place in the record; the sine's is taken at its
     largest.
     """
-    if not block.has(*_PEAKS):
+    if not points.has(*_PEAKS):
         return None
-    quadratic, cubic, sinusoidal = (block[path] for path in _PEAKS)
-    half = 0.5 * block.record_duration
-    middle, per_length = block.start + half, 2 / block["instrument.chirp.duration"]
-    passed = -1 * block.beta * half
-    delay = [(2 / SPEED_OF_LIGHT) * block.range - block.beta * middle, passed]
-    rest = delay[0].magnitude + passed.magnitude
-    errors = []
-    for sign in (1, -1):
-        step = [-sign * per_length * part for part in delay]
-        place = [sign * (per_length * middle - 1) + 0.5 * step[0], sign * per_length * half]
-        place[1] = place[1] + 0.5 * step[1]
-        square, small = _product(place, place), _product(step, step)
-        mean = [2 * quadratic * a + quadratic * b / 6 for a, b in zip(square, small, strict=True)]
-        mean[0] = mean[0] - quadratic
-        factor = [4 * a + b for a, b in zip(square, small, strict=True)]
-        factor[0] = factor[0] - 3
-        cube = [cubic * part for part in _product(place, factor)]
-        mean = [a + b for a, b in zip([*mean, Span.of(0.0)], cube, strict=True)]
-        constant, *powers = (part.magnitude for part in _product(delay, mean))
-        errors.append(Error(tuple(powers), rest * sinusoidal.magnitude, constant))
-    return by_segment(block, errors[0], None, errors[1])
+    quadratic, cubic, sinusoidal = (points[path] for path in _PEAKS)
+    half, signs = 0.5 * points.record_duration, points.signs
+    middle, per_length = points.start + half, 2 / points["instrument.chirp.duration"]
+    delay = [points.delay - points.beta * middle, -points.beta * half]
+    step = [-signs * per_length * part for part in delay]
+    place = [
+        signs * (per_length * middle - 1) + 0.5 * step[0],
+        signs * per_length * half + 0.5 * step[1],
+    ]
+    square, small = _product(place, place), _product(step, step)
+    mean = [quadratic * (2 * a + b / 6) for a, b in zip(square, small, strict=True)]
+    mean[0] = mean[0] - quadratic
+    factor = [4 * a + b for a, b in zip(square, small, strict=True)]
+    factor[0] = factor[0] - 3
+    cube = [cubic * part for part in _product(place, factor)]
+    mean = [a + b for a, b in zip([*mean, np.zeros(())], cube, strict=True)]
+    chirped = np.abs(signs)
+    constant, *powers = (chirped * np.abs(part) for part in _product(delay, mean))
+    rest = chirped * (np.abs(delay[0]) + np.abs(delay[1])) * np.abs(sinusoidal)
+    turns = 2 * np.pi * points["instrument.chirp.error_periods"] * per_length * half
+    return Smear(tuple(powers), rest, constant, rest * turns)
 
 
-def _product(one: list[Span], other: list[Span]) -> list[Span]:
+def _product(one: Sequence[Sized], other: Sequence[Sized]) -> list[Sized]:
     """Coefficients of a product of polynomials, lowest power first."""
-    product = [Span.of(0.0)] * (len(one) + len(other) - 1)
+    product: list[Sized] = [0.0] * (len(one) + len(other) - 1)
     for i, a in enumerate(one):
         for j, b in enumerate(other):
             product[i + j] = product[i + j] + a * b
     return product
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving the sweep's error out can change of the detecting bins, (3, tiles)."""
-    return error_change(block, error)
+def size(points: Points) -> Size | None:
+    """What leaving the sweep's error out changes of the detecting bins."""
+    return phase_size(points, NAME)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -179,10 +176,11 @@ def _error(shape: str, about: str) -> Parameter:
 
 
 EFFECT = Effect(
-    name="chirp_nonlinearity",
+    name=NAME,
     about="departure of the sweep from a straight line",
     stage="record",
-    bound=bound,
+    size=size,
+    smear=smear,
     act=act,
     parameters=(
         _error("quadratic", "Peak of the sweep's frequency error that goes as a square"),

@@ -7,46 +7,41 @@ where between two bins the line comes to lie.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects import footprint_phase
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.line_spread import NO_SPREAD, NOT_AWAY, moved_change
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.footprint import by_power
+from sweep.model.effects.points import Points
+from sweep.model.effects.spread import NO_SPREAD
 from sweep.model.preparation import Shots, doppler_ratio
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+NOT_AWAY = 0.1
+"""Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
 
-def bound(block: "Block") -> Change | None:
-    """What the shift can change in the largest bin, from the block's amplitude, which has it.
+def size(points: Points) -> Size | None:
+    """What the shift changes in the largest bin.
 
     Its size in bins counts besides, as velocity is measured by it. A line that goes elsewhere is
-    not left out, nor is it any other effect's business where it was.
+    not left out.
     """
-    if not block.has("target.radial_velocity"):
+    if not points.has("target.radial_velocity"):
         return None
-    moved = block.doppler_shift
+    moved = points.doppler_shift
     away = (moved > NOT_AWAY).any(axis=0)
-    change = Change(shift=np.where(away, 1.0, moved))
+    shift = np.where(away, 1.0, moved.max(axis=0))
     if away.all():
-        return change
-    if block.architecture != "direct":
-        factors = moved_change(
-            block.lines, block.resting_lines, moved, NO_SPREAD, block.spread, block.number
-        )
-        low, high = factors.signal
-        with np.errstate(divide="ignore"):
-            least, most = (np.where(away, 1.0, 1 / np.asarray(end)) for end in (high, low))
-        change = change._replace(signal=(least, most))
-    if block.adds_amplitudes:
-        bins = moved * (1 + block.spread.extreme)  # the beat of a range stretches too
-        added = footprint_phase.sum_added(block, block.lines, bins)
-        change = change._replace(added=np.where(away, 0.0, added))
-    return change
+        return Size(shift=shift)
+    magnitude: np.ndarray | float = 0.0
+    added: np.ndarray | float = 0.0
+    if points.architecture != "direct":
+        change = by_power(points.moved(NO_SPREAD, points.spread, moved))
+        magnitude = np.where(away, 0.0, change)
+    if points.adds_amplitudes:
+        bins = moved * (1 + points.spread.extreme)  # the beat of a range stretches too
+        added = np.where(away, 0.0, points.in_phase(bins))
+    return Size(magnitude=magnitude, added=added, shift=shift)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -58,6 +53,6 @@ EFFECT = Effect(
     name="doppler",
     about="shift of all lines by the radial velocity",
     stage="lines",
-    bound=bound,
+    size=size,
     act=act,
 )

@@ -6,38 +6,30 @@ lines' positions in all three segments.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects import footprint_phase
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.line_spread import spread_change
-from sweep.model.effects.span import any_holds
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.footprint import by_power
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 NAME = "doppler_spread"
 
 
-def bound(block: "Block") -> Change | None:
-    """What differences of velocity can change in the largest bin.
+def size(points: Points) -> Size | None:
+    """What differences of velocity change in the largest bin.
 
-    That the ranges are there already makes no difference to whether this is a bound, as powers;
-    of amplitudes that add, lines in phase change by their own moves.
+    Of amplitudes that add, lines in phase change by their own moves.
     """
-    velocities = block.spreads.velocities
-    if not any_holds(np.greater(velocities.extreme, 0)):
+    velocities = points.velocity_spread
+    if not np.any(velocities.extreme):
         return None
-    change = Change()
-    if block.architecture != "direct":
-        change = spread_change(block.lines, velocities, block.spreads.ranges, block.number)
-    if not block.adds_amplitudes:
-        return change
-    return change._replace(added=footprint_phase.sum_added(block, block.lines, velocities.extreme))
+    added = points.in_phase(velocities.extreme) if points.adds_amplitudes else 0.0
+    if points.architecture == "direct":
+        return Size(added=added)
+    power = points.moved(velocities, points.range_spread)
+    return Size(magnitude=by_power(power), added=added)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -52,7 +44,7 @@ EFFECT = Effect(
     name=NAME,
     about="radial velocities that differ over the footprint",
     stage="lines",
-    bound=bound,
+    size=size,
     act=act,
     apart=False,
     parameters=(

@@ -1,9 +1,9 @@
 """What every physical effect is to the rest: where it acts, what it can change, what it does.
 
 An effect is one module with one :class:`Effect` in it, in :mod:`sweep.model.effects.catalogue`.
-Its parameters become fields of a spec by themselves; the planner asks its bound, block by block,
-whether the scene calls for it; :mod:`sweep.model.chain` applies it where it does. Where it does
-not, nothing of it is computed.
+Its parameters become fields of a spec by themselves; the planner asks its size at the points of
+each tile, whether the scene calls for it; :mod:`sweep.model.chain` applies it where it does. Where
+it does not, nothing of it is computed.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.change import Bound
 from sweep.model.ground import Ground
 from sweep.model.preparation import Parameters, Shots
 
 if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+    from sweep.model.effects.points import Points, Smear
 
 STAGES = ("lines", "light", "noise", "record", "spectrum", "detection", "draws")
 """Where in the chain effects act, in this order: on the lines of a footprint; on the light that
@@ -90,6 +89,30 @@ class Realisation(NamedTuple):
     """(n,) int64: number of each point's draw."""
 
 
+Sized = np.ndarray | float
+
+
+class Size(NamedTuple):
+    """What leaving an effect out would change at each point, by segment or alike in all."""
+
+    magnitude: Sized = 0.0
+    """Relative change of the largest bin's magnitude; from 1 on nothing is known of it."""
+    added: Sized = 0.0
+    """What is besides added to that magnitude, or taken from it, as a share of what all amplitudes
+    make in phase: of sums that may cancel a share cannot be told."""
+    noise: Sized = 0.0
+    """Relative change of a bin's noise variance."""
+    threshold_follows: bool = True
+    """Whether the threshold is set on the changed noise, as for noise that is always there; else it
+    stays where it was, as for noise that comes with the signal."""
+    shift: Sized = 0.0
+    """Bins by which what is measured moves; they count as a change of a probability does."""
+    alarms: Sized = 0.0
+    """Change of log10 of a shot's probability of a false alarm, by bins that cross the level."""
+    chance: Sized = 0.0
+    """Change of a probability itself, summed over the segments where there is one of each."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """A physical effect, the same as no other."""
@@ -99,9 +122,11 @@ class Effect:
     """What it is, in a few words, for tables and help."""
     stage: str
     """One of :data:`STAGES`."""
-    bound: "Callable[[Block], Bound | None]"
-    """What it can change in any point of each tile, (tiles,) or (3, tiles) by segment: factors,
-    or a bound on the change of a probability. None: the scene has nothing of it."""
+    size: "Callable[[Points], Size | None]"
+    """What leaving it out would change at each point. None: the scene has nothing of it."""
+    smear: "Callable[[Points], Smear | None] | None" = None
+    """What it does to lines over the record, for those that smear them: it is looked at before any
+    size is."""
     act: Callable[[Shots, Scene], Shots] | None = None
     """What it does to shots, once."""
     turn: Callable[[dict[str, np.ndarray], Realisation], dict[str, np.ndarray]] | None = None

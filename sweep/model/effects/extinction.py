@@ -6,50 +6,12 @@ the sun's, by T.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import ArrayLike
 
 from sweep.model.effects import solar_background
-from sweep.model.effects.atmosphere import (
-    PARAMETERS,
-    depth_over,
-    path_heights,
-    path_of,
-    profile_of,
-    profile_over,
-    transmission,
-)
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.span import Span
+from sweep.model.effects.atmosphere import PARAMETERS, path_heights, profile_of, transmission
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
-
-
-def dimming(*, depth: Span, amplitude_exponent: float, dimmed_share: ArrayLike) -> Change:
-    """Change by extinction: exact on the signal; less light from the target is less shot noise.
-
-    Parameters
-    ----------
-    depth : Span
-        Optical depth of the path, one way.
-    amplitude_exponent : float
-        Power of T in the beat's amplitude: 1 with a local oscillator (its square is T^2), 2 for
-        direct detection.
-    dimmed_share : array_like
-        Largest share of the noise variance, 0..1, that light from the target makes without
-        extinction (signal and solar shot noise): at most 1 - T^2 of that share is gone.
-    """
-    quieter = 1 + np.expm1(-2 * np.asarray(depth.high)) * np.asarray(dimmed_share, float)
-    low, high = (np.exp(-amplitude_exponent * np.asarray(d)) for d in (depth.high, depth.low))
-    # The threshold follows the sun's part and not the echo's: an interval that holds both.
-    return Change(
-        signal=(low, high), noise=(quieter, np.ones_like(quieter)), threshold_follows=False
-    )
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -68,19 +30,21 @@ def act(shots: Shots, scene: Scene) -> Shots:
     )
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving extinction out can change, (tiles,)."""
-    air = profile_over(block)
+def size(points: Points) -> Size | None:
+    """What leaving extinction out changes: the echo, and shot noise of light from the target."""
+    air = profile_of(points.parameters)
     if air is None:
         return None
-    echo = block.shot_noise_scale * block.echo_scale * block.echo * Span.hull(1.0, block.echo_ratio)
-    dimmed = (echo / block.noise_variance).high
-    if (sun := solar_background.bound(block)) is not None:
-        dimmed = dimmed + np.asarray(sun.noise[1]) - 1
-    return dimming(
-        depth=depth_over(air, path_of(block)),
-        amplitude_exponent=2.0 if block.architecture == "direct" else 1.0,
-        dimmed_share=dimmed / (1 + dimmed),
+    lidar, target = path_heights(points.parameters, points.range)
+    t = transmission(air, start_height=lidar, end_height=target, range=points.range)
+    light = points.echo_noise
+    if (sun := solar_background.size(points)) is not None:
+        light = light + sun.noise
+    # the threshold follows the sun's part and not the echo's: the worse is taken
+    return Size(
+        magnitude=1 - (t**2 if points.architecture == "direct" else t),
+        noise=-(1 - t**2) * light / (1 + light),
+        threshold_follows=False,
     )
 
 
@@ -88,7 +52,7 @@ EFFECT = Effect(
     name="extinction",
     about="air, haze and dust that dim the light",
     stage="light",
-    bound=bound,
+    size=size,
     act=act,
     parameters=PARAMETERS,
 )

@@ -3,24 +3,14 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 
 
 def flags_of(kept: np.ndarray) -> np.ndarray:
     """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
-    flags = np.zeros(kept.shape[1], np.uint32)
-    _put_flags(kept, flags)
-    return flags
-
-
-@njit(cache=True)
-def _put_flags(kept, flags):
-    for k in range(kept.shape[0]):
-        for t in range(flags.size):
-            if kept[k, t]:
-                flags[t] |= np.uint32(1 << k)
+    masks = np.uint32(1) << np.arange(kept.shape[0], dtype=np.uint32)
+    return np.bitwise_or.reduce(np.where(kept, masks[:, None], np.uint32(0)), axis=0)
 
 
 def flags_apart() -> np.uint32:

@@ -7,44 +7,40 @@ an effect of their own (:mod:`sweep.model.effects.footprint_phase`), the velocit
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects import footprint_phase
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.line_spread import NO_SPREAD, spread_change
-from sweep.model.effects.span import Span
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
+from sweep.model.effects.spread import NO_SPREAD
 from sweep.model.footprint import PATTERNS
 from sweep.model.preparation import Shots, relative_amplitude
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
-
-def bound(block: "Block") -> Change | None:
-    """What the ranges of the footprint can change in the largest bin, and how much more it echoes.
+def size(points: Points) -> Size | None:
+    """What the ranges of the footprint change in the largest bin, and how much more it echoes.
 
     Of powers, without velocities, other surfaces or phases: these are within it. In direct
     detection the echoes' beats always add as amplitudes, with the phases that the ranges give to
     the radio frequency.
     """
-    if block.number == 1:
+    if points.number == 1:
         return None
-    spread, ratio = block.spreads.own_ranges, block.echo_ratio
-    if block.architecture != "direct":
-        change = spread_change(block.lines, spread, NO_SPREAD, block.number)
-        ratio = ratio.sqrt()
-    else:
-        uphill = np.exp(np.minimum(block.lines.tilt * spread.extreme, 50.0))
-        most = 2.1 * uphill / block.lines.lobe.worst  # all, and their images
-        phase = footprint_phase.phase_reach(block, block.geometry.own_ranges, NO_SPREAD)
-        change = footprint_phase.sum_change(
-            block.lines, phase=phase, gain=Span.of(1.0), spread=spread, most=most
-        )
-    low, high = change.signal
-    return Change(signal=(np.multiply(low, ratio.low), np.multiply(high, ratio.high)))
+    power = points.moved(points.own_spread, NO_SPREAD)
+    echo = 2 * np.abs(points.footprint.echo_ratio - 1)
+    if points.architecture != "direct":
+        return Size(magnitude=by_power(power + echo))
+    away = points.range * points.footprint.own_ranges.extreme
+    highest = points.carriers + 2 * points["instrument.chirp.bandwidth"]
+    phase = np.minimum(4 * np.pi / SPEED_OF_LIGHT * highest * away, 2.0)
+    beside = np.where(points.near_image, 2 * phase, 0.5 * phase**2)
+    return Size(magnitude=by_power(power + echo) + beside + echo)
+
+
+def by_power(change: np.ndarray) -> np.ndarray:
+    """Relative change of a magnitude by that of its power, downwards, which is the larger one."""
+    return np.asarray(1 - np.sqrt(1 - np.minimum(change, 1.0)))
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -65,7 +61,7 @@ EFFECT = Effect(
     name="footprint",
     about="beamlets at ranges of their own",
     stage="lines",
-    bound=bound,
+    size=size,
     act=act,
     parameters=(
         Parameter(

@@ -2,9 +2,10 @@
 
 X[k] has W(k - nu) and, conjugated, W(k + nu); past Nyquist the line that is seen is the image of
 one that is not. Without the effect only the kernel of the folded line itself is summed, where it
-is seen. It acts on the spectrum. Bound by the envelope E of the window's sidelobes: with a
-footprint that keeps e bins from the edge (DC or Nyquist), bins within e/2 of its lines have
-images at most E(3/2 e) high, and all others at most E(e/2) + E(e) altogether.
+is seen. It acts on the spectrum. Its size follows from the envelope E of the window's sidelobes:
+with all light of a line, wherever footprint and record put it, e bins from the edge (DC or Nyquist)
+or further, bins within e/2 have images at most E(3/2 e) high, and all others at most E(e/2) + E(e)
+altogether.
 
 A bin at the threshold, far down the lines' sidelobes, is smaller than the largest by far, and moved
 by an image that the largest does not feel. It then belongs to the detection, or does no more, and
@@ -15,123 +16,60 @@ and bins whose sidelobes fall no slower than 1/d lie there with a chance of x d.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
-from sweep.model.effects.change import Change
-from sweep.model.effects.columns import columns
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.footprint_sum import footprint_sum
-from sweep.model.effects.line_powers import extremes_of, power_range_of, uphill_of
-from sweep.model.effects.line_spread import sizes_of
-from sweep.model.effects.lobes import lobe_least, lobe_tail, lobe_within
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import PROCESSING, Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 _LN_10 = math.log(10)
 _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
 
 
-def bound(block: "Block") -> Change:
-    """What images can change in the largest bin.
+def size(points: Points) -> Size:
+    """What images change in the largest bin.
 
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
-    found, lobe = np.empty((2, 3, block.size)), block.lines.lobe
-    put_bounds(
-        block.axis, block.number, *sizes_of(lobe), (lobe.reach, lobe.envelope),
-        found.reshape(2, -1),
-    )  # fmt: skip
-    high, added = found
-    alarms = alarm_change(block)
-    if not block.adds_amplitudes:
-        return Change(signal=(1.0, high), alarms=alarms)
-    most = 1.0 if block.architecture == "direct" else high
-    return Change(signal=(1.0, most), added=added, alarms=alarms)
+    form, apart = points.lobe, points.apart
+    smeared = 1 + 2 * points.smeared / points.margin
+    least = points.powers[0] / smeared
+    outside = form.tail(apart)
+    inside, beside = form.tail(1.5 * apart), form.tail(0.5 * apart)
+    far = beside * beside + outside * outside
+    power = np.maximum(inside * inside, np.maximum(far - least, 0.0)) / least
+    alarms = alarm_change(points)
+    if not points.adds_amplitudes:
+        return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms)
+    uphill = np.exp(np.minimum(points.tilt * points.spread.extreme, 50.0))
+    added = uphill * outside * np.sqrt(smeared) / form.near(points.offset)
+    return Size(added=added, alarms=alarms)
 
 
-@njit(cache=True, error_model="numpy")
-def put_bounds(axis, beamlets, tables, sizes, lobe, out):
-    """Largest factor on the largest bin's magnitude, and what is added to a sum, (2, n)."""
-    bounds, (reach, envelope) = extremes_of(beamlets, tables), lobe
-    for i in range(axis.shape[1]):
-        offset, offset_least, edge, _, _, tilt, mean, rms, extreme = axis[:, i]
-        line, spread = (offset, offset_least, edge, tilt), (mean, rms, extreme)
-        least_power, _ = power_range_of(line, spread, bounds, tables, sizes)
-        apart = edge - extreme
-        inside = lobe_tail(reach, envelope, 1.5 * apart)
-        beside = lobe_tail(reach, envelope, 0.5 * apart)
-        outside = lobe_tail(reach, envelope, 1.0 * apart)
-        far = (beside * beside + outside * outside) / least_power
-        out[0, i] = np.sqrt(np.maximum(1 + inside * inside / least_power, far))
-        out[1, i] = uphill_of(tilt, extreme) * outside / lobe_least(tables[1], offset)
+def alarm_change(points: Points) -> np.ndarray | float:
+    """Change of log10 pfa of a shot by the bins that images move across the threshold.
 
-
-def alarm_change(block: "Block") -> np.ndarray:
-    """Change of log10 pfa of a shot by the bins that images move across the threshold, (tiles,).
-
-    That of one bin, or of as many as are to be expected; 0 where fewer than ``_SELDOM`` are.
+    That of one bin, or of as many as are to be expected were lines anywhere between two bins; 0
+    where fewer than ``_SELDOM`` are.
     """
-    if block.word(PROCESSING + "bins_counted") == "all":
-        return np.zeros(block.size)
-    found = np.empty(block.size)
-    put_alarms(*moved_bins(block), block.fft_size / 2, found)
-    return found
-
-
-@njit(cache=True, error_model="numpy")
-def put_alarms(bins, taken, half, out):
-    """Changes of log10 pfa (tiles,)."""
-    for t in range(out.size):
-        left = np.maximum(half - taken[t], 1.0)
-        out[t] = np.maximum(bins[t], 1.0) / (_LN_10 * left) if bins[t] > _SELDOM else 0.0
-
-
-def moved_bins(block: "Block") -> tuple[np.ndarray, np.ndarray]:
-    """Bins of a shot that images move across the threshold, and most that a detection takes.
-
-    Returns
-    -------
-    (tiles,), (tiles,) ndarray
-        Expected number, were lines anywhere between two bins, of both chirps together; bins of
-        one.
-    """
-    lobe, found = block.lines.lobe, np.empty((2, block.size))
-    table, shape = columns(footprint_sum(block).in_phase, block.peak.high, block.threshold.low)
-    put_moved_bins(
-        block.axis.reshape(-1, *shape), table.reshape(-1, *shape), block.fft_size / 2,
-        (lobe.reach, lobe.envelope), block.adds_amplitudes, found,
-    )  # fmt: skip
-    return found[0], found[1]
-
-
-@njit(cache=True, error_model="numpy")
-def put_moved_bins(axis, table, half, lobe, amplitudes, out):
-    """Expected bins that both chirps' images move, and most that a detection takes, (2, tiles)."""
-    reach, envelope = lobe
-    for t in range(out.shape[1]):
-        bins, furthest = 0.0, -np.inf
-        for s in (0, 2):
-            _, _, edge, transfer, _, tilt, _, _, extreme = axis[:, s, t]
-            in_phase, peak, level = table[:, s, t]
-            extreme = np.fmin(extreme, half)
-            transfer = np.minimum(transfer * uphill_of(tilt, extreme), 1.0)
-            whole = np.maximum(peak * transfer * in_phase, 1e-300)
-            away = np.minimum(lobe_within(reach, envelope, level / whole), half)
-            apart = edge - extreme
-            moved = 0.0
-            for distance in (np.maximum(2 * apart - away, apart), 2 * apart + away):
-                share = np.minimum(whole * lobe_tail(reach, envelope, distance) / level, 1.0)
-                moved += share if amplitudes else share * share / 2
-            bins += moved * (away + extreme)
-            furthest = np.maximum(furthest, away + extreme)
-        out[0, t], out[1, t] = bins, 2 * furthest + 4
+    if points.word(PROCESSING + "bins_counted") == "all":
+        return 0.0
+    form, half = points.lobe, points.fft_size / 2
+    chirps = slice(None, None, 2) if len(points.signs) == 3 else slice(None)
+    extreme = np.minimum(points.spread.extreme + points.smeared, half)
+    whole = np.maximum(points.level * points.footprint.gain, 1e-300)
+    away = np.minimum(form.within(points.threshold / whole), half)
+    moved: np.ndarray | float = 0.0
+    for distance in (np.maximum(2 * points.apart - away, points.apart), 2 * points.apart + away):
+        share = np.minimum(whole * form.tail(distance) / points.threshold, 1.0)
+        moved = moved + (share if points.adds_amplitudes else share * share / 2)
+    reach = away + extreme
+    bins = (moved * reach)[chirps].sum(axis=0)
+    left = np.maximum(half - 2 * reach[chirps].max(axis=0) - 4, 1.0)
+    return np.where(bins > _SELDOM, np.maximum(bins, 1.0) / (_LN_10 * left), 0.0)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -143,6 +81,6 @@ EFFECT = Effect(
     name="image",
     about="lines at negative frequencies, near DC and Nyquist",
     stage="spectrum",
-    bound=bound,
+    size=size,
     act=act,
 )

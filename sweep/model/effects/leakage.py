@@ -6,241 +6,84 @@ acts on the detection: without it no bin beside the groups need be looked at. By
     p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E_k, b),
 
 over the bins that may leak, with A the magnitude of all lines together, E_k the largest |W| at
-the distances that lines may have from bin k, and b the threshold, all over sigma. Not among them
-are the detecting bin and those that surely reach the threshold, and all their neighbours; so A is
-in the main lobe at most what leaves the bin before k below the threshold. Bins amid lines that add
-as powers have what Parseval's theorem gives them together. Images are no nearer to a bin than the
-lines are, nor than these are to DC and Nyquist.
-
-Amplitudes may cancel. With S the most that they add up to (:mod:`.footprint_sum`), their lines x_b
-from the axis's, bins have S |W| to sum a_b |x_b| max |W'|, and no more than A E_k. Either the
-largest is next to the axis's line, or their sum is so small that this leaves it open, and then
-every bin may leak, none with more than that makes of it.
+the distances that light may have from bin k, and b the threshold, all over sigma. Not among them
+are the detecting bin and its neighbours. By Parseval's theorem the bins have no more power together
+than ENBW times A^2, and the chance rises faster than a^2, so that the sum is at most ENBW times
+that of one bin of A, or A^2 / b^2 times that of one at the threshold.
 """
 
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
-from sweep.model.effects.change import Mean
-from sweep.model.effects.columns import columns
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.footprint_sum import footprint_sum
-from sweep.model.effects.line_powers import uphill_of
-from sweep.model.effects.lobes import lobe, lobe_tail
-from sweep.model.effects.sidelobes import CELLS, LEVELS, STEEPEST, sidelobes
-from sweep.model.effects.span import Span
-from sweep.model.marcum import excess_crossing
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.lobes import lobe
+from sweep.model.effects.points import Points
+from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import Shots
+from sweep.model.window import window
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
-
-
-_STEPS = 24
-_ROUNDING = 1e-6
-"""Bins by which a line's place may be off."""
-_NEGLIGIBLE = 1e-14
-"""Chance that needs no closer look."""
-_HIGHER = 1.25
-"""How much more leaks, at the most, with a higher threshold than one of 2 sigma or more: only bins
-that reach the threshold, whose chance to cross then rises from 0.468 to 0.556."""
-_STAR = 1.3
-"""How much more than in proportion to a^2 <= b^2 the chance to cross may fall, at the most."""
+_REACHES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
+"""Bins that light may be moved by, up to which there is a table each."""
+_OCTAVES, _FAINTEST, _STRONGEST = 2, -8, 30
+"""Rows an octave of A over the threshold, and where they begin and end."""
+_LEVELS = 1.04
+"""Thresholds have the table of the next lower of some, so far apart."""
+_NEAR, _FAR = 48, 24
+"""Bins that are looked at one by one, and stretches beyond."""
+_IMAGES = 1.1
+"""What images may make of sidelobes far from the edge."""
 
 
-def bound(block: "Block") -> Mean:
-    """Bound on the chance that leaked signal raises an extra group."""
-
-    def change(amplitude: Span, threshold: Span) -> np.ndarray:
-        return probability_bound(block, amplitude=amplitude, threshold=threshold)
-
-    return Mean(change)
-
-
-def probability_bound(block: "Block", *, amplitude: Span, threshold: Span) -> np.ndarray:
-    """Bound on the chance that leaked signal raises an extra group in a segment, (3, tiles), 0..1.
-
-    Parameters
-    ----------
-    block : Block
-        The tiles.
-    amplitude : Span
-        Magnitude of the detecting bin over sigma, (3, tiles), whatever the effects make of it.
-    threshold : Span
-        Threshold over sigma, likewise.
-    """
-    main, shape = block.lines.lobe, block.window
-    table, ratio = sidelobes(shape.name, shape.length), shape.length / block.fft_size
-    given, size = columns(
-        *footprint_sum(block), block.peak.high, amplitude.low, threshold.low, threshold.high
-    )
-    found = unions(
-        block.axis, given, (main.reach, main.envelope),
-        (table.highest, table.lowest, table.steepest),
-        far_steps(shape.name, shape.length, block.fft_size),
-        (ratio, block.fft_size / 2, shape.equivalent_noise_bandwidth),
-        not block.adds_amplitudes,
-    ).reshape(size)  # fmt: skip
-    if not block.segment_exists[1]:
-        found[1] = 0.0
-    return found
+def size(points: Points) -> Size:
+    """Chance that leaked signal raises an extra group, in all segments together."""
+    b = points.threshold
+    together = points.level * points.footprint.gain * _IMAGES
+    reach = points.spread.extreme + points.smeared
+    reach = np.where(points.near_image, np.inf, reach)
+    together = together * np.where(points.near_image, 2.0, 1.0)
+    row = np.searchsorted(_REACHES, reach)
+    octave = np.log2(np.maximum(together / b, 2.0**_FAINTEST))
+    place = np.minimum((octave - _FAINTEST) * _OCTAVES + 1, (_STRONGEST - _FAINTEST) * _OCTAVES)
+    place = place.astype(np.int64)
+    step = np.floor(np.log(np.maximum(b, 1e-3)) / math.log(_LEVELS))
+    steps, which = np.unique(step, return_inverse=True)
+    shape = points.window
+    tables = np.array([
+        table(shape.name, shape.length, points.fft_size, _LEVELS**float(v)) for v in steps
+    ])  # fmt: skip
+    chance = tables[which.reshape(np.shape(b)), row, place]
+    scale = np.where(octave < _FAINTEST + 0.5, (together / b / 2.0**_FAINTEST) ** 2, 1.0)
+    return Size(chance=(chance * np.minimum(scale, 1.0)).sum(axis=0))
 
 
-@lru_cache(maxsize=32)
-def far_steps(name: str, length: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distances [bins] from the table's end on, between which sidelobes are taken to be even.
-
-    Returns
-    -------
-    (m,) ndarray, (m,) ndarray, (m,) ndarray
-        Bins from each to the next; largest magnitude and slope from each on.
-    """
-    ratio, form = length / fft_size, lobe(name, length, fft_size)
-    first = sidelobes(name, length).lowest.size / CELLS / ratio
-    steps = np.geomspace(first, max(fft_size / 2, first) + 1, _STEPS)
-    begin = steps[:-1]
-    return np.diff(steps), form.tail(begin), STEEPEST * form.tail(begin - 1 / ratio)
-
-
-@njit(cache=True, error_model="numpy")
-def unions(axis, given, lobe, table, far, sizes, powers):
-    """Largest sum of the chances of all bins that may leak, (n,)."""
-    out, column = np.empty(given.shape[1]), np.empty(12)
-    for i in range(out.size):
-        _put_column(axis[:, i], given[:, i], lobe, table[2][LEVELS, 0], sizes, column)
-        together, b, upper = column[1], column[3], column[4]
-        if not b > 0.0:  # where other effects may drown the threshold, any bin may cross it
-            out[i] = 1.0
-            continue
-        first, second, limit, sure = _starts(column, table, sizes[0])
-        total = 0.0
-        if limit < together:
-            total = _sum(together, first, second, column, table, far, sizes, powers)
-        if not sure:
-            other = min(together, limit)
-            total = max(total, _sum(other, 0.0, 1.0, column, table, far, sizes, powers))
-        higher = (upper / b) ** 4
-        higher = min(higher, _HIGHER) if b > 2.0 else higher
-        out[i] = min(higher * min(total / -math.expm1(-0.5 * b * b), 1.0), 1.0)
-    return out
+@lru_cache(maxsize=256)
+def table(name: str, length: int, fft_size: int, level: float) -> np.ndarray:
+    """Chances by reach and by octaves of A over the threshold, the last row by Parseval alone."""
+    form, rows = lobe(name, length, fft_size), (_STRONGEST - _FAINTEST) * _OCTAVES + 1
+    together = level * 2.0 ** (np.arange(rows) / _OCTAVES + _FAINTEST)
+    quiet = marcum_q1(np.zeros(1), np.array([level])).q[0]
+    enough = _crossing(np.minimum(together, level), level, quiet)
+    energy = window(name, length).equivalent_noise_bandwidth * form.margin
+    parseval = enough * np.maximum(together / level, 1.0) ** 2 * energy
+    half = fft_size / 2
+    edges = np.unique(np.round(np.geomspace(_NEAR, max(half, _NEAR + 1), _FAR)))
+    distance = np.concatenate([np.arange(2.0, _NEAR), edges[:-1]])
+    number = np.concatenate([np.ones(_NEAR - 2), np.diff(edges)])
+    found = [
+        2 * (_crossing(np.minimum(together[:, None] * form.tail(distance - 0.5 - reach), level),
+                       level, quiet) * number).sum(axis=1)
+        for reach in _REACHES
+    ]  # fmt: skip
+    return np.minimum(np.minimum([*found, parseval], parseval), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
-def _put_column(axis, given, lobe, steepest, sizes, out):
-    """What a segment's bins follow from: sums of lines, ends of what they may be, sidelobes."""
-    offset, offset_least, edge, transfer, _, tilt, _, _, extreme = axis
-    in_phase, most, lean, peak, low, b, upper = given
-    (reach, envelope), (ratio, half, _) = lobe, sizes
-    extreme = np.fmin(extreme, 2.0 * half)
-    peak *= np.minimum(transfer * uphill_of(tilt, extreme), 1.0)
-    in_phase, most, lean = peak * in_phase, peak * most, peak * lean
-    image = lobe_tail(reach, envelope, edge - extreme)
-    sloping = STEEPEST * lobe_tail(reach, envelope, edge - extreme - 1 / ratio)
-    askew = np.minimum(lean * sloping * ratio, in_phase * image)
-    out[0], out[1], out[2], out[3], out[4], out[5] = in_phase, most, low, b, upper, extreme
-    out[6], out[7], out[8] = offset_least, offset, image
-    out[9] = np.minimum(most * image + askew, in_phase * image)
-    out[10] = askew + np.minimum(lean * ratio * steepest, 2 * in_phase)
-    out[11] = lean * ratio
-
-
-@njit(cache=True, error_model="numpy")
-def _starts(column, table, ratio):
-    """First bins that may leak on either side, from the nearest (0) up and from the next (1) up.
-
-    Returns
-    -------
-    first, second : float
-    limit : float
-        The sum of all lines below which any bin may be the largest.
-    sure : bool
-        Whether the sum is above it.
-    """
-    _, _, peak, b, _, extreme, least, most, image, _, askew, _ = column
-    beyond, lowest = table[0][LEVELS], table[1]
-    nearest = _read(beyond, (least - extreme) * ratio)
-    sum_ = max(peak - askew, 0.0) / (nearest + image)
-    near = _read(lowest, (most + extreme) * ratio) - 2.0 * image
-    first, second = 2.0, 2.0
-    gap = near - _read(beyond, (1.0 - most - extreme) * ratio)
-    if gap < 0.1 and sum_ * gap <= 2.0 * askew:
-        first = 1.0
-        gap = near - _read(beyond, (1.0 + least - extreme) * ratio)
-    limit = 2.0 * askew / gap if gap > 0.0 else math.inf
-    # the furthest that bins are sure to reach the threshold
-    weakest = (b + askew) / sum_ + image
-    reach = np.searchsorted(-lowest, -weakest, "right") / CELLS / ratio - extreme
-    if reach > most:
-        first = max(first, math.floor(reach - most) + 2.0)
-        second = max(second, math.floor(reach + least) + 2.0)
-    return first, second, limit, sum_ > limit
-
-
-@njit(cache=True, error_model="numpy")
-def _sum(whole, first, second, column, table, far, sizes, powers):
-    """Sum of the chances of the bins from the first two on, of lines that add up to ``whole``."""
-    a, _, _, b, upper, extreme, least, most, tail, image, askew, lean = column
-    ratio, half, noise_bandwidth = sizes
-    stride = max(int(1.0 / ratio), 1)
-    width = (most - least + 2.0 * extreme + stride - 1.0) * ratio + 2.0 * _ROUNDING
-    level = min(math.ceil(math.log2(math.floor(CELLS * min(width, 1.0)) + 2.0)) - 1, LEVELS)
-    row, lowest, slope = table[0][level], table[1], table[2][level]
-    beyond, steepest = table[0][LEVELS], table[2][LEVELS]
-    total = 0.0
-    for side in range(2):
-        start = second if side else first
-        # bins of this side lie at k + nearest or further from the nearest line
-        nearest, furthest = (-most, -least) if side else (least, most)
-        nearest -= extreme
-        inside = min(max(math.ceil(-nearest) - start, 0.0), half + 1.0)
-        amid = min(a, whole + lean * table[2][LEVELS, 0])
-        total += _inside(inside, amid, b, image, noise_bandwidth / ratio, powers)
-        k = start + inside
-        j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
-        while j < row.size and total <= 1.0 and k <= half:
-            # where the bin before reaches the threshold this one does not leak
-            before = max(k + stride - 2.0 + furthest, most) + extreme
-            least_before = _read(lowest, before * ratio)
-            most_whole = min(whole, (upper + askew) / max(least_before - tail, 1e-300))
-            beside = min(most_whole * row[j] + lean * slope[j], a * row[j])
-            mirrored = min(min(whole * beyond[j] + lean * steepest[j], a * beyond[j]), image)
-            beside = math.hypot(beside, mirrored) if powers else beside + mirrored
-            total += stride * excess_crossing(min(beside, b), b)
-            k += stride
-            j = int(CELLS * ((k + nearest) * ratio - _ROUNDING))
-    for j in range(far[0].size):
-        beside = min(whole * far[1][j] + lean * far[2][j], a * far[1][j])
-        mirrored = min(beside, image)
-        both = math.hypot(beside, mirrored) if powers else beside + mirrored
-        chance = excess_crossing(min(both, b), b)
-        if chance * half < _NEGLIGIBLE or total > 1.0:
-            total += 2.0 * half * chance
-            break
-        total += (2.0 * far[0][j] + 2.0) * chance
-    return total
-
-
-@njit(cache=True, error_model="numpy")
-def _inside(number, a, b, image, energy, powers):
-    """Sum of the chances of so many bins within the spread of lines."""
-    if number <= 0.0:
-        return 0.0
-    at = min(math.hypot(a, image) if powers else a + image, b)
-    if powers:
-        energy += 2.0 * (image / a) ** 2
-        number = min(number, max(_STAR * energy * (a / at) ** 2, 1.0))
-    return number * excess_crossing(at, b)
-
-
-@njit(cache=True, error_model="numpy")
-def _read(table, place):
-    j = int(CELLS * max(place, 0.0))
-    return table[j] if j < table.size else table[-1]
+def _crossing(signal: np.ndarray, level: float, quiet: float) -> np.ndarray:
+    """Chance to cross the threshold that a bin of some signal has more than one without."""
+    chance = marcum_q1(signal, np.full(signal.shape, level)).q
+    return np.maximum(chance - quiet, 0.0) / max(1 - quiet, 1e-12)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -252,6 +95,6 @@ EFFECT = Effect(
     name="leakage",
     about="further groups raised by sidelobes below the threshold",
     stage="detection",
-    bound=bound,
+    size=size,
     act=act,
 )

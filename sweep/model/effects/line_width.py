@@ -29,33 +29,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.gaussian_line import gaussian_bound
-from sweep.model.effects.phase_bounds import (
-    DEVIATION_OF_FWHM,
-    Error,
-    Peak,
-    added,
-    errors_of,
-    may_cancel,
-    missed,
-    peak_of,
-)
-from sweep.model.effects.span import Operand, Span
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.footprint import by_power
+from sweep.model.effects.gaussian_line import DEVIATION_OF_FWHM
+from sweep.model.effects.phase_sizes import added, means
+from sweep.model.effects.points import Points, Smear
 from sweep.model.preparation import Shots
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from sweep.model.effects.block import Block
-
 _GONE = 40.0
 """Gamma T from where exp(-Gamma T) is nothing."""
 
 _FEW_LAGS = 0.1
 """Gamma over the sample rate from where lags are taken one by one: 400 of them, then none."""
+
+_SIGMAS = 6.0
+"""Standard deviations of a Gaussian line beyond which there is no light to speak of."""
 
 _MOST_NOISE = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
@@ -216,81 +208,60 @@ def _lag(
     return gamma, lag
 
 
-def lorentzian_bound(
-    *,
-    line_width: Operand,
-    delay: Operand,
-    duration: Operand,
-    sample_rate: Operand,
-    cnr: Operand = 0.0,
-) -> Change:
-    """What leaving a Lorentzian laser's line width out can change: the line, and noise under it.
-
-    The pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w). The pedestal is in no bin
-    above sum w^2 (fs S(0) + 1 - exp(-g)), as a sum over lags exceeds the integral by at most its
-    term at no lag. S(0) rises with the delay, and with the width up to g = 1.79. It is noise that
-    comes with the signal, from line and image.
-
-    Parameters
-    ----------
-    line_width, delay, duration : Span or array_like
-        As of :func:`coherent_share`.
-    sample_rate : Span or array_like
-        Sample rate [Hz].
-    cnr : Span or array_like
-        The beats' power sum a^2 / 2 over the noise variance, in the record.
-    """
-    width = Span.of(line_width)
-    longest = np.asarray(Span.of(delay).minimum(duration).high)
-    share = coherent_share(
-        line_width=np.asarray(width.high), delay=longest, duration=np.asarray(np.inf)
-    )
-    with np.errstate(divide="ignore"):
-        most_noise = _MOST_NOISE / (2 * np.pi * longest)
-    density = pedestal_density(
-        np.array(0.0), line_width=np.clip(most_noise, width.low, width.high), delay=longest
-    )
-    share_in_noise = Span.of(sample_rate).high * density + (1 - share)
-    raised = 1 + Span.of(cnr).high * share_in_noise
-    return Change(
-        signal=(np.sqrt(share), np.ones_like(share)), noise=(1.0, raised), threshold_follows=False
-    )
-
-
 _WIDTH, _SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving the width out can change of the detecting bins, (3, tiles)."""
-    width = block[_WIDTH]
-    if not block.has(_WIDTH):
+def _deviation(points: Points) -> np.ndarray:
+    """Standard deviation of a Gaussian line [bins of fs/L]."""
+    return DEVIATION_OF_FWHM * points[_WIDTH] * points.record_duration
+
+
+def smear(points: Points) -> Smear | None:
+    """How far a Gaussian line puts light."""
+    if not points.has(_WIDTH) or points.word(_SHAPE) != "gaussian":
         return None
-    if block.word(_SHAPE) == "lorentzian":
-        relative = block.echo * block.echo_ratio
-        power = block.beat_scale**2 * (relative**2 if block.architecture == "direct" else relative)
-        return lorentzian_bound(
-            line_width=width,
-            delay=(2 / SPEED_OF_LIGHT) * block.range,
-            duration=block.record_duration,
-            sample_rate=block.sample_rate,
-            cnr=0.5 * power / block.noise_variance,
-        )
-    errors = errors_of(block)
-    peak, images = peak_of(block, errors, broadened=False)
-    cancelling = may_cancel(block, images)
-    beside = missed(errors, block.window)
-    peak = Peak(
-        np.maximum(peak.least - beside, 0.0), peak.most + beside, peak.single and not beside.any()
+    return Smear(reach=_SIGMAS * _deviation(points))
+
+
+def size(points: Points) -> Size | None:
+    """What leaving the width out changes of the detecting bins.
+
+    The mean power under a Gaussian line departs from |X|^2 by at most (2 pi s)^2 var_w (sum |w|)^2,
+    s the deviation and var_w the variance of the place in the record under |w|. A Lorentzian one's
+    pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w); the pedestal is in no bin above
+    sum w^2 (fs S(0) + 1 - exp(-g)), and is noise that comes with the signal.
+    """
+    if not points.has(_WIDTH):
+        return None
+    if points.word(_SHAPE) == "lorentzian":
+        return _lorentzian(points)
+    known, deviation = means(points.window), _deviation(points)
+    spread = np.minimum((2 * np.pi * deviation) ** 2 * known.variance, 1.0)
+    smeared = 1 + 2 * points.smeared / points.margin
+    least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / smeared
+    magnitude = by_power(known.most**2 * spread / least)
+    cancelling = points.may_cancel
+    if not cancelling.any():
+        return Size(magnitude=magnitude)
+    half = 0.5 * _SIGMAS * deviation
+    away = added(points, Smear((half, 0.0, 0.0, 0.0), constant=half))
+    return Size(
+        magnitude=np.where(cancelling, 0.0, magnitude), added=np.where(cancelling, away, 0.0)
     )
-    change = gaussian_bound(
-        fwhm=width, duration=block.record_duration, window=block.window, peak=peak
-    )
-    deviation = DEVIATION_OF_FWHM * width.high * block.record_duration.high
-    shift = Error((0.5 * deviation, 0.0, 0.0, 0.0), constant=0.5 * deviation)
-    low, high = (np.where(cancelling, 1.0, end) for end in change.signal)
-    return Change(
-        signal=(low, high),
-        added=np.where(cancelling, added(block, shift, images), 0.0),
+
+
+def _lorentzian(points: Points) -> Size:
+    width, delay = points[_WIDTH], np.minimum(points.delay, points.record_duration)
+    share = coherent_share(line_width=width, delay=delay, duration=np.asarray(np.inf))
+    most = np.minimum(width, _MOST_NOISE / (2 * np.pi * delay))
+    density = pedestal_density(np.array(0.0), line_width=most, delay=delay)
+    ratio = points.footprint.echo_ratio
+    beat = points.beat * (ratio if points.architecture == "direct" else np.sqrt(ratio))
+    cnr = beat**2 / points.noise_variance  # with its image
+    return Size(
+        magnitude=1 - np.sqrt(share),
+        noise=cnr * (points.sample_rate * density + (1 - share)),
+        threshold_follows=False,
     )
 
 
@@ -321,7 +292,8 @@ EFFECT = Effect(
     name="line_width",
     about="width of the laser's line",
     stage="record",
-    bound=bound,
+    size=size,
+    smear=smear,
     act=act,
     parameters=(
         Parameter(

@@ -1,4 +1,4 @@
-"""What bounds on bins need to know of a window: its main lobe and how fast its power can change.
+"""What sizes of effects need to know of a window: its main lobe and how its power can change.
 
 F(x) = |W(x r)|^2 / (sum w)^2 is the power of a bin x FFT bins away from a line, r = L/N. It is a
 cosine series in the autocorrelation of the window,
@@ -19,23 +19,25 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model.window import Window, samples, window
 
+_ROUNDING = 1e-6
 _TERMS = 28
 _STEPS = 1024
-_ROUNDING = 1e-6
-"""Relative room for reading the main lobe from a table of its values, h^2 |W''| / 8 at most."""
+_CELLS, _KNEE = 8192, 16.0
+"""Cells of the table of sidelobes, even in d / (d + knee), and its knee [bins of fs/L]."""
+_OCTAVES = 64
+"""Cells an octave of the table of how far lines reach."""
+_LEAST = -80
+"""Octaves below the peak at which that table ends."""
 
 
 class Lobe(NamedTuple):
-    """Main lobe of a window over an FFT's bins; powers and magnitudes relative to the peak's."""
+    """A window over an FFT's bins; powers and magnitudes relative to the peak's."""
 
-    highest: np.ndarray
-    """(m,): largest magnitude at or beyond each distance, 0..1/2 bin in equal steps."""
-    lowest: np.ndarray
-    """(m,): least magnitude up to each distance."""
+    main: np.ndarray
+    """(m,): magnitude at distances of 0..1/2 bin in equal steps."""
     slope: float
     """Bound on |F'| [1/bin]."""
     curvature: float
@@ -44,105 +46,32 @@ class Lobe(NamedTuple):
     """Bins to either side that are counted for ``energy``: 1/r, one of the window's."""
     energy: float
     """Least sum of F over the bins within ``margin`` of a line."""
-    reach: np.ndarray
-    """(k,): distances [bins], 0 and up."""
     envelope: np.ndarray
-    """(k,): largest magnitude at or beyond each."""
+    """(cells + 1,): largest magnitude at or beyond distances even in d / (d + knee)."""
+    away: np.ndarray
+    """(cells,): distance [bins] from which on all are smaller, by octaves of magnitude."""
     worst: float
     """Least magnitude of the bin nearest to a line."""
 
+    def near(self, distance: np.ndarray) -> np.ndarray:
+        """Magnitude of a bin at a distance from a line, 0..1/2 bin."""
+        return self.main[(distance * (2 * _STEPS) + 0.5).astype(np.int64)]
+
     def tail(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
-        away = np.asarray(distance, float)
-        found = np.empty(away.shape)
-        _put_tails(self.reach, self.envelope, away.ravel(), found.reshape(-1))
-        return found
+        away = np.maximum(distance, 0.0)
+        share = away / (away + _KNEE * self.margin)
+        return self.envelope[(share * _CELLS).astype(np.int64)]
 
     def within(self, magnitude: np.ndarray) -> np.ndarray:
         """Distance [bins] from which on all bins are smaller; infinite where none is known."""
-        sizes = np.asarray(magnitude, float)
-        found = np.empty(sizes.shape)
-        _put_within(self.reach, self.envelope, sizes.ravel(), found.reshape(-1))
-        return found
-
-    def most(self, distance: np.ndarray) -> np.ndarray:
-        """Largest magnitude of a bin at least ``distance`` [bins] from a line, 0..1/2."""
-        return _read(self.highest, distance) * (1 + _ROUNDING)
-
-    def least(self, distance: np.ndarray) -> np.ndarray:
-        """Least magnitude of a bin at most ``distance`` [bins] from a line, 0..1/2."""
-        return _read(self.lowest, distance) * (1 - _ROUNDING)
-
-
-def _read(table: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Main lobe's table at distances, of their shape."""
-    away = np.asarray(distance, float)
-    found = np.empty(away.shape)
-    _read_each(table, away.ravel(), found.reshape(-1))
-    return found
-
-
-@njit(cache=True, error_model="numpy")
-def _read_each(table, distance, found):
-    for i in range(distance.size):
-        found[i] = _at(table, distance[i])
-
-
-@njit(cache=True, error_model="numpy")
-def _at(table, distance):
-    x = np.minimum(np.maximum(distance, 0.0), 0.5) * (2 * (table.size - 1))
-    low = max(min(int(x), table.size - 2), 0)
-    return table[low] + (x - low) * (table[low + 1] - table[low])
-
-
-@njit(cache=True, error_model="numpy")
-def lobe_most(highest, distance):
-    """:meth:`Lobe.most` of one distance, compiled."""
-    return _at(highest, distance) * (1 + _ROUNDING)
-
-
-@njit(cache=True, error_model="numpy")
-def lobe_least(lowest, distance):
-    """:meth:`Lobe.least` of one distance, compiled."""
-    return _at(lowest, distance) * (1 - _ROUNDING)
-
-
-@njit(cache=True, error_model="numpy")
-def lobe_tail(reach, envelope, distance):
-    """:meth:`Lobe.tail` of one distance, compiled."""
-    return envelope[np.searchsorted(reach, np.fmax(distance, 0.0), "right") - 1]
-
-
-@njit(cache=True, error_model="numpy")
-def lobe_within(reach, envelope, magnitude):
-    """:meth:`Lobe.within` of one magnitude, compiled."""
-    if np.isnan(magnitude):
-        return np.inf
-    first, last = 0, envelope.size
-    while first < last:
-        middle = (first + last) // 2
-        if envelope[middle] > magnitude:
-            first = middle + 1
-        else:
-            last = middle
-    return reach[first] if first < reach.size else np.inf
-
-
-@njit(cache=True, error_model="numpy")
-def _put_tails(reach, envelope, distance, found):
-    for i in range(distance.size):
-        found[i] = lobe_tail(reach, envelope, distance[i])
-
-
-@njit(cache=True, error_model="numpy")
-def _put_within(reach, envelope, magnitude, found):
-    for i in range(magnitude.size):
-        found[i] = lobe_within(reach, envelope, magnitude[i])
+        octave = np.log2(np.clip(magnitude, 2.0**_LEAST, 1.0))
+        return self.away[np.ceil(-octave * _OCTAVES).astype(np.int64)]
 
 
 @lru_cache(maxsize=32)
 def lobe(name: str, length: int, fft_size: int) -> Lobe:
-    """The main lobe of the window of this name over an FFT, prepared once and kept."""
+    """The lobe of the window of this name over an FFT, prepared once and kept."""
     shape = window(name, length)
     w = samples(shape.name, length)
     place = np.arange(length) / length - 0.5
@@ -152,19 +81,23 @@ def lobe(name: str, length: int, fft_size: int) -> Lobe:
     ratio = length / fft_size
     curvature = 2 * variance * (2 * math.pi * ratio * excess) ** 2
     coefficients = _series(w, place)
-    distance = np.linspace(0.0, 0.5, _STEPS + 1)
-    value = main_lobe(shape, coefficients, distance * ratio)
-    lowest = np.minimum.accumulate(value)
+    value = main_lobe(shape, coefficients, np.linspace(0.0, 0.5, _STEPS + 1) * ratio)
+    reach = np.concatenate([[0.0], shape.reach])
+    envelope = np.concatenate([[max(1.0, value.max(), shape.envelope[0])], shape.envelope])
+    share = np.arange(_CELLS + 1) / _CELLS
+    with np.errstate(divide="ignore"):
+        distance = _KNEE * share / (1 - share)
+    magnitude = 2.0 ** (-np.arange(-_LEAST * _OCTAVES + 2) / _OCTAVES)
+    first = np.searchsorted(-envelope, -magnitude)
     return Lobe(
-        highest=np.maximum.accumulate(value[::-1])[::-1].copy(),
-        lowest=lowest,
+        main=value,
         slope=excess * math.sqrt(curvature),
         curvature=curvature,
         margin=1 / ratio,
         energy=_least_energy(shape, coefficients, ratio, excess * math.sqrt(curvature)),
-        reach=np.concatenate([[0.0], shape.reach / ratio]),
-        envelope=np.concatenate([[max(1.0, value.max(), shape.envelope[0])], shape.envelope]),
-        worst=lobe_least(lowest, 0.5),
+        envelope=envelope[np.searchsorted(reach, distance, "right") - 1],
+        away=np.append(reach, np.inf)[first] / ratio,
+        worst=float(value.min()) * (1 - _ROUNDING),
     )
 
 

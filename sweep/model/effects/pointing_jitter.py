@@ -19,25 +19,20 @@ too; the turned beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
 """
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Realisation
-from sweep.model.effects.span import Span
+from sweep.model.effects.effect import Effect, Parameter, Realisation, Size
+from sweep.model.effects.footprint import by_power
+from sweep.model.effects.points import Points, Smear
+from sweep.model.effects.spread import NO_SPREAD, reach_of
 from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
-
 RARE = 1e-6
-"""Chance of a draw whose beam is further off than :func:`turned_change` takes it to be."""
-
+"""Chance of a draw whose beam is further off than its size takes it to be."""
 
 _JITTER = "target.pointing_jitter"
 
@@ -102,150 +97,56 @@ def turned(
     )
 
 
-def turned_change(
-    *,
-    sigma: ArrayLike,
-    range: ArrayLike,
-    grazing_angle: ArrayLike,
-    radial_velocity: ArrayLike,
-    wavelength: ArrayLike,
-    beam_divergence: ArrayLike,
-    chirp_rate: ArrayLike,
-    sample_rate: ArrayLike,
-    fft_size: ArrayLike,
-    bandwidths: tuple[ArrayLike, ArrayLike],
-    signal_shot_share: ArrayLike,
-    reach: float,
-    single: bool,
-    coherent: bool,
-    direct: bool = False,
-    speed_across: ArrayLike = 0.0,
-    record: ArrayLike = 1.0,
-    spread: ArrayLike = 0.0,
-    edge: ArrayLike = np.inf,
-    tail: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
-) -> Change:
-    """What jitter can change in the detecting bin and its noise, in all draws but few.
+class _Turn(NamedTuple):
+    """What the furthest turn but for few makes of beams, down to their lowest beamlets."""
 
-    A draw is off by more than t = sigma sqrt(2 ln(1/RARE)) in a share ``RARE`` of all draws. Down
-    to the footprint's lowest beamlet, t changes
-
-    - echo powers by the cube of the ratio of sines (1/R^2 and at most Lambert's cosine);
-    - beats by D bins, out of footprints F bins long. As |W|^2 is band-limited and within 0..1 (of
-      its peak), its slope is at most pi L/N a bin (Bernstein). The strongest bin of a footprint
-      holds at least c of all power: 4/pi^2 of what comes nearest to it, or what a rectangular
-      window, which falls fastest, leaves half the footprint and half a bin away. So its power
-      moves by a factor within 1 +- pi D (L/N) / c, and c to 1/c;
-    - the receiver's transfer by no more than a beat's shift by its poles.
-
-    Near DC and Nyquist images may double powers. A footprint whose phases follow its geometry may
-    fade altogether, or not any more, and so may lines with their images: of those, nothing is
-    promised.
-
-    All rises with sigma, range, speeds, divergence and chirp rate and falls with the grazing
-    angle, sample rate, wavelength and poles, so that one end of each serves a whole tile.
-
-    Parameters
-    ----------
-    sigma : array_like
-        [rad]
-    range, grazing_angle, radial_velocity, wavelength, beam_divergence : array_like
-        [m, rad, m/s, m, rad]
-    chirp_rate, sample_rate, fft_size : array_like
-        [Hz/s, Hz, 1]
-    bandwidths : (array_like, array_like)
-        Poles of detector and amplifier [Hz].
-    signal_shot_share : array_like
-        Share of the echo's own shot noise in the noise variance, 0..1.
-    reach : float
-        Farthest beamlet from the axis in the beam's standard deviations.
-    single : bool
-        Whether there is but one beamlet.
-    coherent : bool
-        Whether beamlets add as amplitudes.
-    direct : bool
-        Direct detection, whose beat follows the echo's power and not its root.
-    speed_across : array_like
-        Speed across the beam [m/s].
-    record : array_like
-        L/N.
-    spread, edge : array_like
-        Bins over which lines are spread besides, and from the axis's line to DC or Nyquist.
-    tail : callable
-        Largest magnitude of a bin at least so many from a line, over the least in the nearest.
-    """
-    off = np.asarray(sigma, float) * math.sqrt(2 * math.log(1 / RARE))
-    aimed, record = np.asarray(grazing_angle, float), np.asarray(record, float)
-    rim = reach * np.asarray(beam_divergence, float) / 4
-    sure = aimed - rim > off  # no beamlet passes over the horizon
-    lowest = np.where(sure, aimed - rim, 1.0)
-    lower, higher = lowest - np.where(sure, off, 0.0), np.minimum(lowest + off, math.pi / 2)
-    highest = np.minimum(lowest + 2 * rim, math.pi / 2)
-    per_metre = np.asarray(chirp_rate, float) * 2 / SPEED_OF_LIGHT
-    slope = per_metre * np.asarray(range, float) * np.sin(aimed)
-    doppler = np.abs(radial_velocity) * off**2 / 2 + np.asarray(speed_across, float) * off
-    shift = slope * (1 / np.sin(lower) - 1 / np.sin(lowest))
-    shift = shift + 2 * doppler / np.asarray(wavelength, float)
-    bins = np.asarray(fft_size, float) / np.asarray(sample_rate, float)
-    length = slope * (1 / np.sin(lowest) - 1 / np.sin(highest)) * bins + spread
-    transfer = np.exp(-shift * sum(1 / np.asarray(pole, float) for pole in bandwidths))
-    weak, strong = ((np.sin(v) / np.sin(lowest)) ** 3 for v in (lower, higher))
-    kept, kept_after = (_kept(v, record) for v in (length, length + 2 * shift * bins))
-    moved = math.pi * record * shift * bins / kept
-    power = 1.0 if direct else 0.5
-    image = np.minimum(tail(2 * (np.asarray(edge) - length - shift * bins) - 1), 1.0)
-    least, most = (1 - image, 1 + image) if coherent else (1.0, np.sqrt(1 + image**2))
-    low = (weak * transfer * np.maximum(1 - moved, kept_after)) ** power * least / most
-    with np.errstate(divide="ignore"):
-        high = (strong / transfer * np.minimum(1 + moved, 1 / kept)) ** power * most / least
-    known = sure & (not coherent or single)
-    share = np.asarray(signal_shot_share, float)
-    loudest = np.where(sure, 1 + share * (strong - 1), np.where(share > 0, np.inf, 1.0))
-    return Change(
-        signal=(np.where(known, low, 0.0), np.where(known, high, np.inf)),
-        noise=(np.where(sure, 1 + share * (weak - 1), 1 - share), loudest),
-        threshold_follows=False,
-    )
+    ratio: np.ndarray
+    """Of ranges, less 1; infinite where a beamlet may pass over the horizon."""
+    bins: np.ndarray
+    """By which lines move, by segment."""
 
 
-def _kept(length: np.ndarray, record: np.ndarray) -> np.ndarray:
-    """Least share of all power in the strongest bin of a footprint so many bins long."""
-    nearest = (2 / math.pi) ** 2 / (np.floor(length) + 2)
-    together = np.minimum((0.5 + 0.5 * length) * record, 1.0)
-    return np.asarray(np.maximum(nearest, np.sinc(together) ** 2))
+def _furthest(points: Points) -> _Turn:
+    off = points[_JITTER] * math.sqrt(2 * math.log(1 / RARE))
+    rim: np.ndarray | float = 0.0
+    if points.number > 1:
+        divergence = points["instrument.laser.beam_divergence"]
+        rim = reach_of(points.number, points.pattern) * divergence / 4
+    lowest = points["target.grazing_angle"] - rim
+    sure = lowest > off
+    lowest = np.where(sure, lowest, 1.0)
+    ratio = np.where(sure, np.sin(lowest) / np.sin(lowest - np.where(sure, off, 0.0)) - 1, np.inf)
+    across = np.abs(points["target.transverse_velocity"])
+    doppler = np.abs(points.radial_velocity) * off**2 / 2 + across * off
+    ratio = np.where(off > 0, np.maximum(ratio, off**2 / 2), 0.0)
+    bins = points.per_range * np.minimum(ratio, 1e6) + points.per_velocity * doppler
+    return _Turn(ratio, bins)
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving jitter out can change in all draws but few, (3, tiles) by segment."""
-    if not block.has(_JITTER):
+def smear(points: Points) -> Smear | None:
+    """How far draws throw lines off."""
+    if not points.has(_JITTER):
         return None
-    echo = block.shot_noise_scale * block.echo_scale * block.echo * Span.hull(1.0, block.echo_ratio)
-    own, lobe = (echo / block.noise_variance).high, block.lines.lobe
-    rates = np.outer([1.0, 0.0, 1.0], np.broadcast_to(block.chirp_rate.high, block.size))
-    return turned_change(
-        sigma=block[_JITTER].high,
-        range=block.range.high,
-        grazing_angle=block.grazing_angle.low,
-        radial_velocity=block.radial_velocity.magnitude,
-        wavelength=SPEED_OF_LIGHT / block.carriers[2].high,
-        beam_divergence=block["instrument.laser.beam_divergence"].high,
-        chirp_rate=rates,
-        sample_rate=block.sample_rate.low,
-        fft_size=block.fft_size,
-        bandwidths=(
-            block["instrument.receiver.detector_bandwidth"].low,
-            block["instrument.receiver.amplifier_bandwidth"].low,
-        ),
-        signal_shot_share=own / (1 + own),
-        reach=block.reach,
-        single=block.number == 1,
-        coherent=block.adds_amplitudes or block.has("target.roughness"),
-        direct=block.architecture == "direct",
-        speed_across=block["target.transverse_velocity"].magnitude,
-        record=block.window.length / block.fft_size,
-        spread=2 * np.asarray(block.spreads.velocities.extreme),
-        edge=block.lines.edge,
-        tail=lambda bins: lobe.tail(bins) / lobe.worst,
+    return Smear(reach=_furthest(points).bins / points.margin)
+
+
+def size(points: Points) -> Size | None:
+    """What leaving jitter out changes in all draws but few.
+
+    Echo powers go by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
+    footprint whose phases follow its geometry may fade altogether, or not any more, and so may
+    lines with their images: of those nothing is known.
+    """
+    if not points.has(_JITTER):
+        return None
+    ratio, bins = _furthest(points)
+    echo = 3 * ratio * (1 + ratio) ** 2
+    power = points.moved(NO_SPREAD, points.spread, bins) + echo
+    unknown = points.may_cancel & (points[_JITTER] > 0)
+    return Size(
+        magnitude=np.where(unknown, 1.0, by_power(power)),
+        noise=np.minimum(echo, 1e6) * points.echo_noise,
+        threshold_follows=False,
     )
 
 
@@ -274,7 +175,8 @@ EFFECT = Effect(
     name="pointing_jitter",
     about="a beam that wanders from shot to shot",
     stage="draws",
-    bound=bound,
+    size=size,
+    smear=smear,
     turn=turn,
     parameters=(
         Parameter(

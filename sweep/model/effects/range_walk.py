@@ -11,27 +11,16 @@ middle of the record and spreads over what drifts within it.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.change import Change
-from sweep.model.effects.columns import columns, product_of
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.phase_bounds import (
-    Error,
-    by_segment,
-    counted,
-    error_change,
-    over_record,
-)
-from sweep.model.effects.span import Span
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.phase_sizes import over_record, phase_size
+from sweep.model.effects.points import Points, Smear
 from sweep.model.preparation import PhaseError, Shots
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+NAME = "range_walk"
 
 
 def phase(
@@ -67,32 +56,17 @@ def record_times(x: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> n
     return start[:, None] + duration[:, None] * (np.asarray(x) + 1) / 2
 
 
-@counted
-def error(block: "Block") -> Error | None:
-    """The phase that range walk adds over a block's tiles."""
-    if not block.has("target.radial_velocity"):
+def smear(points: Points) -> Smear | None:
+    """The phase that range walk adds."""
+    if not points.has("target.radial_velocity"):
         return None
-    rate, beta = block.chirp_rate, block.beta
-    table, shape = columns(rate.low, rate.high, beta.low, beta.high)
-    drift = np.empty((2, *shape))
-    put_drifts(table, drift.reshape(2, -1))
-    terms = {2: Span(drift[0], drift[1])}
-    walk = over_record(terms, start=block.start, duration=block.record_duration)
-    return by_segment(block, walk, None, walk)
+    drift = points.signs * points.chirp_rate * points.beta * (1 + points.beta / 2)
+    return over_record(points, {2: drift})
 
 
-@njit(cache=True, error_model="numpy")
-def put_drifts(table, out):
-    """Ends of S beta (1 + beta / 2), (2, n), from those of S and beta."""
-    for i in range(out.shape[1]):
-        beta = table[2, i], table[3, i]
-        moved = product_of((table[0, i], table[1, i]), beta)
-        out[0, i], out[1, i] = product_of(moved, (1.0 + 0.5 * beta[0], 1.0 + 0.5 * beta[1]))
-
-
-def bound(block: "Block") -> Change | None:
-    """What leaving range walk out can change of the detecting bins, (3, tiles)."""
-    return error_change(block, error)
+def size(points: Points) -> Size | None:
+    """What leaving range walk out changes of the detecting bins."""
+    return phase_size(points, NAME)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -111,9 +85,10 @@ def act(shots: Shots, scene: Scene) -> Shots:
 
 
 EFFECT = Effect(
-    name="range_walk",
+    name=NAME,
     about="drift of the beat as the target moves",
     stage="record",
-    bound=bound,
+    size=size,
+    smear=smear,
     act=act,
 )

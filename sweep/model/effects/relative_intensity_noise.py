@@ -10,20 +10,16 @@ RIN of the echo is left out: it is below that of the local oscillator by P/P_lo.
 RIN = 2 q / (Re P_lo), -155 dB/Hz for a milliampere, one diode sees as much of it as shot noise.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model import receiver
-from sweep.model.effects.change import Change, added_noise
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import monotone
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 
 def current_variance(
@@ -57,48 +53,40 @@ def current_variance(
     return current**2 * seen * np.asarray(electrical_bandwidth, float)
 
 
-def bound(block: "Block") -> Change | None:
-    """Change by intensity noise: exact, a ratio of variances; the threshold is set on it."""
-    if block.architecture == "direct" or not block.has(_RIN):
-        return None
-    current = monotone(
-        current_variance,
-        falling=("common_mode_rejection",),
-        relative_intensity_noise=block[_RIN],
-        common_mode_rejection=block[_REJECTION],
-        electrical_bandwidth=block.electrical_bandwidth,
-        **{
-            name: block["instrument.receiver." + name]
-            for name in ("local_oscillator_power", "apd_gain", "responsivity")
-        },
-    )
-    variance = current * block.noise_scale
-    return added_noise(
-        least=variance.low, largest=variance.high, noise_variance=block.noise_variance
-    )
-
-
 _RIN = "instrument.laser.relative_intensity_noise"
 _REJECTION = "instrument.receiver.common_mode_rejection"
+
+
+def size(points: Points) -> Size | None:
+    """Intensity noise: exact, a ratio of variances; the threshold is set on it."""
+    if points.architecture == "direct" or not points.has(_RIN):
+        return None
+    current = _current(points.numbers)
+    return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
+
+
+def _current(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Current variance of points by their parameters [A^2]."""
+    own = {
+        name: p["instrument.receiver." + name]
+        for name in ("local_oscillator_power", "apd_gain", "responsivity")
+    }
+    return current_variance(
+        relative_intensity_noise=p[_RIN],
+        common_mode_rejection=p[_REJECTION],
+        electrical_bandwidth=receiver.electrical_bandwidth(
+            detector_bandwidth=p["instrument.receiver.detector_bandwidth"],
+            amplifier_bandwidth=p["instrument.receiver.amplifier_bandwidth"],
+        ),
+        **own,
+    )
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
     """Intensity noise of the local oscillator; direct detection has none."""
     if shots.architecture == "direct":
         return shots
-    p = scene.parameters
-    current = current_variance(
-        relative_intensity_noise=p[_RIN],
-        common_mode_rejection=p[_REJECTION],
-        electrical_bandwidth=receiver.electrical_bandwidth(
-            detector_bandwidth=shots.detector_bandwidth,
-            amplifier_bandwidth=shots.amplifier_bandwidth,
-        ),
-        **{
-            name: p["instrument.receiver." + name]
-            for name in ("local_oscillator_power", "apd_gain", "responsivity")
-        },
-    )
+    current = _current(scene.parameters)
     noise = {"relative_intensity": current * shots.noise_scale}
     return replace(shots, noise_sources=shots.noise_sources | noise)
 
@@ -107,7 +95,7 @@ EFFECT = Effect(
     name="relative_intensity_noise",
     about="fluctuation of the local oscillator's power",
     stage="noise",
-    bound=bound,
+    size=size,
     act=act,
     parameters=(
         Parameter(

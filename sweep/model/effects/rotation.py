@@ -6,24 +6,18 @@ thus what a velocity -omega x (O - X) of the instrument would be, whatever the b
 Doppler shift by its component along the beam, a Doppler spread by that across it.
 """
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from sweep.model.effects.effect import Effect
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
+from sweep.model.effects.effect import Effect, Size
+from sweep.model.effects.points import Points
 
 
-def bound(block: "Block") -> np.ndarray | None:
+def size(points: Points) -> Size | None:
     """Whether anything turns: what it does to velocities is in the scene, and not left out."""
-    return np.ones(block.size) if block.rotating else None
+    return Size(chance=1.0) if points.rotating else None
 
 
 EFFECT = Effect(
     name="rotation",
     about="surfaces of turning bodies",
     stage="lines",
-    bound=bound,
+    size=size,
 )

@@ -17,7 +17,7 @@ an envelope that changes over the record, which clips less than its peak says.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,14 +31,10 @@ from sweep.model.effects import (
     relative_intensity_noise,
     solar_background,
 )
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import Span
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
 from sweep.model.unsupported import UnsupportedShot
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _CUTS = np.array([-8.0, 0.0, 8.0])
@@ -101,30 +97,6 @@ def harmonic_amplitude(
     loss, _ = _lost(a * np.sin(phase), s, v)
     line = a[..., 0] if order == 1 else 0.0
     return np.asarray(line - 2 * (weight * loss * np.sin(order * phase)).sum(axis=-1))
-
-
-def clipped(*, amplitude: ArrayLike, deviation: Span, full_scale: ArrayLike) -> Change:
-    """Change by clipping of a sine of some amplitude or less; the threshold stays.
-
-    The line's gain falls as beat or noise grow against full scale. Clipping contracts, so the
-    variance of a sample never rises, and by the inequality of Cramer and Rao, Var f(n) >=
-    (s E f')^2, it is at least the square of the chance that the highest sample is not clipped.
-    Where noise grows that chance falls, or rises and then falls: its least is at an end. Noise
-    alone is taken to fit within full scale.
-
-    Parameters
-    ----------
-    amplitude, full_scale : array_like
-        As of :func:`clipping` [V]: the largest, and the least.
-    deviation : Span
-        Likewise.
-    """
-    x, v = np.asarray(amplitude, float), np.asarray(full_scale, float)
-    least = clipping(amplitude=x, deviation=deviation.high, full_scale=v).signal_gain
-    ends = (np.asarray(deviation.low), np.asarray(deviation.high))
-    unclipped = np.minimum(*(ndtr((v - x) / s) - ndtr((-v - x) / s) for s in ends))
-    noise = (np.maximum(unclipped**2, _SMALLEST), np.ones_like(unclipped))
-    return Change(signal=(least, np.ones_like(least)), noise=noise, threshold_follows=False)
 
 
 def _columns(*values: ArrayLike) -> tuple[np.ndarray, ...]:
@@ -223,26 +195,27 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
     return np.asarray(shots.beat_scale * together * np.abs(gain))
 
 
-def bound(block: "Block") -> Change | None:
-    """What leaving clipping out can change, (tiles,), whatever else is noise or dims the echo."""
-    if not block.has(_FULL_SCALE):
+def size(points: Points) -> Size | None:
+    """What leaving clipping out changes, whatever else is noise or dims the echo.
+
+    Line and noise lose no more than the chance that the highest sample is clipped, as the mean
+    slope of what is left is one less that chance; the threshold stays.
+    """
+    if not points.has(_FULL_SCALE):
         return None
-    limits = [np.asarray(v, float) for v in (block[_FULL_SCALE].low, block[_FULL_SCALE].high)]
-    echo = block.echo * Span.hull(1.0, block.echo_ratio)
-    together = echo if block.architecture == "direct" else echo.sqrt()
-    amplitude = (block.beat_scale * together).high * block.lines.transfer.max(axis=0)
-    quiet = block.noise_variance
-    loud = quiet + block.shot_noise_scale * block.echo_scale * echo
+    echo = np.maximum(points.footprint.echo_ratio, 1.0)
+    together = echo if points.architecture == "direct" else np.sqrt(echo)
+    amplitude = (points.beat * together * points.transfer).max(axis=0)
+    louder = 1 + points.echo_noise
     for source in (solar_background, backscatter, relative_intensity_noise, quantisation):
-        change = source.bound(block)
-        if change is not None:
-            loud = loud * np.asarray(change.noise[1])
-    # a tile with points without a limit, at 0, has the others' between 0 and their largest
-    limit = np.where(limits[0] > 0, limits[0], np.where(limits[1] > 0, _SMALLEST, _NO_LIMIT))
-    return clipped(
-        amplitude=np.maximum(amplitude, _SMALLEST),
-        deviation=Span.hull(quiet, loud).sqrt(),
-        full_scale=limit,
+        if (other := source.size(points)) is not None:
+            louder = louder + other.noise
+    deviation = np.sqrt(points.noise_variance * louder)
+    limit = points[_FULL_SCALE]
+    v = np.where(limit > 0, limit, _NO_LIMIT)
+    clipped = ndtr((amplitude - v) / deviation) + ndtr(-(amplitude + v) / deviation)
+    return Size(
+        magnitude=clipped, noise=-clipped * (2 - clipped) * (1 - 1e-9), threshold_follows=False
     )
 
 
@@ -250,7 +223,7 @@ EFFECT = Effect(
     name="saturation",
     about="clipping at the ADC's full scale",
     stage="record",
-    bound=bound,
+    size=size,
     act=act,
     parameters=(
         Parameter(

@@ -15,36 +15,27 @@ spreading of the beam and the loss of mixing over the aperture.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 from scipy import special
 
 from sweep.model import philox
-from sweep.model.effects.atmosphere import path_heights, path_of
-from sweep.model.effects.change import Mean
-from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene
-from sweep.model.effects.span import Span
+from sweep.model.effects.atmosphere import path_heights
+from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.effects.turbulence import (
     HUFNAGEL_VALLEY,
     LogVariances,
     Turbulence,
     both_ways,
-    largest_both_ways,
 )
-from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import Shots
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
-
 DISTRIBUTIONS = ("log_normal", "gamma_gamma")
-_CHANCES = np.array([1e-9, 1e-6, 1e-4, 1e-2])
-_HUGE = 1e9
 _LEAST_SPREAD = 1e-5
+_STEEPEST, _MOST_BENT = 0.5, 0.5
+"""Suprema over a of |dQ_1(a, b)/d ln a| over 1 + b, and of its second derivative over 1 + b^2."""
 
 
 def factors(
@@ -72,45 +63,6 @@ def factors(
     return total
 
 
-def mean_pd_bound(
-    distribution: str, legs: Sequence[LogVariances], *, amplitude: Span, threshold: Span
-) -> np.ndarray:
-    """Bound on how far means of probabilities of detection lie from those of the mean echo, (k, n).
-
-    Their sum bounds that of the product of segments, which twinkle alike. With L half the
-    logarithm of the factor I, E I = 1, and h the probability over the logarithm of the amplitude,
-    the lesser of two bounds is taken:
-
-    - |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2, whatever the amplitude; in a
-      product the suprema of two slopes, times E L^2, come on top;
-    - h rises, so the mean falls by at most h - (1 - e) h(q) with P(I < q) <= e, for any e, and
-      rises by at most (1 - e) h(q') + e - h with P(I > q') <= e; both may happen in a product.
-
-    Parameters
-    ----------
-    distribution, legs
-        As of :func:`factors`, (n,).
-    amplitude : Span
-        Magnitude of the detecting bin without scintillation over the noise's standard deviation
-        in a quadrature, >= 0, (k, n) by segment.
-    threshold : Span
-        Threshold over the same deviation, >= 0, (n,).
-    """
-    mean, square = _moments(distribution, legs)
-    slope, bend = steepest(np.asarray(threshold.high))
-    smooth = slope * mean + 0.5 * (bend + slope**2) * square
-    low, high = _interval(distribution, legs, _CHANCES)
-    a, b = (
-        Span(np.minimum(v.low, _HUGE)[..., None], np.minimum(v.high, _HUGE)[..., None])
-        for v in (amplitude, threshold)
-    )
-    least, most = marcum_q1(a.low, b.high).q, marcum_q1(a.high, b.low).q
-    fall = most - (1 - _CHANCES) * marcum_q1(a.low * np.sqrt(low), b.high).q
-    rise = (1 - _CHANCES) * marcum_q1(a.high * np.sqrt(high), b.low).q + _CHANCES - least
-    apart = np.maximum(fall.min(axis=-1), 0.0) + np.maximum(rise.min(axis=-1), 0.0)
-    return np.minimum(smooth, apart)
-
-
 def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarray, np.ndarray]:
     """|E L| and E L^2, or more, of half the logarithm of the whole factor.
 
@@ -126,56 +78,6 @@ def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarra
         mean = sum(s / 2 + s**2 / 12 for s in shapes)
         spread = sum(s + s**2 / 2 + s**3 / 6 for s in shapes)
     return np.asarray(mean / 2), np.asarray((mean**2 + spread) / 4)
-
-
-def steepest(threshold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Largest |h'| and |h''| of h(x) = Q_1(e^x, b) over all x, for thresholds up to b.
-
-    h' = g = z I_1(z) e^{-(a^2 + b^2)/2}, z = a b, and h'' = g (z I_0(z) / I_1(z) - a^2).
-    """
-    place, slopes, bends = _steepest_table()
-    b = np.asarray(threshold, float)
-    slope, bend = (np.interp(b, place, values) for values in (slopes, bends))
-    return slope * (1 + b), bend * (1 + b * b)
-
-
-@lru_cache(maxsize=1)
-def _steepest_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Thresholds, and the suprema over 1 + b and 1 + b^2, with 2 % for what lies between."""
-    b = np.linspace(0.0, 40.0, 161)[:, None]
-    a = np.maximum(b + np.linspace(-8.0, 8.0, 801), 1e-3)
-    z = np.maximum(a * b, 1e-12)
-    first, zeroth = special.ive(1, z), special.ive(0, z)
-    slope = z * first * np.exp(-((a - b) ** 2) / 2)
-    bend = np.abs(slope * (z * zeroth / first - a * a))
-    found = [
-        1.02 * np.maximum.accumulate(v.max(axis=1)) / (1 + b[:, 0] ** power)
-        for power, v in ((1, slope), (2, bend))
-    ]
-    return b[:, 0], found[0], found[1]
-
-
-def _interval(
-    distribution: str, legs: Sequence[LogVariances], chance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ends that the whole factor leaves with no more than `chance` to each side.
-
-    Exact for the log-normal law. A product of independent factors is below the product of their
-    quantiles only where one of them is below its own: the chance is shared among them.
-    """
-    if distribution == "log_normal":
-        variance = sum(leg.large + leg.small for leg in legs)
-        parts: list[ArrayLike] = [variance]
-    else:
-        parts = [variance for leg in legs for variance in leg]
-    each = chance / len(parts)
-    low, high = np.ones(1), np.ones(1)
-    for part in parts:
-        column = np.asarray(part, float)
-        column = column[..., None] if chance.ndim else column
-        low = low * _inverse(distribution, each, column)
-        high = high * _inverse(distribution, each, column, upper=True)
-    return low, high
 
 
 def _parts(legs: Sequence[LogVariances], size: int) -> list[np.ndarray]:
@@ -224,27 +126,36 @@ def turbulence_of(p: Mapping[str, np.ndarray]) -> Turbulence | None:
     return HUFNAGEL_VALLEY if name == "hufnagel_valley" else None
 
 
-def bound(block: "Block") -> Mean | None:
-    """What leaving twinkling out can change of mean probabilities."""
-    if block.word(_TURBULENCE) == "none":
-        return None
-    numbers = {_CONSTANT: np.ravel(block[_CONSTANT].low)[0]}
-    air = turbulence_of(numbers | {_TURBULENCE: block.word(_TURBULENCE)})
-    if air is None:
-        return None
-    legs = largest_both_ways(
+def _legs(
+    air: Turbulence, p: Mapping[str, np.ndarray], range: np.ndarray
+) -> tuple[LogVariances, LogVariances]:
+    """Log variances of points by their parameters."""
+    lidar, target = path_heights(p, range)
+    return both_ways(
         air,
-        wavelength=block["instrument.laser.wavelength"],
-        path=path_of(block),
-        aperture=block["instrument.telescope.aperture"],
-        beam_divergence=block["instrument.laser.beam_divergence"],
+        wavelength=p["instrument.laser.wavelength"],
+        range=range,
+        lidar_height=lidar,
+        target_height=target,
+        aperture=p["instrument.telescope.aperture"],
+        beam_divergence=p["instrument.laser.beam_divergence"],
     )
-    law = block.word(_LAW)
 
-    def change(amplitude: Span, threshold: Span) -> np.ndarray:
-        return mean_pd_bound(law, legs, amplitude=amplitude, threshold=threshold)
 
-    return Mean(change)
+def size(points: Points) -> Size | None:
+    """What leaving twinkling out changes of mean probabilities.
+
+    With L half the logarithm of the factor I, E I = 1, and h the probability over the logarithm of
+    the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2; in a product of
+    segments, which twinkle alike, the suprema of two slopes, times E L^2, come on top.
+    """
+    if points.word(_TURBULENCE) == "none" or (air := turbulence_of(points.parameters)) is None:
+        return None
+    mean, square = _moments(points.word(_LAW), _legs(air, points.parameters, points.range))
+    b = points.threshold
+    slope, bend = _STEEPEST * (1 + b), _MOST_BENT * (1 + b * b)
+    each = slope * mean + 0.5 * (bend + slope**2) * square
+    return Size(chance=np.minimum(len(points.signs) * each, 1.0))
 
 
 def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
@@ -253,16 +164,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     air = turbulence_of(p)
     if air is None:
         return shots
-    lidar, target = path_heights(p, shots.range)
-    legs = both_ways(
-        air,
-        wavelength=p["instrument.laser.wavelength"],
-        range=shots.range,
-        lidar_height=lidar,
-        target_height=target,
-        aperture=p["instrument.telescope.aperture"],
-        beam_divergence=p["instrument.laser.beam_divergence"],
-    )
+    legs = _legs(air, p, shots.range)
     power = factors(str(p[_LAW]), legs, realisation)
     beat = power if shots.architecture == "direct" else np.sqrt(power)
     sources = shots.noise_sources
@@ -281,7 +183,7 @@ EFFECT = Effect(
     name="scintillation",
     about="an echo that twinkles in turbulent air",
     stage="draws",
-    bound=bound,
+    size=size,
     draw=draw,
     parameters=(
         Parameter(

@@ -6,31 +6,19 @@ leaving it out can change: of the echo on the axis, or of the whole footprint's.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects.change import Change, added_noise
-from sweep.model.effects.effect import Effect, Scene
-from sweep.model.effects.span import Span
+from sweep.model.effects.effect import Effect, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 NAME = "signal_shot_noise"
 
 
-def bound(block: "Block") -> Change:
-    """Change by the echo's shot noise, which the threshold does not follow."""
-    more = Span.hull(1.0, block.echo_ratio)
-    variance = block.echo_scale.times(block.echo, more, block.shot_noise_scale)
-    return added_noise(
-        least=variance.low,
-        largest=variance.high,
-        noise_variance=block.noise_variance,
-        threshold_follows=False,
-    )
+def size(points: Points) -> Size:
+    """The echo's shot noise, which the threshold does not follow."""
+    return Size(noise=points.echo_noise, threshold_follows=False)
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
@@ -44,7 +32,7 @@ EFFECT = Effect(
     name=NAME,
     about="shot noise of the echo itself",
     stage="noise",
-    bound=bound,
+    size=size,
     act=act,
     apart=False,
 )

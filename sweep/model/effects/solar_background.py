@@ -6,20 +6,15 @@ What it does is in :func:`sweep.model.noise.solar_power` and
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model import noise
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects.change import Change, added_noise
-from sweep.model.effects.effect import Effect, Parameter, Scene
-from sweep.model.effects.span import Span, monotone
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
 
 NAME = "solar_background"
 
@@ -32,25 +27,6 @@ _SCATTERING = {
 }
 
 
-def bound(block: "Block") -> Change | None:
-    """Change by sunlight on the detector: its share of the other noise, or what air leaves of it.
-
-    The threshold is set on it: the sun shines with and without an echo.
-    """
-    if not block.has("target.solar_irradiance", _DISTANCE):
-        return None
-    field, divergence = block[_FIELD], block["instrument.laser.beam_divergence"].high
-    widest = np.where(np.less_equal(field.low, 0), np.maximum(field.high, divergence), field.high)
-    light = monotone(
-        noise.solar_power,
-        solar_irradiance=block["target.solar_irradiance"] + _sunlight_over(block),
-        beam_divergence=Span(0.0, widest),
-        **{name: block[path] for name, path in _SCATTERING.items()},
-    )
-    variance = light * block.shot_noise_scale
-    return added_noise(least=0.0, largest=variance.high, noise_variance=block.noise_variance)
-
-
 _DISTANCE, _ELEVATION = "target.sun_distance", "target.sun_elevation"
 _FIELD = "instrument.receiver.field_of_view"
 
@@ -58,8 +34,6 @@ SUN_TEMPERATURE = 5772.0
 """Effective temperature of the sun [K], IAU 2015 resolution B3."""
 SUN_RADIUS = 6.957e8
 """Nominal radius of the sun [m], likewise."""
-_BRIGHTEST = PLANCK * SPEED_OF_LIGHT / (4.965114231744276 * BOLTZMANN * SUN_TEMPERATURE)
-"""Wavelength at which a black sun is brightest [m], Wien's law."""
 
 
 def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike) -> np.ndarray:
@@ -81,28 +55,6 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     return np.asarray(exitance * dilution * np.maximum(np.sin(elevation), 0.0))
 
 
-def _sunlight_over(block: "Block") -> Span:
-    """Irradiance by the sun over wavelengths that may hold its brightest."""
-    wavelength = block["instrument.laser.wavelength"]
-    distance = block[_DISTANCE]
-    none = np.less_equal(distance.low, 0)
-    some = Span(np.where(none, np.minimum(SUN_RADIUS, distance.high), distance.low), distance.high)
-    brightest = np.clip(_BRIGHTEST, wavelength.low, wavelength.high)
-    places = [
-        monotone(
-            lambda distance, elevation, at=at: sunlight(
-                wavelength=at, distance=distance, elevation=elevation
-            ),
-            falling=("distance",),
-            distance=some,
-            elevation=block[_ELEVATION],
-        )
-        for at in (wavelength.low, brightest, wavelength.high)
-    ]
-    found = Span.hull(*places)
-    return Span(np.where(none, 0.0, found.low), found.high)
-
-
 def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Sunlight on the detector [W] without extinction, (n,) or scalar."""
     lit = p["target.solar_irradiance"] + sunlight(
@@ -118,6 +70,14 @@ def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
     )
 
 
+def size(points: Points) -> Size | None:
+    """Sunlight on the detector, without the air; the threshold is set on it."""
+    if not points.has("target.solar_irradiance", _DISTANCE):
+        return None
+    variance = received(points.numbers) * points.receiver.per_watt
+    return Size(noise=variance / points.noise_variance)
+
+
 def act(shots: Shots, scene: Scene) -> Shots:
     """Shot noise of sunlight; the air dims it on its way up."""
     light = received(scene.parameters) * shots.ground_transmission * scene.share(NAME)
@@ -129,7 +89,7 @@ EFFECT = Effect(
     name=NAME,
     about="shot noise of sunlight on the target",
     stage="noise",
-    bound=bound,
+    size=size,
     act=act,
     apart=False,
     parameters=(

@@ -25,26 +25,21 @@ noise, stays.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model import philox
-from sweep.model.effects.change import Change
-from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene
-from sweep.model.effects.line_spread import image_factor
-from sweep.model.effects.span import Operand, Span, monotone
+from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
+from sweep.model.effects.points import Points
 from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import Shots
 
-if TYPE_CHECKING:
-    from sweep.model.effects.block import Block
-
 _ROUGHNESS = "target.roughness"
-RARE = 1e-6
-"""Chance of a draw in which the amplitude changes by more than :func:`drawn_change` says."""
+_FURTHEST = 5.0
+"""Root mean squares of a bin's diffuse part that the largest of some bins keeps to but in one of a
+million draws."""
 
 
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -150,74 +145,28 @@ def fixed_bin_detection(
     return marcum_q1(np.asarray(steady, float) / s, np.asarray(threshold, float) / s).q
 
 
-def drawn_change(
-    *, coherent_share: Operand, diffuse_over_found: ArrayLike, bins: ArrayLike
-) -> Change:
-    """What speckle can change in the magnitude of the detecting bin, in all draws but few.
+def size(points: Points) -> Size | None:
+    """What leaving speckle out changes in all draws but few.
 
-    A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa) P.
-    |D| exceeds t sqrt((1 - kappa) P) with probability exp(-t^2), and no more often than
-    sqrt(2 pi t^2) times that if it is a sum of beamlets of random phase (whose moments are at
-    most the normal ones). So the strongest of some ``bins`` lies within
-    sqrt(kappa) +- t sqrt((1 - kappa) P / |X|^2), t about 4.2, in all draws but a share ``RARE``.
-    Between smooth and rough, 4 pi sigma_h << lambda, that is 1 +- t 4 pi sigma_h / lambda.
-
-    Parameters
-    ----------
-    coherent_share : Span or array_like
-        kappa, 0..1; 0 for incoherent footprints of several beamlets, whose coherent share is one
-        of random phases.
-    diffuse_over_found : array_like
-        P / |X|^2, the largest mean power of a bin over all its speckles, by the power of the
-        detecting bin without speckle: 1 for one beamlet and for incoherent phases; the whole
-        echo's SNR over that of the bin (or 1 / share of the power in the bin) otherwise.
-    bins : array_like
-        Bins among which the largest may be: those of the footprint and of the window's main lobe.
+    A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power
+    (1 - kappa) |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within
+    1 +- 5 (4 pi sigma_h / lambda). Incoherent footprints have a coherent share of random phases.
+    What may have cancelled is no measure of what is scattered: the sum of powers is.
     """
-    kappa = Span.of(coherent_share)
-    reach = _reach(bins) * np.sqrt(np.asarray(diffuse_over_found, float))
-    least = np.sqrt(kappa.low) - reach * np.sqrt(1 - np.asarray(kappa.low))
-    # sqrt(kappa) + reach sqrt(1 - kappa) rises up to here and falls from there
-    highest = np.clip(1 / (1 + reach**2), kappa.low, kappa.high)
-    most = np.sqrt(highest) + reach * np.sqrt(1 - highest)
-    return Change(signal=(np.maximum(least, 0.0), most))
-
-
-def bound(block: "Block") -> Change | None:
-    """What leaving speckle out can change in all draws but few, (3, tiles)."""
-    if not block.has(_ROUGHNESS):
+    if not points.has(_ROUGHNESS):
         return None
-    roughness, wavelength = block[_ROUGHNESS], block["instrument.laser.wavelength"]
-    kappa = monotone(
-        coherent_share, falling=("roughness",), roughness=roughness, wavelength=wavelength
+    kappa = coherent_share(
+        roughness=points[_ROUGHNESS], wavelength=points["instrument.laser.wavelength"]
     )
-    several = block.number > 1
-    if several and not block.adds_amplitudes:
-        kappa = Span.of(0.0)
-    lines, extreme = block.lines, np.asarray(block.spread.extreme)
-    worst = np.asarray(lines.lobe.worst)
-    bins = 2 * extreme + 2 * lines.lobe.margin + 1
-    image = lines.lobe.tail(2 * (lines.edge - extreme) - 1) / worst
-    low, high = drawn_change(coherent_share=kappa, diffuse_over_found=1.0, bins=bins).signal
-    near = image_factor(lines, extreme) > 1.5
-    low = np.where(near, 0.0, np.maximum(low * (1 - image), 0.0))
-    high = np.where(near, np.sqrt(2) * high, high * (1 + image))
-    if not block.adds_amplitudes:
-        return Change(signal=(low, high))
-    # What may have cancelled is no measure of what is scattered: the sum of powers is.
-    cancelling = near | several
-    steady = np.sqrt(np.asarray(kappa.low))
-    scattered = np.sqrt(2 * (1 - np.asarray(kappa.low))) * _reach(bins) / worst
-    return Change(
-        signal=(np.where(cancelling, steady, low), np.where(cancelling, 1.0, high)),
-        added=np.where(cancelling, scattered, 0.0),
+    scattered = _FURTHEST * np.sqrt(1 - kappa)
+    if not points.adds_amplitudes:
+        near = points.near_image | (points.number > 1)
+        return Size(magnitude=np.where(near & (kappa < 1), 1.0, 1 - np.sqrt(kappa) + scattered))
+    cancelling = points.may_cancel
+    return Size(
+        magnitude=1 - np.sqrt(kappa) + np.where(cancelling, 0.0, scattered),
+        added=np.where(cancelling, math.sqrt(2) * scattered / points.lobe.worst, 0.0),
     )
-
-
-def _reach(bins: ArrayLike) -> np.ndarray:
-    """What the largest of some bins' diffuse parts exceeds, over its rms, in a share RARE."""
-    square = np.log(np.asarray(bins, float) / RARE)
-    return np.asarray(np.sqrt(square + 0.5 * np.log(2 * math.pi * (square + 3))))
 
 
 _SMOOTH = 1e-6
@@ -274,7 +223,7 @@ EFFECT = Effect(
     name="speckle",
     about="amplitudes of a rough surface, at random",
     stage="draws",
-    bound=bound,
+    size=size,
     draw=draw,
     needs=("footprint", "doppler_spread"),  # by them the segments' speckles differ
     parameters=(

@@ -14,16 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from sweep.model.effects.atmosphere import Path
-from sweep.model.effects.span import Span
-
 WAVES = ("plane", "spherical")
 
 _ENDS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Powers of the distances to receiver and source in the integral over the path."""
 _LARGE = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
-_WINDIEST = 1e4
-"""Height [m] at which the part of the wind in the structure constant is largest."""
 
 
 class Turbulence(NamedTuple):
@@ -52,16 +47,8 @@ class LogVariances(NamedTuple):
 
 def structure_constant(turbulence: Turbulence, height: ArrayLike) -> np.ndarray:
     """C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground that on it."""
-    return largest_structure_constant(turbulence, height, height)
-
-
-def largest_structure_constant(
-    turbulence: Turbulence, low: ArrayLike, high: ArrayLike
-) -> np.ndarray:
-    """Largest C_n^2 [m^(-2/3)] between two heights: the part of the wind has a maximum."""
-    h = np.maximum(np.asarray(low, float), 0.0)
-    windy = np.clip(_WINDIEST, h, np.maximum(np.asarray(high, float), 0.0))
-    aloft = 0.00594 * (turbulence.wind / 27) ** 2 * (1e-5 * windy) ** 10 * np.exp(-windy / 1e3)
+    h = np.maximum(np.asarray(height, float), 0.0)
+    aloft = 0.00594 * (turbulence.wind / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
     middle = turbulence.middle * np.exp(-h / 1.5e3)
     return turbulence.uniform + aloft + middle + turbulence.surface * np.exp(-h / 100)
 
@@ -101,21 +88,6 @@ def _rule(wave: str) -> tuple[np.ndarray, np.ndarray]:
     to_receiver, to_source = _ENDS[wave]
     x, weights = special.roots_jacobi(64, to_receiver, to_source)
     return (1 + x) / 2, weights / 2 ** (1 + to_receiver + to_source)
-
-
-def largest_rytov_variance(
-    wave: str, turbulence: Turbulence, *, wavelength: Span, path: Path
-) -> np.ndarray:
-    """Largest :func:`rytov_variance` over tiles, (tiles,), of a plane wave out or one back."""
-    share, weights = _rule(wave)
-    climb, from_target = path.range * path.sine, 1 - share if wave == "plane" else share
-    low, high = (
-        np.asarray(target, float)[..., None] + np.asarray(rise, float)[..., None] * from_target
-        for target, rise in ((path.target.low, climb.low), (path.target.high, climb.high))
-    )
-    mean = (largest_structure_constant(turbulence, low, high) * weights).sum(axis=-1)
-    k = 2 * math.pi / np.asarray(wavelength.low, float)
-    return np.asarray(2.25 * k ** (7 / 6) * np.asarray(path.range.high) ** (11 / 6) * mean)
 
 
 def log_variances(
@@ -180,42 +152,3 @@ def both_ways(
             "spherical", rytov_variance=back, wavelength=wavelength, range=range, aperture=aperture
         ),
     )
-
-
-def largest_log_variances(
-    wave: str, *, rytov_variance: ArrayLike, wavelength: Span, range: Span, aperture: Span
-) -> LogVariances:
-    """Largest :func:`log_variances` up to some Rytov variance: strong turbulence saturates."""
-    v = np.asarray(rytov_variance, float)
-    where = {"wavelength": wavelength.high, "range": range.high, "aperture": aperture.low}
-    d2 = math.pi / 2 * np.asarray(aperture.low, float) ** 2 / (wavelength.high * range.high)
-    by_aperture, by_strength = _LARGE[wave]
-    turning = ((1 + by_aperture * d2) / (0.4 * by_strength)) ** (1 / 1.2)
-    large = log_variances(wave, rytov_variance=np.minimum(v, turning), **where).large
-    small = log_variances(wave, rytov_variance=v, **where).small
-    return LogVariances(large, small * (1 + 0.62 * d2 * v**1.2 / (1 + 0.90 * d2)))
-
-
-def largest_both_ways(
-    turbulence: Turbulence,
-    *,
-    wavelength: Span,
-    path: Path,
-    aperture: Span,
-    beam_divergence: Span,
-) -> tuple[LogVariances, LogVariances]:
-    """Largest :func:`both_ways` over tiles, (tiles,) each."""
-    apertures = {"plane": aperture + beam_divergence * path.range, "spherical": aperture}
-    out, back = (
-        largest_log_variances(
-            wave,
-            rytov_variance=largest_rytov_variance(
-                wave, turbulence, wavelength=wavelength, path=path
-            ),
-            wavelength=wavelength,
-            range=path.range,
-            aperture=apertures[wave],
-        )
-        for wave in WAVES
-    )
-    return out, back

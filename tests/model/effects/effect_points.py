@@ -1,14 +1,11 @@
-"""Scenes over the whole reachable range, as points and as tiles around them, and the measure."""
+"""Scenes over the whole reachable range, as points, and their plans."""
 
 import numpy as np
 
 from sweep.model.chain import prepare
-from sweep.model.effects import leakage
-from sweep.model.effects.block import Block
-from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
-from sweep.model.effects.change import Change
-from sweep.model.effects.probability_bounds import within_changes
-from sweep.model.effects.span import Span
+from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+from sweep.model.effects.planning import plan
+from sweep.model.effects.points import Points
 from sweep.model.shot import find
 
 SIZES = (2**12, 2**13, 2**14, 2**15, 2**16, 2**17, 2**18)
@@ -16,12 +13,6 @@ CLOSED = ("hamming", "hann", "rectangular", "flattop")
 WINDOWS = (*CLOSED, "kaiser(8.6)")
 
 ACROSS = "target.transverse_velocity"
-WIDENED = {
-    "target.range": 0.3, "target.grazing_angle": 0.1, "instrument.laser.beam_divergence": 0.1,
-    "target.radial_velocity": 0.3, "instrument.laser.power": 0.3, "instrument.processing.tnr": 0.1,
-    ACROSS: 0.3,
-}  # fmt: skip
-"""Parameters that tiles extend over, and how far at the most, relatively."""
 
 
 def scene(table, number, seed, **fixed):
@@ -55,39 +46,21 @@ def small(seed):
     return 2 ** int(np.random.default_rng(seed).integers(12, 16))
 
 
-def point_block(parameters):
-    """Every point a tile of its own."""
-    return Block.of_plane(
-        {
-            path: str(value) if np.asarray(value).dtype.kind in "UO" else Span.of(value)
-            for path, value in (DEFAULTS | dict(parameters)).items()
-        }
-    )
+def points_of(parameters, footprint=None, **further):
+    """Points as the planner looks at them."""
+    words = {path: str(v) for path, v in parameters.items() if np.asarray(v).dtype.kind in "UO"}
+    return Points(DEFAULTS | dict(parameters) | words, footprint, **further)
 
 
-def tile_block(parameters, seed):
-    """Tiles that hold the points, each as wide as chance has it, and points from within."""
-    rng = np.random.default_rng((72, seed))
-    spans, inner = {}, dict(parameters)
-    number = max(np.size(value) for value in parameters.values())
-    wide = 10 ** rng.uniform(-7, 0, number)
-    for path, value in (DEFAULTS | dict(parameters)).items():
-        if path not in WIDENED:
-            words = np.asarray(value).dtype.kind in "UO"
-            spans[path] = str(value) if words else Span.of(value)
-            continue
-        middle = np.broadcast_to(np.asarray(value, float), (number,))
-        reach = abs(middle) * WIDENED[path] * wide * rng.choice([0, 1], number, p=[0.3, 0.7])
-        below, above = rng.random((2, number)) * reach
-        low, high = middle - below, middle + above
-        if path == "target.grazing_angle":
-            high = np.minimum(high, np.pi / 2)
-            low = np.minimum(low, high)
-        spans[path] = Span(low, high)
-        place = rng.random(number)
-        place = np.where(rng.random(number) < 0.3, np.rint(place), place)
-        inner[path] = np.clip(low + place * (high - low), low, high)
-    return Block.of_plane(spans), inner
+def planned(points, modes, tolerance, effects=EFFECTS, edges=None):
+    """The plan of points, each by itself or in stretches between edges."""
+    number = max(np.size(value) for value in points.numbers.values())
+
+    def tiles(values):
+        each = np.broadcast_to(values, (number,))
+        return each if edges is None else np.maximum.reduceat(each, edges[:-1])
+
+    return plan(points, tiles, modes, tolerance, effects)
 
 
 def shots_of(parameters, effects):
@@ -104,29 +77,3 @@ def found(parameters, effects):
 def magnitudes(parameters, effects):
     """Largest bin's |X| of each segment, (3, n)."""
     return found(parameters, effects)[:, 2]
-
-
-def leakage_bound(block):
-    """Bound on what leaks, (3, tiles), whichever of the core's effects are there."""
-    asked = (effect.bound(block) for effect in EFFECTS if effect.name in CORE)
-    changes = [bound for bound in asked if isinstance(bound, Change)]
-    amplitude, threshold = within_changes(
-        changes, amplitude=block.amplitude, threshold=block.threshold
-    )
-    return leakage.bound(block).change(amplitude, threshold)
-
-
-ROUNDING = 1e-9
-"""Of a magnitude: the spectrum's own 1e-12, and the phase of lines 1e8 wavelengths away."""
-
-
-def held(change, with_effect, without):
-    """Whether the true factor lies within the interval, and interval / change in logs."""
-    low, high = (np.broadcast_to(end, without.shape) for end in change.signal)
-    factor = with_effect / without
-    inside = (factor >= low * (1 - ROUNDING)) & (factor <= high * (1 + ROUNDING))
-    with np.errstate(divide="ignore"):
-        length = np.log(high) - np.log(low)
-        moved = abs(np.log(factor))
-    noticed = moved > 1e-7
-    return inside, (length[noticed] / moved[noticed])

@@ -3,9 +3,6 @@
 import mpmath
 import numpy as np
 import pytest
-from effect_points import point_block
-from effect_points import scene as scene_of
-from phase_error_checks import check_blocks
 
 from sweep.model.effects import acceleration
 from sweep.model.effects.line_splitting import split_lines
@@ -66,37 +63,6 @@ def scenes(n, rng, sign):
         "start": rng.uniform(0, 1e-4, n),
         "duration": 10 ** rng.uniform(-4, -3.3, n),
     }
-
-
-def accelerated(rng, n):
-    return {"target.acceleration": 10 ** rng.uniform(-2, 3, n) * rng.choice([-1, 1], n)}
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("beamlets", [1, 7])
-def test_the_bound_holds_and_is_not_idle(table_4_1, phases, beamlets):
-    idle = check_blocks("acceleration", table_4_1, accelerated, phases=phases, beamlets=beamlets)
-    if phases == "incoherent" or beamlets == 1:
-        assert np.median(idle) < 30
-
-
-def test_the_bound_s_powers_are_those_of_the_phase(table_4_1):
-    """At a point: their sum with the right signs is the phase, which here are all alike or not."""
-    parameters = scene_of(table_4_1, 20, 3) | accelerated(np.random.default_rng(1), 20)
-    block = point_block(parameters)
-    error = acceleration.error(block)
-    x = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
-    for segment, sign in enumerate((1, 0, -1)):
-        exact = acceleration.phase(
-            x, sign=sign, carrier=block.carrier(segment).low, chirp_rate=block.chirp_rate.low,
-            range=block.range.low, radial_velocity=block.radial_velocity.low,
-            acceleration=parameters["target.acceleration"], start=0.0,
-            duration=block.record_duration.low,
-        )  # fmt: skip
-        fitted = np.polynomial.polynomial.polyfit(x, exact.T, 6)[1:5]
-        rounding = 1e-12 * abs(exact).max()
-        for power, coefficient in zip(error.powers, fitted, strict=True):
-            np.testing.assert_allclose(power[segment], abs(coefficient), rtol=1e-6, atol=rounding)
 
 
 def test_its_lines_are_its_phase():

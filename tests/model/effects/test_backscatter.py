@@ -2,20 +2,17 @@
 
 import numpy as np
 import pytest
-from effect_points import point_block, scene, shots_of, small, tile_block
 from scipy.integrate import quad
 from scipy.special import exp1
 
 from sweep.model.effects.atmosphere import (
     PROFILES,
-    Path,
     Profile,
     exponential,
     layer,
     optical_depth,
 )
-from sweep.model.effects.backscatter import bound, largest_power, power
-from sweep.model.effects.span import Span
+from sweep.model.effects.backscatter import power
 
 BEAM = {
     "laser_power": 1.0, "aperture": 25e-3, "optical_efficiency": 0.8, "beam_divergence": 50e-6,
@@ -100,45 +97,3 @@ def test_slant_paths_agree_with_adaptive_quadrature_over_range():
         found = power(profile, start_height=start, end_height=end, range=length, **BEAM)
         expected = 0.8 * AREA / 50 * total
         assert found == pytest.approx(expected, rel=1e-8, abs=2 * 0.8 * AREA / 50 * error)
-
-
-def test_no_path_returns_more_than_the_bound_which_is_near():
-    spans = []
-    for profile, start, end, length in scenes():
-        if np.any(np.diff(profile.extinction) > 0):
-            continue  # denser above: no table of a spec's
-        true = power(profile, start_height=start, end_height=end, range=length, **BEAM)
-        path = Path(*(Span.of(v) for v in (length, end, (start - end) / length)))
-        largest = largest_power(profile, path, **{k: Span.of(v) for k, v in BEAM.items()})
-        assert true <= largest * (1 + 1e-9) + 1e-30
-        if true > 1e-25:
-            spans.append(largest / true)
-    assert len(spans) > 50
-    assert np.median(spans) < 1.5 and np.max(spans) < 20
-
-
-AIR = ("earth_haze", "mars_storm", "exponential", "layer")
-
-
-@pytest.mark.parametrize("seed", range(16))
-def test_blocks_bound_the_noise_of_what_the_air_sends_back(table_4_1, seed):
-    rng, number = np.random.default_rng((75, seed)), 40
-    architecture = ("homodyne", "heterodyne", "direct")[seed % 3]
-    parameters = scene(table_4_1, number, seed, fft_size=small(seed), architecture=architecture)
-    parameters |= {
-        "atmosphere.profile": AIR[seed % 4],
-        "atmosphere.extinction": 10 ** rng.uniform(-5, -2),
-        "atmosphere.depth": 10 ** rng.uniform(1, 4),
-        "atmosphere.target_height": rng.uniform(-10, 2000, number),
-        "atmosphere.path": ("slant", "level")[seed // 8],
-        "atmosphere.lidar_ratio": rng.uniform(10, 80, number),
-    }
-    for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
-        least, largest = bound(block).noise
-        alone, lit = (shots_of(points, names) for names in ((), ("backscatter",)))
-        added = lit.noise_variance / alone.noise_variance - 1
-        assert np.all(least <= 1) and np.all(1 + added <= largest * (1 + 1e-12))
-        if points is parameters:
-            told = added > 1e-9
-            assert not told.any() or np.median((np.asarray(largest) - 1)[told] / added[told]) < 2
-    assert bound(block).threshold_follows

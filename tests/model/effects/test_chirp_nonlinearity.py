@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-from effect_points import point_block
-from effect_points import scene as scene_of
-from phase_error_checks import check_blocks
 from scipy.special import jv
 
 from sweep.model.effects import chirp_nonlinearity
@@ -97,54 +94,6 @@ def test_the_down_chirp_runs_through_the_error_backwards():
             for sign in (1, -1)
         )
         np.testing.assert_allclose(down[::-1], up, atol=1e-6 * np.abs(up).max())
-
-
-def erring(rng, n):
-    """One kind of error, or all three."""
-    only = rng.integers(0, 4)
-    peaks = {
-        f"instrument.chirp.{kind}_error": 10 ** rng.uniform(3, 6, n) * rng.choice([-1, 1], n)
-        for i, kind in enumerate(("quadratic", "cubic", "sinusoidal"))
-        if only in (i, 3)
-    }
-    return peaks | {"instrument.chirp.error_periods": rng.uniform(0.5, 12, n)}
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("beamlets", [1, 7])
-def test_the_bound_holds_and_is_not_idle(table_4_1, phases, beamlets):
-    idle = check_blocks(
-        "chirp_nonlinearity", table_4_1, erring, phases=phases, beamlets=beamlets, seeds=8
-    )
-    if phases == "incoherent" or beamlets == 1:
-        assert np.median(idle) < 30
-
-
-def test_the_bound_s_powers_are_those_of_the_phase(table_4_1):
-    """At a point, of square and cube together; the sine stays within what is left."""
-    parameters = scene_of(table_4_1, 20, 3) | {
-        "instrument.chirp.quadratic_error": 3e5,
-        "instrument.chirp.cubic_error": -2e5,
-        "instrument.chirp.sinusoidal_error": 1e4,
-        "instrument.chirp.error_periods": 4.0,
-    }
-    block = point_block(parameters)
-    error = chirp_nonlinearity.error(block)
-    x = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
-    for segment, sign in ((0, 1), (2, -1)):
-        chirp = {
-            "sign": sign, "chirp_duration": parameters["instrument.chirp.duration"],
-            "range": block.range.low, "radial_velocity": block.radial_velocity.low,
-            "start": 0.0, "duration": block.record_duration.low, "periods": 4.0,
-        }  # fmt: skip
-        exact = chirp_nonlinearity.phase(x, quadratic=3e5, cubic=-2e5, sinusoidal=0.0, **chirp)
-        fitted = np.polynomial.polynomial.polyfit(x, exact.T, 6)[1:5]
-        for power, coefficient in zip(error.powers, fitted, strict=True):
-            rounding = 1e-12 * abs(exact).max()
-            np.testing.assert_allclose(power[segment], abs(coefficient), rtol=1e-6, atol=rounding)
-        wave = chirp_nonlinearity.phase(x, quadratic=0.0, cubic=0.0, sinusoidal=1e4, **chirp)
-        assert (abs(wave).max(axis=1) <= error.rest[segment]).all()
-        assert (abs(wave).max(axis=1) > 0.5 * error.rest[segment]).mean() > 0.5
 
 
 def test_its_lines_are_its_phase():

@@ -2,27 +2,19 @@
 
 import numpy as np
 import pytest
-from effect_points import point_block, scene, shots_of, small, tile_block
 from hypothesis import given
 from hypothesis import strategies as st
-from pd_changes import pd_change
 from scipy.integrate import quad
 
 from sweep.model.effects.atmosphere import (
     PROFILES,
-    Path,
     Profile,
-    depth_over,
     exponential,
     layer,
     optical_depth,
     transmission,
     visibility_extinction,
 )
-from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.extinction import bound, dimming
-from sweep.model.effects.span import Span
-from sweep.model.marcum import marcum_q1
 
 HEIGHT = st.floats(0, 20e3)
 
@@ -116,84 +108,3 @@ def test_paths_are_worked_out_together_as_one_by_one():
     for i, j in np.ndindex(table.shape):
         one = optical_depth(profile, start_height=start[i, 0], end_height=end[j], range=1e4)
         assert table[i, j] == one
-
-
-@pytest.mark.parametrize("exponent", [1, 2])
-def test_no_dimmed_shot_changes_beyond_the_bound(exponent):
-    """Echo and sun dimmed by hand; the threshold is set on noise with the sun's light."""
-    rng = np.random.default_rng(4)
-    n = 500
-    depth = 10 ** rng.uniform(-3, 0.5, n)
-    profile = exponential(surface_extinction=1e-4, scale_height=1e3)
-    share = -np.expm1(-1.0)  # of the 1e-4 * 1e3 of the column, from 1 km down
-    length = depth / (1e-4 * share)
-    echo, sun = rng.uniform(0, 0.5, (2, n)) * rng.integers(0, 2, (2, n))
-    a, tnr = rng.uniform(2, 20, n), rng.uniform(4, 10, n)
-    t = np.exp(-depth)
-    quiet = (1 - echo - sun) + sun  # shares of the undimmed noise, without the echo
-    thresholds = tnr * np.sqrt([quiet, quiet - sun * (1 - t)])
-    spread = np.sqrt(1 - echo * (1 - t**2) - sun * (1 - t))
-    without = marcum_q1(a, thresholds[0]).q
-    true = marcum_q1(a * t**exponent / spread, thresholds[1] / spread).q
-    found = optical_depth(profile, start_height=1e3, end_height=0.0, range=length)
-    change = dimming(depth=Span.of(found), amplitude_exponent=exponent, dimmed_share=echo + sun)
-    np.testing.assert_allclose(change.signal[0], t**exponent, rtol=1e-11)
-    assert np.all(change.noise[0] <= spread**2 + 1e-15) and np.all(spread**2 <= change.noise[1])
-    found = pd_change(change, amplitude=a, threshold=thresholds[0])
-    assert np.all(abs(true - without) <= found + 1e-14)
-    still = (echo == 0) & (sun == 0)
-    np.testing.assert_allclose(abs(true - without)[still], found[still], atol=1e-13)
-
-
-AIR = ("earth_clear", "earth_haze", "mars_dusty", "exponential", "layer")
-
-
-def aired(table, seed, number=40):
-    """Scenes of all architectures and profiles, slanted and level, some in sunlight."""
-    rng = np.random.default_rng((74, seed))
-    architecture = ("homodyne", "heterodyne", "direct")[seed % 3]
-    return scene(table, number, seed, fft_size=small(seed), architecture=architecture) | {
-        "atmosphere.profile": AIR[seed % 5],
-        "atmosphere.extinction": 10 ** rng.uniform(-6, -3),
-        "atmosphere.depth": 10 ** rng.uniform(1, 4),
-        "atmosphere.target_height": rng.uniform(-10, 2000, number),
-        "atmosphere.path": ("slant", "level")[seed // 5 % 2],
-        "target.solar_irradiance": 10 ** rng.uniform(6, 9, number) * (seed % 2),
-    }
-
-
-@pytest.mark.parametrize("seed", range(15))
-def test_blocks_hold_what_the_air_takes_and_points_to_the_last_digit(table_4_1, seed):
-    core, parameters = (*CORE, "backscatter"), aired(table_4_1, seed)
-    for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
-        change = bound(block)
-        clear, dim = (shots_of(points, names) for names in (core, (*core, "extinction")))
-        factor, quieter = (
-            getattr(dim, name) / getattr(clear, name) for name in ("beat_scale", "noise_variance")
-        )
-        low, high = change.signal
-        assert np.all(low * (1 - 1e-12) <= factor) and np.all(factor <= high * (1 + 1e-12))
-        assert np.all(change.noise[0] <= quieter * (1 + 1e-12)) and np.all(quieter <= 1)
-        if points is parameters:
-            np.testing.assert_allclose(low, factor, rtol=1e-12)
-
-
-def test_depths_of_beams_up_and_down_lie_within_their_ends():
-    """Elevations by the shot, here level or up to a target overhead, spanned by hand."""
-    rng = np.random.default_rng(8)
-    n = 200
-    path = {
-        "range": rng.uniform(100, 900, n), "target": rng.uniform(900, 2000, n),
-        "sine": rng.uniform(-1, 0.3, n),
-    }  # fmt: skip
-    low, high = ({k: f(v) for k, v in path.items()} for f in (np.min, np.max))
-    over = depth_over(PROFILES["earth_haze"], Path(**{k: Span(low[k], high[k]) for k in low}))
-    each = optical_depth(
-        PROFILES["earth_haze"], start_height=path["target"] + path["range"] * path["sine"],
-        end_height=path["target"], range=path["range"],
-    )  # fmt: skip
-    assert np.all(over.low <= each) and np.all(each <= over.high)
-
-
-def test_clear_air_has_nothing_of_it(table_4_1):
-    assert bound(point_block(scene(table_4_1, 5, 1))) is None

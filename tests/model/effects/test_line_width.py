@@ -2,12 +2,8 @@
 
 import numpy as np
 import pytest
-from effect_points import point_block, scene, shots_of, small, tile_block
-from phase_error_checks import check_blocks
 
 from sweep.model.effects import gaussian_line, line_width
-from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.gaussian_line import gaussian_bound
 from sweep.model.window import samples, transform, window
 
 WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
@@ -166,10 +162,6 @@ def test_a_line_about_as_wide_as_the_band_leaves_noise_of_its_own_power(laser_wi
     assert np.abs(found - expected).max() < (1e-6 + kinks) * found.max()
     even = 1 + 2 * np.exp(-g) / -np.expm1(-g)  # the sum over all lags, without a window
     assert pedestal.max() <= window("hann", LENGTH).energy * even * (1 + 1e-6)
-    change = line_width.lorentzian_bound(
-        line_width=laser_width, delay=delay / RATE, duration=DURATION, sample_rate=RATE, cnr=10.0
-    )
-    assert 10.0 * pedestal.max() / window("hann", LENGTH).energy <= change.noise[1] - 1
 
 
 def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_energy():
@@ -181,100 +173,3 @@ def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_ene
     density = line_width.pedestal_density(y[0] / duration, line_width=1e3, delay=40 / RATE)
     # Lags up to a hundredth of the record: the window's autocorrelation has hardly fallen there.
     np.testing.assert_allclose(found[0], form.energy * RATE * density, rtol=2e-3)
-
-
-def test_no_width_is_no_change():
-    laser = {"line_width": np.array([0.0]), "delay": np.array([1e-5]), "duration": DURATION}
-    assert line_width.coherent_share(**laser)[0] == 1
-    form = window("hann", LENGTH)
-    assert not line_width.pedestal_power(np.array([[0.0, 3.0]]), window=form, **laser).any()
-    change = line_width.lorentzian_bound(**laser, sample_rate=RATE, cnr=10.0)
-    assert change.signal[0] == 1 and change.noise[1] == 1
-    change = gaussian_bound(fwhm=np.array([0.0]), duration=DURATION, window=form)
-    assert change.signal == (1, 1)
-
-
-def true_changes(name, correlations, places):
-    """Root of the mean power of the largest bin over that of a pure line."""
-    bins = np.arange(-30, 31)
-    pure = np.ones(LENGTH)
-    return np.sqrt(
-        [
-            by_lags(name, bins + p, r).max() / by_lags(name, bins + p, pure).max()
-            for r, p in zip(correlations, places, strict=True)
-        ]
-    )
-
-
-def check(change, true):
-    low, high = change.signal
-    assert (low <= true * (1 + 1e-12)).all()
-    assert (true <= high * (1 + 1e-12)).all()
-    return np.median(np.log(high / low) / np.abs(np.log(true)))
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_the_gaussian_bound_holds_and_is_not_idle(name):
-    rng = np.random.default_rng(43)
-    bins_fwhm, places = 10 ** rng.uniform(-2, 1, 60), rng.uniform(-0.5, 0.5, 60)
-    deviation = bins_fwhm / np.sqrt(8 * np.log(2))
-    lag = np.arange(LENGTH) / LENGTH
-    true = true_changes(name, np.exp(-2 * (np.pi * np.outer(deviation, lag)) ** 2), places)
-    change = gaussian_bound(
-        fwhm=bins_fwhm / DURATION, duration=DURATION, window=window(name, LENGTH)
-    )
-    assert check(change, true) < 30
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_the_lorentzian_bound_holds_and_is_not_idle(name):
-    rng = np.random.default_rng(44)
-    laser_width, delay = 10 ** rng.uniform(0, 4.3, 60), 10 ** rng.uniform(-5, -3, 60)
-    lags = np.minimum(np.arange(LENGTH) / RATE, delay[:, None])
-    correlation = np.exp(-2 * np.pi * laser_width[:, None] * lags)
-    form = window(name, LENGTH)
-    change = line_width.lorentzian_bound(
-        line_width=laser_width, delay=delay, duration=DURATION, sample_rate=RATE, cnr=0.3
-    )
-    pure = np.sqrt(correlation[:, -1])  # what is left at the longest lag
-    one_more = pure * np.exp(-np.pi * laser_width / RATE)  # a sample beyond
-    assert (change.signal[0] <= pure).all() and (change.signal[0] >= one_more * (1 - 1e-12)).all()
-    assert (change.signal[1] == 1).all()
-    # No bin of the pedestal, with |C|^2 = a^2 / 4, is above what the bound says of noise.
-    y = np.broadcast_to(np.arange(-10.0, 11), (60, 21))
-    pedestal = line_width.pedestal_power(
-        y, line_width=laser_width, delay=delay, duration=np.full(60, DURATION), window=form
-    )
-    raised = 1 + 0.3 / 2 * pedestal.max(axis=1) / form.energy
-    assert (raised <= change.noise[1]).all()
-    assert np.median((change.noise[1] - 1) / (raised - 1)) < 4
-
-
-def broad(rng, n):
-    return {"instrument.laser.line_width": 10 ** rng.uniform(2, 5, n)}
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("beamlets", [1, 7])
-def test_blocks_bound_what_a_gaussian_line_makes(table_4_1, phases, beamlets):
-    others = ("range_walk",)
-    idle = check_blocks(
-        "line_width", table_4_1, broad, phases=phases, beamlets=beamlets, others=others,
-        seeds=3, number=20,
-    )  # fmt: skip
-    if phases == "incoherent" or beamlets == 1:
-        assert np.median(idle) < 30
-
-
-def test_blocks_bound_what_a_lorentzian_line_makes(table_4_1):
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        parameters = scene(table_4_1, 40, seed, fft_size=small(seed), beamlets=7)
-        parameters |= broad(rng, 40) | {"instrument.laser.line_shape": "lorentzian"}
-        for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
-            change = line_width.bound(block)
-            plain, wide = (shots_of(points, (*CORE, *more)) for more in ((), ("line_width",)))
-            factor = wide.beat_scale / plain.beat_scale
-            assert (change.signal[0] * (1 - 1e-12) <= factor).all() and (factor <= 1).all()
-            louder = 1 + wide.pedestal / wide.noise_variance
-            assert (louder <= change.noise[1]).all()

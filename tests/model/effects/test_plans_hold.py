@@ -1,15 +1,14 @@
-"""Plans on the model itself: no effect changes more than it may, what is left out no more than
-the tolerance, at single points and anywhere in tiles."""
+"""Plans on the model itself: no effect changes more than its size, what is left out no more than
+the tolerance."""
 
 import numpy as np
 import pytest
-from cast_blocks import block_of_cast
-from effect_points import found, point_block, scene, shots_of, tile_block
+from effect_points import found, planned, points_of, scene, shots_of
 
 from sweep.model import shot
 from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
-from sweep.model.effects.planning import plan
+from sweep.model.effects.spread import of_rays
 from sweep.model.ground import Cast, Footprints
 from sweep.model.shot import find
 
@@ -34,8 +33,11 @@ STILL = {"doppler": "off"}
 
 def some_of(rng, name):
     """Any of the other effects, with what they need, but for those within this one."""
-    chosen = {n for n in CORE if n != name and WITHIN[n] != name and rng.random() < 0.6}
-    return {n for n in chosen if not WITHIN[n] or WITHIN[n] in chosen} | {WITHIN[name]} - {""}
+    chosen = {n for n in CORE if n != name and rng.random() < 0.6}
+    chosen -= {n for n in CORE if name and WITHIN[n] == name}
+    return {n for n in chosen if not WITHIN[n] or WITHIN[n] in chosen} | {WITHIN.get(name, "")} - {
+        ""
+    }
 
 
 def counted(parameters, seed):
@@ -58,8 +60,7 @@ def magnitudes_moved(on, off, sigma):
 
 
 @pytest.mark.parametrize("kind", range(len(KINDS)))
-@pytest.mark.parametrize("tiles", [False, True], ids=["points", "tiles"])
-def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1, kind, tiles):
+def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, kind):
     noticed = 0
     for seed in range(6):
         rng = np.random.default_rng((seed, kind))
@@ -67,9 +68,10 @@ def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1,
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7} | KINDS[kind],
         )  # fmt: skip
-        block, inner = tile_block(parameters, seed) if tiles else (point_block(parameters),) * 2
-        inner = counted(inner if tiles else parameters, seed)
-        moving, still = (plan(block, modes, 1.0, CHOICE).change for modes in ({}, STILL))
+        inner = counted(parameters, seed)
+        moving, still = (
+            planned(points_of(parameters), modes, 1.0, CHOICE).change for modes in ({}, STILL)
+        )
         for name in CORE:
             others = some_of(rng, name)
             changes = moving if "doppler" in others | {name} else still
@@ -90,6 +92,56 @@ def test_no_effect_changes_more_than_its_bound_whatever_else_there_is(table_4_1,
     assert noticed > 500
 
 
+def sizes_of_many(rng, low, high):
+    return rng.choice([-1, 1], POINTS) * 10 ** rng.uniform(low, high, POINTS)
+
+
+FURTHER = {
+    "range_walk": lambda rng: {},
+    "acceleration": lambda rng: {"target.acceleration": sizes_of_many(rng, -3, 3)},
+    "chirp_nonlinearity": lambda rng: {
+        "instrument.chirp.quadratic_error": sizes_of_many(rng, 1, 5),
+        "instrument.chirp.cubic_error": sizes_of_many(rng, 1, 5),
+        "instrument.chirp.sinusoidal_error": sizes_of_many(rng, 1, 4.5),
+        "instrument.chirp.error_periods": 10 ** rng.uniform(-0.5, 1, POINTS),
+    },
+    "line_width": lambda rng: {
+        "instrument.laser.line_width": 10 ** rng.uniform(0, 4.5, POINTS),
+        "instrument.laser.line_shape": str(rng.choice(["gaussian", "lorentzian"])),
+    },
+    "extinction": lambda rng: {
+        "atmosphere.profile": "exponential",
+        "atmosphere.extinction": float(10 ** rng.uniform(-8, -3)),
+    },
+    "saturation": lambda rng: {
+        "instrument.processing.full_scale": 10 ** rng.uniform(-3, 0, POINTS)
+    },
+}
+"""What brings the effects that are not at hand in every scene."""
+
+
+@pytest.mark.parametrize("kind", [0, 1, 3, 4])
+@pytest.mark.parametrize("name", FURTHER)
+def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
+    noticed = 0
+    for seed in range(4):
+        rng = np.random.default_rng((seed, kind, 5))
+        slow = rng.choice([-1, 1], POINTS) * 10 ** rng.uniform(-2, 2.5, POINTS)
+        parameters = scene(
+            table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
+            **{"beamlets": 7, "radial_velocity": slow} | KINDS[kind],
+        ) | FURTHER[name](rng)  # fmt: skip
+        others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set()) - {name}
+        made = planned(points_of(parameters), {}, 1.0)
+        most = made.change[made.names.index(name)]
+        on, off = found(parameters, others | {name}), found(parameters, others)
+        assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
+        moved = magnitudes_moved(on, off, shots_of(parameters, others).bin_deviation)
+        assert (np.minimum(moved, 1) <= most + ROUNDING).all()
+        noticed += (most < 1).sum()
+    assert noticed > 10
+
+
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
 def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
@@ -98,27 +150,23 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
         parameters = scene(
             table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
         )
-        for tiles in (False, True):
-            block, inner = point_block(parameters), parameters
-            if tiles:
-                block, inner = tile_block(parameters, seed)
-            made = plan(block, {}, tolerance, CHOICE)
-            inner = counted(inner, seed)
-            truth = shot.evaluate(inner)
-            assert (made.error <= tolerance).all()
-            for column in np.unique(made.kept, axis=1).T:
-                names = [name for name, there in zip(made.names, column, strict=True) if there]
-                here = (made.kept == column[:, None]).all(axis=0)
-                of_kept = shot.evaluate(inner, names)
-                error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
-                assert (error <= tolerance + ROUNDING).all(), names
-                whole, part = shots_of(inner, CORE), shots_of(inner, names)
-                moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
-                assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
-                if "leakage" not in names:
-                    extra = truth["p_leakage_up"] + truth["p_leakage_down"]
-                    assert (extra[here] <= tolerance).all()
-            kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+        made = planned(points_of(parameters), {}, tolerance, CHOICE)
+        inner = counted(parameters, seed)
+        truth = shot.evaluate(inner)
+        assert (made.error <= tolerance).all()
+        for column in np.unique(made.kept, axis=1).T:
+            names = [name for name, there in zip(made.names, column, strict=True) if there]
+            here = (made.kept == column[:, None]).all(axis=0)
+            of_kept = shot.evaluate(inner, names)
+            error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
+            assert (error <= tolerance + ROUNDING).all(), names
+            whole, part = shots_of(inner, CORE), shots_of(inner, names)
+            moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
+            assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
+            if "leakage" not in names:
+                extra = truth["p_leakage_up"] + truth["p_leakage_down"]
+                assert (extra[here] <= tolerance).all()
+        kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
     assert kept > 100 and dropped > 100
 
 
@@ -132,7 +180,7 @@ def test_leakage_that_is_asked_for_keeps_the_tolerance_too(table_4_1, velocity, 
     )  # fmt: skip
     truth, worst = shot.evaluate(parameters), {}
     for mode in ("on", "auto"):
-        made, worst[mode] = plan(point_block(parameters), {"leakage": mode}, tolerance, CHOICE), 0
+        made, worst[mode] = planned(points_of(parameters), {"leakage": mode}, tolerance, CHOICE), 0
         for column in np.unique(made.kept, axis=1).T:
             names = [name for name, there in zip(made.names, column, strict=True) if there]
             here = (made.kept == column[:, None]).all(axis=0)
@@ -147,7 +195,7 @@ def test_the_image_of_a_still_target_is_kept_for_the_magnitude_s_sake(table_4_1)
     parameters = DEFAULTS | table_4_1(
         range=np.geomspace(20, 300, 8), radial_velocity=0.0, phases="incoherent", beamlets=19
     )
-    made = plan(point_block(parameters), {}, 1e-3, CHOICE)
+    made = planned(points_of(parameters), {}, 1e-3, CHOICE)
     with_it, without = (found(parameters, names) for names in ({"image"}, set()))
     assert (with_it[:, 1] == 0).all() and (without[:, 1] == 0).all()  # no miss: pd is 1
     image = np.sqrt(2)  # power of the line at DC, and of its image there
@@ -172,7 +220,7 @@ def cast_scene(rng, shots, beamlets, beside_chance):
 
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 @pytest.mark.parametrize("stretch", [1, 5])
-def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, stretch):
+def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, stretch):
     kept = dropped = 0
     for seed in range(10):
         rng = np.random.default_rng((seed, stretch))
@@ -184,10 +232,12 @@ def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, 
             fft_size=2**13, phases=phases, power=10 ** rng.uniform(-3, 0), window="hann",
         )  # fmt: skip
         edges = np.arange(0, POINTS + 1, stretch)
-        block = block_of_cast(parameters, footprints, beside, edges)
-        tile = np.repeat(np.arange(block.size), stretch)
+        tile = np.repeat(np.arange(len(edges) - 1), stretch)
         ground = Cast(footprints, beside)
-        made, still = (plan(block, modes, 0.05, CHOICE) for modes in ({}, STILL))
+        made, still = (
+            planned(points_of(parameters, of_rays(ground)), modes, 0.05, CHOICE, edges)
+            for modes in ({}, STILL)
+        )
         for place, name in enumerate(CORE):
             others = some_of(rng, name)
             changes = (made if "doppler" in others | {name} else still).change
@@ -195,7 +245,7 @@ def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, 
             on, off = (find(prepare_cast(parameters, ground, e)) for e in (others | {name}, others))
             assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
         truth = find(prepare_cast(parameters, ground))
-        for i in range(block.size):
+        for i in range(len(edges) - 1):
             of_kept = find(prepare_cast(parameters, ground, made.effects(i)))
             error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
@@ -207,11 +257,11 @@ def test_bounds_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, 
 
 def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     footprints, _ = cast_scene(np.random.default_rng(1), 4, 7, 0.0)
-    edges = np.array([0, 2, 4])
     parameters = DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
+    seen = of_rays(Cast(footprints))
     turning, still = (
-        plan(block_of_cast(parameters, footprints, None, edges, rotating=r), {}, 0.5,
-             [effect for effect in EFFECTS if effect.name == "rotation"])
-        for r in (True, False)
+        planned(points_of(parameters, seen, rotating=turns), {}, 0.5,
+                [effect for effect in EFFECTS if effect.name == "rotation"])
+        for turns in (True, False)
     )  # fmt: skip
     assert turning.kept.all() and not still.kept.any() and not still.error.any()

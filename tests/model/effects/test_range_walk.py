@@ -1,25 +1,14 @@
-"""Range walk: its phase, its lines against the time-domain truth, its bound against spectra."""
+"""Range walk: its phase, its lines against the time-domain truth."""
 
 import numpy as np
 import pytest
-from effect_points import point_block, scene
-from phase_error_checks import (
-    WINDOWS,
-    check_blocks,
-    check_bound,
-    lines_spectrum,
-    peak_ratio,
-)
+from line_spectra import WINDOWS, lines_spectrum
 
 from sweep.model import truth
 from sweep.model.chain import prepare
 from sweep.model.effects import range_walk
 from sweep.model.effects.line_splitting import split_lines
-from sweep.model.effects.phase_bounds import Error, Peak, over_record, phase_change
-from sweep.model.effects.phase_bounds import shape as shape_of
-from sweep.model.effects.span import Span
 from sweep.model.waveform import SIGNS, beat_frequency
-from sweep.model.window import window
 
 AGREEMENT = 1e-8
 """Of a bin with the truth, relative to the line's peak without the effect."""
@@ -142,107 +131,3 @@ def test_drift_counts_bins_and_has_the_chirps_sign():
         cycles = range_walk.phase(x, sign=sign, start=0.0, **motion)[0]
         slope = (np.diff(cycles)[[0, 2]] / 0.001) * 2  # bins at the record's ends
         np.testing.assert_allclose(np.diff(slope), sign * bins, rtol=1e-3)
-
-
-def powers_of(chirp):
-    """The error as powers of the place in the record, of the effect's own formula."""
-    beta = 2 * chirp["radial_velocity"] / 299792458
-    drift = chirp["chirp_rate"] * beta * (1 + beta / 2)
-    start, duration = Span.of(chirp["start"]), Span.of(chirp["duration"])
-    return over_record({2: Span.of(drift)}, start=start, duration=duration)
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_the_bound_holds_and_is_not_idle(name):
-    rng = np.random.default_rng(11)
-    n, length = 120, 512
-    drift = 10 ** rng.uniform(-3, 2, n) * rng.choice([-1, 1], n)
-    chirp = {
-        "sign": 1,
-        "chirp_rate": 1e12,
-        "radial_velocity": drift / (2e12 * 1e-8) * 299792458 / 2,
-        "start": np.where(rng.random(n) < 0.5, 0.0, rng.uniform(0, 1e-4, n)),
-        "duration": 1e-4,
-    }
-    bins = 200 + rng.uniform(-0.5, 0.5, n)
-    ratio = peak_ratio(lambda x: range_walk.phase(x, **chirp), name, length, bins)
-    idle = check_bound(phase_change(powers_of(chirp), window=window(name, length)), ratio)
-    assert np.median(idle) < 30
-
-
-def test_the_bound_holds_for_lines_that_add_as_powers():
-    """Lines over many bins, with the share of the largest bin in all their power."""
-    rng = np.random.default_rng(12)
-    length, lines = 512, 40
-    shape, n = window("hamming", length), np.arange(length)
-    w = np.hamming(length + 1)[:-1]
-    for drift in 10 ** rng.uniform(-3, 1.5, 60):
-        chirp = {
-            "sign": -1,
-            "chirp_rate": 1e12,
-            "radial_velocity": np.array([drift / (2e12 * 1e-8) * 299792458 / 2]),
-            "start": 0.0,
-            "duration": 1e-4,
-        }
-        weight = rng.exponential(size=lines)
-        tones = np.exp(2j * np.pi * np.outer(200 + rng.uniform(-3, 3, lines), n) / length)
-        error = np.exp(2j * np.pi * range_walk.phase(2 * n / length - 1, **chirp)[0])
-        found, without = (
-            np.sqrt((weight @ np.abs(np.fft.fft(w * v, 8 * length)) ** 2)[::8].max())
-            for v in (tones * error, tones)
-        )
-        everywhere = np.sqrt((weight @ np.abs(np.fft.fft(w * tones, 8 * length)) ** 2).max())
-        total = np.sqrt(weight.sum()) * shape.sum
-        # Anywhere between bins: the bin's own least is not known, its peak is at most that here.
-        worst = shape_of(shape).scalloped * without / total
-        peak = Peak(np.array([worst]), np.array([everywhere / total * 1.01]), single=False)
-        low, high = phase_change(powers_of(chirp), window=shape, peak=peak).signal
-        assert low[0] <= found / without <= high[0]
-
-
-def test_others_turn_what_changes_and_lower_the_bin():
-    """Two opposite errors: leaving one out undoes what the other makes up for."""
-    rng = np.random.default_rng(13)
-    shape, n, length = window("hann", 512), 200, 512
-    x = 2 * np.arange(length) / length - 1
-    own, other = (10 ** rng.uniform(-3, 0.5, (n, 4)) * rng.choice([-1, 1], (n, 4)) for _ in "ab")
-    powers = x ** np.arange(1, 5)[:, None]
-    tone = np.hanning(length + 1)[:-1] * np.exp(
-        2j * np.pi * (200 + rng.uniform(-0.5, 0.5, n))[:, None] * np.arange(length) / length
-    )
-    first = tone * np.exp(2j * np.pi * (other @ powers))
-    without, found = (
-        np.abs(np.fft.fft(v, axis=1)).max(axis=1)
-        for v in (first, first * np.exp(2j * np.pi * (own @ powers)))
-    )
-    errors = [Error(tuple(abs(v).T)) for v in (own, other)]
-    low, high = phase_change(errors[0], window=shape, others=errors[1]).signal
-    assert (low <= found / without).all() and (found / without <= high).all()
-    assert (low > 0).any() and (high < 2).any()
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-@pytest.mark.parametrize("beamlets", [1, 7])
-def test_blocks_bound_what_is_simulated(table_4_1, phases, beamlets):
-    idle = check_blocks(
-        "range_walk", table_4_1, lambda rng, n: {}, phases=phases, beamlets=beamlets
-    )
-    if phases == "incoherent" or beamlets == 1:
-        assert np.median(idle) < 30
-
-
-def test_blocks_bound_it_beside_other_errors(table_4_1):
-    def further(rng, n):
-        return {
-            "target.acceleration": 10 ** rng.uniform(-2, 2, n),
-            "instrument.chirp.cubic_error": 10 ** rng.uniform(3, 5, n),
-        }
-
-    check_blocks(
-        "range_walk", table_4_1, further, others=("acceleration", "chirp_nonlinearity"), seeds=4
-    )
-
-
-def test_nothing_that_moves_walks(table_4_1):
-    still = point_block(scene(table_4_1, 5, 1, radial_velocity=0.0))
-    assert range_walk.bound(still) is None

@@ -1,18 +1,12 @@
-"""Clipping: closed forms of a clipped sine, clipped records, and bounds of blocks."""
+"""Clipping: closed forms of a clipped sine, clipped records."""
 
 import numpy as np
 import pytest
 from adc import truth_quantise
-from effect_points import point_block, scene, shots_of, small, tile_block
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import erf
 
-from sweep.model import window
-from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.saturation import bound, clipped, clipping, harmonic_amplitude
-from sweep.model.effects.span import Span
+from sweep.model.effects.saturation import clipping, harmonic_amplitude
 
 
 @pytest.mark.parametrize("ratio", [0.999, 0.9, 0.5, 0.1, 0.01])
@@ -82,74 +76,6 @@ def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude
     assert np.mean(records[0] ** 2) == pytest.approx(power + lsb**2 / 24, abs=error)
 
 
-def clipped_moments(x, s, v):
-    """Mean and variance of clipped x + noise by a sum over the noise, |error| < 1e-5 s."""
-    z = np.linspace(-9, 9, 1201)
-    weight = np.exp(-z * z / 2)
-    weight /= weight.sum()
-    out = np.clip(x[:, None] + s * z, -v, v)
-    mean = (out * weight).sum(axis=1)
-    return mean, ((out - mean[:, None]) ** 2 * weight).sum(axis=1)
-
-
-@given(
-    st.floats(0.01, 0.5), st.floats(0.1, 5), st.integers(5, 70), st.floats(0, 6.3),
-    st.sampled_from(["rectangular", "hann", "hamming"]),
-)  # fmt: skip
-def test_no_clipped_tone_strays_beyond_the_bound(s, amplitude, cycles, phase, name):
-    """By sums over samples; harmonics that fold onto the bin are no part of the gain."""
-    n = np.arange(401)  # prime: low harmonics fold elsewhere
-    w = window.samples(name, n.size)
-    x = amplitude * np.cos(2 * np.pi * cycles * n / n.size + phase)
-    mean, spread = clipped_moments(x, s, 1.0)
-    turn = w * np.exp(-2j * np.pi * cycles * n / n.size)
-    gain = abs((turn * mean).sum()) / abs((turn * x).sum())
-    noise = (w**2 * spread).sum() / ((w**2).sum() * s**2)
-    change = clipped(amplitude=amplitude, deviation=Span.of(s), full_scale=1.0)
-    assert change.signal[0] - 2e-3 <= gain <= 1 + 1e-9
-    assert change.noise[0] * (1 - 1e-5) <= noise <= 1 + 1e-5
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_blocks_bound_what_clipping_does(table_4_1, seed):
-    """Also beside other noise and air, and where some points have no limit."""
-    rng, number = np.random.default_rng((77, seed)), 40
-    architecture = ("homodyne", "heterodyne", "direct")[seed % 3]
-    parameters = scene(table_4_1, number, seed, fft_size=small(seed), architecture=architecture)
-    full_scale = 10 ** rng.uniform(-3.5, 0, number) * (rng.random(number) < 0.8)
-    parameters |= {
-        "instrument.processing.full_scale": full_scale,
-        "instrument.processing.bits": (0.0, 8.0)[seed % 2],
-        "target.solar_irradiance": 10 ** rng.uniform(6, 11, number),
-        "atmosphere.profile": ("none", "earth_haze")[seed % 2],
-    }
-    others = (*CORE, "extinction", "quantisation", "backscatter")
-    idle = []
-    for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
-        change = bound(block)
-        plain, cut = (shots_of(points, names) for names in (others, (*others, "saturation")))
-        gain = cut.beat_scale / plain.beat_scale
-        assert (change.signal[0] * (1 - 1e-9) <= gain).all() and (gain <= 1 + 1e-12).all()
-        assert (change.noise[0] * (1 - 1e-9) <= cut.noise_gain).all()
-        assert (cut.noise_gain <= 1 + 1e-12).all()
-        lost = 1 - gain
-        told = lost > 1e-7
-        if points is parameters and told.any():
-            idle.append(np.median((1 - change.signal[0])[told] / lost[told]))
-    assert np.median(idle) < 10
-
-
-def test_no_limit_is_nothing(table_4_1):
-    assert bound(point_block(scene(table_4_1, 5, 1))) is None
-
-
 def test_the_gain_of_next_to_nothing_is_the_share_of_unclipped_noise():
     found = clipping(amplitude=[1e-4, 1e-9, 1e-30], deviation=1.0, full_scale=1.5).signal_gain
     np.testing.assert_allclose(found, erf(1.5 / np.sqrt(2)), rtol=1e-8)
-
-
-def test_a_record_well_within_full_scale_is_left_alone():
-    change = clipped(amplitude=0.5, deviation=Span.of(0.01), full_scale=1.0)
-    np.testing.assert_array_equal([*change.signal, *change.noise], 1)
-    found = clipping(amplitude=0.5, deviation=0.01, full_scale=1.0)
-    assert found == pytest.approx((1.0, 1.0, 0.0), abs=1e-12)

@@ -2,36 +2,23 @@
 
 import numpy as np
 import pytest
-from effect_points import point_block, scene, tile_block
-from mean_over_draws import evaluate as mean_over_draws
 from scipy import special, stats
 from scipy.integrate import quad
 
 from sweep.model import philox
-from sweep.model.effects.atmosphere import Path
-from sweep.model.effects.catalogue import CORE, EFFECTS
-from sweep.model.effects.change import Change
 from sweep.model.effects.effect import Realisation
-from sweep.model.effects.probability_bounds import within_changes
 from sweep.model.effects.scintillation import (
-    bound,
     factors,
-    mean_pd_bound,
-    steepest,
 )
-from sweep.model.effects.span import Span
 from sweep.model.effects.turbulence import (
     HUFNAGEL_VALLEY,
     LogVariances,
     Turbulence,
     both_ways,
-    largest_both_ways,
     log_variances,
     rytov_variance,
     structure_constant,
 )
-from sweep.model.marcum import marcum_q1
-from sweep.model.shot import evaluate
 
 WAVENUMBER = 2 * np.pi / 1.55e-6
 EVEN = Turbulence(uniform=1e-14)
@@ -225,151 +212,6 @@ def test_still_air_is_exactly_one_and_faint_turbulence_the_same_by_either_law():
     np.testing.assert_allclose(a, b, atol=0.01 * np.sqrt(3.3e-5) * 5)
     with pytest.raises(ValueError, match="gamma_gamma"):
         draws_of("rayleigh", faint, 1, 1, 0)
-
-
-RULES = {
-    "log_normal": np.polynomial.legendre.leggauss(400),
-    "gamma_gamma": np.polynomial.legendre.leggauss(100),
-}
-
-
-def pd(factor, amplitudes, b):
-    return np.prod([marcum_q1(a * np.sqrt(factor), b).q for a in amplitudes], axis=0)
-
-
-def mean_pd(distribution, one, amplitudes, b):
-    """E Q_1(a sqrt(I), b) by Gauss's rule over the chances of one or both factors."""
-    u, weight = RULES[distribution]
-    # A cubic map that crowds nodes near both ends of the chances.
-    chance = (2 + 3 * u - u**3) / 4
-    weight = weight * 0.75 * (1 - u**2)
-    if distribution == "log_normal":
-        variance = one.large + one.small
-        value = np.exp(np.sqrt(variance) * special.ndtri(chance) - variance / 2)
-        return (weight * pd(value, amplitudes, b)).sum()
-    parts = [stats.gamma(1 / np.expm1(v), scale=np.expm1(v)).ppf(chance) for v in one]
-    value = np.outer(*parts)
-    return (np.outer(weight, weight) * pd(value, amplitudes, b)).sum()
-
-
-@pytest.mark.parametrize("segments", [1, 2])
-@pytest.mark.parametrize("distribution", ["log_normal", "gamma_gamma"])
-def test_the_mean_of_pd_lies_within_the_bounds_and_near_them(distribution, segments):
-    """Of the product of segments, whose bounds add up."""
-    rng = np.random.default_rng(11)
-    ratios = []
-    for _ in range(60):
-        b = rng.uniform(2, 9)
-        amplitudes = np.maximum(b + rng.uniform(-2.5, 4) - rng.uniform(0, 1, segments), 0.5)
-        one = leg(*(10 ** rng.uniform(-4, -0.3, 2)))
-        true = abs(mean_pd(distribution, one, amplitudes, b) - pd(1.0, amplitudes, b))
-        found = mean_pd_bound(
-            distribution, [one], amplitude=Span.of(amplitudes[:, None]), threshold=Span.of(b)
-        ).sum()
-        assert true <= found * (1 + 1e-6) + 1e-9
-        ratios.append(found / max(true, 1e-9))
-    assert np.median(ratios) < 30
-
-
-@pytest.mark.parametrize("b", [0.3, 1.0, 2.6, 6.45, 20.0, 60.0])
-def test_no_slope_of_pd_over_the_logarithm_of_the_amplitude_is_steeper(b):
-    """Differences of Q_1 around thresholds between and beyond those of the table."""
-    step = 1e-4
-    x = np.log(np.maximum(b + np.linspace(-7, 7, 6001), 1e-2))
-    low, middle, high = (marcum_q1(np.exp(x + d), b).q for d in (-step, 0, step))
-    slope, bend = steepest(np.array(b))
-    first, second = abs(high - low) / (2 * step), abs(high - 2 * middle + low) / step**2
-    assert first.max() <= slope and second.max() <= bend + 1e-6
-    assert slope < 1.1 * first.max() and bend < 1.1 * second.max()
-
-
-def test_spans_of_magnitudes_are_bounded_as_their_worst_point(table_4_1):
-    rng = np.random.default_rng(3)
-    a, b, one = rng.uniform(1, 30, 200), rng.uniform(3, 8, 200), leg(0.02, 0.01)
-    for law in ("log_normal", "gamma_gamma"):
-        points = mean_pd_bound(law, [one], amplitude=Span.of(a[None]), threshold=Span.of(b))
-        tiles = [v.reshape(50, 4) for v in (a, b)]
-        spans = [Span(v.min(axis=1), v.max(axis=1)) for v in tiles]
-        over = mean_pd_bound(
-            law, [one], amplitude=Span(spans[0].low[None], spans[0].high[None]), threshold=spans[1]
-        )
-        assert (over[0] >= points[0].reshape(50, 4).max(axis=1) - 1e-12).all()
-
-
-def test_other_effects_widen_the_magnitudes_that_twinkle():
-    changes = [
-        Change(signal=(0.5, 0.8)),
-        Change(noise=(1.0, 4.0), threshold_follows=False),
-        Change(signal=(1.0, np.inf), added=0.1),
-    ]
-    ends = {"amplitude": Span.of(np.full((3, 1), 10.0)), "threshold": Span.of(6.0)}
-    amplitude, threshold = within_changes(changes[:2], **ends)
-    assert amplitude.low == pytest.approx(2.5) and amplitude.high == pytest.approx(10)
-    assert threshold.low == pytest.approx(3) and threshold.high == pytest.approx(6)
-    amplitude, _ = within_changes(changes, **ends)
-    assert (amplitude.low == 0).all() and (amplitude.high > 1e9).all()
-
-
-def test_turbulence_over_tiles_is_no_weaker_than_at_their_points():
-    rng = np.random.default_rng(14)
-    n = 400
-    scene = {
-        "wavelength": rng.uniform(1e-6, 2e-6, n), "range": 10 ** rng.uniform(2, 4.5, n),
-        "aperture": rng.uniform(0.01, 0.2, n), "beam_divergence": 10 ** rng.uniform(-5, -3, n),
-    }  # fmt: skip
-    target, sine = rng.uniform(-10, 3000, n), rng.uniform(0, 1, n)
-    for air in (EVEN, Turbulence(uniform=1e-12), HUFNAGEL_VALLEY):
-        each = both_ways(
-            air, lidar_height=target + scene["range"] * sine, target_height=target, **scene
-        )
-        for points in (1, 4):
-            spans = {
-                name: Span(v.reshape(-1, points).min(axis=1), v.reshape(-1, points).max(axis=1))
-                for name, v in (scene | {"target": target, "sine": sine}).items()
-            }
-            path = Path(spans.pop("range"), spans.pop("target"), spans.pop("sine"))
-            over = largest_both_ways(air, path=path, **spans)
-            for one, most in zip(each, over, strict=True):
-                for value, largest in zip(one, most, strict=True):
-                    assert (value.reshape(-1, points).max(axis=1) <= largest * (1 + 1e-9)).all()
-                    weak = (scene["range"] < 500) & (air.uniform < 1e-12)
-                    if points == 1 and weak.any():
-                        assert (value[weak] >= 0.9 * largest[weak]).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_blocks_bound_the_mean_over_draws(table_4_1, seed):
-    """At points and over tiles; 2000 draws, whose mean strays by 4 standard errors at most."""
-    n, draws = 12, 2000
-    rng = np.random.default_rng((78, seed))
-    parameters = scene(
-        table_4_1, n, seed, fft_size=4096, beamlets=3, tnr=6.0, power=10 ** rng.uniform(-4, 0, n),
-        range=10 ** rng.uniform(2.5, 3.8, n), radial_velocity=30.0,
-    ) | {
-        "atmosphere.turbulence": ("uniform", "hufnagel_valley")[seed % 2],
-        "atmosphere.structure_constant": 10 ** rng.uniform(-17, -14),
-        "atmosphere.scintillation_law": ("gamma_gamma", "log_normal")[seed // 2],
-    }  # fmt: skip
-    for block, points in ((point_block(parameters), parameters), tile_block(parameters, seed)):
-        others = [e.bound(block) for e in EFFECTS if e.name != "scintillation"]
-        left = within_changes(
-            [change for change in others if isinstance(change, Change)],
-            amplitude=block.amplitude, threshold=block.threshold,
-        )  # fmt: skip
-        found = bound(block).change(*left)
-        plain = evaluate(points)
-        means = mean_over_draws(points, (*CORE, "scintillation"), keys=keys(n), draws=draws)
-        for name, most in zip(("up", "doppler", "down"), found, strict=True):
-            moved = abs(means[f"pd_{name}"] - plain[f"pd_{name}"])
-            error = 4 * np.minimum(0.5, most) / np.sqrt(draws)
-            assert (moved <= most + error).all()
-        moved = abs(means["pd_shot"] - plain["pd_shot"])
-        together = np.minimum(found[0] + found[2], 1.0)
-        assert (moved <= together + 2 / np.sqrt(draws) * together).all()
-
-
-def test_still_air_has_nothing_of_it(table_4_1):
-    assert bound(point_block(scene(table_4_1, 5, 1))) is None
 
 
 def test_two_ways_take_the_footprint_out_and_the_aperture_back():

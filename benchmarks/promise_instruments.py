@@ -1,0 +1,186 @@
+"""Random instruments near DC and Nyquist whose lines are smeared over the record, each its own.
+
+Drawn anew each time, under range walk, acceleration, a sweep that is not straight, line width and
+jitter of the beam; held at each tolerance against all effects on at the tightest. What is kept is
+what each point calls for by itself: no neighbour lends it an effect.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from sweep.model.chain import DEFAULTS
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.flags import flags_of, names_of
+from sweep.model.effects.planning import plan
+from sweep.model.effects.points import Points
+from sweep.model.resolution import effects_tolerance
+from sweep.spec import load
+from sweep.tasks.evaluate import evaluate_points, select
+from sweep.tasks.grid import Grid
+
+ROOT = Path(__file__).parents[1]
+TABLE = ROOT / "experiments" / "instruments" / "table_4_1.yaml"
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
+FOOTPRINTS = (("coherent", 1), ("incoherent", 1), ("coherent", 37), ("incoherent", 37))
+TIGHTEST = 1e-9
+NEAR, DRAWS = 40.0, 4
+"""Bins from DC or Nyquist within which lines lie at the most; draws of what jitters."""
+SAMPLE_RATE, LIGHT = 100e6, 299792458.0
+WHAT = ("pd", "magnitude", "leakage")
+SEEN = (
+    "pd_up", "pd_doppler", "pd_down", "pd_shot", "snr_up", "snr_doppler", "snr_down",
+    "p_leakage_up", "p_leakage_down",
+)  # fmt: skip
+
+
+class Off(NamedTuple):
+    """How far off points are at a tolerance, (n,) each."""
+
+    pd: np.ndarray
+    """Of a segment or a shot."""
+    magnitude: np.ndarray
+    """|X| of the largest bins, relative to itself or to sigma; and so the root of snr."""
+    leakage: np.ndarray
+    """Of either chirp, where it is asked for; else nan."""
+    told: np.ndarray
+    """What is said to be left out."""
+
+
+def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """Specs of about so many points together, by window, footprint, and what is asked for."""
+    kinds = [
+        (window, *footprint, asked)
+        for window in WINDOWS
+        for footprint in FOOTPRINTS
+        for asked in ("nothing", "leakage", "jitter")
+        if asked != "jitter" or footprint[1] == 1
+    ]
+    for window, phases, beamlets, asked in kinds:
+        points = [_point(rng, asked) for _ in range(-(-number // len(kinds)))]
+        yield {
+            "title": f"{window} {phases} {beamlets} {asked}",
+            "instrument": {
+                "file": str(TABLE),
+                "processing": {"window": window, "fft_size": f"2^{rng.integers(10, 15)}",
+                               "sample_rate": f"{SAMPLE_RATE!r} Hz"},
+            },
+            "target": {"reflectance": 0.1},
+            "footprint": {"phases": phases, "beamlets": beamlets},
+            "effects": {"leakage": "on"} if asked == "leakage" else {},
+            "axes": {"sample": {"zip": points}},
+            **({"draws": {"number": DRAWS}, "seed": int(rng.integers(1 << 30))}
+               if asked == "jitter" else {}),
+        }  # fmt: skip
+
+
+def _point(rng: np.random.Generator, asked: str) -> dict[str, str]:
+    """An instrument and a target; sizes of effects over many decades, some of them 0."""
+
+    def some(low: float, high: float) -> float:
+        """Log-uniform between two powers of ten, of either sign, or 0."""
+        return float(rng.choice([-1, 0, 1], p=(0.4, 0.2, 0.4)) * 10 ** rng.uniform(low, high))
+
+    duration = 2**14 / SAMPLE_RATE * rng.uniform(1.0, 1.5)
+    bandwidth, wavelength = 10 ** rng.uniform(8, 9.3), 1.55e-6
+    slope, sign = bandwidth / duration, rng.choice([1, -1])
+    velocity = some(-2, 1.5)
+    edge = SAMPLE_RATE / 2 * rng.integers(0, 2)
+    beat = abs(edge + rng.uniform(-1, 1) * NEAR * SAMPLE_RATE / 2**13)
+    distance = (beat + sign * 2 * velocity / wavelength) * LIGHT / (2 * slope)
+    distance = max(abs(float(distance)), 2.0)
+    delay = 2 * distance / LIGHT
+    found = {
+        "instrument.chirp.bandwidth": f"{bandwidth!r} Hz",
+        "instrument.chirp.duration": f"{duration!r} s",
+        "instrument.laser.power": f"{10 ** rng.uniform(-4.5, 0)!r} W",
+        "instrument.laser.line_width": f"{abs(some(0, 4.5))!r} Hz",
+        "instrument.chirp.quadratic_error": f"{some(-6, 1) / delay!r} Hz",
+        "instrument.chirp.cubic_error": f"{some(-6, 1) / delay!r} Hz",
+        "instrument.chirp.sinusoidal_error": f"{some(-6, 0.5) / delay!r} Hz",
+        "instrument.chirp.error_periods": f"{10 ** rng.uniform(-0.5, 1)!r}",
+        "instrument.processing.tnr": f"{rng.uniform(2, 10)!r}",
+        "target.range": f"{distance!r} m",
+        "target.grazing_angle": f"{rng.uniform(30, 90)!r} deg",
+        "target.radial_velocity": f"{velocity!r} m/s",
+        "target.acceleration": f"{some(-1, 3)!r} m/s^2",
+    }
+    if asked == "jitter":
+        found["target.pointing_jitter"] = f"{10 ** rng.uniform(-3, 2)!r} urad"
+    return found
+
+
+def off(written: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES) -> list[Off]:
+    """How far off a study's points are at each tolerance."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "study.yaml"
+        file.write_text(yaml.safe_dump(written, sort_keys=False))
+        spec = load(file)
+    grid = Grid(spec)
+    parameters = DEFAULTS | grid.parameters_at(np.arange(grid.points))
+    points = Points(parameters)
+
+    def each(values: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(values, (grid.points,))
+
+    def found(tolerance: float, flags: np.ndarray) -> dict[str, np.ndarray]:
+        own = parameters | {"accuracy.tolerance": tolerance}
+        out: dict[str, np.ndarray] = {}
+        for flag in np.unique(flags):
+            index = np.flatnonzero(flags == flag)
+            part = evaluate_points(spec, select(own, index), index.size, names_of(int(flag)))
+            for name in set(part) & set(SEEN):
+                out.setdefault(name, np.empty(grid.points))[index] = part[name]
+        return out
+
+    number = int(parameters["footprint.beamlets"])
+    every = np.array([not effect.is_random or spec.draws.any for effect in EFFECTS])
+    absent = [effect.absent(parameters) | np.zeros(grid.points, bool) for effect in EFFECTS]
+    there = ~np.array(absent)
+    exact = found(TIGHTEST, flags_of(every[:, None] & there))
+    rows = []
+    for tolerance in tolerances:
+        most = effects_tolerance(parameters, number, tolerance)
+        made = plan(points, each, spec.modes(), most)
+        own = found(tolerance, flags_of(made.kept & there))
+        rows.append(_apart(own, exact, made.error, "leakage" in written["effects"]))
+    return rows
+
+
+def _apart(own: dict[str, Any], exact: dict[str, Any], told: np.ndarray, leaks: bool) -> Off:
+    pd = [
+        abs(own[f"pd_{name}"] - exact[f"pd_{name}"]) for name in ("up", "doppler", "down", "shot")
+    ]
+    apart = []
+    for name in ("up", "doppler", "down"):
+        # over sigma: snr is |X|^2 over 2 sigma^2
+        one, other = (np.sqrt(2 * found[f"snr_{name}"]) for found in (own, exact))
+        apart.append(abs(one - other) / np.maximum(other, 1.0))
+    leaked = [abs(own[f"p_leakage_{name}"] - exact[f"p_leakage_{name}"]) for name in ("up", "down")]
+    leakage = np.fmax.reduce(leaked) if leaks else np.full(told.shape, np.nan)
+    return Off(np.fmax.reduce(pd), np.fmax.reduce(apart), leakage, told)
+
+
+def table(number: int, seed: int | None = None) -> tuple[list[str], list[str]]:
+    """Lines of Markdown; and what is not kept, in words."""
+    rng = np.random.default_rng(seed)
+    found = [off(written) for written in studies(number, rng)]
+    lines = ["| tolerance | points | " + " | ".join(WHAT) + " |", "|" + " --- |" * (2 + len(WHAT))]
+    missed = []
+    for k, tolerance in enumerate(TOLERANCES):
+        together = Off(*map(np.concatenate, zip(*(rows[k] for rows in found), strict=True)))
+        cells = []
+        for what in WHAT:
+            errors = getattr(together, what)
+            there = errors[np.isfinite(errors)]
+            share = float((there <= tolerance).mean())
+            cells.append(f"{100 * share:.2f} %, {there.max():.1e}")
+            if share < 0.999:
+                missed.append(f"- random instruments at {tolerance:g}: {what} of {1 - share:.2%}")
+        lines.append(f"| {tolerance:g} | {together.pd.size:,} | " + " | ".join(cells) + " |")
+    return lines, missed

@@ -1,0 +1,474 @@
+"""What sizes of effects look at: a link budget, lines and footprints, for many points at once.
+
+By the formulas that shots themselves are prepared with, for arrays that broadcast over the points;
+nothing is computed before it is asked for. By segment arrays have one axis more, in front, of those
+segments that exist. Words, and what :meth:`Points.whole` names, all points share.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import detection, ground, noise, reflectance, resolution, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import spread
+from sweep.model.effects.lobes import Lobe, lobe
+from sweep.model.effects.spread import Footprint, Moments
+from sweep.model.footprint import beamlets
+from sweep.model.preparation import (
+    CHIRP,
+    LASER,
+    NOISY,
+    PROCESSING,
+    RECEIVER,
+    ReceiverNoise,
+    link_scales,
+    receiver_noise,
+    relative_amplitude,
+)
+from sweep.model.window import Window, canonical_name, window
+
+_CHEBYSHEV = (1.4, 2.5, 8.0)
+_NEAR_EDGE = 8.0
+"""Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
+
+
+class Smear(NamedTuple):
+    """What an effect does to lines over the record: a phase, or places in their own right.
+
+    Sizes by segment, or scalars; powers are of the place x in the record, -1..1, in cycles.
+    """
+
+    powers: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """Of x, x^2, x^3, x^4."""
+    rest: np.ndarray | float = 0.0
+    """Of all phase that is no such power."""
+    constant: np.ndarray | float = 0.0
+    """In the record's middle, which matters to lines beside their images."""
+    reach: np.ndarray | float = 0.0
+    """Bins of fs/L that light may be moved by besides the slopes of the powers."""
+
+    @property
+    def bins(self) -> np.ndarray | float:
+        """Bins of fs/L that light may be moved by."""
+        slopes = sum(2 * (k + 1) * value for k, value in enumerate(self.powers))
+        return slopes + self.reach
+
+    def plus(self, other: "Smear") -> "Smear":
+        """Both together."""
+        powers = tuple(a + b for a, b in zip(self.powers, other.powers, strict=True))
+        return Smear(powers, *(a + b for a, b in zip(self[1:], other[1:], strict=True)))
+
+
+NO_SMEAR = Smear()
+
+
+class Points:
+    """Some points that share every word.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Dotted path to word, number or array, for every parameter, those that effects bring among
+        them. Arrays broadcast against each other and have as many axes each.
+    footprint : Footprint, optional
+        What rays have found; by default that of a flat plane.
+    rotating : bool
+        Whether any surface belongs to a body that turns.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, np.ndarray | float | str],
+        footprint: Footprint | None = None,
+        *,
+        rotating: bool = False,
+    ) -> None:
+        self._words = {path: v for path, v in parameters.items() if isinstance(v, str)}
+        self._numbers = {
+            path: np.asarray(v) for path, v in parameters.items() if path not in self._words
+        }
+        self.ndim = max((v.ndim for v in self._numbers.values()), default=0)
+        self._footprint, self.rotating = footprint, rotating
+        self.architecture = self.word(RECEIVER + "architecture")
+        self.fft_size = self.whole(PROCESSING + "fft_size")
+        self.at_rest = False
+        """Whether the Doppler effect is off."""
+        self.smears: dict[str, Smear] = {}
+        """Of the effects that smear lines, by name."""
+        number = self.whole(resolution.BEAMLETS)
+        self.number, self.pattern = (
+            (number, ground.pattern(self._words)) if number else resolution.finest(self._words)
+        )
+        direct = self.architecture == "direct"
+        self.signs = self.columns(*(waveform.SIGNS[::2] if direct else waveform.SIGNS))
+        self.coherent = self.word("footprint.phases") == "coherent"
+        self.adds_amplitudes = self.coherent or direct
+        self.by_roots = self.coherent and not direct
+        """Whether roots of echoes add."""
+
+    def __getitem__(self, path: str) -> np.ndarray:
+        """A parameter that is a number."""
+        return self._numbers[path]
+
+    @property
+    def numbers(self) -> Mapping[str, np.ndarray]:
+        """All parameters that are numbers."""
+        return self._numbers
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """All parameters as shots have them."""
+        return self._numbers | {path: np.asarray(word) for path, word in self._words.items()}
+
+    def word(self, path: str) -> str:
+        """A parameter that is a word."""
+        return self._words[path]
+
+    def whole(self, path: str) -> int:
+        """A parameter that is a number shared by all points.
+
+        Raises
+        ------
+        ValueError
+            They do not share it.
+        """
+        value = self._numbers[path]
+        if value.ndim and (value != value.flat[0]).any():
+            raise ValueError(f"points that are planned together must share {path}")
+        return int(value.flat[0])
+
+    def has(self, *paths: str) -> bool:
+        """Whether any of some numbers is other than 0 anywhere."""
+        return any(bool(self._numbers[path].any()) for path in paths)
+
+    def columns(self, *values: np.ndarray | float) -> np.ndarray:
+        """Values by segment, one behind the other."""
+        arrays = [np.asarray(value, float) for value in values]
+        ones = (1,) * self.ndim
+        out = np.empty((len(arrays), *np.broadcast_shapes(ones, *(a.shape for a in arrays))))
+        for k, value in enumerate(arrays):
+            out[k] = value
+        return out
+
+    # The instrument
+
+    @cached_property
+    def window(self) -> Window:
+        """Window of the record, whose length all points share."""
+        length = waveform.record_length(
+            fft_size=self[PROCESSING + "fft_size"],
+            duration=self[CHIRP + "duration"],
+            acquisition_delay=self.start,
+            sample_rate=self.sample_rate,
+        )
+        if length.ndim and (length != length.flat[0]).any():
+            raise ValueError("points that are planned together must share the record's length")
+        return window(canonical_name(self.word(PROCESSING + "window")), int(length.flat[0]))
+
+    @cached_property
+    def lobe(self) -> Lobe:
+        """Its transform over the FFT's bins."""
+        return lobe(self.window.name, self.window.length, self.fft_size)
+
+    @property
+    def margin(self) -> float:
+        """Bins of the FFT to one of fs/L."""
+        return self.lobe.margin
+
+    @property
+    def sample_rate(self) -> np.ndarray:
+        """Sample rate [Hz]."""
+        return self[PROCESSING + "sample_rate"]
+
+    @property
+    def start(self) -> np.ndarray:
+        """Acquisition delay t_0 [s]."""
+        return self[PROCESSING + "acquisition_delay"]
+
+    @cached_property
+    def record_duration(self) -> np.ndarray:
+        """Length of the record L/fs [s]."""
+        return self.window.length / self.sample_rate
+
+    @cached_property
+    def bin_width(self) -> np.ndarray:
+        """Width of a bin fs/N [Hz]."""
+        return self.sample_rate / self.fft_size
+
+    @cached_property
+    def chirp_rate(self) -> np.ndarray:
+        """Chirp rate S = B/T [Hz/s]."""
+        return self[CHIRP + "bandwidth"] / self[CHIRP + "duration"]
+
+    @cached_property
+    def carriers(self) -> np.ndarray:
+        """Frequency that the delay turns into phase [Hz], by segment."""
+        found = waveform.carrier_frequencies(
+            self.architecture,
+            wavelength=self[LASER + "wavelength"],
+            start_frequency=self[CHIRP + "start_frequency"],
+            bandwidth=self[CHIRP + "bandwidth"],
+        )
+        return self.columns(*(found if len(self.signs) == 3 else found[::2]))
+
+    @cached_property
+    def receiver(self) -> ReceiverNoise:
+        """Noise at the ADC [V^2]."""
+        values = {name: self[RECEIVER + name] for name in NOISY}
+        return receiver_noise(self.architecture, values)
+
+    @cached_property
+    def noise_variance(self) -> np.ndarray:
+        """Of the receiver alone, at the ADC [V^2]."""
+        return np.asarray(sum(self.receiver.sources.values()))
+
+    @cached_property
+    def deviation(self) -> np.ndarray:
+        """Noise sigma of a bin, per quadrature [V]."""
+        energy = np.asarray(self.window.energy)
+        return noise.bin_deviation(noise_variance=self.noise_variance, window_energy=energy)
+
+    @cached_property
+    def threshold(self) -> np.ndarray:
+        """Threshold over sigma."""
+        return np.asarray(
+            detection.threshold(tnr=self[PROCESSING + "tnr"], bin_deviation=np.asarray(1.0))
+        )
+
+    # The target
+
+    @property
+    def range(self) -> np.ndarray:
+        """Range on the beam's axis [m]."""
+        return self["target.range"]
+
+    @property
+    def delay(self) -> np.ndarray:
+        """Delay of the echo [s]."""
+        return 2 / SPEED_OF_LIGHT * self.range
+
+    @cached_property
+    def radial_velocity(self) -> np.ndarray:
+        """Radial velocity on the beam's axis [m/s], positive when closing."""
+        return self["target.radial_velocity"]
+
+    @cached_property
+    def beta(self) -> np.ndarray:
+        """Doppler ratio 2 v_r / c."""
+        return 2 * self.radial_velocity / SPEED_OF_LIGHT
+
+    @cached_property
+    def footprint(self) -> Footprint:
+        """What the beams meet, as they all have it or on a plane."""
+        if (found := self._footprint) is not None:
+            return found if self.by_roots else found._replace(gain=1.0)
+        angle = self["target.grazing_angle"]
+        echo = reflectance.backscatter(self.word("target.reflectance_law"), np.sin(angle))
+        if self.number == 1:
+            none = spread.NO_SPREAD
+            return Footprint(echo, 1.0, none, none, none)
+        shape: dict[str, Any] = {
+            "grazing_angle": angle, "beam_divergence": self[LASER + "beam_divergence"],
+            "number": self.number, "pattern": self.pattern,
+        }  # fmt: skip
+        ranges = spread.plane_range_moments(**shape)
+        velocities = spread.plane_velocity_moments(
+            across=self["target.transverse_velocity"], along=self.radial_velocity, **shape
+        )
+        ratio = spread.plane_echo_ratio(self.word("target.reflectance_law"), **shape)
+        gain = 1.0
+        if self.by_roots:
+            gain = float(np.sqrt(beamlets(self.number, self.pattern)[1]).sum())
+        return Footprint(echo, ratio, ranges, ranges, velocities, gain * np.sqrt(ratio))
+
+    @cached_property
+    def scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """Echo power [W] for a relative echo of 1/sr; amplitude of the beat [V] for that of 1."""
+        power, current = link_scales(self.architecture, self._numbers)
+        return power, current * self[RECEIVER + "transimpedance"]
+
+    @cached_property
+    def beat(self) -> np.ndarray:
+        """Amplitude of the bare line's beat at the ADC [V], before the receiver's poles."""
+        return self.scales[1] * relative_amplitude(self.architecture, self.footprint.echo)
+
+    @cached_property
+    def echo_noise(self) -> np.ndarray:
+        """Shot noise of the whole echo over the receiver's noise variance."""
+        whole = self.footprint.echo * np.maximum(self.footprint.echo_ratio, 1.0)
+        return self.scales[0] * whole * self.receiver.per_watt / self.noise_variance
+
+    # Lines
+
+    @cached_property
+    def frequency(self) -> np.ndarray:
+        """Signed beat of the line on the axis [Hz], by segment."""
+        beta = np.zeros(()) if self.at_rest else self.beta
+        beat = self.chirp_rate * self.delay * (1 + beta)
+        return self.carriers * beta - self.signs * beat
+
+    @cached_property
+    def offset(self) -> np.ndarray:
+        """Distance from the nearest bin [bins], 0..1/2."""
+        place = self.frequency / self.bin_width
+        return np.abs(place - np.rint(place))
+
+    @cached_property
+    def edge(self) -> np.ndarray:
+        """Distance of the folded line from the nearer of DC and Nyquist [bins]."""
+        half = self.fft_size / 2
+        place = self.frequency / (self.bin_width * half)
+        return np.abs(place - np.rint(place)) * half
+
+    @cached_property
+    def transfer(self) -> np.ndarray:
+        """|H| at the line over that at DC."""
+        poles = [self[RECEIVER + f"{part}_bandwidth"] for part in ("detector", "amplifier")]
+        one, other = ((self.frequency / pole) ** 2 for pole in poles)
+        return 1 / np.sqrt((1 + one) * (1 + other))
+
+    @cached_property
+    def tilt(self) -> np.ndarray:
+        """Bound on the relative change of |H|^2 a bin [1/bin]."""
+        poles = (self[RECEIVER + f"{part}_bandwidth"] for part in ("detector", "amplifier"))
+        return np.asarray(sum(1 / pole for pole in poles) * self.bin_width)
+
+    @cached_property
+    def level(self) -> np.ndarray:
+        """Magnitude of the bare line on a bin over sigma, by segment."""
+        return self.beat * (0.5 * self.window.sum) / self.deviation * self.transfer
+
+    @cached_property
+    def amplitude(self) -> np.ndarray:
+        """Magnitude of the largest bin of the bare line over sigma, by segment."""
+        return self.level * self.lobe.near(self.offset)
+
+    @cached_property
+    def per_range(self) -> np.ndarray:
+        """Bins for a relative difference of range of 1, by segment."""
+        slope = self.chirp_rate * self.delay * (1 + np.abs(self.beta))
+        return np.abs(self.signs) * (slope / self.bin_width)
+
+    @cached_property
+    def per_velocity(self) -> np.ndarray:
+        """Bins for 1 m/s, by segment."""
+        return spread.velocity_to_bins(
+            range=self.range, carrier=self.carriers, chirp_rate=self.chirp_rate,
+            bin_width=self.bin_width,
+        )  # fmt: skip
+
+    @cached_property
+    def doppler_shift(self) -> np.ndarray:
+        """Bins by which the Doppler effect moves lines, by segment."""
+        return np.abs(self.radial_velocity) * self.per_velocity
+
+    @cached_property
+    def own_spread(self) -> Moments:
+        """Bins off the axis's line by the ranges of beamlets on the axis's surface."""
+        return self.footprint.own_ranges.times(self.per_range)
+
+    @cached_property
+    def range_spread(self) -> Moments:
+        """The same of all beamlets."""
+        return self.footprint.ranges.times(self.per_range)
+
+    @cached_property
+    def velocity_spread(self) -> Moments:
+        """Bins off the axis's line by the velocities of beamlets."""
+        return self.footprint.velocities.times(self.per_velocity)
+
+    @cached_property
+    def spread(self) -> Moments:
+        """By both."""
+        return self.range_spread.plus(self.velocity_spread)
+
+    @cached_property
+    def smear(self) -> Smear:
+        """All that smears lines over the record."""
+        total = NO_SMEAR
+        for one in self.smears.values():
+            total = total.plus(one)
+        return total
+
+    @cached_property
+    def smeared(self) -> np.ndarray | float:
+        """Bins that light may be moved by over the record."""
+        return self.smear.bins * self.margin
+
+    @cached_property
+    def apart(self) -> np.ndarray:
+        """Bins from DC and Nyquist to the nearest light of a line."""
+        return self.edge - self.spread.extreme - self.smeared
+
+    @cached_property
+    def near_image(self) -> np.ndarray:
+        """Where lines and their images are so close that they may add up, or cancel."""
+        return 2 * self.apart < _NEAR_EDGE * self.margin
+
+    @cached_property
+    def may_cancel(self) -> np.ndarray:
+        """Where amplitudes that add, or may, might leave next to nothing."""
+        adds = self.adds_amplitudes or self.has("target.roughness")
+        if not adds:
+            return np.zeros_like(self.near_image)
+        return self.near_image | (self.number > 1)
+
+    @cached_property
+    def powers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest power of the largest bin, over that of all lines on a bin."""
+        return self.power_range(self.spread)
+
+    def power_range(self, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
+        """The same of lines that are spread so; images are in it.
+
+        By Taylor's series; and by Chebyshev's inequality a share 1 - 1/t^2 of the power lies
+        within t s, whose largest bin holds the mean at least; nor is any less than the line of
+        the strongest beamlet.
+        """
+        form, tilt, (mean, rms, extreme) = self.lobe, self.tilt, moments
+        on_axis = form.near(self.offset) ** 2
+        if moments is spread.NO_SPREAD or self.number == 1:
+            return on_axis, on_axis * np.where(self.near_image, 2.0, 1.01)
+        second = 0.5 * form.curvature * rms * rms
+        least = on_axis - np.minimum(form.slope, form.curvature * self.offset) * mean
+        least = least - second - tilt * rms
+        least = np.maximum(least, np.exp(-tilt * extreme) * (form.worst**2 / self.number))
+        for t in _CHEBYSHEV:
+            wide = t * rms
+            most = (1 - 1 / t**2) * form.energy / (2 * wide + 2 * form.margin + 1)
+            least = np.maximum(least, most * np.exp(-tilt * wide))
+        most = np.minimum(on_axis + form.slope * mean + second, 1.0)
+        uphill = np.exp(np.minimum(tilt * extreme, 50.0))
+        most = most * np.where(self.near_image, 2.0, 1.01)
+        most = most * (1 + uphill * np.minimum(tilt * rms, 50.0))
+        return np.minimum(least, most), most
+
+    def moved(self, added: Moments, present: Moments, shift: np.ndarray | float = 0.0):
+        """Relative change of the largest bin's power as lines are moved, or spread further.
+
+        P_k = sum_b p_b F(k - x_0 - X_b), and with F1, F2 the bounds on |F'| and |F''|
+
+            |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s
+
+        for the mean m and the rms s of X, added to lines of rms S, and c of the receiver's poles.
+        """
+        form, least = self.lobe, self.power_range(present)[0]
+        change = form.slope * (added.mean + shift)
+        change = change + form.curvature * (present.rms * added.rms + added.rms**2 / 2)
+        away = self.tilt * (present.extreme + added.extreme + shift)
+        change = change + self.tilt * (added.rms + shift)
+        double = np.where(self.near_image, 2.0, 1.05)
+        return double * np.exp(np.minimum(away, 50.0)) * change / least
+
+    def in_phase(self, bins: np.ndarray | float) -> np.ndarray:
+        """What moving lines by some bins changes of a sum of amplitudes, over that in phase.
+
+        |W'|, |H'| and the phase at the record's middle, of line and image.
+        """
+        turn = 2 * np.pi * (self.start + 0.5 * self.record_duration) * self.bin_width
+        each = (np.sqrt(self.lobe.curvature) + 2 * self.tilt + turn) * bins
+        uphill = np.exp(np.minimum(self.tilt * (self.spread.extreme + bins), 50.0))
+        return 2 * uphill * np.minimum(each, 2.0) / self.lobe.worst
