@@ -54,7 +54,8 @@ def test_random_effects_are_refused_in_a_study_without_draws():
 )
 def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
     accelerations = ["0 m/s^2", "1 m/s^2", "1e6 m/s^2", "2 m/s^2", "9e5 m/s^2"]
-    modes = {"acceleration": "on", "range_walk": "on"}  # whatever is beside a point
+    every = ("acceleration", "range_walk", "image", "leakage")
+    modes = dict.fromkeys(every, "on")  # whatever is beside a point
     given = {"draws": draws, "effects": modes, "axes": {"target.acceleration": accelerations}}
     outcome = quiet(small(**given), tmp_path / "some.zarr")
     assert outcome.complete and not outcome.failures
