@@ -145,7 +145,7 @@ def off(written: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES) -> 
     exact = found(TIGHTEST, flags_of(every[:, None] & there))
     rows = []
     for tolerance in tolerances:
-        most = effects_tolerance(parameters, number, tolerance)
+        most = effects_tolerance(parameters | {"accuracy.tolerance": tolerance}, number)
         made = plan(points, each, spec.modes(), most)
         own = found(tolerance, flags_of(made.kept & there))
         rows.append(_apart(own, exact, made.error, "leakage" in written["effects"]))

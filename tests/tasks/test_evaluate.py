@@ -54,7 +54,7 @@ def test_random_effects_are_refused_in_a_study_without_draws():
 )
 def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
     accelerations = ["0 m/s^2", "1 m/s^2", "1e6 m/s^2", "2 m/s^2", "9e5 m/s^2"]
-    every = ("acceleration", "range_walk", "image", "leakage")
+    every = ("acceleration", "range_walk", "image", "leakage", "footprint", "doppler_spread")
     modes = dict.fromkeys(every, "on")  # whatever is beside a point
     given = {"draws": draws, "effects": modes, "axes": {"target.acceleration": accelerations}}
     outcome = quiet(small(**given), tmp_path / "some.zarr")
