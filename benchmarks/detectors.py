@@ -12,9 +12,17 @@ from scipy.optimize import brentq
 
 from sweep.analysis import canvas
 from sweep.model import cramer_rao
-from sweep.model.detectors import CA, DETECTORS, GOCA, OS, cfar_factor, crossing_probability
+from sweep.model.detectors import (
+    CA,
+    DETECTORS,
+    GOCA,
+    OS,
+    Setting,
+    cfar_factor,
+    crossing_probability,
+    taper,
+)
 from sweep.model.estimators import ESTIMATORS
-from sweep.model.processing import Setting, taper
 from sweep.model.window import window
 
 DOCS = Path(__file__).parents[1] / "docs"

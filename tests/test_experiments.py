@@ -8,8 +8,13 @@ from drawn_files import shows
 
 import sweep
 from sweep.analysis.figures import draw
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+from sweep.model.outputs import (
+    ACCURACY_OUTPUTS,
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    OUTPUTS,
+    SPECTRA_OUTPUTS,
+)
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.reading import read_document
 

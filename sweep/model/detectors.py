@@ -27,16 +27,62 @@ the other way round.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy.special import gammaln
 
-from sweep.model.processing import Setting
+from sweep.model.window import Window, samples
 
 FIXED = "fixed"
 CA, OS, GOCA = "ca_cfar", "os_cfar", "goca_cfar"
+
+
+@lru_cache(maxsize=8)
+def taper(window: Window) -> np.ndarray:
+    """Samples (L,) of a window, made once; not to be written to."""
+    values = samples(window.name, window.length)
+    values.flags.writeable = False
+    return values
+
+
+@lru_cache(maxsize=8)
+def main_lobe(window: Window) -> float:
+    """Distance [bins of fs/L] of the first minimum of |W|, to 1/8 bin."""
+    magnitude = np.abs(np.fft.rfft(taper(window), 8 * window.length))
+    return float(np.argmax(np.diff(magnitude) > 0)) / 8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Setting:
+    """How spectra were made, and how they are to be looked at."""
+
+    fft_size: int
+    """Points N of the FFT; spectra have the bins 0..N/2."""
+    sample_rate: float
+    """[Hz]; a bin is ``sample_rate / fft_size`` wide."""
+    window: Window
+    """Its ``length`` L <= N is that of the record, which is padded with zeros to N."""
+    noise_power: float
+    """Mean |X|^2 of a bin of noise alone, by the receiver's noise budget [V^2]."""
+    threshold: float
+    """Fixed threshold on |X| [V]."""
+    training: int
+    """Training cells, half of them on either side; even."""
+    guard: int
+    """Guard cells on either side."""
+    rank: int
+    """Rank of the ordered statistic among the training cells, 1 for the least."""
+    pfa: float
+    """Design probability of a false alarm in a bin of noise alone."""
+
+    @property
+    def taper(self) -> np.ndarray:
+        """Samples (L,) of the window."""
+        return taper(self.window)
+
 
 Detector = Callable[[np.ndarray, Setting], np.ndarray]
 """From power |X|^2 (m, N/2 + 1) of m spectra and the setting to bool of the same shape."""
@@ -95,19 +141,23 @@ def fixed(power: np.ndarray, setting: Setting) -> np.ndarray:
 
 def ca_cfar(power: np.ndarray, setting: Setting) -> np.ndarray:
     """Bins at or above the cell-averaging threshold."""
-    return _averaged(power, setting.training // 2, setting.guard, _factor(CA, setting), False)
+    below, above = _sums(power, setting)
+    return _at_or_above(power, (below + above) / (setting.training // 2 * 2), CA, setting)
 
 
 def goca_cfar(power: np.ndarray, setting: Setting) -> np.ndarray:
     """Bins at or above the greatest-of cell-averaging threshold."""
-    return _averaged(power, setting.training // 2, setting.guard, _factor(GOCA, setting), True)
+    level = np.maximum(*_sums(power, setting)) / (setting.training // 2)
+    return _at_or_above(power, level, GOCA, setting)
 
 
 def os_cfar(power: np.ndarray, setting: Setting) -> np.ndarray:
-    """Bins at or above the threshold of an ordered statistic."""
-    return _ordered(
-        power, setting.training // 2, setting.guard, _factor(OS, setting), setting.rank
-    )  # fmt: skip
+    """Bins at or above the threshold of an ordered statistic: so many cells stay below the bin."""
+    least, count = power[:, 1:-1] / _factor(OS, setting), np.zeros(power[:, 1:-1].shape, np.int64)
+    for below, above in _training_cells(power, setting):
+        count += below <= least
+        count += above <= least
+    return np.pad(count >= setting.rank, ((0, 0), (1, 1)))
 
 
 DETECTORS: dict[str, Detector] = {FIXED: fixed, CA: ca_cfar, OS: os_cfar, GOCA: goca_cfar}
@@ -117,46 +167,27 @@ def _factor(kind: str, setting: Setting) -> float:
     return cfar_factor(kind, training=setting.training, rank=setting.rank, pfa=setting.pfa)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _unfolded(power, reach, cells):
-    """Bins of a spectrum but DC and Nyquist, with ``reach`` more at either end, its other end's."""
-    number = power.size - 2
-    for i in range(number + 2 * reach):
-        cells[i] = power[1 + (i - reach) % number]
+def _training_cells(power: np.ndarray, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Training cells of all bins but DC and Nyquist, one below and one above at a time.
+
+    The spectrum goes on at either end with its other end's bins.
+    """
+    half, number = setting.training // 2, power.shape[1] - 2
+    reach = half + setting.guard
+    cells = power[:, 1 + np.arange(-reach, number + reach) % number]
+    for i in range(half):
+        above = reach + setting.guard + 1 + i
+        yield cells[:, i : i + number], cells[:, above : above + number]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _averaged(power, half, guard, factor, greatest):
-    """Means of training cells, or the greater of the means of both sides, times the factor."""
-    rows, bins = power.shape
-    found = np.zeros((rows, bins), np.bool_)
-    reach = half + guard
-    cells = np.empty(bins - 2 + 2 * reach)
-    for row in range(rows):
-        _unfolded(power[row], reach, cells)
-        for k in range(1, bins - 1):
-            below, above = 0.0, 0.0
-            for i in range(half):
-                below += cells[k - 1 + i]
-                above += cells[k + reach + guard + i]
-            level = max(below, above) / half if greatest else (below + above) / (2 * half)
-            found[row, k] = power[row, k] >= factor * level
-    return found
+def _sums(power: np.ndarray, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of the training cells below and above each bin."""
+    sums = np.zeros((2, len(power), power.shape[1] - 2))
+    for pair in _training_cells(power, setting):
+        sums += pair
+    return sums[0], sums[1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ordered(power, half, guard, factor, rank):
-    """The same with a training cell of a rank: as many of them must stay below the bin."""
-    rows, bins = power.shape
-    found = np.zeros((rows, bins), np.bool_)
-    reach = half + guard
-    cells = np.empty(bins - 2 + 2 * reach)
-    for row in range(rows):
-        _unfolded(power[row], reach, cells)
-        for k in range(1, bins - 1):
-            least, count = power[row, k] / factor, 0
-            for i in range(half):
-                count += cells[k - 1 + i] <= least
-                count += cells[k + reach + guard + i] <= least
-            found[row, k] = count >= rank
-    return found
+def _at_or_above(power: np.ndarray, level: np.ndarray, kind: str, setting: Setting) -> np.ndarray:
+    found = power[:, 1:-1] >= _factor(kind, setting) * level
+    return np.pad(found, ((0, 0), (1, 1)))

@@ -34,10 +34,10 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy import fft
 
-from sweep.model.processing import Setting, taper
+from sweep.model.detectors import Setting
+from sweep.model.interpolation import lone_tone, phasors
 from sweep.model.window import Window
 
 if TYPE_CHECKING:
@@ -123,10 +123,11 @@ def maximum_likelihood(spectrum: np.ndarray, peak: np.ndarray, setting: Setting)
     start = candan(spectrum, peak, setting)
     size, number, found = float(setting.fft_size), float(used.sum()), start.copy()
     for row in range(peak.size):
-        record = (_record(spectrum[row], setting) * weight).astype(complex)
-        found[row] = _climb(record, start[row], size)
-        _without_image(record, found[row], size, number)
-        found[row] = _climb(record, found[row], size)
+        record = _record(spectrum[row], setting) * weight
+        turned = phasors(_climb(record, start[row], size) / size, record.size)
+        image = ((record * turned).sum() / number).conjugate() * turned
+        # Where the window was not undone there is no tone.
+        found[row] = _climb(np.where(used, record - image, 0.0), found[row], size)
     return found
 
 
@@ -173,22 +174,15 @@ def _ratio(turned: np.ndarray, sign: int) -> np.ndarray:
 @lru_cache(maxsize=16)
 def _lone_tones(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances [bins] from -1 to 1, and the turned bins of tones that far above one, (k, 3)."""
-    from scipy import signal  # slow to import
-
-    steps = np.arange(-_STEPS, _STEPS + 1)
-    half_turn = 0.5 * window.length / fft_size
-    y = np.arange(2 * _STEPS + 1) / _STEPS
-    far = signal.zoom_fft(taper(window), [0.0, 2.0 / fft_size], y.size, fs=1.0, endpoint=True)
-    real = (far * np.exp(2j * np.pi * half_turn * y)).real
-    tone = real[np.abs(_STEPS * np.array([-1, 0, 1]) - steps[:, None])]
-    return steps / _STEPS, tone.astype(complex)
+    delta = np.arange(-_STEPS, _STEPS + 1) / _STEPS
+    return delta, lone_tone(window, fft_size)(np.array([-1, 0, 1]) - delta[:, None]).real
 
 
 @lru_cache(maxsize=16)
 def jacobsen_form(window: Window, fft_size: int) -> tuple[int, float]:
     """Sign of the neighbours in Jacobsen's denominator, and the factor of his ratio."""
     delta, tone = _lone_tones(window, fft_size)
-    middle = tone[_STEPS].real
+    middle = tone[_STEPS]
     if abs(middle[2]) < _VANISHING * middle[1]:
         return 1, 1.0
     near = np.abs(delta) <= 0.5
@@ -216,36 +210,13 @@ def _at_rest(record: np.ndarray, bin_: int, setting: Setting) -> np.ndarray:
     return np.asarray(record * np.exp(-2j * np.pi * turns))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _without_image(record, place, fft_size, number):
-    """Takes a tone's half at negative frequency off a record, which else moves the maximum."""
-    angle, total = -2.0 * math.pi * place / fft_size, 0j
-    step, turn = complex(math.cos(angle), math.sin(angle)), complex(1.0, 0.0)
-    for i in range(record.size):
-        total += record[i] * turn
-        turn *= step
-    image, turn = (total / number).conjugate(), complex(1.0, 0.0)
-    for i in range(record.size):
-        if record[i] != 0:  # where the window was not undone there is no tone
-            record[i] -= image * turn
-        turn *= step
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _climb(record, start, fft_size):
+def _climb(record: np.ndarray, start: float, fft_size: float) -> float:
     """Place [bins] of the nearest maximum of |sum x e^{-2 pi i n f / N}|^2, from a start."""
-    middle = 0.5 * (record.size - 1)
+    n = np.arange(record.size) - 0.5 * (record.size - 1)
     place = start
     for _ in range(_NEWTON):
-        angle = -2.0 * math.pi * place / fft_size
-        step, turn = complex(math.cos(angle), math.sin(angle)), complex(1.0, 0.0)
-        s0, s1, s2 = 0j, 0j, 0j
-        for i in range(record.size):
-            value, n = record[i] * turn, i - middle
-            s0 += value
-            s1 += n * value
-            s2 += n * n * value
-            turn *= step
+        value = record * phasors(place / fft_size, record.size)
+        s0, s1, s2 = value.sum(), (n * value).sum(), (n * n * value).sum()
         # of |S|^2 by the angle
         slope = 2.0 * (1j * s1 * s0.conjugate()).real
         bend = 2.0 * (abs(s1) ** 2 - (s2 * s0.conjugate()).real)
@@ -257,4 +228,4 @@ def _climb(record, start, fft_size):
             return start
         if abs(moved) < 1e-9:
             break
-    return place
+    return float(place)

@@ -1,4 +1,4 @@
-"""Complex spectra of a shot with noise in every bin, draw by draw.
+"""Complex spectra of a shot with noise in every bin, and what is found in them, draw by draw.
 
 Noise is drawn as the receiver makes it: white Gaussian in the record, which is windowed, padded and
 transformed; so bins are alike as far as window and padding make them, and DC and Nyquist are what
@@ -9,20 +9,49 @@ effects. Where beamlets add as powers these are root mean squares, and have no p
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
 is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make.
 A phase common to all bins makes no difference to circular noise and is left out.
+
+A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
+|X|^2. A segment is detected where it flags the strongest bin of the signal or one of the two beside
+it; adjacent flagged bins form a group, and a group outside the bins that the signal occupies is a
+false alarm. The estimator is given the spectrum and the largest bin of the detected group. Where
+all segments are detected, their frequencies are resolved into range and radial velocity.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
 
-from sweep.model.cramer_rao import beat_deviation
-from sweep.model.interpolation import interpolator, sub_bin
+from sweep.model import waveform
+from sweep.model.cramer_rao import Deviation, beat_deviation, resolved_deviation
+from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
+from sweep.model.estimators import ESTIMATORS, PEAK_BIN, Estimator
+from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.philox import STREAM_RECORD, normals
-from sweep.model.preparation import Shots
-from sweep.model.processing import Setting, main_lobe, taper
+from sweep.model.preparation import Parameters, Shots
 from sweep.model.spectra import segment_spectrum
+
+DETECTOR, ESTIMATOR = "instrument.processing.detector.", "instrument.processing.estimator."
+DEFAULTS: dict[str, float | int | str] = {
+    DETECTOR + "kind": FIXED,
+    DETECTOR + "training": 32,
+    DETECTOR + "guard": 4,
+    DETECTOR + "rank": 0,
+    DETECTOR + "pfa": 1e-6,
+    ESTIMATOR + "kind": PEAK_BIN,
+}
+
+VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
+"""What is averaged over draws; the last two are squares of bounds."""
+
+
+class Methods(NamedTuple):
+    """Detectors and estimators by name: those of the program, and any others."""
+
+    detectors: Mapping[str, Detector] = DETECTORS
+    estimators: Mapping[str, Estimator] = ESTIMATORS
 
 
 class Signal(NamedTuple):
@@ -42,23 +71,6 @@ class Signal(NamedTuple):
     """Where a lone tone of these magnitudes about the largest bin stands [bins]."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
-
-
-def setting_of(
-    shots: Shots, i: int, *, training: int, guard: int, rank: int, pfa: float
-) -> Setting:
-    """What a detector and an estimator are told of point i; rank 0 for three quarters."""
-    return Setting(
-        fft_size=shots.fft_size,
-        sample_rate=float(shots.sample_rate[i]),
-        window=shots.window,
-        noise_power=float(shots.window.energy * shots.quiet_variance[i]),
-        threshold=float(shots.threshold[i]),
-        training=training,
-        guard=guard,
-        rank=rank or math.ceil(0.75 * training),
-        pfa=pfa,
-    )
 
 
 def signal_of(shots: Shots, i: int, segment: int) -> Signal:
@@ -86,42 +98,174 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
 
 def _tone_phases(place: float, shots: Shots) -> np.ndarray:
     """Phase factors (N/2 + 1,) of a lone tone at a place [bins]; 1 where it vanishes."""
-    turns = np.arange(shots.window.length) * (place / shots.fft_size)
-    tone = fft.rfft(taper(shots.window) * np.cos(2 * np.pi * turns), shots.fft_size)
+    record = phasors(place / shots.fft_size, shots.window.length).real
+    tone = fft.rfft(taper(shots.window) * record, shots.fft_size)
     magnitude = np.abs(tone)
     return np.where(magnitude > 0, tone / np.where(magnitude > 0, magnitude, 1.0), 1.0)
 
 
-def beat_bound(shots: Shots, i: int, cnr: np.ndarray) -> np.ndarray:
-    """Cramer-Rao bound of a beat's standard deviation [Hz] for lone tones of some cnr."""
-    return beat_deviation(
-        cnr=cnr, samples=shots.window.length, sample_rate=float(shots.sample_rate[i])
-    )
-
-
 def noise_of(
-    shots: Shots, i: int, segment: int, signal: Signal, key: np.ndarray, draw: int
+    shots: Shots, i: int, segment: int, signal: Signal, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Noise (N/2 + 1,) complex of one draw of point i's segment [V].
+    """Noise (m, N/2 + 1) complex of some draws of point i's segment, by their numbers [V].
 
     Where noise stands under the lines only (:attr:`Shots.pedestal`), the bins that the signal
     occupies have more of it.
     """
-    record = normals(key, draw, STREAM_RECORD[segment], shots.window.length)
-    record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
+    records = normals(key, draws, STREAM_RECORD[segment], shots.window.length)
+    records *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
-    noise = np.asarray(fft.rfft(record, shots.fft_size))
+    noise = np.array([fft.rfft(record, shots.fft_size) for record in records])
     more = float(shots.line_deviation[i] / shots.bin_deviation[i])
     if more != 1.0:
-        noise[signal.first : signal.last + 1] *= more
+        noise[:, signal.first : signal.last + 1] *= more
     return noise
 
 
-def noisy_spectra(
-    shots: Shots, i: int, segment: int, signal: Signal, *, key: np.ndarray, draws: np.ndarray
-) -> np.ndarray:
-    """Spectra (m, N/2 + 1) complex of some draws of point i's segment, by their numbers [V]."""
-    spectra = np.empty((draws.size, shots.fft_size // 2 + 1), complex)
-    for row, draw in enumerate(draws):
-        spectra[row] = signal.spectrum + noise_of(shots, i, segment, signal, key, int(draw))
-    return spectra
+class View(NamedTuple):
+    """A shot, and how it is looked at."""
+
+    shots: Shots
+    i: int
+    """Which of the shots."""
+    key: np.ndarray
+    """(2,) uint64: random key of the point."""
+    signals: tuple[Signal | None, ...]
+    """By segment; None for one that does not exist."""
+    setting: Setting
+    detect: Detector
+    estimate: Estimator
+
+
+class Found(NamedTuple):
+    """What is found in a segment of m draws, (m,) each."""
+
+    detected: np.ndarray
+    alarms: np.ndarray
+    """Groups outside the signal."""
+    flagged: np.ndarray
+    """Bins in them."""
+    frequency: np.ndarray
+    """[bins]"""
+
+
+def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Methods) -> View:
+    """View of one of some shots, by the parameters p of its point (:data:`DEFAULTS`)."""
+    training, rank = int(p[DETECTOR + "training"]), int(p[DETECTOR + "rank"])
+    setting = Setting(
+        fft_size=shots.fft_size,
+        sample_rate=float(shots.sample_rate[i]),
+        window=shots.window,
+        noise_power=float(shots.window.energy * shots.quiet_variance[i]),
+        threshold=float(shots.threshold[i]),
+        training=training,
+        guard=int(p[DETECTOR + "guard"]),
+        rank=rank or math.ceil(0.75 * training),  # 0 stands for three quarters
+        pfa=float(p[DETECTOR + "pfa"]),
+    )
+    signals = tuple(
+        signal_of(shots, i, s) if there else None for s, there in enumerate(shots.segments)
+    )
+    return View(
+        shots, i, key, signals, setting, methods.detectors[str(p[DETECTOR + "kind"])],
+        methods.estimators[str(p[ESTIMATOR + "kind"])],
+    )  # fmt: skip
+
+
+def look(spectra: np.ndarray, signal: Signal, view: View) -> Found:
+    """What is found in spectra (m, N/2 + 1) of a segment."""
+    power = spectra.real**2 + spectra.imag**2
+    flags = np.array(view.detect(power, view.setting), bool)
+    flags[:, [0, -1]] = False  # DC and Nyquist
+    low, high = max(signal.strongest - 1, 1), min(signal.strongest + 2, power.shape[1] - 1)
+    near = np.where(flags[:, low:high], power[:, low:high], -1.0)
+    hit, detected = low + near.argmax(axis=1), near.max(axis=1) >= 0
+    edges = np.diff(flags.astype(np.int8), axis=1)
+    row, start = np.nonzero(edges > 0)  # of each group of flagged bins
+    start, end = start + 1, np.nonzero(edges < 0)[1] + 1
+    false = (start > signal.last) | (end <= signal.first)
+    alarms, flagged = (
+        np.bincount(row[false], weights, len(spectra)).astype(np.int64)
+        for weights in (None, (end - start)[false])
+    )
+    own = detected[row] & (start <= hit[row]) & (hit[row] < end)
+    first, last = np.ones((len(spectra), 1)), np.full((len(spectra), 1), power.shape[1] - 1)
+    first[row[own], 0], last[row[own], 0] = start[own], end[own]
+    bins = np.arange(power.shape[1])
+    peak = np.where((first <= bins) & (bins < last), power, -1.0).argmax(axis=1)
+    return Found(detected, alarms, flagged, view.estimate(spectra, peak, view.setting))
+
+
+def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Counts of some draws, and what is averaged over them.
+
+    Returns
+    -------
+    counts : (names, m) int64 ndarray
+        By the names of DRAW_OUTPUTS.
+    values : (names, m) ndarray
+        By those of VALUES; nan where there is none.
+    """
+    nothing = np.zeros(draws.size, np.int64)
+    found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3
+    searched = 0
+    for s, signal in enumerate(view.signals):
+        if signal is not None:
+            noise = noise_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
+            spectra = signal.spectrum + noise
+            found[s] = look(spectra, signal, view)
+            searched += view.setting.fft_size // 2 - 1 - max(signal.last - signal.first + 1, 0)
+    up, doppler, down = found
+    both, alarm = up.detected & down.detected, (up.alarms > 0, down.alarms > 0)
+    counts = np.array([
+        up.detected, down.detected, doppler.detected, both, *alarm, alarm[0] & alarm[1]
+    ], np.int64)  # fmt: skip
+    flagged, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
+    least = resolved_bound(view)
+    squares = [np.full(draws.size, bound**2) for bound in least]
+    whole = both & (doppler.detected | (view.signals[1] is None))
+    errors = [np.where(whole, error, np.nan) for error in _errors(view, found)]
+    return counts, np.array([flagged / max(searched, 1), alarms, *errors, *squares])
+
+
+def resolved_bound(view: View) -> Deviation:
+    """Cramer-Rao bound of range and velocity that are resolved from up and down beat."""
+    shots, i = view.shots, view.i
+    length, rate = shots.window.length, float(shots.sample_rate[i])
+    up, _, down = (
+        np.inf if s is None else beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate)
+        for s in view.signals
+    )
+    return resolved_deviation(
+        up=up, doppler=np.inf, down=down, carriers=_carriers(shots, i),
+        chirp_rate=_at(shots.chirp_rate, i), range=shots.range[i],
+        radial_velocity=shots.radial_velocity[i],
+    )  # fmt: skip
+
+
+def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]:
+    """Reported less true range [m] and radial velocity [m/s], (m,) each."""
+    shots, i = view.shots, view.i
+    width = view.setting.sample_rate / view.setting.fft_size
+    up, doppler, down = (segment.frequency * width for segment in found)
+    reported = waveform.resolve(
+        up=up, doppler=doppler, down=down, carrier=_carriers(shots, i)[0],
+        bandwidth=_at(shots.bandwidth, i), duration=_at(shots.duration, i),
+        sample_rate=shots.sample_rate[i], bin_width=np.asarray(width),
+    )  # fmt: skip
+    walked = _at(shots.walk, i) * reported.radial_velocity  # within the record
+    return (
+        reported.range + walked - shots.range[i],
+        reported.radial_velocity - shots.radial_velocity[i],
+    )
+
+
+def _carriers(shots: Shots, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    up, doppler, down = (_at(carrier, i) for carrier in shots.carriers)
+    return up, doppler, down
+
+
+def _at(column: np.ndarray | float, i: int) -> np.ndarray:
+    """Point i of a column that may be one value for all."""
+    column = np.asarray(column)
+    return np.asarray(column[i] if column.ndim else column)

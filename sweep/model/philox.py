@@ -36,6 +36,7 @@ _WEYL_0 = np.uint64(0x9E3779B97F4A7C15)
 _WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
 _HALF_WORD = np.uint64(0xFFFFFFFF)
 _32, _12 = np.uint64(32), np.uint64(12)
+_ALL = 2**64 - 1
 
 
 @njit(cache=True)
@@ -102,13 +103,20 @@ def normal_pair(key0, key1, draw, stream, index):
     return radius * math.cos(angle), radius * math.sin(angle)
 
 
-def normals(key: np.ndarray, draw: int, stream: int, number: int) -> np.ndarray:
-    """The first so many numbers of `normal_pair`, but for a last bit or two."""
-    before = (int(stream) << 192) + (int(draw) << 128) - 1  # numpy counts before it draws
-    generator = np.random.Philox(key=int(key[0]) + (int(key[1]) << 64), counter=before)
-    uniforms = ((generator.random_raw(number + number % 2) >> _12) + 0.5) * 2.0**-52
-    radius, angle = np.sqrt(-2.0 * np.log(uniforms[::2])), 2.0 * np.pi * uniforms[1::2]
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).ravel()[:number]
+def normals(key: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:
+    """The first so many numbers of `normal_pair` in each draw (m, number), but for a last bit."""
+    generator = np.random.Philox(0)
+    state, cells = generator.state, np.empty((draws.size, number + number % 2), np.uint64)
+    for row, draw in enumerate(draws.tolist()):
+        # numpy raises its counter by 1 before it draws
+        before = [_ALL, _ALL, draw - 1 if draw else _ALL, stream if draw else stream - 1]
+        state["state"] = {"counter": np.array(before, np.uint64), "key": key}
+        generator.state = state
+        cells[row] = generator.random_raw(cells.shape[1])
+    uniforms = ((cells >> _12) + 0.5) * 2.0**-52
+    radius, angle = np.sqrt(-2.0 * np.log(uniforms[:, ::2])), 2.0 * np.pi * uniforms[:, 1::2]
+    uniforms[:, ::2], uniforms[:, 1::2] = radius * np.cos(angle), radius * np.sin(angle)
+    return uniforms[:, :number]
 
 
 def point_keys(rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:

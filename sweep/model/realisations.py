@@ -119,7 +119,7 @@ class Means:
     def add(self, point: np.ndarray, outputs: Mapping[str, np.ndarray]) -> None:
         """Adds draws, (m,) each, in the order of their numbers for each point."""
         values = np.array([outputs[name] for name in OUTPUTS])
-        _add(point, values, _LOGARITHMS, self._count, self._mean, self._spread)
+        add(point, values, _LOGARITHMS, self._count, self._mean, self._spread)
 
     def moments(
         self, names: Sequence[str], points: np.ndarray
@@ -172,10 +172,12 @@ class Means:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add(point, values, logarithms, count, mean, spread):
+def add(point, values, logarithms, count, mean, spread):
     """Draws into running means and sums of squared deviations [Welford, Technometrics 4, 1962].
 
-    For logarithms instead the largest, and the sum of the numbers over its number.
+    (names, m) values of points (m,), nan where a draw is none; what is infinite in one of them, as
+    bounds without an echo are, is so in the mean. For logarithms instead the largest, and the sum
+    of the numbers over its number.
     """
     for k in range(values.shape[0]):
         for j in range(point.size):
@@ -184,6 +186,9 @@ def _add(point, values, logarithms, count, mean, spread):
                 continue
             count[k, i] += 1
             if not logarithms[k]:
+                if np.isinf(x) or np.isinf(mean[k, i]):
+                    mean[k, i] = np.inf
+                    continue
                 apart = x - mean[k, i]
                 mean[k, i] += apart / count[k, i]
                 spread[k, i] += apart * (x - mean[k, i])

@@ -1,5 +1,9 @@
 """Points sampled by draws: a fixed number of them, or as many as it takes to keep a promise.
 
+Draws are held against probabilities, or noise is added to the bins that matter
+(:mod:`sweep.model.draws`), or a detector and an estimator look at whole spectra with noise
+(:mod:`sweep.model.noisy_spectra`).
+
 What is promised is how far pd may be off, each segment's and the shot's, with some confidence. What
 draws tell of pd depends on what is random. Where effects are, pd is the mean over draws of the
 conditional probabilities that each draw has over its noise. Where noise alone is and is drawn, it
@@ -10,27 +14,40 @@ Drawing until the promise is kept goes in rounds over all points that are still 
 stops sooner, on the average, where the draws happen to vary little, and that costs coverage and
 adds bias: :func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping.py``
 measures them. Looks come at the same numbers of draws for every point, and what a point has drawn
-depends on nothing but its own draws: other points, blocks and workers change no bit of it.
+depends on nothing but its own draws: other points, blocks and workers change no bit of it. A
+detector sees the draws of one point and segment together, in pieces that depend on the FFT size and
+on numbers of draws alone.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
+from sweep.model.chain import prepare
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_counts
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
-from sweep.model.outputs import DRAW_OUTPUTS, PROMISED, RUNNING
-from sweep.model.preparation import Parameters
-from sweep.model.realisations import ROWS, Means, certain, random_effects, realise
+from sweep.model.noisy_spectra import DEFAULTS, VALUES, Methods, View, counted, view_of
+from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.realisations import ROWS, Means, add, certain, random_effects, realise
 from sweep.model.shot import evaluate, statistics
 
 PIECE = 1 << 16
 """Draws of a point that are taken at once where nothing but noise is random."""
 LEAST = 16
 """Draws of a point that are taken at once where random effects are simulated, at the least."""
+
+SAMPLES = 1 << 18
+"""Samples of whole spectra that are held at once."""
+
+FFT_SIZE = "instrument.processing.fft_size"
+
+SPECTRA = "spectra"
+"""Way to draw beside :data:`sweep.model.draws.METHODS`."""
 
 COUNT_OF = [list(DRAW_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PROMISED]
 
@@ -51,11 +68,12 @@ class Drawn(ABC):
 
     Parameters
     ----------
-    size, before
-        Number of points; what was drawn of them before.
+    parameters, size, before
+        Theirs; number of points; what was drawn of them before.
     """
 
-    def __init__(self, size: int, before: Before | None) -> None:
+    def __init__(self, parameters: Parameters, size: int, before: Before | None) -> None:
+        self.parameters: dict[str, Any] = dict(parameters)
         self.number = np.zeros(size, np.int64)
         self.counts = np.zeros((len(DRAW_OUTPUTS), size), np.int64)
         if before is not None:
@@ -82,6 +100,24 @@ class Drawn(ABC):
 
         By the names of PROMISED; nan for what there is not.
         """
+
+    @abstractmethod
+    def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
+        """Outputs, their errors and their accuracy, (n,) each; what further draws are added to."""
+
+    def some(self, points: np.ndarray | int) -> dict[str, Any]:
+        """Parameters of some of the points."""
+        return {
+            path: v[points] if isinstance(v, np.ndarray) and v.ndim else v
+            for path, v in self.parameters.items()
+        }
+
+    def counted_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
+        """Half-widths of the shares of draws with a detection."""
+        counts, n = self.counts[COUNT_OF][:, points], self.number[points]
+        confidence = accuracy.at(points, self.number.size).confidence
+        interval = COUNTED[accuracy.interval](successes=counts, trials=n, confidence=confidence)
+        return half_width(counts / n, interval)
 
     def missed(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
@@ -122,26 +158,40 @@ def simulate(
     effects: Collection[str],
     *,
     keys: np.ndarray,
-    first_draw: int = 0,
-    batch_sizes: Sequence[int],
     method: str,
+    first_draw: int = 0,
+    batch_sizes: Sequence[int] = (),
+    batch: int = 0,
+    limit: int = 0,
     accuracy: Accuracy = Accuracy(),  # noqa: B008  # frozen
+    methods: Methods = Methods(),  # noqa: B008  # a tuple
     before: Before | None = None,
     stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
-    """Outputs, their errors, and counts over batches of draws, with all effects.
+    """Outputs, their errors, and counts of draws, with all effects.
 
     Parameters
     ----------
     parameters, effects
         As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
-        are means over the same draws that are counted.
-    keys, first_draw, batch_sizes, method
+        are means over the same draws that are counted. For whole spectra, parameters also by the
+        names of :data:`sweep.model.noisy_spectra.DEFAULTS`.
+    keys, first_draw
         As of :func:`sweep.model.draws.draw`.
+    method : str
+        ``probabilities``, ``noise`` or ``spectra``.
+    batch_sizes : sequence of int
+        Draws of each point in each batch; without them as many as keep the promise.
+    batch, limit : int
+        Draws of which a look at the promise comes after a whole number; draws of a point at most,
+        where the promise may still be broken.
     accuracy : Accuracy
         What half-widths are held against.
+    methods : Methods
+        What the names of detectors and estimators in the parameters mean.
     before : Before, optional
-        What was drawn before, from ``first_draw`` on.
+        What was drawn before, from ``first_draw`` on, for the same promise or a looser one, or up
+        to a lower limit.
     stop : callable
         Asked between draws: whether to return with those taken so far. They make a `before` from
         which another call goes on, and at least some are taken.
@@ -149,47 +199,22 @@ def simulate(
     Returns
     -------
     dict of ndarray
-        (n,) by the names of OUTPUTS, ERROR_OUTPUTS and ACCURACY_OUTPUTS, (n, batches) int64 by
-        those of DRAW_OUTPUTS of :mod:`sweep.model.outputs`; where random effects are simulated
-        RUNNING, (n, columns).
+        (n,) by the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS of
+        :mod:`sweep.model.outputs`, (n, batches) int64 by those of DRAW_OUTPUTS (all draws in one
+        count without batches); where random effects or whole spectra are simulated RUNNING,
+        (n, columns).
     """
-    sample = Sample(parameters, effects, keys=keys, method=method, before=before)
-    counts = fill(sample, batch_sizes, first_draw=first_draw, before=before, stop=stop)
+    sample: Drawn
+    if method == SPECTRA:
+        sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
+    else:
+        sample = Sample(parameters, effects, keys=keys, method=method, before=before)
+    if batch_sizes:
+        counts = fill(sample, batch_sizes, first_draw=first_draw, before=before, stop=stop)
+    else:
+        settle(sample, np.arange(len(keys)), looks(batch, limit), accuracy, stop)
+        counts = sample.counts
     return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
-
-
-def simulate_until(
-    parameters: Parameters,
-    effects: Collection[str],
-    *,
-    keys: np.ndarray,
-    batch: int,
-    limit: int,
-    method: str,
-    accuracy: Accuracy,
-    before: Before | None = None,
-    stop: Callable[[], bool] = never,
-) -> dict[str, np.ndarray]:
-    """Outputs, their errors, and counts, of as many draws of each point as keep a promise.
-
-    Parameters
-    ----------
-    parameters, effects, keys, method, accuracy, before, stop
-        As of :func:`simulate`; what was drawn before was drawn for the same accuracy or a looser
-        one, or up to a lower limit.
-    batch : int
-        Draws of which a look comes after a whole number.
-    limit : int
-        Draws of a point at most, where the promise may still be broken.
-
-    Returns
-    -------
-    dict of (n,) ndarray
-        As of :func:`simulate`, with all draws in one count.
-    """
-    sample = Sample(parameters, effects, keys=keys, method=method, before=before)
-    settle(sample, np.arange(len(keys)), looks(batch, limit), accuracy, stop)
-    return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, sample.counts, strict=True))
 
 
 def fill(
@@ -268,8 +293,8 @@ class Sample(Drawn):
         self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str,
         before: Before | None = None,
     ) -> None:  # fmt: skip
-        super().__init__(len(keys), before)
-        self._parameters, self._effects = parameters, effects
+        super().__init__(parameters, len(keys), before)
+        self._effects = effects
         self._keys, self._method = keys, method
         self._means = Means(len(keys)) if random_effects(effects) else None
         if self._means is None:
@@ -286,7 +311,7 @@ class Sample(Drawn):
         """As of :class:`Drawn`."""
         if self._means is None:
             found = draw(
-                self._some(points), {name: v[points] for name, v in self._outputs.items()},
+                self.some(points), {name: v[points] for name, v in self._outputs.items()},
                 keys=self._keys[points], first_draw=first, batch_sizes=batch_sizes,
                 method=self._method, effects=self._effects,
             )  # fmt: skip
@@ -304,7 +329,7 @@ class Sample(Drawn):
         keys, ends = self._keys[points], first + np.cumsum([0, *batch_sizes])
         counts = no_counts(len(points), len(batch_sizes), self._method)
         for point, number, shots in realise(
-            self._some(points), self._effects, keys=keys, first_draw=first, draws=ends[-1] - first
+            self.some(points), self._effects, keys=keys, first_draw=first, draws=ends[-1] - first
         ):
             found = statistics(shots)
             means.add(points[point], found)
@@ -315,16 +340,9 @@ class Sample(Drawn):
                 count_in_noise(rows, ends, shots, counts)
         return counts
 
-    def _some(self, points: np.ndarray) -> Parameters:
-        """Parameters of some of the points."""
-        return {
-            path: v[points] if isinstance(v, np.ndarray) and v.ndim else v
-            for path, v in self._parameters.items()
-        }
-
     def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """As of :class:`Drawn`."""
-        confidence, n = accuracy.at(points, self.number.size).confidence, self.number[points]
+        confidence = accuracy.at(points, self.number.size).confidence
         if self._means is not None:
             mean, variance, number = self._means.moments(PROMISED, points)
             interval = bounded_mean(
@@ -334,14 +352,127 @@ class Sample(Drawn):
         exact = np.stack([0.0 * self._outputs[name][points] for name in PROMISED])
         if self._method == "probabilities":
             return exact
-        successes = self.counts[COUNT_OF][:, points]
-        interval = COUNTED[accuracy.interval](successes=successes, trials=n, confidence=confidence)
-        return exact + half_width(successes / n, interval)
+        return exact + self.counted_widths(points, accuracy)
 
     def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
-        """Outputs, their errors and their accuracy, (n,) each."""
+        """As of :class:`Drawn`."""
         if self._means is None:
             outputs = self._outputs | certain(self._outputs)
         else:
             outputs = self._means.results() | {RUNNING: self._means.running()}
         return outputs | self.accuracy(accuracy)
+
+
+_NO_LOGARITHMS = np.zeros(len(VALUES), bool)
+
+
+class SpectraSample(Drawn):
+    """Draws of whole spectra.
+
+    Parameters
+    ----------
+    parameters, effects, keys, methods, before
+        As of :func:`simulate`.
+    """
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
+        methods: Methods, before: Before | None,
+    ) -> None:  # fmt: skip
+        size = len(keys)
+        super().__init__({**DEFAULTS, **parameters}, size, before)
+        self._effects = effects
+        self._keys, self._methods = keys, methods
+        self._count = np.zeros((len(VALUES), size), np.int64)
+        self._mean, self._square = np.zeros((2, len(VALUES), size))  # the latter about the mean
+        self._fixed = Means(size)
+        self._prepared: dict[int, tuple[Shots, int]] = {}
+        if not random_effects(effects):
+            everywhere = np.broadcast_to(np.asarray(parameters["target.range"]), size)
+            whole: dict[str, Any] = {**parameters, "target.range": everywhere}
+            for index, shots in prepare(whole, effects):
+                self._fixed.add(index, statistics(shots))
+                self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
+        if before is not None:
+            columns = len(VALUES) * np.arange(1, 4)
+            self._count[...], self._mean, self._square, sums = (
+                part.copy() for part in np.split(before.means[RUNNING].T, columns)
+            )
+            if not self._prepared:
+                self._fixed.restore(sums)
+
+    def at_once(self, points: int) -> int:
+        """Draws of each of so many points that one `take` is for: some of :data:`SAMPLES`.
+
+        Whole ones, so that a detector sees the same draws together however they are cut.
+        """
+        sizes = np.unique(self.parameters[FFT_SIZE])
+        return max(1, 4 // points) * math.lcm(*(max(1, SAMPLES // int(n)) for n in sizes))
+
+    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
+        """As of :class:`Drawn`."""
+        ends = first + np.cumsum([0, *batch_sizes])
+        counts = np.zeros((len(DRAW_OUTPUTS), points.size, len(batch_sizes)), np.int64)
+        for place, point in enumerate(points):
+            for view, draws in self._views(int(point), int(ends[0]), int(ends[-1])):
+                batch = np.searchsorted(ends, draws, "right") - 1
+                found, values = counted(view, draws)
+                np.add.at(counts[:, place].T, batch, found.T)
+                place_of = np.full(draws.size, point)
+                add(place_of, values, _NO_LOGARITHMS, self._count, self._mean, self._square)
+        self.counts[:, points] += counts.sum(axis=-1)
+        self.number[points] += ends[-1] - ends[0]
+        return counts
+
+    def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
+        """What is looked at of a point, with the numbers of draws that are looked at together."""
+        p = self.some(point)
+        if self._prepared:
+            view = view_of(*self._prepared[point], p, self._keys[point], self._methods)
+            step = max(1, SAMPLES // view.setting.fft_size)
+            for start in range(first, last, step):
+                yield view, np.arange(start, min(start + step, last))
+            return
+        for stretch in realise(
+            p, self._effects, keys=self._keys[[point]], first_draw=first, draws=last - first
+        ):
+            self._fixed.add(np.full(stretch.draw.size, point), statistics(stretch.shots))
+            for i, number in enumerate(stretch.draw):
+                view = view_of(stretch.shots, i, p, self._keys[point], self._methods)
+                yield view, np.array([number])
+
+    def _there(self) -> np.ndarray:
+        """0, but nan for a segment that is not there, (4, n), by the names of PROMISED."""
+        direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
+        there = np.zeros((len(PROMISED), self.number.size))
+        there[PROMISED.index("pd_doppler"), np.broadcast_to(direct, self.number.shape)] = np.nan
+        return there
+
+    def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
+        """As of :class:`Drawn`."""
+        return self.counted_widths(points, accuracy) + self._there()[:, points]
+
+    def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
+        """As of :class:`Drawn`."""
+        n, mean, square = (
+            dict(zip(VALUES, part, strict=True)) for part in (self._count, self._mean, self._square)
+        )
+        fixed = self._fixed.results()
+        outputs = {name: fixed[name] for name in KEPT}
+        shares = self.counts[COUNT_OF] / self.number + self._there()
+        outputs |= dict(zip(PROMISED, shares, strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = {name: np.sqrt(square[name] / (n[name] * (n[name] - 1))) for name in VALUES}
+            for name in ("pfa_bin", "false_alarms"):
+                outputs |= {name: mean[name], f"{name}_error": error[name]}
+            for name in ("range", "radial_velocity"):
+                some = np.where(n[name] > 0, 0.0, np.nan)
+                outputs |= {
+                    f"{name}_bias": mean[name] + some,
+                    f"{name}_bias_error": error[name] + some,
+                    f"{name}_rmse": np.sqrt(mean[name] ** 2 + square[name] / n[name]),
+                    f"{name}_bound": np.sqrt(mean[f"{name}_2"]),
+                }
+        sums = self._fixed.sums()
+        running = np.concatenate([self._count, self._mean, self._square, sums]).T
+        return outputs | self.accuracy(accuracy) | {RUNNING: running}

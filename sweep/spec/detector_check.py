@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.spectra_look import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.model.noisy_spectra import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.spec.axes import Axis
 from sweep.spec.limits import place_on_grid
 from sweep.spec.mistakes import ABSENT, Finding

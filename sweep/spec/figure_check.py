@@ -8,8 +8,13 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+from sweep.model.outputs import (
+    ACCURACY_OUTPUTS,
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    OUTPUTS,
+    SPECTRA_OUTPUTS,
+)
 from sweep.spec.axes import Axis
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure

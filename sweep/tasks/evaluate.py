@@ -226,25 +226,21 @@ def _drawn(
     stop: Callable[[], bool] | None,
 ) -> Results:
     from sweep.model.accuracy import Accuracy
-    from sweep.model.sampling import never, simulate, simulate_until
-    from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
+    from sweep.model.sampling import never, simulate
     from sweep.tasks.user_code import methods
 
     draws = spec.draws
     given: dict[str, Any] = {
         "keys": draw_keys(spec, parameters, count), "before": before, "stop": stop or never,
-        "accuracy": Accuracy.of(parameters, interval=draws.interval),
+        "method": draws.method, "accuracy": Accuracy.of(parameters, interval=draws.interval),
     }  # fmt: skip
     if draws.adaptive:
         given |= {"batch": draws.batch, "limit": draws.limit}
     else:
         given |= {"batch_sizes": batch_sizes(spec)}
-    draw: Callable[..., Results]
     if draws.whole_spectra:
-        draw = simulate_spectra_until if draws.adaptive else simulate_spectra
-        return draw(parameters, effects, methods=methods(parameters), **given)
-    draw = simulate_until if draws.adaptive else simulate
-    return no_sums(spec, count) | draw(parameters, effects, method=draws.method, **given)
+        return simulate(parameters, effects, methods=methods(parameters), **given)
+    return no_sums(spec, count) | simulate(parameters, effects, **given)
 
 
 def no_sums(spec: Spec, count: int) -> Results:

@@ -30,8 +30,8 @@ def outputs_of(spec: Spec) -> dict[str, Output]:
         ERROR_OUTPUTS,
         OUTPUTS,
         RUNNING_OUTPUTS,
+        SPECTRA_OUTPUTS,
     )
-    from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
 
     if not spec.draws.any:
         return dict(OUTPUTS)

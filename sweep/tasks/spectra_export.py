@@ -44,7 +44,7 @@ def spectra(
         Every effect is there that is not off and that the point has anything of.
     """
     from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
-    from sweep.model.noisy_spectra import noisy_spectra, signal_of
+    from sweep.model.noisy_spectra import noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
 
     modes, key = spec.modes(), draw_keys(spec, parameters, 1)
@@ -62,7 +62,7 @@ def spectra(
             signals = [signal_of(shots, i, s) for s in there]
             chosen = np.array([draw]) if random else numbers
             drawn.append(np.stack([
-                noisy_spectra(shots, i, s, signal, key=key[0], draws=chosen)
+                signal.spectrum + noise_of(shots, i, s, signal, key=key[0], draws=chosen)
                 for s, signal in zip(there, signals, strict=True)
             ], axis=1))  # fmt: skip
             found.append(signals)
@@ -96,7 +96,7 @@ def _dataset(
 ) -> xr.Dataset:
     import xarray as xr
 
-    from sweep.model.processing import taper
+    from sweep.model.detectors import taper
 
     width = float(shots.sample_rate[0]) / shots.fft_size
     there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]

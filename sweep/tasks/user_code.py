@@ -22,8 +22,8 @@ import numpy as np
 from sweep.tasks.errors import CodeError
 
 if TYPE_CHECKING:
-    from sweep.model.processing import Setting
-    from sweep.model.spectra_look import Methods
+    from sweep.model.detectors import Setting
+    from sweep.model.noisy_spectra import Methods
     from sweep.spec import SceneSpec, Spec
 
 ALLOWED = "SWEEP_ALLOW_CODE"
@@ -103,7 +103,7 @@ def methods(parameters: Mapping[str, Any]) -> Methods:
     """
     from sweep.model.detectors import DETECTORS
     from sweep.model.estimators import ESTIMATORS
-    from sweep.model.spectra_look import Methods
+    from sweep.model.noisy_spectra import Methods
 
     own = {
         role: {
@@ -179,7 +179,7 @@ def _whole(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> n
 
 def _try(role: str, name: str) -> None:
     """One call on three spectra of a tone at bin 40.25 of 128, in a little noise."""
-    from sweep.model.processing import Setting
+    from sweep.model.detectors import Setting
     from sweep.model.window import window
 
     size, rng = 256, np.random.default_rng(1)

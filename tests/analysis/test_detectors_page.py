@@ -7,8 +7,7 @@ import yaml
 from drawn_studies import study
 
 from sweep.model.estimators import ESTIMATORS
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
-from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, SPECTRA_OUTPUTS
 from sweep.spec import Spec
 from sweep.spec.instrument import Detector
 from sweep.tasks.spectra_export import TOLD

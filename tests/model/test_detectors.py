@@ -12,10 +12,11 @@ from sweep.model.detectors import (
     DETECTORS,
     GOCA,
     OS,
+    Setting,
     cfar_factor,
     crossing_probability,
+    taper,
 )
-from sweep.model.processing import Setting, taper
 from sweep.model.window import window
 
 TRAINING, RANK = 24, 18

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sweep.model import cramer_rao
+from sweep.model.detectors import Setting, taper
 from sweep.model.estimators import ESTIMATORS, jacobsen_form
-from sweep.model.processing import Setting, taper
 from sweep.model.window import window
 
 SIZE, BIN, DRAWS = 512, 120, 1500

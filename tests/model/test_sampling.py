@@ -18,7 +18,7 @@ from sweep.model.outputs import (
     PROMISED,
     RUNNING,
 )
-from sweep.model.sampling import looks, settle, simulate, simulate_until
+from sweep.model.sampling import looks, settle, simulate
 from sweep.model.shot import evaluate
 
 SPECKLED = (*CORE, "speckle")
@@ -59,7 +59,7 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     """Each point against a fixed number of draws, the one at which it stopped, to the last bit."""
     parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
     chosen = {"keys": keys(4), "method": method, "accuracy": accuracy}
-    found = simulate_until(parameters, effects, batch=20, limit=400, **chosen)
+    found = simulate(parameters, effects, batch=20, limit=400, **chosen)
     drawn = {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
     assert set(found) == (drawn | {RUNNING} if effects is SPECKLED else drawn)
     numbers = found["n_draws"]
@@ -74,7 +74,7 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
 def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_1):
     parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
     chosen = {"keys": keys(4), "method": "probabilities", "accuracy": accuracy}
-    found = simulate_until(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
+    found = simulate(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
     assert (found["accuracy_missed"] == 0).all()
     for name in PROMISED:
         assert (found[f"{name}_half_width"] <= 0.06).all()
@@ -91,19 +91,19 @@ def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_
 def test_neighbours_and_the_cutting_of_work_change_no_bit(effects, method, table_4_1, monkeypatch):
     parameters = scene(table_4_1)
     chosen = {"batch": 20, "limit": 300, "method": method, "accuracy": Accuracy(0.06, 0.9)}
-    together = simulate_until(parameters, effects, keys=keys(4), **chosen)
+    together = simulate(parameters, effects, keys=keys(4), **chosen)
     monkeypatch.setattr(sampling, "PIECE", 13)
     monkeypatch.setattr(realisations, "ROWS", 7)
     for point in range(4):
         index = slice(point, point + 1)
-        alone = simulate_until(some(parameters, index), effects, keys=keys(4)[index], **chosen)
+        alone = simulate(some(parameters, index), effects, keys=keys(4)[index], **chosen)
         for name, values in alone.items():
             np.testing.assert_array_equal(values[0], together[name][point], err_msg=name)
 
 
 def test_where_the_limit_comes_first_the_excess_is_told(table_4_1):
     tolerance = np.array([0.5, 0.01, 0.2, 0.01])
-    found = simulate_until(
+    found = simulate(
         scene(table_4_1), SPECKLED, keys=keys(4), batch=30, limit=100, method="probabilities",
         accuracy=Accuracy(tolerance, 0.95),
     )  # fmt: skip
@@ -127,12 +127,12 @@ def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_
         expected = COUNTED[interval](successes=k, trials=200, confidence=0.9)
         np.testing.assert_array_equal(found[f"{name}_half_width"], half_width(k / 200, expected))
     assert 20 < found["n_detected_up"][1].sum() < 180
-    until = simulate_until(scene(table_4_1), CORE, batch=50, limit=1000, **chosen)
+    until = simulate(scene(table_4_1), CORE, batch=50, limit=1000, **chosen)
     assert (until["n_draws"] > 150).all()
 
 
 def test_probabilities_that_are_known_need_no_draws(table_4_1):
-    found = simulate_until(
+    found = simulate(
         scene(table_4_1), CORE, keys=keys(4), batch=50, limit=10**6, method="probabilities",
         accuracy=Accuracy(0.0),
     )  # fmt: skip
@@ -146,7 +146,7 @@ def test_probabilities_that_are_known_need_no_draws(table_4_1):
 def test_a_segment_that_is_not_there_keeps_no_point_open(effects, method, table_4_1):
     parameters = table_4_1(range=np.array([20.0]), architecture="direct")
     parameters |= {"target.pointing_jitter": 1e-6}
-    found = simulate_until(
+    found = simulate(
         parameters, effects, keys=keys(1), batch=40, limit=10_000, method=method,
         accuracy=Accuracy(0.05),
     )  # fmt: skip
@@ -160,7 +160,7 @@ def test_a_speckled_targets_pd_is_within_the_tolerance_as_often_as_promised(tabl
     single = evaluate(scene(table_4_1, ranges=[500.0]))
     beta = 8.0 * np.sqrt(2 - np.pi / 2)
     exact = {s: np.exp(-(beta**2) / (2 + 2 * single[f"snr_{s}"])) for s in ("up", "down")}
-    found = simulate_until(
+    found = simulate(
         scene(table_4_1, ranges=np.full(number, 500.0)), SPECKLED, keys=keys(number), batch=4,
         limit=10_000, method="probabilities", accuracy=Accuracy(tolerance, 0.9),
     )  # fmt: skip

@@ -3,20 +3,18 @@
 import numpy as np
 import pytest
 
-from sweep.model import philox, spectra_sampling
+from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
 from sweep.model.chain import prepare
 from sweep.model.interpolation import noise_correlation
-from sweep.model.noisy_spectra import noise_of, signal_of
-from sweep.model.outputs import DRAW_OUTPUTS
-from sweep.model.sampling import Before
+from sweep.model.noisy_spectra import DETECTOR, ESTIMATOR, Methods, noise_of, signal_of
+from sweep.model.outputs import DRAW_OUTPUTS, SPECTRA_OUTPUTS
+from sweep.model.sampling import Before, simulate
 from sweep.model.shot import evaluate
-from sweep.model.spectra_look import DETECTOR, ESTIMATOR, Methods
-from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
-from sweep.model.spectra_sampling import simulate_spectra, simulate_spectra_until
 from sweep.model.truth import spectrum
 
 EFFECTS = ("doppler",)
+WHOLE = {"method": "spectra"}
 
 
 def _points(table_4_1, **changes):
@@ -34,7 +32,7 @@ def _keys(n):
 
 def _drawn(parameters, number=400, effects=EFFECTS, **place):
     size = np.size(parameters["target.range"])
-    return simulate_spectra(parameters, effects, keys=_keys(size), batch_sizes=[number], **place)
+    return simulate(parameters, effects, keys=_keys(size), batch_sizes=[number], **place, **WHOLE)
 
 
 @pytest.mark.parametrize(("window", "duration"), [("rectangular", 5e-4), ("hamming", 2.5e-6)])
@@ -43,7 +41,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
     ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
     signal = signal_of(shots, 0, 0)
-    noise = np.array([noise_of(shots, 0, 0, signal, _keys(1)[0], d) for d in range(300)])[:, 8:-8]
+    noise = noise_of(shots, 0, 0, signal, key=_keys(1)[0], draws=np.arange(300))[:, 8:-8]
     power = 2 * float(shots.bin_deviation[0]) ** 2
     independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
@@ -127,37 +125,37 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
     parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
     keys = _keys(3)
-    whole = simulate_spectra(parameters, effects, keys=keys, batch_sizes=[40, 30])
+    whole = simulate(parameters, effects, keys=keys, batch_sizes=[40, 30], **WHOLE)
     other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
-    parts = simulate_spectra(other, effects, keys=keys[::-1], batch_sizes=[13, 7, 50])
+    parts = simulate(other, effects, keys=keys[::-1], batch_sizes=[13, 7, 50], **WHOLE)
     for name, values in whole.items():
         if values.ndim == 2:
             np.testing.assert_array_equal(values.sum(axis=1), parts[name][::-1].sum(axis=1))
         else:
             np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
     alone = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
-    one = simulate_spectra(alone, effects, keys=keys[1:2], batch_sizes=[70])
+    one = simulate(alone, effects, keys=keys[1:2], batch_sizes=[70], **WHOLE)
     for name in SPECTRA_OUTPUTS:
         np.testing.assert_array_equal(one[name], whole[name][1:2], err_msg=name)
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
     parameters, accuracy = _points(table_4_1), Accuracy(0.1, 0.95, interval="wilson")
-    given = {"keys": _keys(3), "accuracy": accuracy}
-    found = simulate_spectra_until(parameters, EFFECTS, batch=20, limit=500, **given)
+    given = {"keys": _keys(3), "accuracy": accuracy} | WHOLE
+    found = simulate(parameters, EFFECTS, batch=20, limit=500, **given)
     assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
-    again = simulate_spectra(
+    again = simulate(
         parameters, EFFECTS, batch_sizes=[int(found["n_draws"][0])], **given
     )  # fmt: skip
     assert again["pd_shot"][0] == found["pd_shot"][0]
     assert again["n_detected_shot"][0, 0] == found["n_detected_shot"][0]
 
 
-def _in_pieces(draw, **given):
+def _in_pieces(**given):
     """Results of draws that are stopped as soon as can be and gone on with, and how often."""
     before, number, pieces = None, -1, 0
     while True:
-        found = draw(before=before, stop=lambda: True, **given)
+        found = simulate(before=before, stop=lambda: True, **given)
         if found["n_draws"].sum() == number:
             return found, pieces
         number, pieces = found["n_draws"].sum(), pieces + 1
@@ -170,22 +168,21 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
     much, table_4_1, monkeypatch
 ):
     """A threshold set by all that is seen at once: 5 draws at 2048 points, 10 at 1024."""
-    monkeypatch.setattr(spectra_sampling, "SAMPLES", 5 * 2048)
+    monkeypatch.setattr(sampling, "SAMPLES", 5 * 2048)
 
     def over_the_median(power, setting):
         return power > 8 * np.median(power)
 
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
     parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
-    given = {"parameters": parameters, "effects": EFFECTS, "keys": _keys(3), **much}
+    given = {"parameters": parameters, "effects": EFFECTS, "keys": _keys(3), **much, **WHOLE}
     given |= {"accuracy": Accuracy(0.1), "methods": Methods({"m:f": over_the_median})}
-    draw = simulate_spectra if "batch_sizes" in much else simulate_spectra_until
-    whole, (found, pieces) = draw(**given), _in_pieces(draw, **given)
+    whole, (found, pieces) = simulate(**given), _in_pieces(**given)
     assert pieces > 3
     for name, values in whole.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
-    monkeypatch.setattr(spectra_sampling, "SAMPLES", 3 * 2048)
-    assert (draw(**given)["pfa_bin"] != whole["pfa_bin"]).all()
+    monkeypatch.setattr(sampling, "SAMPLES", 3 * 2048)
+    assert (simulate(**given)["pfa_bin"] != whole["pfa_bin"]).all()
 
 
 def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):

@@ -9,8 +9,7 @@ import pandas
 import xarray as xr
 
 from sweep.analysis.answers.physical import parameter, si, study_of
-from sweep.model.outputs import OUTPUTS, PROMISED
-from sweep.model.spectra_outputs import SPECTRA_OUTPUTS
+from sweep.model.outputs import OUTPUTS, PROMISED, SPECTRA_OUTPUTS
 
 ROUNDING = 1e-12
 """What another processor's last digits may change of a probability."""
