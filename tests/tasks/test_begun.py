@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small import STUDY, quiet, receipts, small, tree
 
-from sweep.model import sampling, spectra_sampling
+from sweep.model import sampling
 from sweep.storage.objects import ObjectPath
 from sweep.tasks import begun, worker
 from sweep.tasks.begun import Begun
@@ -49,7 +49,7 @@ def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
     """Take so few draws at once; by default save them each time, as though they had taken long."""
     assign(sampling, "PIECE", piece)
     assign(sampling, "ROWS", rows)
-    assign(spectra_sampling, "SAMPLES", samples)
+    assign(sampling, "SAMPLES", samples)
     assign(worker, "PIECE_SECONDS", seconds)
 
 
@@ -186,7 +186,7 @@ def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     before = status(store).points_begun * drawn(kind).draws.number
     monkeypatch.setattr(GridStudy, "compile", lambda study: None)  # it draws once
     taken = []
-    for sample in (sampling.Sample, spectra_sampling.SpectraSample):
+    for sample in (sampling.Sample, sampling.SpectraSample):
 
         def take(self, points, first, batch_sizes, real=sample.take):
             taken.append((first, sum(batch_sizes)))
