@@ -38,17 +38,16 @@ UNDETERMINED = 3
 """Too few beams, or too near to a plane or a line of them: no solution."""
 
 
-def flat_cycles(
+def _flat_cycles(
     direction: np.ndarray,
     value: np.ndarray,
     standard_error: np.ndarray,
-    valid: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
     """Directions (n, b, 3), values, errors and mask (n, b), and the shape that n stands for."""
     u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
     if u.shape[-1:] != (3,):
         raise ValueError(f"directions have three components: (..., b, 3), not {u.shape}")
-    mask = np.isfinite(value) if valid is None else np.asarray(valid, bool)
+    mask = np.isfinite(value)
     shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape, mask.shape)
     if not shape:
         raise ValueError("a cycle of beams has a dimension for them, the last: (..., b)")
@@ -57,30 +56,11 @@ def flat_cycles(
         np.ascontiguousarray(np.broadcast_to(a, shape)).reshape(-1, shape[-1])
         for a in (value, error, mask)
     )
-    if not np.isfinite(value[mask]).all():
-        raise ValueError("a valid beam has a value that is not finite")
     if not (np.isfinite(error[mask]) & (error[mask] > 0)).all():
         raise ValueError("a valid beam has a standard error that is not positive and finite")
     if not (np.abs(np.linalg.norm(u[mask], axis=-1) - 1) < 1e-6).all():
         raise ValueError("a valid beam has a direction whose length is not 1")
     return u, value, error, mask, shape[:-1]
-
-
-def level_frame(up: np.ndarray | tuple[float, float, float]) -> np.ndarray:
-    """Two horizontal unit vectors and the vertical as rows, (..., 3, 3).
-
-    x, y, z themselves for an upward z. Without a singular direction, after Duff et al. (2017),
-    "Building an orthonormal basis, revisited".
-    """
-    z = np.asarray(up, float)
-    if z.shape[-1:] != (3,) or not (np.abs(np.linalg.norm(z, axis=-1) - 1) < 1e-6).all():
-        raise ValueError("the vertical is a unit vector (..., 3)")
-    sign = np.copysign(1.0, z[..., 2])
-    a = -1 / (sign + z[..., 2])
-    b = z[..., 0] * z[..., 1] * a
-    x = np.stack([1 + sign * z[..., 0] ** 2 * a, sign * b, -sign * z[..., 0]], axis=-1)
-    y = np.stack([b, sign + z[..., 1] ** 2 * a, -z[..., 1]], axis=-1)
-    return np.stack([x, y, z], axis=-2)
 
 
 class Fit(NamedTuple):
@@ -153,7 +133,6 @@ def velocity(
     direction: np.ndarray,
     radial_velocity: np.ndarray,
     standard_error: np.ndarray,
-    valid: np.ndarray | None = None,
     level: float | None = None,
     largest_condition: float = 1e6,
 ) -> Velocity:
@@ -164,10 +143,8 @@ def velocity(
     direction : (..., b, 3) array_like
         Unit vectors from the instrument; their frame is that of the result.
     radial_velocity, standard_error : (..., b) array_like
-        Closing velocity along each beam and its standard error > 0 [m/s].
-    valid : (..., b) array_like of bool or None
-        Beams that returned; what stands in the others is not looked at. None: those of finite
-        radial velocity.
+        Closing velocity along each beam, not finite where it has not returned, and its standard
+        error > 0 [m/s].
     level : float or None
         Level of the test for one false beam (:func:`screen`), which needs
         five beams to find it; with four it withholds the solution. None: no test.
@@ -181,7 +158,7 @@ def velocity(
         Shapes do not fit; a valid beam has no finite number, no positive standard error or a
         direction whose length is not 1; `level` is out of range.
     """
-    u, closing, error, mask, shape = flat_cycles(direction, radial_velocity, standard_error, valid)
+    u, closing, error, mask, shape = _flat_cycles(direction, radial_velocity, standard_error)
 
     def fit(index: np.ndarray, used: np.ndarray) -> Fit:
         n = index.size
@@ -207,8 +184,6 @@ def altitude(
     direction: np.ndarray,
     range: np.ndarray,
     standard_error: np.ndarray,
-    valid: np.ndarray | None = None,
-    up: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 1.0),
     offset: np.ndarray | None = None,
     slope: float = math.inf,
     relief: float = 0.0,
@@ -227,13 +202,9 @@ def altitude(
     Parameters
     ----------
     direction : (..., b, 3) array_like
-        Unit vectors from the instrument.
+        Unit vectors from the instrument, z up.
     range, standard_error : (..., b) array_like
-        Range along each beam and its standard error > 0 [m].
-    valid : (..., b) array_like of bool or None
-        Beams that returned; None: those of finite range.
-    up : (..., 3) array_like
-        Unit vector of the vertical in the frame of the directions; one for each cycle if need be.
+        Range along each beam, likewise [m].
     offset : (..., b, 3) array_like or None
         Place of the instrument when each beam fires, from that whose altitude is asked [m].
     slope : float
@@ -250,23 +221,21 @@ def altitude(
     Raises
     ------
     ValueError
-        As for :func:`velocity`; `up` is not of length 1; `slope` or `relief` is negative or nan.
+        As for :func:`velocity`; `slope` or `relief` is negative or nan.
     """
     if not slope >= 0 or not 0 <= relief < math.inf:
         raise ValueError("the ground's slope and relief are not negative")
-    u, distance, error, mask, shape = flat_cycles(direction, range, standard_error, valid)
-    frame = np.broadcast_to(level_frame(up), (*shape, 3, 3)).reshape(-1, 3, 3)
-    beams = u @ frame.swapaxes(-1, -2)
-    points = beams * distance[..., None]
+    u, distance, error, mask, shape = _flat_cycles(direction, range, standard_error)
+    points = u * distance[..., None]
     if offset is not None:
-        moved = np.broadcast_to(np.asarray(offset, float), (*shape, *u.shape[1:])).reshape(u.shape)
-        points += moved @ frame.swapaxes(-1, -2)
+        moved = np.broadcast_to(np.asarray(offset, float), (*shape, *u.shape[1:]))
+        points += moved.reshape(u.shape)
     ground = slope, relief, least_spread
 
     def fit(index: np.ndarray, used: np.ndarray) -> Fit:
         n = index.size
         solution, chi, slopes = np.full((n, 4), np.nan), np.full(n, np.nan), np.zeros(n, np.int8)
-        _fit_planes(points[index], beams[index], error[index], used, ground, solution, slopes, chi)
+        _fit_planes(points[index], u[index], error[index], used, ground, solution, slopes, chi)
         solved, needed = np.isfinite(chi), 1 + (0 if math.isfinite(slope) else slopes)
         degrees = np.where(solved, used.sum(axis=1) - needed, 0)
         return Fit(solved, chi, degrees, (*solution.T[:2], solution[:, 2:], slopes))
@@ -276,7 +245,7 @@ def altitude(
     height[status > EXCLUDED] = variance[status > EXCLUDED] = np.nan
     gradient[status > EXCLUDED] = np.nan
     normal = np.concatenate([-gradient, np.ones((len(gradient), 1))], axis=1)
-    normal = ((normal / np.linalg.norm(normal, axis=1)[:, None])[:, None] @ frame)[:, 0]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
     arrays = (height, variance, normal, slopes, found.chi_square, found.degrees, used, status)
     return Altitude(*(a.reshape(shape + a.shape[1:]) for a in arrays))
 

@@ -130,12 +130,9 @@ def test_what_is_not_there_is_nan_and_never_a_warning():
 def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_covariance():
     n, pd, moving = 20_000, 0.8, np.array([5.0, -3.0, -60.0])
     beams, rng = corners(math.radians(22.5)), np.random.default_rng(3)
-    found = velocity(
-        direction=beams,
-        radial_velocity=beams @ moving + rng.normal(0, 0.01, (n, 4)),
-        standard_error=0.01,
-        valid=rng.random((n, 4)) < pd,
-    )
+    measured = beams @ moving + rng.normal(0, 0.01, (n, 4))
+    measured[rng.random((n, 4)) >= pd] = np.nan
+    found = velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
     result = tally(found.velocity - moving, found.covariance, available=found.available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)

@@ -70,7 +70,11 @@ class Mesh:
     """(3,) float64 [m]: where the vertices' zero lies in the frame of the scene or the body."""
 
     def __post_init__(self):
-        _require_mesh(self.vertices, self.faces, self.surface)
+        _require_shapes(self.vertices, self.faces, self.surface)
+        if len(self.faces) == 0:
+            raise ValueError("a mesh needs at least one triangle")
+        if not np.isfinite(self.vertices).all():
+            raise ValueError("a mesh's vertices are finite")
         if np.shape(self.origin) != (3,) or not np.isfinite(self.origin).all():
             raise ValueError("a mesh's origin is three finite coordinates")
         kinds = {"vertices": np.float64, "faces": np.int32, "surface": np.int16}
@@ -104,11 +108,6 @@ class Report:
     """Edges whose two faces are wound against each other: one of them is inverted."""
     inside_out: int = 0
     """1 where a closed and evenly wound mesh has its normals pointing inwards."""
-
-    @property
-    def watertight(self) -> bool:
-        """Whether every edge joins just two faces."""
-        return self.open_edges == 0 and self.crowded_edges == 0
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
@@ -220,14 +219,6 @@ def _require_shapes(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray
 def _require_faces(left: int, given: int) -> None:
     if left == 0:
         raise ValueError(f"of {given} faces none is left that a ray could hit")
-
-
-def _require_mesh(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> None:
-    _require_shapes(vertices, faces, surface)
-    if len(faces) == 0:
-        raise ValueError("a mesh needs at least one triangle")
-    if not np.isfinite(vertices).all():
-        raise ValueError("a mesh's vertices are finite")
 
 
 def _compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +77,7 @@ class PointingJitter(NamedTuple):
         ((a, b),) = point_keys(np.empty((1, 0)), domain=DOMAIN, seed=self.seed)
         draws = np.empty((len(index), 3))
         _draw(a, b, np.asarray(index, np.int64), STREAM_POINTING_JITTER, draws)
-        return jitter_attitude(attitude, sigma=self.sigma, draws=draws)
+        return multiply(attitude, from_rotation_vector(draws * self.sigma))
 
 
 @njit(cache=True, nogil=True)
@@ -87,21 +86,3 @@ def _draw(key0, key1, index, stream, draws):
     for i in range(index.size):
         draws[i, 0], draws[i, 1] = normal_pair(key0, key1, index[i], stream, 0)
         draws[i, 2], _ = normal_pair(key0, key1, index[i], stream, 1)
-
-
-def jitter_attitude(
-    attitude: np.ndarray, *, sigma: float | Sequence[float] | np.ndarray, draws: np.ndarray
-) -> np.ndarray:
-    """Attitudes with a small random turn in the body frame, (n, 4).
-
-    Parameters
-    ----------
-    attitude : (n, 4) ndarray
-        Unit quaternions, body to world.
-    sigma : float or (3,) array_like
-        Standard deviation of the turn about body x, y and z [rad].
-    draws : (n, 3) ndarray
-        Independent standard normal numbers.
-    """
-    turn = np.asarray(draws, float) * np.asarray(sigma, float)
-    return multiply(attitude, from_rotation_vector(turn))

@@ -24,7 +24,7 @@ def exact(values: np.ndarray) -> Pair:
     return values, np.zeros_like(values)
 
 
-def two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
+def _two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
     """Sum and what its rounding left."""
     s = a + b
     part = s - a
@@ -53,8 +53,8 @@ def product(a: Pair, b: Pair) -> Pair:
 
 def add(a: Pair, b: Pair) -> Pair:
     """Sum of two pairs, accurate also where the high parts cancel."""
-    s, e = two_sum(a[0], b[0])
-    t, f = two_sum(a[1], b[1])
+    s, e = _two_sum(a[0], b[0])
+    t, f = _two_sum(a[1], b[1])
     s, e = _quick_two_sum(s, e + t)
     return _quick_two_sum(s, e + f)
 

@@ -32,23 +32,6 @@ class Pose(NamedTuple):
     """(4,) or (n, 4) float64: quaternion (w, x, y, z) from the body's frame to the world's."""
 
 
-class Hits(NamedTuple):
-    """What each ray hits first."""
-
-    face: np.ndarray
-    """(n,) int64: triangle in the body's mesh, -1 for a miss."""
-    range: np.ndarray
-    """(n,) float64 [m] > 0: distance along the direction given, inf for a miss."""
-    cos_incidence: np.ndarray
-    """(n,) float64, 0..1: cosine of the angle to the normal, nan for a miss."""
-    normal: np.ndarray
-    """(n, 3) float64: unit normal of the facet, towards the ray's origin, nan for a miss."""
-    surface: np.ndarray
-    """(n,) int16: the triangle's surface, -1 for a miss."""
-    body: np.ndarray
-    """(n,) int16: number of the body hit, -1 for a miss."""
-
-
 class Bundle(NamedTuple):
     """What the beamlets of each bundle hit first."""
 
@@ -97,19 +80,15 @@ class Caster:
         origins: ArrayLike,
         directions: ArrayLike,
         *,
-        origin_offset: ArrayLike | None = None,
         poses: Sequence[Pose | None] | None = None,
-    ) -> Hits:
-        """First hits of single rays.
+    ) -> Bundle:
+        """First hits of single rays: those of bundles, without the dimension of beamlets.
 
         Parameters
         ----------
         origins, directions : (n, 3) array_like
             Where rays start [m] and their unit vectors, in the world's frame. A facet on which a
             ray starts, within rounding, may count as hit or not.
-        origin_offset : (3,) array_like, optional
-            Added to the origins without rounding the sum [m], default zero: for coordinates of
-            which float64 alone would keep too few digits.
         poses : sequence of Pose or None, optional
             Of each body, None for one that rests in the world's frame; default all at rest.
 
@@ -119,19 +98,15 @@ class Caster:
             Shapes do not fit, a number is not finite, or a direction is not of length 1.
         """
         directions = np.asarray(directions, dtype=np.float64)
-        found = self.bundle(
-            origins, directions[..., None, :], origin_offset=origin_offset, poses=poses
-        )
-        alone = found.face, found.cos_incidence, found.surface, found.body
-        face, cos_incidence, surface, body = (values[:, 0] for values in alone)
-        return Hits(face, found.range, cos_incidence, found.normal, surface, body)
+        found = self.bundle(origins, directions[..., None, :], poses=poses)
+        of_beamlets = "offset", "valid", "cos_incidence", "surface", "face", "body"
+        return found._replace(**{name: getattr(found, name)[:, 0] for name in of_beamlets})
 
     def bundle(
         self,
         origins: ArrayLike,
         directions: ArrayLike,
         *,
-        origin_offset: ArrayLike | None = None,
         poses: Sequence[Pose | None] | None = None,
     ) -> Bundle:
         """First hits of bundles of beamlets, each bundle from one origin.
@@ -142,7 +117,7 @@ class Caster:
             Where bundles start [m].
         directions : (n, b, 3) array_like
             Unit vectors of each bundle's beamlets, b >= 1, the beam's centre first.
-        origin_offset, poses
+        poses
             As in `cast`, a pose for each bundle.
 
         Raises
@@ -151,7 +126,7 @@ class Caster:
             As in `cast`.
         """
         start, along = _rays(origins, directions)
-        frames = self._frames(origin_offset, poses, len(start))
+        frames = self._frames(poses, len(start))
         face, body = self._first_hits(frames, start, along)
         hit = face >= 0
         reference = np.where(hit.any(axis=1), hit.argmax(axis=1), -1)
@@ -212,16 +187,13 @@ class Caster:
                 found[:, some] = _met_on(mesh, frame, i, origins[i], directions[i, b], hit[0][some])
         return found[0], found[1], found[2:5].T, found[5]
 
-    def _frames(self, offset, poses, n):
+    def _frames(self, poses, n):
         """Frame of each body."""
-        shift = np.zeros(3) if offset is None else np.array(offset, dtype=np.float64)
-        if shift.shape != (3,) or not np.isfinite(shift).all():
-            raise ValueError("an offset of origins is three finite coordinates")
         poses = [None] * len(self.meshes) if poses is None else poses
         if len(poses) != len(self.meshes):
             raise ValueError(f"{len(self.meshes)} bodies need as many poses, not {len(poses)}")
         return [
-            _Frame(shift, mesh.origin, *((None, None) if pose is None else _turned(pose, n)))
+            _Frame(mesh.origin, *((None, None) if pose is None else _turned(pose, n)))
             for mesh, pose in zip(self.meshes, poses, strict=True)
         ]
 
@@ -229,8 +201,6 @@ class Caster:
 class _Frame(NamedTuple):
     """Frame of a mesh, for n rays or bundles."""
 
-    shift: np.ndarray
-    """(3,): what is added to origins to give world coordinates [m]."""
     anchor: np.ndarray
     """(3,): the mesh's own origin in the body's frame [m]."""
     rotation: np.ndarray | None
@@ -240,11 +210,11 @@ class _Frame(NamedTuple):
 
     def origins(self, origins, rows):
         """Origins of rays (m, 3) by their places (m,) as a vector of pairs (3, m)."""
-        x, anchor = ray_plane.exact(origins.T), self.anchor[:, None]
+        x, anchor = ray_plane.exact(origins.T), ray_plane.exact(self.anchor[:, None])
         if self.rotation is None:
-            return ray_plane.add(x, ray_plane.two_sum(self.shift[:, None], -anchor))
-        away = ray_plane.two_sum(self.shift[:, None], -self.position[rows].T)
-        return ray_plane.less(self._back(ray_plane.add(x, away), rows), ray_plane.exact(anchor))
+            return ray_plane.less(x, anchor)
+        away = ray_plane.less(x, ray_plane.exact(self.position[rows].T))
+        return ray_plane.less(self._back(away, rows), anchor)
 
     def directions(self, directions, rows):
         """Directions of rays, likewise."""

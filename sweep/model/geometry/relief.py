@@ -115,12 +115,8 @@ def hills(
 
     Parameters
     ----------
-    generator : numpy.random.Generator
-        Source of randomness; the same state gives the same ground.
-    shape : (rows, columns) of int
-        Nodes.
-    spacing : (dx, dy) of float
-        Grid steps [m], finer than a third of the correlation length; signs are ignored.
+    generator, shape, spacing
+        As of `fractal`; steps finer than a third of the correlation length.
     rms_height : float
         Standard deviation of the height [m], >= 0.
     correlation_length : float
@@ -142,25 +138,9 @@ def hills(
 
 
 def _field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
-    """Stationary Gaussian field of a given isotropic covariance, (rows, columns).
+    """Stationary Gaussian field of an isotropic covariance, a function of distance.
 
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-        Source of white noise, one number a node of the torus.
-    shape, steps : pairs
-        Nodes and grid steps, rows first.
-    covariance : callable
-        Covariance as a function of distance.
-    period : float
-        Size of the torus a side, in the unit of `steps`, at least.
-
-    Raises
-    ------
-    ValueError
-        For a torus of more than 2e8 nodes.
-    ArithmeticError
-        Where the covariance is no covariance on the torus.
+    `shape` and `steps` have rows first; the torus is at least `period` a side, in their unit.
     """
     size = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
     if math.prod(size) > 2e8:

@@ -93,10 +93,6 @@ class MartianRocks:
         """Decay of the area with the diameter, q [1/m]."""
         return 1.79 + 0.152 / self.cover
 
-    def area_fraction(self, diameter: np.ndarray) -> np.ndarray:
-        """Fraction of the ground under rocks of this diameter or larger [1]."""
-        return np.asarray(self.cover * np.exp(-self.decay * np.asarray(diameter, float)))
-
     def cumulative(self, diameter: np.ndarray) -> np.ndarray:
         """Number per area of this diameter or larger [1/m^2]."""
         d = np.asarray(diameter, float)
@@ -399,7 +395,7 @@ def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """
     side = 2**subdivisions
     points: list[np.ndarray] = []
-    faces: list[tuple[int, int, int]] = []
+    faces: list[np.ndarray] = []
     first = {}
     # Rows of the octahedron's four upper faces: row k has 4 k nodes, evenly round at k / side.
     for k in range(side + 1):
@@ -408,8 +404,13 @@ def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         tilt = math.pi / 2 * k / side
         ring = math.sin(tilt) * np.cos(angle), math.sin(tilt) * np.sin(angle)
         points += list(np.column_stack([*ring, np.full(len(angle), math.cos(tilt))]))
-    for k in range(side):
-        faces += _ring(first[k], max(4 * k, 1), first[k + 1], k)
+    for k in range(side):  # between row k and the next
+        quarter, i = np.divmod(np.arange(4 * k + 4), k + 1)
+        here, out = k * quarter + i, np.arange(4 * k + 4)
+        a, b = (first[k] + n % max(4 * k, 1) for n in (here, here + 1))
+        c, d = (first[k + 1] + n % (4 * k + 4) for n in (out, out + 1))
+        both = np.stack([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)], axis=1)
+        faces.append(both[np.stack([i <= k, i < k], axis=1)])
     rim, around = first[side], 4 * side
     vertices = np.array(points)
     vertices[rim:, 2] = 0.0
@@ -421,20 +422,4 @@ def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     vertices = np.concatenate([vertices, skirt])
     polygon = around / 2 * math.sin(2 * math.pi / around)
     vertices[:, :2] *= math.sqrt(math.pi / polygon)
-    return vertices, np.concatenate([np.array(faces, np.int64), *walls])
-
-
-def _ring(inner: int, inside: int, outer: int, k: int) -> list[tuple[int, int, int]]:
-    """Faces between row k (from node `inner`) and row k+1 (from node `outer`)."""
-    faces = []
-    outside = 4 * (k + 1)
-    for quarter in range(4):
-        for i in range(k + 1):
-            out = quarter * (k + 1) + i
-            here = quarter * k + i
-            a = inner + here % inside
-            faces.append((a, outer + out, outer + (out + 1) % outside))
-            if i < k:
-                b = inner + (here + 1) % inside
-                faces.append((a, outer + (out + 1) % outside, b))
-    return faces
+    return vertices, np.concatenate([*faces, *walls])

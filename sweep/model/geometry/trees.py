@@ -81,24 +81,16 @@ def clump(
     trunk_surface: int = 0,
     leaf_surface: int = 0,
 ) -> Facets:
-    """A clump of trees on a terrain.
-
-    Trunks stand at least half a crown apart.
+    """A clump of trees on a terrain, their trunks at least half a crown apart.
 
     Parameters
     ----------
-    generator : numpy.random.Generator
-        Source of randomness.
-    terrain : Terrain
-        Ground that they grow on.
-    centre : (x, y) of float
-        World position of the clump's middle [m].
-    radius : float
-        Trunks stand within this distance of it [m].
-    number : int
-        Trees, at least 1.
-    tree : Tree
-        Their mean measures.
+    generator, terrain
+        Source of randomness; ground that they grow on.
+    centre, radius
+        World position (x, y) of the clump's middle, and how far from it trunks stand [m].
+    number, tree
+        Number of trees, at least 1, and their mean measures.
     trunk_surface, leaf_surface : int
         Surface indices.
 

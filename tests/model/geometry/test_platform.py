@@ -19,7 +19,7 @@ from sweep.model.geometry.platform import (
     Waypoints,
     straight,
 )
-from sweep.model.geometry.pointing import jitter_attitude, transverse_of
+from sweep.model.geometry.pointing import transverse_of
 
 TIMES = np.array([0.0, 2.0, 3.5, 7.0, 8.0, 11.0])
 PLACES = np.array(
@@ -332,15 +332,6 @@ def test_a_mounted_instrument_is_turned_first():
 def test_a_vertical_descent_has_no_heading_to_follow(law):
     with pytest.raises(ValueError, match="no heading"):
         law.turn(np.zeros(1), np.array([[0.0, 0.0, -5.0]]), np.zeros((1, 3)))
-
-
-def test_jitter_turns_each_axis_by_its_own_standard_deviation():
-    """Rotation angles of given draws exactly, not statistics."""
-    q, draws = unit(8), np.random.default_rng(8).normal(size=(20, 3))
-    sigma = np.array([1e-4, 2e-4, 0.0])
-    jittered = jitter_attitude(q, sigma=sigma, draws=draws)
-    turn = (scipys(q).inv() * scipys(jittered)).as_rotvec()
-    np.testing.assert_allclose(turn, draws * sigma, atol=1e-15)
 
 
 def test_transverse_axes_complete_a_right_handed_frame():

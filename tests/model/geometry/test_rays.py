@@ -153,7 +153,7 @@ def closed():
     """A bumpy sphere: vertices, faces and caster."""
     vertices, faces = bumpy_sphere(4)
     mesh, report = clean(vertices, faces, 0)
-    assert report.watertight
+    assert not (report.open_edges or report.crowded_edges)
     return vertices, faces, Caster(mesh)
 
 
@@ -523,25 +523,6 @@ def test_of_bodies_one_behind_the_other_the_nearest_is_hit_in_whatever_order_the
         assert hits.body.tolist() == [order.index(1)]
 
 
-def test_an_offset_of_origins_is_added_without_rounding():
-    """Origins on a grid far finer than float64's at 4e6 m."""
-    vertices, faces = heightfield(np.zeros((3, 3)))
-    mesh, _ = clean(vertices + 4e6, faces, 0)
-    small = np.array([[0.3, 0.4, 2000.0 + k * 1e-12] for k in range(1, 9)])
-    down = np.tile([0.0, 0.0, -1.0], (8, 1))
-    hits = Caster(mesh).cast(small, down, origin_offset=[4e6, 4e6, 4e6])
-    np.testing.assert_array_equal(hits.range, small[:, 2])
-    pose = Pose(np.full(3, 4e6), np.array([1.0, 0, 0, 0]))
-    moving = Caster(clean(vertices, faces, 0)[0])
-    hits = moving.cast(small, down, origin_offset=np.full(3, 4e6), poses=[pose])
-    np.testing.assert_array_equal(hits.range, small[:, 2])
-    high = [[4e6 + 1.0, 4e6 + 1.0, 4e6 + 2000.0]]
-    exact = float(2000 + Fraction(1 / 3))
-    assert Caster(mesh).cast(high, down[:1], origin_offset=[0, 0, 1 / 3]).range[0] == exact
-    hits = moving.cast(high, down[:1], origin_offset=[0, 0, 1 / 3], poses=[pose])
-    assert hits.range[0] == exact
-
-
 def test_no_rays_give_no_hits(closed):
     assert closed[2].cast(np.empty((0, 3)), np.empty((0, 3))).range.shape == (0,)
     assert closed[2].bundle(np.empty((0, 3)), np.empty((0, 5, 3))).offset.shape == (0, 5)
@@ -563,7 +544,6 @@ def test_mistakes_are_refused(closed):
             o, d, poses=[Pose(np.full(3, np.nan), still.attitude)]
         ),
         "quaternion": lambda: caster.cast(o, d, poses=[Pose(np.zeros(3), np.zeros(4))]),
-        "three finite": lambda: caster.cast(o, d, origin_offset=[0, np.nan, 0]),
         "no body": lambda: Caster([]),
     }.items():
         with pytest.raises(ValueError, match=match):
