@@ -144,9 +144,10 @@ def _radial_velocity(
     A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
     turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
     """
-    x, y, z = state.velocity.T[:, :, None]
-    along = rays[..., 0] * x + rays[..., 2] * z + rays[..., 1] * y
-    closing = np.where(bundle.valid, along, np.nan)
+    closing = rays[..., 0] * state.velocity[:, :1]
+    for k in (2, 1):  # the order that results have had, bit for bit
+        closing += rays[..., k] * state.velocity[:, k, None]
+    closing[~bundle.valid] = np.nan
     for body, motion in enumerate(moving):
         if motion is None:
             continue

@@ -18,7 +18,6 @@ w p(0) (1 + B(0)) / (8 pi) whatever the incidence: a ball of it shines as evenly
 import math
 
 import numpy as np
-from numba import njit
 
 LAWS = ("thesis", "lambert", "lommel_seeliger")
 
@@ -49,11 +48,3 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     if law == "lommel_seeliger":
         return np.full_like(cos_incidence, 1 / math.pi)
     raise ValueError(f"no reflectance law {law!r}: choose from {', '.join(LAWS)}")
-
-
-@njit(cache=True, nogil=True)
-def backscatter_of(law, cos_incidence):
-    """:func:`backscatter` of one beamlet by a law's place in :data:`LAWS`, compiled."""
-    if law == 0:
-        return 0.5 / math.pi
-    return (cos_incidence if law == 1 else 1.0) / math.pi

@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate
 
 from sweep.model.geometry.mesh import Surface
-from sweep.model.reflectance import LAWS, backscatter, backscatter_of
+from sweep.model.reflectance import LAWS, backscatter
 
 COSINES = np.array([0.01, 0.1, 0.5, 0.9, 1.0])
 
@@ -62,9 +62,3 @@ def test_an_unknown_law_is_refused_where_a_surface_is_made():
         Surface("rock", 0.2, "minnaert")
     with pytest.raises(ValueError, match="minnaert"):
         backscatter("minnaert", COSINES)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_the_compiled_law_of_one_beamlet_is_that_of_all(law):
-    each = [backscatter_of(LAWS.index(law), cosine) for cosine in COSINES]
-    assert (backscatter(law, COSINES) == each).all()

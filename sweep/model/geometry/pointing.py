@@ -33,12 +33,18 @@ def beamlet_rays(
     """
     vectors = rotate(attitude[:, None], np.stack([*transverse_of(axis), axis], axis=1))
     first, second, centre = np.moveaxis(vectors, 0, 2)[..., None]
-    rays = [
-        c + (f * (across * sigma) + s * (along * sigma))
-        for f, s, c in zip(first, second, centre, strict=True)
-    ]
-    length = np.sqrt(rays[0] * rays[0] + rays[1] * rays[1] + rays[2] * rays[2])
-    return np.stack([ray / length for ray in rays], axis=-1)
+    rays = np.empty((len(axis), len(across), 3))
+    for k in range(3):
+        np.multiply(first[k], across * sigma, out=rays[..., k])
+        rays[..., k] += second[k] * (along * sigma)
+        rays[..., k] += centre[k]
+    length = rays[..., 0] * rays[..., 0]
+    for k in (1, 2):
+        length += rays[..., k] * rays[..., k]
+    np.sqrt(length, out=length)
+    for k in range(3):
+        rays[..., k] /= length
+    return rays
 
 
 def transverse_of(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -137,13 +137,16 @@ class Caster:
         high[rows], low[rows], normal[rows], cosine = met
         normal[rows[cosine > 0]] *= -1.0  # towards the ray's origin
         # On one facet  t_b - t_0 = -t_0 n.delta / (n.d_b),  delta = d_b - d_0: nothing is lost.
-        (x, y, z), d = normal.T[:, :, None], np.moveaxis(along, 2, 0)
-        delta = d - d[:, np.arange(n), reference][:, :, None]
-        cos_incidence = x * d[0] + y * d[1] + z * d[2]
+        every, (offset, cos_incidence) = np.arange(n), np.zeros((2, *face.shape))
+        for k in range(3):
+            unit, d = normal[:, k, None], along[..., k]
+            cos_incidence += unit * d
+            offset += unit * (d - d[every, reference][:, None])
+        offset *= -high[:, None]
         with np.errstate(invalid="ignore"):  # nothing is hit
-            offset = -high[:, None] * (x * delta[0] + y * delta[1] + z * delta[2]) / cos_incidence
-        other = face != face[np.arange(n), reference][:, None]
-        other |= body != body[np.arange(n), reference][:, None]
+            offset /= cos_incidence
+        other = face != face[every, reference][:, None]
+        other |= body != body[every, reference][:, None]
         offset[other] = cos_incidence[other] = np.nan
         others = np.nonzero(other & hit)
         met = self._met(frames, start, along, others, (face[others], body[others]))
@@ -160,13 +163,14 @@ class Caster:
     def _first_hits(self, frames, origins, directions):
         """Triangle and body that each beamlet hits first, (n, b)."""
         shape = directions.shape[:2]
-        distance, face, body = np.full(shape, np.inf), np.full(shape, -1), np.full(shape, -1)
+        distance, face = np.full(shape, np.inf), np.full(shape, -1)
+        body = np.full(shape, -1, np.int16)
         for number, frame in enumerate(frames):
             found = np.full(shape, -1)
             nearest(self._trees[number], *frame.rounded(origins, directions), distance, found)
             nearer = found >= 0
             face[nearer], body[nearer] = found[nearer], number
-        return face, body.astype(np.int16)
+        return face, body
 
     def _met(self, frames, origins, directions, rays, hit):
         """Ranges of facets that rays meet, high and low [m], normals (m, 3), cosines to these.
