@@ -1,6 +1,7 @@
 """Whether tolerances are kept: 1,000 points of every experiment, at six tolerances.
 
-Run with `make promise`, some twenty minutes; names of experiments as arguments look at those alone.
+And of as many instruments drawn at random. Run with `make promise`, some twenty minutes; names of
+experiments, or `instruments`, as arguments look at those alone.
 Writes docs/promise.md.
 """
 
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import promise_drawn
+import promise_instruments
 from rich.console import Console
 from rich.progress import Progress
 
@@ -54,6 +56,7 @@ DEARER = 1.1
 ALIKE, NOTHING = 1.1, 1e-9
 """Errors that count as the same, relative to each other, and as none."""
 WHAT = ("pd", "log10 pfa", "magnitude", "leakage")
+INSTRUMENTS = "instruments"
 VARIANTS = {
     "range_angle_over_rough_ground": (
         "range_angle", {"footprint.phases": "incoherent", "footprint.beamlets": "auto"},
@@ -312,6 +315,13 @@ class Page:
         self._fronts: list[str] = []
         self._costs: list[str] = []
         self._drawn: list[str] = []
+        self._instruments: list[str] = []
+
+    def draw(self) -> None:
+        """Look at instruments drawn at random."""
+        missed, text = promise_instruments.section(POINTS, np.random.default_rng())
+        self._short += missed
+        self._instruments.append(text)
 
     def add(self, stem: str) -> None:
         """Look at an experiment."""
@@ -350,6 +360,7 @@ class Page:
             "\n".join(self._short) if self._short else "Every tolerance is kept.",
             "\n".join([header(heads), *self._table]),
             *self._drawn,
+            *self._instruments,
             RAYS.strip(),
             "\n".join([header(["experiment", "tolerance", *WHAT, "us"]), *self._rays]),
             COSTS.strip().format(margin=DEARER - 1, front=front, fixed=fixed),
@@ -366,12 +377,16 @@ def main() -> None:
     """The whole page, or some experiments' rows."""
     every = sorted([*VARIANTS, *(path.stem for path in (ROOT / "experiments").glob("*.yaml"))])
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[*every, []])
+    parser.add_argument("names", nargs="*", choices=[*every, INSTRUMENTS, []])
     asked = parser.parse_args()
     page = Page()
     with Progress(console=Console(stderr=True)) as bar:
-        for stem in bar.track(asked.names or every, description="points of each experiment"):
-            page.add(stem)
+        names = asked.names or [*every, INSTRUMENTS]
+        for stem in bar.track(names, description="points of each experiment"):
+            if stem == INSTRUMENTS:
+                page.draw()
+            else:
+                page.add(stem)
     text = page.text()
     if asked.names:
         print(text.removeprefix(HEAD))

@@ -32,6 +32,8 @@ TIGHTEST = 1e-9
 NEAR, DRAWS = 40.0, 4
 """Bins from DC or Nyquist within which lines lie at the most; draws of what jitters."""
 SAMPLE_RATE, LIGHT = 100e6, 299792458.0
+KEPT = 0.999
+"""Share of the points that shall keep a tolerance."""
 WHAT = ("pd", "magnitude", "leakage")
 SEEN = (
     "pd_up", "pd_doppler", "pd_down", "pd_shot", "snr_up", "snr_doppler", "snr_down",
@@ -61,13 +63,14 @@ def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
         for asked in ("nothing", "leakage", "jitter")
         if asked != "jitter" or footprint[1] == 1
     ]
+    sizes = {window: f"2^{rng.integers(10, 15)}" for window in WINDOWS}
     for window, phases, beamlets, asked in kinds:
         points = [_point(rng, asked) for _ in range(-(-number // len(kinds)))]
         yield {
             "title": f"{window} {phases} {beamlets} {asked}",
             "instrument": {
                 "file": str(TABLE),
-                "processing": {"window": window, "fft_size": f"2^{rng.integers(10, 15)}",
+                "processing": {"window": window, "fft_size": sizes[window],
                                "sample_rate": f"{SAMPLE_RATE!r} Hz"},
             },
             "target": {"reflectance": 0.1},
@@ -166,21 +169,31 @@ def _apart(own: dict[str, Any], exact: dict[str, Any], told: np.ndarray, leaks: 
     return Off(np.fmax.reduce(pd), np.fmax.reduce(apart), leakage, told)
 
 
-def table(number: int, seed: int | None = None) -> tuple[list[str], list[str]]:
-    """Lines of Markdown; and what is not kept, in words."""
-    rng = np.random.default_rng(seed)
+SECTION = """
+## Instruments drawn at random
+
+{number:,} instruments, drawn anew each time, whose lines lie within {near:g} bins of DC or Nyquist
+and are smeared by range walk, acceleration, a crooked sweep, line width and jitter, each over many
+decades; every point is planned by itself. A cell has the share of the points within the tolerance,
+and the worst error: of pd; of |X|, and so the root of `snr_*`, over itself or sigma; of leakage
+where it is asked for.
+"""
+
+
+def section(number: int, rng: np.random.Generator) -> tuple[list[str], str]:
+    """What is not kept, in words; and the part of the page."""
     found = [off(written) for written in studies(number, rng)]
     lines = ["| tolerance | points | " + " | ".join(WHAT) + " |", "|" + " --- |" * (2 + len(WHAT))]
     missed = []
     for k, tolerance in enumerate(TOLERANCES):
         together = Off(*map(np.concatenate, zip(*(rows[k] for rows in found), strict=True)))
         cells = []
-        for what in WHAT:
-            errors = getattr(together, what)
+        for what, errors in zip(WHAT, together, strict=False):
             there = errors[np.isfinite(errors)]
             share = float((there <= tolerance).mean())
             cells.append(f"{100 * share:.2f} %, {there.max():.1e}")
-            if share < 0.999:
+            if share < KEPT:
                 missed.append(f"- random instruments at {tolerance:g}: {what} of {1 - share:.2%}")
         lines.append(f"| {tolerance:g} | {together.pd.size:,} | " + " | ".join(cells) + " |")
-    return lines, missed
+    head = SECTION.strip().format(number=number, near=NEAR)
+    return missed, head + "\n\n" + "\n".join(lines)

@@ -34,19 +34,16 @@ def size(points: Points) -> Size:
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
+    alarms = alarm_change(points)
+    if points.adds_amplitudes:
+        return Size(added=points.image, alarms=alarms)
     form, apart = points.lobe, points.apart
-    smeared = 1 + 2 * points.smeared / points.margin
-    least = points.powers[0] / smeared
+    least = points.powers[0] / (1 + 2 * points.smeared / points.margin)
     outside = form.tail(apart)
     inside, beside = form.tail(1.5 * apart), form.tail(0.5 * apart)
     far = beside * beside + outside * outside
     power = np.maximum(inside * inside, np.maximum(far - least, 0.0)) / least
-    alarms = alarm_change(points)
-    if not points.adds_amplitudes:
-        return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms)
-    uphill = np.exp(np.minimum(points.tilt * points.spread.extreme, 50.0))
-    added = uphill * outside * np.sqrt(smeared) / form.near(points.offset)
-    return Size(added=added, alarms=alarms)
+    return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms)
 
 
 def alarm_change(points: Points) -> np.ndarray | float:

@@ -240,14 +240,11 @@ def size(points: Points) -> Size | None:
     smeared = 1 + 2 * points.smeared / points.margin
     least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / smeared
     magnitude = by_power(known.most**2 * spread / least)
-    cancelling = points.may_cancel
-    if not cancelling.any():
+    if not points.may_add:
         return Size(magnitude=magnitude)
     half = 0.5 * _SIGMAS * deviation
     away = added(points, Smear((half, 0.0, 0.0, 0.0), constant=half))
-    return Size(
-        magnitude=np.where(cancelling, 0.0, magnitude), added=np.where(cancelling, away, 0.0)
-    )
+    return Size(magnitude=np.where(points.may_cancel, 0.0, magnitude), added=away)
 
 
 def _lorentzian(points: Points) -> Size:

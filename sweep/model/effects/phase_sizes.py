@@ -103,12 +103,16 @@ def missed(smear: Smear, window: Window) -> np.ndarray:
 
 
 def added(points: Points, smear: Smear) -> np.ndarray:
-    """What a phase error adds to sums of amplitudes, lines and images, as of :class:`Size`."""
+    """What a phase error adds to sums of amplitudes, lines and images, as of :class:`Size`.
+
+    Lines beside their images change by the phase in the record's middle too, and so does a line by
+    what an image far away adds to it.
+    """
     known = means(points.window)
-    anywhere = _TURN * (sum(smear.powers) + smear.rest + smear.constant)
-    near = known.most * np.minimum(anywhere, 2.0)
-    each = np.where(points.near_image, near, missed(smear, points.window))
-    return 2 * each / points.lobe.worst
+    anywhere = np.minimum(_TURN * (sum(smear.powers) + smear.rest + smear.constant), 2.0)
+    each = np.where(points.near_image, known.most * anywhere, missed(smear, points.window))
+    whole = 2 * each / points.lobe.worst
+    return np.where(points.may_cancel, whole, points.image * anywhere)
 
 
 def phase_size(points: Points, name: str) -> Size | None:
@@ -143,11 +147,7 @@ def phase_size(points: Points, name: str) -> Size | None:
     for value, steady in zip(own.powers, known.steady, strict=False):
         moved = moved + value * steady
     shift = 2 * moved * points.margin
-    cancelling = points.may_cancel
-    if not cancelling.any():
+    if not points.may_add:
         return Size(magnitude=magnitude, shift=shift)
-    return Size(
-        magnitude=np.where(cancelling, 0.0, magnitude),
-        added=np.where(cancelling, added(points, own), 0.0),
-        shift=shift,
-    )
+    alone = np.where(points.may_cancel, 0.0, magnitude)
+    return Size(magnitude=alone, added=added(points, own), shift=shift)

@@ -143,8 +143,13 @@ def size(points: Points) -> Size | None:
     echo = 3 * ratio * (1 + ratio) ** 2
     power = points.moved(NO_SPREAD, points.spread, bins) + echo
     unknown = points.may_cancel & (points[_JITTER] > 0)
+    added: np.ndarray | float = 0.0
+    if points.may_add:  # a line turns against its image as the range changes
+        turns = points.carriers * points.delay * np.minimum(ratio, 1e6)
+        added = points.image * np.minimum(4 * math.pi * turns, 2.0)
     return Size(
         magnitude=np.where(unknown, 1.0, by_power(power)),
+        added=added,
         noise=np.minimum(echo, 1e6) * points.echo_noise,
         threshold_follows=False,
     )

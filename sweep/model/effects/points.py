@@ -409,10 +409,22 @@ class Points:
         return 2 * self.apart < _NEAR_EDGE * self.margin
 
     @cached_property
+    def image(self) -> np.ndarray:
+        """Most that images add to the largest bin, over the magnitude that lines make in phase."""
+        smeared = 1 + 2 * self.smeared / self.margin
+        uphill = np.exp(np.minimum(self.tilt * self.spread.extreme, 50.0))
+        outside = self.lobe.tail(self.apart) * np.sqrt(smeared)
+        return np.asarray(uphill * outside / self.lobe.near(self.offset))
+
+    @property
+    def may_add(self) -> bool:
+        """Whether amplitudes add, or may."""
+        return self.adds_amplitudes or self.has("target.roughness")
+
+    @cached_property
     def may_cancel(self) -> np.ndarray:
         """Where amplitudes that add, or may, might leave next to nothing."""
-        adds = self.adds_amplitudes or self.has("target.roughness")
-        if not adds:
+        if not self.may_add:
             return np.zeros_like(self.near_image)
         return self.near_image | (self.number > 1)
 
