@@ -200,30 +200,20 @@ def seen_ground(
         Where a shot sees nothing, or a surface that is not given.
     """
     lit, relative, doppler, echo, beside = _footprints(eyepoints, surfaces)
+    upwards = eyepoints.direction[:, 2]
+    height = eyepoints.position[:, 2] + eyepoints.range * upwards
     ground = Cast(Footprints(np.arange(len(echo)), relative, doppler, echo), beside)
     shots = {
         **parameters,
-        **axis_parameters(eyepoints),
+        "target.range": eyepoints.range,
+        "target.radial_velocity": eyepoints.radial_velocity,
+        PATH_ELEVATION: -np.arcsin(upwards),
         "target.reflectance": 1.0,
-        HEIGHT: parameters.get(HEIGHT, 0.0) + height_of_target(eyepoints),
+        HEIGHT: parameters.get(HEIGHT, 0.0) + height,
         # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
         SUNLIGHT: np.asarray(parameters[SUNLIGHT]) * lit,
     }
     return shots, ground
-
-
-def axis_parameters(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
-    """What is seen along the beams' axes, by path, (n,) each."""
-    return {
-        "target.range": eyepoints.range,
-        "target.radial_velocity": eyepoints.radial_velocity,
-        PATH_ELEVATION: -np.arcsin(eyepoints.direction[:, 2]),
-    }
-
-
-def height_of_target(eyepoints: Eyepoints) -> np.ndarray:
-    """Height in the world where the beam's axis ends [m], (n,)."""
-    return eyepoints.position[:, 2] + eyepoints.range * eyepoints.direction[:, 2]
 
 
 def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, ...]:

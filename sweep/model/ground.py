@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,21 +21,6 @@ class Footprints(NamedTuple):
     """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
     echo: np.ndarray
     """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
-
-
-class Ground(Protocol):
-    """What n points' beams meet."""
-
-    def axis(self, size: int) -> Footprints:
-        """One line for each point, at the range and the velocity of the beam's axis."""
-
-    @property
-    def beamlets(self) -> Footprints:
-        """The whole footprint."""
-
-    @property
-    def beside(self) -> np.ndarray | None:
-        """Beamlets that lie on another surface than the axis, (rows, beamlets) bool; or None."""
 
 
 class Plane:
@@ -111,6 +96,10 @@ class Cast:
         whole = self.beamlets.echo.sum(axis=1)[:, None]
         nothing = np.zeros_like(whole)
         return Footprints(self.beamlets.row, nothing, nothing, whole)
+
+
+Ground = Plane | Cast
+"""What n points' beams meet."""
 
 
 def powers_add(p: Mapping[str, Any]) -> bool:

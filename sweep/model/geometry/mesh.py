@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,53 +84,41 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Report:
-    """What `clean` found and did, in counts."""
+    """What `clean` was given, found and did, in counts that `_WORDS` tells the meaning of."""
 
     vertices: int
-    """Vertices given."""
     faces: int
-    """Faces given."""
     non_finite: int = 0
-    """Faces dropped because a vertex of theirs is not finite (no data)."""
     degenerate: int = 0
-    """Faces dropped because they have no area: a repeated vertex, or three in one line."""
     duplicate: int = 0
-    """Faces dropped because an earlier one has the same three corners, in whatever winding."""
     merged: int = 0
-    """Vertices replaced by an earlier one at the same place."""
     unreferenced: int = 0
-    """Vertices dropped because no face is left that uses them."""
     open_edges: int = 0
-    """Edges with a face on one side only: the mesh's rim and holes."""
     crowded_edges: int = 0
-    """Edges shared by more than two faces."""
     opposed_edges: int = 0
-    """Edges whose two faces are wound against each other: one of them is inverted."""
     inside_out: int = 0
-    """1 where a closed and evenly wound mesh has its normals pointing inwards."""
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
         said = [
-            f"{getattr(self, field.name)} {_WORDS[field.name]}"
-            for field in fields(self)
-            if field.name in _WORDS and getattr(self, field.name)
+            words.format(getattr(self, name))
+            for name, words in _WORDS.items()
+            if getattr(self, name)
         ]
-        if self.inside_out:
-            said.append("closed, with normals pointing inwards")
         given = f"{self.faces} faces on {self.vertices} vertices"
         return "; ".join([given, *(said or ["nothing to mend"])])
 
 
 _WORDS = {
-    "non_finite": "faces without data dropped",
-    "degenerate": "faces without area dropped",
-    "duplicate": "duplicate faces dropped",
-    "merged": "coincident vertices merged",
-    "unreferenced": "unused vertices dropped",
-    "open_edges": "open edges (not watertight)",
-    "crowded_edges": "edges of more than two faces",
-    "opposed_edges": "edges with one side's normal inverted",
+    "non_finite": "{} faces without data dropped",
+    "degenerate": "{} faces without area dropped",  # a repeated vertex, or three in one line
+    "duplicate": "{} duplicate faces dropped",  # in whatever winding
+    "merged": "{} coincident vertices merged",
+    "unreferenced": "{} unused vertices dropped",
+    "open_edges": "{} open edges (not watertight)",  # a face on one side only
+    "crowded_edges": "{} edges of more than two faces",
+    "opposed_edges": "{} edges with one side's normal inverted",
+    "inside_out": "closed, with normals pointing inwards",  # 1 where it is so
 }
 
 
