@@ -5,7 +5,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install demo test test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 $(READY): pyproject.toml requirements.lock
@@ -23,9 +23,14 @@ demo: $(READY)
 	$(BIN)/sweep figures results/quickstart.zarr
 
 test: $(READY)
-	$(TIMED) "lint" $(MAKE) --no-print-directory lint
-	$(TIMED) "compiling" $(MAKE) --no-print-directory --jobs 2 --output-sync $(KERNELS)
+	$(MAKE) --no-print-directory --jobs 3 --output-sync timed-lint timed-kernels
 	$(TIMED) "tests" $(BIN)/pytest -n auto --dist worksteal --durations 12
+
+timed-lint:
+	$(TIMED) "lint" $(MAKE) lint
+
+timed-kernels:
+	$(TIMED) "compiling" $(MAKE) $(KERNELS)
 
 test-all: $(READY)
 	$(MAKE) --jobs 2 --output-sync $(KERNELS)

@@ -26,7 +26,7 @@ def evaluate(study, block):
     return study.evaluate(block)
 
 spec = small()
-outcome = sweep.run(spec, store=sys.argv[1], workers=2, evaluate=evaluate, progress=False)
+outcome = sweep.run(spec, store=sys.argv[1], workers=1, evaluate=evaluate, progress=False)
 print(outcome.complete)
 """
 

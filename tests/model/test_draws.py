@@ -112,8 +112,14 @@ UNSTEADY = {
 }
 
 
-@pytest.mark.parametrize("effects", RANDOM.values(), ids=RANDOM)
-@pytest.mark.parametrize("method", ["probabilities", "noise"])
+@pytest.mark.parametrize(
+    "method, effects",
+    [
+        pytest.param(method, effects, id=f"{method}, {name}", marks=[pytest.mark.slow] * more)
+        for number, (name, effects) in enumerate(RANDOM.items())
+        for method, more in (("probabilities", number % 2 == 1), ("noise", number % 2 == 0))
+    ],
+)
 def test_counts_over_random_effects_have_the_means_over_their_draws(effects, method, table_4_1):
     """A draw's Bernoulli variance is p (1 - p) of its own p: 5 sigma of their sum.
 

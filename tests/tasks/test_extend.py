@@ -158,6 +158,7 @@ def test_many_grids_extended_to_larger_ones(tmp_path_factory, pair):
     see_that_it_extends(tmp_path_factory.mktemp("many"), pair)
 
 
+@pytest.mark.slow
 def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed):
     store, spec = copied(undisturbed, tmp_path), small(axes=MORE["in between"][0])
     outcome = extend(store, spec, workers=2, progress=False)
