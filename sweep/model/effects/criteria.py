@@ -69,7 +69,7 @@ def changes(
             moved = (np.minimum(size.magnitude, _HUGE) + size.added) * high
             most = np.maximum(most, np.minimum(moved, sizes["leakage"].chance))
         change = np.maximum(_sum(total, points), _most(most, points))
-        found[name] = np.minimum(np.maximum(change, size.chance), 1.0)
+        found[name] = np.fmin(np.maximum(change, size.chance), 1.0)
     return found
 
 

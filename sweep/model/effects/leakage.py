@@ -34,29 +34,28 @@ _LEVELS = 1.04
 _NEAR, _FAR = 48, 24
 """Bins that are looked at one by one, and stretches beyond."""
 _IMAGES = 1.1
-"""What images may make of sidelobes far from the edge."""
+"""What images may make of sidelobes far from the edge; near it twice as much."""
 
 
 def size(points: Points) -> Size:
     """Chance that leaked signal raises an extra group, in all segments together."""
-    b = points.threshold
-    together = points.level * points.footprint.gain * _IMAGES
-    reach = points.spread.extreme + points.smeared
-    reach = np.where(points.near_image, np.inf, reach)
-    together = together * np.where(points.near_image, 2.0, 1.0)
+    b, near = points.threshold, points.near_image
+    over = points.level * points.footprint.gain * np.where(near, 2.0, _IMAGES) / b
+    over = np.where(np.isnan(over), np.inf, over)
+    reach = np.where(near, np.inf, points.spread.extreme + points.smeared)
     row = np.searchsorted(_REACHES, reach)
-    octave = np.log2(np.maximum(together / b, 2.0**_FAINTEST))
+    octave = np.clip(np.log2(over), _FAINTEST, _STRONGEST)
     place = np.minimum((octave - _FAINTEST) * _OCTAVES + 1, (_STRONGEST - _FAINTEST) * _OCTAVES)
     place = place.astype(np.int64)
-    step = np.floor(np.log(np.maximum(b, 1e-3)) / math.log(_LEVELS))
+    step = np.floor(np.log(np.clip(b, 1e-3, 1e4)) / math.log(_LEVELS))
     steps, which = np.unique(step, return_inverse=True)
     shape = points.window
     tables = np.array([
         table(shape.name, shape.length, points.fft_size, _LEVELS**float(v)) for v in steps
     ])  # fmt: skip
     chance = tables[which.reshape(np.shape(b)), row, place]
-    scale = np.where(octave < _FAINTEST + 0.5, (together / b / 2.0**_FAINTEST) ** 2, 1.0)
-    return Size(chance=(chance * np.minimum(scale, 1.0)).sum(axis=0))
+    faint = np.minimum(over / 2.0**_FAINTEST, 1.0) ** 2
+    return Size(chance=(chance * faint).sum(axis=0))
 
 
 @lru_cache(maxsize=256)

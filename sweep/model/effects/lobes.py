@@ -55,17 +55,18 @@ class Lobe(NamedTuple):
 
     def near(self, distance: np.ndarray) -> np.ndarray:
         """Magnitude of a bin at a distance from a line, 0..1/2 bin."""
-        return self.main[(distance * (2 * _STEPS) + 0.5).astype(np.int64)]
+        away = np.fmin(distance, 0.5)
+        return self.main[(away * (2 * _STEPS) + 0.5).astype(np.int64)]
 
     def tail(self, distance: np.ndarray) -> np.ndarray:
         """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
-        away = np.maximum(distance, 0.0)
-        share = away / (away + _KNEE * self.margin)
+        knee = _KNEE * self.margin
+        share = 1 - knee / (np.fmax(distance, 0.0) + knee)
         return self.envelope[(share * _CELLS).astype(np.int64)]
 
     def within(self, magnitude: np.ndarray) -> np.ndarray:
         """Distance [bins] from which on all bins are smaller; infinite where none is known."""
-        octave = np.log2(np.clip(magnitude, 2.0**_LEAST, 1.0))
+        octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_LEAST), 1.0))
         return self.away[np.ceil(-octave * _OCTAVES).astype(np.int64)]
 
 

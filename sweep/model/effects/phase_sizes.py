@@ -141,8 +141,7 @@ def phase_size(points: Points, name: str) -> Size | None:
     b = np.minimum(even, known.most) + turned
     least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / (1 + others.reach)
     c = _IMAGE * np.sqrt(least) - besides
-    with np.errstate(divide="ignore", invalid="ignore"):
-        magnitude = np.where(c > 0, (a + b * known.edge / c) / c + 0.5 * (b / c) ** 2, np.inf)
+    magnitude = np.where(c > 0, (a + b * known.edge / c) / c + 0.5 * (b / c) ** 2, np.inf)
     moved = rest / _TURN * known.steady[4]
     for value, steady in zip(own.powers, known.steady, strict=False):
         moved = moved + value * steady

@@ -79,11 +79,12 @@ def plan(
     """
     rules = rules_of(tuple(effects), tuple((modes or {}).items()))
     points.at_rest = rules.decided.get("doppler") == "off"
-    sizes = sizes_of(points, effects)
-    leaking = None
-    if rules.decided.get("leakage") == "on" and "leakage" in sizes:
-        leaking = {effect.name: effect.stage in _MOVING for effect in effects}
-    found = {name: tiles(change) for name, change in changes(sizes, points, leaking).items()}
+    with np.errstate(all="ignore"):  # of what exceeds all numbers nothing is known: it is kept
+        sizes = sizes_of(points, effects)
+        leaking = None
+        if rules.decided.get("leakage") == "on" and "leakage" in sizes:
+            leaking = {effect.name: effect.stage in _MOVING for effect in effects}
+        found = {name: tiles(change) for name, change in changes(sizes, points, leaking).items()}
     there = np.array([name in found for name in rules.names])
     number = max((value.size for value in found.values()), default=1)
     change = np.array([found.get(name, np.zeros(number)) for name in rules.names])

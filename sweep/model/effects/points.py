@@ -406,7 +406,7 @@ class Points:
     @cached_property
     def near_image(self) -> np.ndarray:
         """Where lines and their images are so close that they may add up, or cancel."""
-        return 2 * self.apart < _NEAR_EDGE * self.margin
+        return ~(2 * self.apart >= _NEAR_EDGE * self.margin)
 
     @cached_property
     def image(self) -> np.ndarray:
