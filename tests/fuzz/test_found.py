@@ -177,7 +177,8 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
                      "rocks": rocks}}
     ).objects  # fmt: skip
     facets = thing["rocks"].facets(thing["ground"].terrain(Files(".")))
-    corners = facets.world.reshape(len(facets.faces) // 96, -1, 3)  # 96 faces each
+    corners = facets.vertices + facets.origin
+    corners = corners.reshape(len(facets.faces) // 96, -1, 3)  # 96 faces each
     middles = corners.mean(axis=1)
     # 0.1 (1 - 1/9) 60^2 = 320 of them, 5 sigma to each side; each reaches 2 m beyond its middle.
     assert abs(len(middles) - 320) < 5 * 320**0.5

@@ -328,11 +328,6 @@ class Facets:
             np.asarray(origin, float),
         )
 
-    @property
-    def world(self) -> np.ndarray:
-        """Vertices in the world frame [m], (n, 3); rounded to a float64 of that size."""
-        return self.vertices + self.origin
-
     def placed(
         self,
         *,
@@ -340,16 +335,9 @@ class Facets:
         rotation: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0, 0.0),
         scale: float = 1.0,
     ) -> Facets:
-        """Facets scaled and turned about their origin, which is then moved.
+        """Facets scaled and turned about their origin, which is then moved [m].
 
-        Parameters
-        ----------
-        translation : (3,) array_like
-            Added to the origin [m].
-        rotation : (4,) array_like
-            Unit quaternion (w, x, y, z).
-        scale : float
-            Size factor, > 0.
+        The rotation is a unit quaternion (w, x, y, z).
         """
         turned = rotate(np.asarray(rotation, float), self.vertices * scale)
         return replace(self, vertices=turned, origin=self.origin + np.asarray(translation, float))

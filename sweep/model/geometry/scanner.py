@@ -15,16 +15,9 @@ import numpy as np
 
 
 def cone(number: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
-    """Directions evenly round nadir, (number, 3).
+    """Directions evenly round nadir, at an angle from it [rad], (number, 3).
 
-    Parameters
-    ----------
-    number : int
-        Beams, at least 1.
-    half_angle : float
-        Angle from nadir [rad].
-    azimuth : float
-        Of the first beam, from forward towards the left [rad].
+    `azimuth` is that of the first beam, from forward towards the left [rad].
     """
     turn = azimuth + 2 * math.pi * np.arange(number) / number
     across = math.sin(half_angle)
@@ -37,12 +30,8 @@ def steered(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
     The angle of an axis is that of the beam's projection on the plane of that axis and nadir, so
     that a grid of angles draws straight lines on level ground: ``tan = x / -z``. Both axes at
-    22.5 deg make 30.4 deg from nadir.
-
-    Parameters
-    ----------
-    angle_x, angle_y : array_like
-        Angles from nadir towards forward and towards the left [rad], under 90 deg.
+    22.5 deg make 30.4 deg from nadir. `angle_x` is towards forward and `angle_y` towards the left
+    [rad], under 90 deg.
     """
     x, y = np.broadcast_arrays(np.tan(angle_x), np.tan(angle_y))
     vector = np.stack([x, y, np.full(x.shape, -1.0)], axis=-1)
@@ -67,16 +56,11 @@ def stacked_angles(elements: Sequence[float]) -> np.ndarray:
 
 
 def squares(elements: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """All angles of a steerer with like axes, sorted into squares.
+    """All angles of a steerer with like axes of `stacked_angles`, sorted into squares.
 
     A square is what a quarter turn about nadir makes of one pair of angles. The widest comes
     first and the narrowest last, each counter-clockwise: for the two elements of [T Fig. 5.2] the
     corners at 22.5 deg, the two squares that are askew, and the corners at 7.5 deg.
-
-    Parameters
-    ----------
-    elements : sequence of float
-        Angle of each element of an axis [rad].
 
     Returns
     -------
@@ -200,10 +184,9 @@ def raster(
 
     Parameters
     ----------
-    columns, rows : int
-        Directions across (y) and along (x), at least 1 each.
-    half_angles : (across, along) of float
-        Reach of the grid to each side of nadir [rad].
+    columns, rows, half_angles
+        Directions across (y) and along (x), at least 1 each; reach of the grid across and along,
+        to each side of nadir [rad].
     rate : float
         Frames a second [Hz].
     both_ways : bool

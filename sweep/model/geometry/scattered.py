@@ -166,16 +166,10 @@ REACH = 4.0
 
 
 class Craters(NamedTuple):
-    """Craters of a piece of ground.
+    """Craters of a piece of ground, (n,) each.
 
-    Parameters
-    ----------
-    x, y : (n,) ndarray
-        World position of the centres [m].
-    diameter : (n,) ndarray
-        From rim crest to rim crest [m].
-    freshness : (n,) ndarray
-        Depth and rim height as a share of a fresh crater's, 0..1.
+    World position of the centres, diameter from rim crest to rim crest [m], and freshness: depth
+    and rim height as a share of a fresh crater's, 0..1.
     """
 
     x: np.ndarray
@@ -206,14 +200,7 @@ def profile(radius: np.ndarray, *, diameter: np.ndarray, freshness: np.ndarray) 
 
     A paraboloid from floor to rim crest; outside, ejecta that thin with the third power of the
     distance (McGetchin, Settle and Head, Earth Planet. Sci. Lett. 20, 226, 1973), lowered so that
-    they end, without a step, at `REACH` radii.
-
-    Parameters
-    ----------
-    radius : ndarray
-        Distance from the centre [m].
-    diameter, freshness : ndarray
-        As in `Craters`.
+    they end, without a step, at `REACH` radii. Diameter and freshness are as in `Craters`.
     """
     depth, rim = fresh_depth(diameter), fresh_rim_height(diameter)
     s = 2 * np.asarray(radius, float) / diameter

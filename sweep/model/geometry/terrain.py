@@ -129,13 +129,6 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
     the size of the survey's posts. Holes stay as they are: a new node has a height where all the
     nodes around it have one.
 
-    Parameters
-    ----------
-    terrain : Terrain
-        Grid of at least 4 x 4 nodes.
-    factor : int
-        New steps to each old one, at least 1.
-
     Raises
     ------
     ValueError
@@ -163,14 +156,9 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
 
 
 def smooth(terrain: Terrain, *, width: float) -> Terrain:
-    """Terrain blurred by a Gaussian; holes stay holes and lend nothing to their neighbours.
+    """Terrain blurred by a Gaussian of that standard deviation [m].
 
-    Parameters
-    ----------
-    terrain : Terrain
-        Grid of heights.
-    width : float
-        Standard deviation of the Gaussian [m], >= 0.
+    Holes stay holes and lend nothing to their neighbours.
 
     Raises
     ------

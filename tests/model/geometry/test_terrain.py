@@ -93,7 +93,7 @@ def test_the_height_at_a_place_is_that_of_the_facet_over_it(seed, spacing):
     x, y = generator.uniform(west, east, 40), generator.uniform(south, north, 40)
     facets = ground.facets()
     expected = np.full(40, np.nan)
-    for a, b, c in facets.world[facets.faces]:
+    for a, b, c in (facets.vertices + facets.origin)[facets.faces]:
         matrix = np.array([[a[0], b[0], c[0]], [a[1], b[1], c[1]], [1, 1, 1]])
         weights = np.linalg.solve(matrix, [x, y, np.ones(40)])
         inside = (weights > 0).all(axis=0)
@@ -132,14 +132,17 @@ def test_joined_facets_keep_their_place_digits_and_surfaces():
 def test_a_placed_object_is_scaled_turned_and_moved_in_that_order():
     corner = Facets.of([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]])
     moved = corner.placed(translation=(10, 20, 30), rotation=about(2, math.pi / 2), scale=2.0)
-    np.testing.assert_allclose(moved.world, [[10, 22, 30], [8, 20, 30], [10, 20, 32]], atol=1e-12)
+    corners = [[10, 22, 30], [8, 20, 30], [10, 20, 32]]
+    np.testing.assert_allclose(moved.vertices + moved.origin, corners, atol=1e-12)
 
 
 def test_facets_become_a_mesh_at_the_same_place():
     facets = terrain(hilly(5, 5), origin=FAR).facets(surface=3)
     mesh, report = facets.mesh()
     np.testing.assert_allclose(
-        np.sort(mesh.vertices + mesh.origin, axis=0), np.sort(facets.world, axis=0), atol=1e-8
+        np.sort(mesh.vertices + mesh.origin, axis=0),
+        np.sort(facets.vertices + facets.origin, axis=0),
+        atol=1e-8,
     )
     assert (mesh.surface == 3).all() and report.faces == len(mesh.faces) == 32
 
