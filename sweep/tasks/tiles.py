@@ -83,7 +83,8 @@ class Tiles:
     def alike(self, tiles: np.ndarray, every: int = 1) -> Iterator[Alike]:
         """Parameters of the points of some tiles, those together that share words and sizes.
 
-        ``every``: of every so manieth point along each axis.
+        ``every``: of every so manieth point along each axis, and of those with the largest value
+        of each parameter.
         """
         positions = np.unravel_index(tiles, self.along) if self.along else ()
         codes = np.zeros(len(tiles), np.int64)
@@ -119,7 +120,12 @@ class Tiles:
             first = int(position[0])
             return {path: values[first].item() for path, values in members.items()}
         side, size = self.shape[axis], self.grid.shape[axis]
-        index = np.minimum(position[:, None] * side + np.arange(0, side, every), size - 1)
+        within = np.minimum(position[:, None] * side + np.arange(side), size - 1)
+        index = within[:, ::every]
+        if every > 1:  # with the largest of each, so that none is missed that is there at all
+            furthest = [np.abs(v[within].astype(float)).argmax(axis=1) for v in members.values()]
+            rows = np.arange(len(position))[:, None]
+            index = np.hstack([index, within[rows, np.transpose(furthest)]])
         shape = [len(position), *(1,) * len(self.shape)]
         shape[axis + 1] = index.shape[1]
         index = index.reshape(shape)

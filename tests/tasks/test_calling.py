@@ -82,6 +82,15 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
     assert not kept.all(axis=1)[kept.any(axis=1)].all()
 
 
+def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
+    velocities = [f"{v} m/s" for v in (0, 1, 2, 3, 4, 70, 6, 7, 8, 9, 10, 11)]
+    spec = small(axes={**WIDE, "target.radial_velocity": velocities})
+    tiles = Tiles(Grid(spec))
+    (few,) = tiles.alike(np.arange(tiles.number), 4)
+    found = few.parameters["target.radial_velocity"]
+    assert found.max() == 70 and found.size < len(few.tiles) * tiles.shape[-1]
+
+
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
     bit = {name: np.uint32(1 << k) for k, name in enumerate(NAMES)}
     base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
