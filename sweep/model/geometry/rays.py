@@ -143,7 +143,7 @@ class Caster:
             cos_incidence += unit * d
             offset += unit * (d - d[every, reference][:, None])
         offset *= -high[:, None]
-        with np.errstate(invalid="ignore"):  # nothing is hit
+        with np.errstate(divide="ignore", invalid="ignore"):  # nothing is hit, or another facet
             offset /= cos_incidence
         other = face != face[every, reference][:, None]
         other |= body != body[every, reference][:, None]
