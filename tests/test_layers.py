@@ -29,7 +29,7 @@ NOT_IN_THE_MODEL = {
 }  # fmt: skip
 """Pure physics: arrays in, arrays out."""
 
-LARGEST_HOUSE = {"lines": 56_088, "modules": 330, "compiled functions": 238}
+LARGEST_HOUSE = {"lines": 55_888, "modules": 330, "compiled functions": 237}
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600
 LARGEST_FUNCTION = 50
