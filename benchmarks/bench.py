@@ -15,7 +15,7 @@ import sweep
 from sweep.model import shot, truth
 from sweep.model.chain import prepare
 from sweep.model.eyepoints import observe, prepare_eyepoints
-from sweep.model.spectra import segment_spectrum
+from sweep.model.segments import spectrum as segment_spectrum
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.reading import read_document
 

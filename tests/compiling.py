@@ -10,27 +10,18 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "tasks"))
 
-from small import STUDY, quiet, small
+from small import quiet, small
 from small_flights import small_scene
 
 
-def of_window(name: str, place: Path) -> None:
-    """The engine for windows of as many terms."""
-    processing = STUDY["instrument"]["processing"] | {"window": name}
-    quiet(small(axes={}, instrument=STUDY["instrument"] | {"processing": processing}), place / name)
-
-
 def grids(place: Path) -> None:
-    """The engine for windows of two terms and of one, and all ways to draw."""
+    """The engine, and all ways to draw."""
     for method in ("probabilities", "noise", "spectra"):
         quiet(small(axes={}, draws={"method": method, "number": 1}), place / method)
-    of_window("rectangular", place)
 
 
 def flights(place: Path) -> None:
-    """The engine for windows of five and three terms; meshes and points, which need that of two."""
-    of_window("flattop", place)
-    of_window("blackman", place)
+    """Meshes and points, and their returns."""
     draws = {"method": "noise", "number": 1, "returns": 2}
     quiet(small_scene(axes={}, draws=draws), place / "flight")
 

@@ -1,65 +1,55 @@
-"""Bins of a segment as the engine looks at them, by what it has compiled for a study's points.
-
-A kernel that is called with arrays as they are would be compiled once more for each window.
-"""
+"""Bins and lines of a segment as detection and leakage look at them."""
 
 import numpy as np
 
-from sweep.model import modulation, segments
-from sweep.model.compiling import owning
-from sweep.model.crossings import crossing_series
-from sweep.model.lending import lend
-from sweep.model.segments import _smooth_lines, inspect_segment, lent
-
-
-@owning(nogil=True)
-def _point(points, row):
-    """Values of the first point, and where its lines are."""
-    p = np.empty(points.shape[0])
-    p[:] = points[:, 0]
-    return p, (row[0], points.shape[1] - 1)
-
-
-@owning(nogil=True)
-def _run(segment, points, row, scene, choices, kernel, work):
-    """First bin and number of those that are looked at; |X| is in the room's first row."""
-    seen, known, (room, exempt, series) = lent(scene, kernel, work)
-    scene, kernel = lend(seen), lend(known)
-    p, at = _point(points, row)
-    crossing_series(p[11] / p[10], series)
-    low, count, _, _, _ = inspect_segment(
-        segment, p, scene, at, choices, kernel, room, exempt, series
-    )
-    return low, count
-
-
-@owning(nogil=True)
-def _kind(segment, points, row, scene, choices, kernel, work):
-    """What :func:`lines_of` tells."""
-    seen, known, (room, _, _) = lent(scene, kernel, work)
-    scene, kernel = lend(seen), lend(known)
-    p, at = _point(points, row)
-    _, number, kind = _smooth_lines(segment, p, scene, at, choices[0], kernel, room)
-    return number, kind[0], kind[1], kind[5]
-
-
-def _given(shots, segment):
-    """One point, as the engine takes it; the room, whose first row will hold |X|."""
-    point = modulation.single(shots, 0)
-    work = segments.workspace(point.lines, shots.fft_size)
-    return (
-        segment, point.points, point.row, point.scene, modulation.choices(shots), shots.kernel(),
-        work,
-    ), work[0]  # fmt: skip
+from sweep.model import line_shape
+from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
+from sweep.model.segments import runs_of
+from sweep.model.spectrum import IMAGED
 
 
 def run_of_bins(shots, segment):
-    """First bin and |X| of those that detection and leakage look at one by one."""
-    given, room = _given(shots, segment)
-    low, count = _run(*given)
-    return low, room[0, :count].copy()
+    """First bin and |X| of those that are looked at one by one, of the first point."""
+    (runs,) = runs_of(shots, points=np.zeros(1, np.int64))
+    return int(runs.low[segment, 0]), runs.run(segment, 0).copy()
 
 
-def lines_of(shots, segment):
-    """Number of lines; row of their moments, or -1; bundles; whether these have a form."""
-    return _kind(*_given(shots, segment)[0])
+def lines_of(shots, i, segment):
+    """Origin of a segment's lines, places beside it [bins], weights C_b."""
+    n, row = shots.offset.shape[1], int(shots.row[i])
+    room = np.empty((BLOCK + 1, n))
+    sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
+    point = np.ascontiguousarray(shots.point_table()[:, i])
+    origin = place_lines(point, segment, shots.footprint, row, sizes, room)
+    return origin, room[PLACE], room[RE] + 1j * room[IM]
+
+
+def shape_of(window, fft_size, *, power=False, phase=None, view=IMAGED):
+    """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1.
+
+    Its table; envelope and ends, as `spectrum` takes them; sizes; shift of the line [bins]; and
+    modes, 0 of a table of all bins.
+    """
+    phase, table, number = phase or np.zeros_like, None, 0
+    for tier, (most, _) in enumerate(line_shape.TIERS):
+        if not line_shape.has_modes(window, fft_size):
+            break
+        centre, modes = np.zeros((1, 1)), np.zeros((1, 1, 2, most))
+        count = np.zeros((1, 1), np.int64)
+        at = phase(line_shape.record_places(2 * most))[None, None]
+        line_shape.find_modes(at, line_shape.to_modes(2 * most), centre, modes, count)
+        number = int(count[0, 0])
+        if number:
+            shapes = line_shape.shapes(window, fft_size, power, tier)
+            table = np.empty((2, shapes.modes.shape[1]))
+            form = np.zeros((7, shapes.reach.size))
+            line_shape.build(*modes[0, 0], number, shapes, table, form[3:, :14], form[1:3])
+            break
+    if table is None:
+        x = 2 * np.arange(window.length) / window.length - 1
+        shapes, centre = line_shape.whole_shapes(window, fft_size, power, phase(x)[None]), None
+        table, form = shapes.whole[0], np.zeros((7, shapes.reach.size))
+        line_shape.put_envelope(table, form[3:, :14], shapes.sizes, shapes.reach, form[1:3])
+    form[0] = shapes.reach
+    shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
+    return table, form, np.append(shapes.sizes, view), shift, number

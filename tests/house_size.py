@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COMPILING = ("numba", "sweep.model.compiling")
+COMPILING = ("numba",)
 """Modules whose names, as decorators, make compiled functions."""
 
 

@@ -12,7 +12,7 @@ from sweep.model import waveform, window
 from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE
-from sweep.model.spectra import segment_spectrum
+from sweep.model.segments import spectrum as segment_spectrum
 
 Parameters = Mapping[str, float | int | str]
 

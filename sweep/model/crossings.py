@@ -12,8 +12,8 @@ costs one polynomial in x, which vectorises.
 
 import math
 
-from sweep.model.compiling import borrowing
-from sweep.model.elementary import fma
+from numba import njit
+
 from sweep.model.marcum import excess_crossing
 
 STRETCH = 256
@@ -28,7 +28,7 @@ _EXPONENTIAL = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Of e^-z, to 1e-16 for z <= 1/4."""
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def crossing_series(beta, series):
     """c_n y^n / n! over the chance that noise alone stays below ``beta``, into ``series``.
 
@@ -46,14 +46,14 @@ def crossing_series(beta, series):
         series[n] = total * power
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def _terms(x, y):
     """Terms that leave less than 1e-16 of the sum for amplitudes up to x (<= y)."""
     root = math.sqrt(x * y)
     return int(8.0 + 1.3 * root + 5.0 * math.sqrt(root) + 4.0 * math.sqrt(x))
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def added_crossings(x, count, beta, series, out):
     """Chances (Q_1 - e^-y) / (1 - e^-y) of ``count`` bins, 0..1.
 
@@ -87,7 +87,7 @@ def added_crossings(x, count, beta, series, out):
         _polynomial(x[first:last], 1.0 / y, series, terms, scale, halvings, out[first:last])
 
 
-@borrowing(fastmath={"nnan"})
+@njit(cache=True, error_model="numpy")
 def largest(x):
     """Largest of some numbers, at least 0."""
     most = 0.0
@@ -96,7 +96,7 @@ def largest(x):
     return most
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def _polynomial(x, inverse, series, terms, scale, halvings, out):
     """e^-x sum d_n (x inverse)^n, n = 1 .. terms; e^-x as a power of e^(-x scale)."""
     for i in range(x.size):
@@ -107,14 +107,14 @@ def _polynomial(x, inverse, series, terms, scale, halvings, out):
         for i in range(x.size):
             u = x[i] * inverse
             u2 = u * u
-            high = fma(u2, fma(u, h + out[i], g), fma(u, f, e))
-            low = fma(u2, fma(u, d, c), fma(u, b, a))
-            out[i] = u * fma(u2 * u2, high, low)
+            high = u2 * (u * (h + out[i]) + g) + (u * f + e)
+            low = u2 * (u * d + c) + (u * b + a)
+            out[i] = u * (u2 * u2 * high + low)
     for i in range(x.size):
         z = scale * x[i]
         decay = _EXPONENTIAL[11]
         for n in range(10, -1, -1):
-            decay = fma(z, decay, _EXPONENTIAL[n])
+            decay = z * decay + _EXPONENTIAL[n]
         x[i] = decay
     for _ in range(halvings):
         for i in range(x.size):
@@ -123,7 +123,7 @@ def _polynomial(x, inverse, series, terms, scale, halvings, out):
         out[i] *= x[i]
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def any_crossing(chances, first, last):
     """1 - prod(1 - chance) over chances first .. last - 1, with all its digits."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
@@ -143,7 +143,7 @@ def any_crossing(chances, first, last):
     return a
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def silence(chance):
     """-ln(1 - chance): what adds up over bins."""
     if chance < 1e-4:
@@ -151,7 +151,7 @@ def silence(chance):
     return -math.log1p(-chance)
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def weighted_silence(chances, weights):
     """Sum of the weighted -ln(1 - chance)."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0

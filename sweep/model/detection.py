@@ -3,15 +3,8 @@
 import math
 
 import numpy as np
+from numba import njit
 
-from sweep.model.compiling import borrowing, owning
-from sweep.model.crossings import (
-    MOST_TERMS,
-    STRETCH,
-    added_crossings,
-    any_crossing,
-    crossing_series,
-)
 from sweep.model.marcum import marcum_q1_pair
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
@@ -51,7 +44,7 @@ def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarr
         return np.minimum(np.sqrt(2 * chance / (bins * math.exp(1 / 8) * each)), 1 / level)
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def mark(magnitude, count, level, exempt):
     """Detection in a run of bins, and the bins that it keeps from raising a false alarm.
 
@@ -94,7 +87,7 @@ def mark(magnitude, count, level, exempt):
     return peak, exempted
 
 
-@borrowing(fastmath={"nnan"})
+@njit(cache=True, error_model="numpy")
 def _survey(magnitude, level):
     """Largest magnitude, and how many reach a level."""
     largest, above = magnitude[0], 0
@@ -104,7 +97,7 @@ def _survey(magnitude, level):
     return largest, above
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def _exempt(first, last, count, exempt):
     """Marks the bins of a group and the two beside it; how many they are."""
     first, last = max(first - 1, 0), min(last + 1, count - 1)
@@ -112,46 +105,7 @@ def _exempt(first, last, count, exempt):
     return last - first + 1
 
 
-@owning()
-def assess(magnitude, count, sigma, level, floor, exempt):
-    """Detection and leakage in a run of bins around a segment's lines, bin by bin.
-
-    What is no detection (:func:`mark`) crosses with Q_1 of its own magnitude [T 3.3.2]; what that
-    adds to the crossings of noise alone is the leakage.
-
-    Parameters
-    ----------
-    magnitude, count, level, exempt
-        As of :func:`mark`.
-    sigma : float
-        Noise per quadrature.
-    floor : float
-        Bins of less than this many sigma count as noise alone.
-
-    Returns
-    -------
-    peak, exempted : int
-        Index of the largest bin; number of exempt bins.
-    leakage : float
-        Probability that leaked signal raises at least one extra group, over noise alone.
-    """
-    peak, exempted = mark(magnitude, count, level, exempt)
-    beta = level / sigma
-    series, x, chance = np.empty(MOST_TERMS), np.empty(STRETCH), np.empty(STRETCH)
-    crossing_series(beta, series)
-    some = 0.0
-    for first in range(0, count, STRETCH):
-        number = min(STRETCH, count - first)
-        for i in range(number):
-            ratio = magnitude[first + i] / sigma
-            quiet = exempt[first + i] or ratio < floor
-            x[i] = 0.0 if quiet else 0.5 * ratio * ratio
-        added_crossings(x, number, beta, series, chance)
-        some += (1.0 - some) * any_crossing(chance, 0, number)
-    return peak, exempted, some
-
-
-@owning()
+@njit(cache=True, error_model="numpy")
 def detect_rows(magnitude, first, bins, deviation, level, out):
     """Detections in spectra without noise that are given bin by bin.
 

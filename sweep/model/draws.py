@@ -21,7 +21,6 @@ from sweep.model import philox
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.marcum import at_least_one
-from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.philox import (
     STREAM_DETECTION,
@@ -30,12 +29,9 @@ from sweep.model.philox import (
     STREAM_NOISE_MAXIMUM,
 )
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.segments import inspect_bins, workspace
+from sweep.model.segments import runs_of
 
 METHODS = ("probabilities", "noise")
-
-BINS = 1 << 22
-"""Bins of which memory holds spectra at once."""
 
 
 class Rows(NamedTuple):
@@ -190,46 +186,42 @@ class Seen(NamedTuple):
         return cls(low, peak, ratio, others, stretch, aside, np.empty(bins))
 
 
-def seen_spectra(shots: Shots) -> Iterator[tuple[slice, Seen]]:
+def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
     """Points of some shots, and their spectra; as many at once as memory holds."""
-    bins = 3 * (shots.fft_size // 2 + 1)
-    for stretch in stretches(shots):
-        work = workspace(stretch.lines, shots.fft_size)
-        step = max(1, BINS // bins)
-        for first in range(0, stretch.row.size, step):
-            last = min(first + step, stretch.row.size)
-            seen = Seen.nothing(last - first, (last - first) * bins)
-            _look(
-                (first, last), stretch.points, stretch.row, stretch.scene, shots.segments,
-                choices(shots), shots.kernel(), work, seen,
-            )  # fmt: skip
-            left = shots.counted_bins(seen.others) - np.diff(seen.stretch)[..., 0]
-            part = slice(stretch.part.start + first, stretch.part.start + last)
-            yield part, seen._replace(others=np.maximum(left, 0.0))
+    sigma = shots.bin_deviation
+    # Without leakage none but the peak is looked at.
+    floor = shots.floor + np.zeros(shots.size) if shots.leakage else np.full(shots.size, np.inf)
+    for runs in runs_of(shots, least=np.minimum(shots.threshold, floor * sigma), leakage=False):
+        seen = Seen.nothing(runs.part.size, runs.magnitudes.size)
+        _look(
+            (runs.low, runs.bins, runs.peak, runs.exempted, runs.start), runs.magnitudes,
+            runs.exempt, np.stack([sigma[runs.part], floor[runs.part]]), seen,
+        )  # fmt: skip
+        left = shots.counted_bins(seen.others) - np.diff(seen.stretch)[..., 0]
+        yield runs.part, seen._replace(others=np.maximum(left, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look(span, points, row, scene, segments, choices, kernel, work, seen):
-    """Fills what is seen of the points of a span; in place of the others the exempt bins."""
-    room, exempt, _ = work
+def _look(runs, magnitudes, exempt, levels, seen):
+    """Fills what is seen of some points; in place of the others the exempt bins."""
+    low, count, peak, exempted, start = runs
     number = 0
-    for i in range(span[0], span[1]):
-        p, place = points[:, i].copy(), i - span[0]
-        for s in range(3):
-            if not segments[s]:
+    for i in range(low.shape[1]):
+        sigma, floor = levels[0, i], levels[1, i]
+        for s in range(low.shape[0]):
+            if count[s, i] == 0:
                 continue
-            low, count, peak, exempted, _ = inspect_bins(
-                s, p, scene, (row[i], i), choices, kernel, room, exempt
-            )
-            seen.low[place, s], seen.peak[place, s] = low, peak
-            seen.ratio[place, s], seen.others[place, s] = room[0, peak] / p[10], exempted
-            seen.stretch[place, s, 0] = number
-            for k in range(count if choices[2] else 0):  # else none but the peak is looked at
-                ratio = room[0, k] / p[10]
-                if k != peak and not exempt[k] and ratio >= p[12]:
+            at = start[s, i]
+            seen.low[i, s], seen.peak[i, s] = low[s, i], peak[s, i]
+            seen.ratio[i, s] = magnitudes[at + peak[s, i]] / sigma
+            seen.others[i, s] = exempted[s, i]
+            seen.stretch[i, s, 0] = number
+            for k in range(count[s, i]):
+                ratio = magnitudes[at + k] / sigma
+                if k != peak[s, i] and not exempt[at + k] and ratio >= floor:
                     seen.aside[number], seen.leaked[number] = k, ratio
                     number += 1
-            seen.stretch[place, s, 1] = number
+            seen.stretch[i, s, 1] = number
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

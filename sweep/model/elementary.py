@@ -6,11 +6,7 @@ cycles keeps its fraction only where the product that makes it is carried in two
 
 import math
 
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
+from numba import njit
 
 _TAU = 2.0 * math.pi
 # Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2; |r| <= 1/8 leaves 5e-17.
@@ -22,51 +18,17 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
 )
 
 
-@intrinsic
-def fma(typingctx, a, b, c):  # type: ignore[no-untyped-def]  # a numba intrinsic
-    """Fused a * b + c with a single rounding: what makes a product exact in two doubles."""
-    signature = types.float64(types.float64, types.float64, types.float64)
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        double = ir.DoubleType()
-        function = builder.module.declare_intrinsic(
-            "llvm.fma", [double], ir.FunctionType(double, [double] * 3)
-        )
-        return builder.call(function, args)
-
-    return signature, codegen
-
-
-@intrinsic
-def borrowed(typingctx, array):  # type: ignore[no-untyped-def]  # a numba intrinsic
-    """The same array without a count of who uses it: its rows and slices cost nothing.
-
-    Each of them would else take two locked instructions, which is most of the time where arrays
-    are short. Only for what a caller outside compiled code holds on to meanwhile.
-    """
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        view = context.make_array(sig.args[0])(context, builder, args[0])
-        view.meminfo = cgutils.get_null_value(view.meminfo.type)
-        view.parent = cgutils.get_null_value(view.parent.type)
-        return view._getvalue()
-
-    return array(array), codegen
-
-
-@intrinsic
-def flat(typingctx, array):  # type: ignore[no-untyped-def]  # a numba intrinsic
-    """All elements of a contiguous array in one row, their use uncounted as of `borrowed`."""
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        whole = context.make_array(sig.args[0])(context, builder, args[0])
-        row = context.make_array(sig.return_type)(context, builder)
-        populate_array(
-            row, whole.data, [whole.nitems], [whole.itemsize], whole.itemsize, meminfo=None
-        )
-        return row._getvalue()
-
-    return types.Array(array.dtype, 1, "C")(array), codegen
+@njit(inline="always")
+def exact_product(a, b):
+    """A * b in two doubles (high, low), by Veltkamp's and Dekker's splitting; |a|, |b| < 1e300."""
+    high = a * b
+    scaled = 134217729.0 * a  # 2^27 + 1
+    a_high = scaled - (scaled - a)
+    a_low = a - a_high
+    scaled = 134217729.0 * b
+    b_high = scaled - (scaled - b)
+    b_low = b - b_high
+    return high, ((a_high * b_high - high) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
 @njit(inline="always")
@@ -79,11 +41,11 @@ def fraction_of_cycle(x):
 def product_fraction(high, low, x):
     """Fraction of (high + low) * x cycles, right to about 1e-16 up to 1e15 cycles.
 
-    The rounding error of high * x is recovered by a fused multiply-add, so what remains is
-    low * x rounded once: beyond, 1e-32 of all cycles.
+    The rounding error of high * x is recovered exactly, so what remains is low * x rounded once:
+    beyond, 1e-32 of all cycles.
     """
-    product = high * x
-    rest = fma(high, x, -product) + low * x
+    product, rest = exact_product(high, x)
+    rest += low * x
     return fraction_of_cycle(fraction_of_cycle(product) + rest)
 
 
@@ -91,7 +53,8 @@ def product_fraction(high, low, x):
 def quotient(numerator, denominator):
     """Numerator / denominator in two doubles (high, low)."""
     high = numerator / denominator
-    return high, -fma(high, denominator, -numerator) / denominator
+    product, rest = exact_product(high, denominator)
+    return high, ((numerator - product) - rest) / denominator
 
 
 @njit(inline="always")

@@ -10,13 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sweep.model.crossings import crossing_series
-from sweep.model.elementary import borrowed
-from sweep.model.lending import lend
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.modulation import Stretch, choices, stretches
 from sweep.model.preparation import Shots
-from sweep.model.segments import inspect_segment, lent, workspace
+from sweep.model.segments import runs_of
 
 BIN, FIRST, LAST = range(3)
 
@@ -54,54 +50,39 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
 
     ``every_bin`` as of :func:`sweep.model.shot.find`.
     """
-    found = [_of_stretch(shots, stretch, most, every_bin) for stretch in stretches(shots)]
-    if len(found) == 1:
-        return found[0]
-    return Groups(*(np.concatenate(fields) for fields in zip(*found, strict=True)))
-
-
-def _of_stretch(shots: Shots, stretch: Stretch, most: int, every_bin: bool) -> Groups:
-    n = stretch.row.size
+    n = shots.size
     bins = np.full((3, n, 3, most), -1, np.int64)
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    _find_groups(
-        stretch.points, stretch.row, stretch.scene, shots.segments,
-        choices(shots, every_bin=every_bin), shots.kernel(),
-        workspace(stretch.lines, shots.fft_size), bins, neighbours, pd, exempted, leakage,
-    )  # fmt: skip
+    levels = np.stack([shots.threshold, shots.line_deviation])
+    for runs in runs_of(shots, every_bin=every_bin):
+        _find_groups(
+            runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
+            shots.fft_size // 2, bins, neighbours, pd,
+        )  # fmt: skip
+        some = np.where(runs.bins > 0, runs.exempted, np.nan)
+        exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_groups(
-    points, row, scene, segments, choices, kernel, work, bins, neighbours, pd, exempted, leakage
-):
-    """Groups of every point and segment, into arrays of the shapes of :class:`Groups`."""
-    half = kernel[0][0] // 2
-    seen, known, (room, exempt, series) = lent(scene, kernel, work)
-    scene, kernel = lend(seen), lend(known)
-    bins = borrowed(bins)
-    p = np.empty(points.shape[0])
-    for i in range(points.shape[1]):
-        p[:] = points[:, i]
-        sigma, level = p[10], p[11]
-        if choices[2]:
-            crossing_series(level / sigma, series)
+def _find_groups(part, runs, magnitudes, levels, half, bins, neighbours, pd):
+    """Groups of every run, into arrays of the shapes of :class:`Groups`."""
+    low, count, peak, start = runs
+    for j in range(part.size):
+        i = part[j]
+        level, deviation = levels[0, i], levels[1, i]
         for s in range(3):
-            if not segments[s]:
+            if count[s, j] == 0:
                 continue
-            low, count, peak, exempted[i, s], leakage[i, s] = inspect_segment(
-                s, p, scene, (row[i], i), choices, kernel, room, exempt, series
-            )
-            magnitude = room[0, :count]
-            found = _list_groups(magnitude, peak, level, bins[:, i, s])
+            magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
+            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]
-                pd[i, s, g] = marcum_q1_pair(magnitude[k] / p[13], level / p[13])[0]
+                pd[i, s, g] = marcum_q1_pair(magnitude[k] / deviation, level / deviation)[0]
                 for side in range(3):
-                    neighbours[i, s, g, side] = _beside(magnitude, low, k + side - 1, half)
-                bins[:, i, s, g] += low
+                    neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
+                bins[:, i, s, g] += low[s, j]
 
 
 @njit(cache=True, error_model="numpy")

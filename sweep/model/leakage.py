@@ -2,17 +2,22 @@
 
 Bins within a run around the lines are evaluated one by one: all that may cross the threshold, and
 as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
-chances that leaked signal adds are summed as an integral (:mod:`sweep.model.far_field`), to better
-than 1e-6 of the leakage; or left out, where the window's envelope says that they come to no more
-than the accuracy asked for. What this leaves of that may do for the bins within the run as well.
+chances that leaked signal adds are summed as an integral, to better than 1e-6 of the leakage; or
+left out, where the shape's envelope says that they come to no more than the accuracy asked for.
+What this leaves of that may do for the bins within the run as well.
+
+The integral: without padding e^{i pi k} is a sign, so |X| far from the lines is a smooth function
+of k, and a sum over bins an integral and corrections at its near end (Euler's and Maclaurin's, in
+central differences). As |X|^2 is even about DC and about Nyquist, there is none at the far end but
+half the value there. In v = cot(pi q / N), q the distance from the lines, the integrand is nearly
+a polynomial: some thirty Gauss points stand for sixty thousand bins.
 """
 
 import math
 
 import numpy as np
+from numba import njit
 
-from sweep.model import far_field
-from sweep.model.compiling import borrowing
 from sweep.model.crossings import (
     added_crossings,
     any_crossing,
@@ -21,18 +26,29 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
-from sweep.model.far_field import CLEARANCE
-from sweep.model.lanes import dot
-from sweep.model.runs import (
-    add_afar,
-    bundle,
+from sweep.model.spectrum import (
+    CHANCE,
+    F_IM,
+    F_RE,
+    HALF_SQUARE,
+    IMAGED,
+    OUT,
+    POINT,
+    S_A_RE,
+    S_PLACE,
+    TAN,
+    TURN_IM,
+    TURN_RE,
+    WEIGHT,
+    WINDOW,
+    add_far,
     magnitudes,
-    near_bins,
-    prepare_field,
-    seen_from,
-    served_beside,
+    run_of,
+    seen,
     stays_below,
-    sum_afar,
+    take_sources,
+    tangent_of,
+    weight_afar,
 )
 
 APRON = 3
@@ -41,88 +57,87 @@ APRON = 3
 SMOOTHNESS = 1e-7
 """Largest last correction at the near end of an integral, relative to all that leaks."""
 
+MOST_POINTS = 200
+"""Gauss points on one side of the lines, at the most."""
 
-@borrowing()
-def inspect(origin, n, kind, noise, choices, kernel, room, exempt, series):
-    """Run of bins, detection and leakage of a segment's lines.
+_LARGEST_ORDER = 12
+_GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
+for _n in range(1, _LARGEST_ORDER + 1):
+    _GAUSS[:, _n, :_n] = np.polynomial.legendre.leggauss(_n)
+
+
+@njit(cache=True, error_model="numpy")
+def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, series):
+    """Run of bins, detection and leakage of a segment's lines; all bins are accounted for.
 
     Parameters
     ----------
-    origin, n : int
-        Bin from which the lines count; their number. Rows DELTA .. hold positions and C_b, for
-        ``power`` |C_b|^2 and nothing; they become strengths.
-    kind : tuple
-        Whether they are sources of bundles, and of which: :func:`sweep.model.bundles.take_bundles`.
+    origin, lines, table, form, sizes, tangent, room, exempt
+        As of :func:`sweep.model.spectrum.detect`.
     noise : (float, float, float)
         sigma per quadrature; threshold; chance of leakage that may be left out.
-    choices, kernel
-        As of :func:`sweep.model.segments.segment_spectrum`.
-    room : (ROOM, width) float64
-        Scratch; |X| of the run in row 0.
-    exempt : (width,) bool
-        Result: bins of the run that can't raise a false alarm.
     series : (MOST_TERMS,) float64
         :func:`sweep.model.crossings.crossing_series` of the threshold.
 
     Returns
     -------
     low, count, peak, exempted : int
-        First bin of the run, number of bins, index of the largest, number of exempt ones; count
-        is 0 where the lines lie too far apart for what this rests on.
+        As of :func:`sweep.model.spectrum.detect`.
     leakage : float
     """
-    half_size = kernel[0][0] // 2
-    power, image = choices[0], choices[1]
-    total, lowest, highest = bundle(n, kind, power, room)
-    near, mirrored, fits = near_bins(
-        origin, lowest, highest, CLEARANCE + len(kernel[1][2]), image, kernel
-    )
-    if not fits:
-        return 0, 0, 0, 0, 0.0
-    spread = lowest, highest
-    poles = len(kernel[1][2])
-    total = math.sqrt(total) if power else sum_afar(n, total, spread, poles, room)
-    centre = seen_from(origin, spread, kernel[0][0])
-    crossing = stays_below(noise[1], total * kernel[2][0], highest - lowest, centre, image, kernel)
-    clearance = CLEARANCE + poles
-    reach = int(min(max(math.ceil(crossing) - clearance, 0), half_size))
-    mirror = min(centre, half_size - centre) - 0.5 * (highest - lowest) - 1.0
-    mirror = mirror if image else math.inf
-    left = noise[2] - _all_beyond(total, float(clearance + reach), mirror, noise, kernel)
-    alone = left >= 0.0
-    if alone and reach > 0:
-        served = min(reach, served_beside(kind, kernel))
-        wider = near_bins(origin, lowest, highest, clearance + served, image, kernel)
-        if wider[2]:
-            near, mirrored, _ = wider
-            reach -= served
-    sources = not alone or reach > 0 or (image and not mirrored)
-    field = prepare_field(origin, n, kind, spread, sources, choices, kernel, room)
-    if alone:
-        low, high = max(near[0] - reach, 0), min(near[1] + reach, half_size)
+    n, lowest, highest, total = lines
+    half, beside = sizes[0] // 2, sizes[2] - WINDOW - 2
+    place = seen(origin, lowest, highest, sizes)
+    mirror = max(min(place[0], half - place[1]), 0.0) if sizes[6] == IMAGED else math.inf
+    crossing = stays_below(noise[1], total, place, form, sizes)
+    afar, sources = total, 0
+    least = max(crossing, float(beside))
+    left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+    if left < 0.0 or crossing > beside:
+        sources = take_sources(n, lowest, highest, sizes, room)
+        afar = weight_afar(total, sources, sizes, room)
+        if crossing > beside:
+            crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
+        least = min(max(crossing, float(beside)), float(beside + half))
+        left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+    known = n, lowest, highest, sources
+    if left >= 0.0:
+        low, high = run_of(least, place, sizes)
         count = high - low + 1
-        magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
-        peak, exempted = mark(room[0], count, noise[1], exempt)
-        chance = _of_run(count, left, noise, kernel, room, exempt, series)
+        magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
+        peak, exempted = mark(room[OUT], count, noise[1], exempt)
+        chance = _of_run(count, left, noise, room, exempt, series)
         return low, count, peak, exempted, chance
-    reach = _least_reach(total, highest - lowest, noise, crossing, kernel)
+    near_low, near_high = run_of(float(beside), place, sizes)
+    reach = _least_reach(afar, highest - lowest, noise, crossing, form, sizes)
     while True:
-        low, high = near[0] - reach, near[1] + reach
+        low, high = near_low - reach, near_high + reach
         low = 0 if low <= reach + APRON else low
-        high = half_size if half_size - high <= reach + APRON else high
+        high = half if half - high <= reach + APRON else high
         count = high - low + 1
-        magnitudes(low, count, origin, n, near, mirrored, field, power, kernel, room)
-        peak, exempted = mark(room[0], count, noise[1], exempt)
+        magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
+        peak, exempted = mark(room[OUT], count, noise[1], exempt)
+        run = low, count, peak, origin, sources
         leakage, settled = _leakage(
-            low, count, peak, field, noise, choices, kernel, room, exempt, series
-        )
+            run, place, noise, form, sizes, tangent, room, exempt, series
+        )  # fmt: skip
         if settled:
             return low, count, peak, exempted, leakage
         reach *= 2
 
 
-@borrowing()
-def _all_beyond(total, first, mirror, noise, kernel):
+@njit(cache=True, error_model="numpy")
+def of_bins(count, noise, floor, room, exempt, series):
+    """Leakage of the bins of a run that stand above ``floor`` sigma, one by one."""
+    for i in range(count):
+        if room[OUT, i] < floor * noise[0]:
+            exempt[i] = True
+    _chances(count, noise, room, exempt, series)
+    return any_crossing(room[CHANCE], 0, count)
+
+
+@njit(cache=True, error_model="numpy")
+def _all_beyond(weight, first, mirror, noise, form):
     """Bound on the chance that any bin ``first`` or more bins from the lines adds to leakage.
 
     With x = a^2/2, y = b^2/2 and z = a b a bin's own is at most
@@ -133,12 +148,12 @@ def _all_beyond(total, first, mirror, noise, kernel):
     nearer to a bin than the lines, nor than ``mirror``; infinite where there are none.
     """
     sigma, level, _ = noise
-    weight = total * kernel[2][0] / sigma
+    weight /= sigma
     b = level / sigma
     y = 0.5 * b * b
-    nearest, squares = _envelope_beyond(first, kernel)
+    nearest, squares = _envelope_beyond(first, form)
     if mirror < math.inf:
-        image, image_squares = _envelope_beyond(max(first, mirror), kernel)
+        image, image_squares = _envelope_beyond(max(first, mirror), form)
         image_squares += max(mirror - first, 0.0) * image * image
         nearest += image
         squares = (math.sqrt(squares) + math.sqrt(image_squares)) ** 2
@@ -151,15 +166,16 @@ def _all_beyond(total, first, mirror, noise, kernel):
     return weight * weight * squares * y * math.exp(growth - y) / -math.expm1(-y)
 
 
-@borrowing()
-def _envelope_beyond(first, kernel):
-    """Window's envelope ``first`` bins away; sum of its squares in all bins from there on."""
-    _, envelope, reach, beyond = kernel[2]
-    place = max(np.searchsorted(reach, max(first - 1.5, 0.0), "right") - 1, 0)
-    return envelope[place], envelope[place] * envelope[place] + beyond[place]
+@njit(cache=True, error_model="numpy")
+def _envelope_beyond(first, form):
+    """Envelope ``first`` bins away; sum of its squares in all bins from there on, both sides."""
+    place = 0
+    while place + 1 < form.shape[1] and form[0, place + 1] <= first - 1.5:
+        place += 1
+    return form[1, place], 2.0 * (form[1, place] * form[1, place] + form[2, place])
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def _at_most(count, noise, exempt, room):
     """Bound on the chance that any bin of a run adds to leakage; infinite where it is large.
 
@@ -168,100 +184,117 @@ def _at_most(count, noise, exempt, room):
     them, and that at most e^{-(b - a)^2 / 2}, of the e^-2 and more below 1 that noise alone leaves.
     """
     sigma, level, _ = noise
-    magnitude, loud = room[0], room[3]
+    most, squares = 0.0, 0.0
     for i in range(count):
-        loud[i] = magnitude[i]
-    for i in range(count):
-        loud[i] = 0.0 if exempt[i] else loud[i]
-    most = largest(loud[:count])
+        loud = 0.0 if exempt[i] else room[OUT, i]
+        most = max(most, loud)
+        squares += loud * loud
     if not most > 0.0:
         return 0.0
     a, b = most / sigma, level / sigma
     if a * a > b * b - 4.0:
         return np.inf
-    share = dot(loud, loud, count) / (most * most)
-    return 1.2 * share * math.exp(-0.5 * (b - a) * (b - a))
+    return 1.2 * squares / (most * most) * math.exp(-0.5 * (b - a) * (b - a))
 
 
-@borrowing()
-def _of_run(count, left, noise, kernel, room, exempt, series):
+@njit(cache=True, error_model="numpy")
+def _of_run(count, left, noise, room, exempt, series):
     """Leakage of a run of bins; 0 where it is sure to be no more than is ``left`` to leave out."""
     if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
         return 0.0
-    _chances(count, noise, kernel, room, exempt, series)
-    return any_crossing(room[4], 0, count)
+    _chances(count, noise, room, exempt, series)
+    return any_crossing(room[CHANCE], 0, count)
 
 
-@borrowing()
-def _chances(count, noise, kernel, room, exempt, series):
-    """Added chances of a run of bins, into row 4."""
+@njit(cache=True, error_model="numpy")
+def _chances(count, noise, room, exempt, series):
+    """Added chances of a run of bins, into row CHANCE."""
     sigma, level, _ = noise
-    _half_squares(room[0, :count], exempt, 0.5 / (sigma * sigma), room[3])
-    added_crossings(room[3], count, level / sigma, series, room[4])
+    scale = 0.5 / (sigma * sigma)
+    for i in range(count):
+        room[HALF_SQUARE, i] = 0.0 if exempt[i] else room[OUT, i] * room[OUT, i] * scale
+    added_crossings(room[HALF_SQUARE], count, level / sigma, series, room[CHANCE])
 
 
-@borrowing()
-def _least_reach(total, spread, noise, crossing, kernel):
+@njit(cache=True, error_model="numpy")
+def _least_reach(weight, spread, noise, crossing, form, sizes):
     """Bins beyond the near ones that the run has to take in: see the module."""
     sigma, level, _ = noise
-    window_sum, envelope, reach, _ = kernel[2]
-    half_size = kernel[0][0] // 2
-    clearance = CLEARANCE + len(kernel[1][2])
-    weight = total * window_sum
-    at = np.searchsorted(reach, float(clearance))
-    beside = envelope[min(at, envelope.size - 1)] * weight / sigma
+    clearance = sizes[2] - WINDOW - 2
+    beside = form[1, clearance] * weight / sigma
     gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
     least = max(crossing, max(gentle, 0.75 * spread)) - clearance
-    return int(min((max(math.ceil(least), 0.0) + 2 * APRON + 7) // 8 * 8, half_size))
+    return int(min((max(math.ceil(least), 0.0) + 2 * APRON + 7) // 8 * 8, sizes[0] // 2))
 
 
-@borrowing()
-def _leakage(low, count, peak, field, noise, choices, kernel, room, exempt, series):
+@njit(cache=True, error_model="numpy")
+def _leakage(run, place, noise, form, sizes, tangent, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
+    low, count, peak, origin, sources = run
     sigma, level, _ = noise
-    fft_size, half_size = kernel[0][0], kernel[0][0] // 2
+    fft_size, half = sizes[0], sizes[0] // 2
     beta, scale = level / sigma, 0.5 / (sigma * sigma)
-    magnitude, chance = room[0], room[4]
-    _chances(count, noise, kernel, room, exempt, series)
-    below, above = low > 0, low + count - 1 < half_size
-    some = any_crossing(chance, APRON if below else 0, count - APRON if above else count)
+    _chances(count, noise, room, exempt, series)
+    below, above = low > 0, low + count - 1 < half
+    some = any_crossing(room[CHANCE], APRON if below else 0, count - APRON if above else count)
     if not below and not above:
         return some, True
+    centre = abs(math.floor(0.5 * (place[0] + place[1]) + 0.5))
+    centre = fft_size - centre if centre > half else centre
     tail, rest, points = 0.0, 0.0, 0
     for side in (-1, 1):
         if not (below if side < 0 else above):
             continue
-        correction, last, steepness, found = _near_end(side, count, chance, exempt)
+        correction, last, steepness, found = _near_end(side, count, room[CHANCE], exempt)
         if not found:
             return 0.0, False
         tail += correction
         rest += last
-        points = _points_beyond(
-            side, low, count, field[0], steepness, choices[1], kernel, room, points
-        )
+        end = centre - low - APRON if side < 0 else low + count - 1 - APRON - centre
+        points = _points_beyond(side, end, centre, steepness, sizes, tangent, room, points)
     while points % 8:  # whole vectors: what is left over costs as much as all of them
-        room[9, points], room[10, points] = room[9, points - 1], 0.0
+        room[POINT, points], room[WEIGHT, points] = room[POINT, points - 1], 0.0
         points += 1
-    far_field.points_to_bins(room[9, :points], room[10, :points], fft_size)
-    largest_beyond = _far_chances(points, field, scale, beta, choices[0], kernel, room, series)
-    tail += weighted_silence(chance[:points], room[10, :points])
-    most = min(0.45 * beta * beta, magnitude[peak] * magnitude[peak] * scale)
+    bins = fft_size / math.pi
+    for i in range(points):
+        room[WEIGHT, i] *= bins / (1.0 + room[POINT, i] * room[POINT, i])
+        room[POINT, i] = 1.0 / room[POINT, i]
+    _far_values(points, centre, origin, sources, form, sizes, tangent, room)
+    for i in range(points):
+        room[HALF_SQUARE, i] *= scale
+    largest_beyond = largest(room[HALF_SQUARE, :points])
+    added_crossings(room[HALF_SQUARE], points, beta, series, room[CHANCE])
+    tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
+    most = min(0.45 * beta * beta, room[OUT, peak] * room[OUT, peak] * scale)
     if not (largest_beyond <= most and rest <= SMOOTHNESS * (some + tail)):
         return 0.0, False
     return some - (1.0 - some) * math.expm1(-tail), True
 
 
-@borrowing()
-def _half_squares(magnitude, exempt, scale, x):
-    """a^2/2 of bins; 0 of those that can't raise a false alarm."""
-    for i in range(magnitude.size):
-        x[i] = magnitude[i] * magnitude[i] * scale
-    for i in range(magnitude.size):
-        if exempt[i]:
-            x[i] = 0.0
+@njit(cache=True, error_model="numpy")
+def _far_values(points, centre, origin, sources, form, sizes, tangent, room):
+    """|X|^2 at points whose tangents from ``centre`` are in row POINT, into row HALF_SQUARE."""
+    power, way = sizes[4] != 0, -1 if origin < 0 else 1
+    for turn in range(2 if sizes[6] == IMAGED else 1):
+        towards = way if turn == 0 else -way
+        shift = tangent_of(centre - towards * origin, sizes[0], tangent)
+        for i in range(points):
+            t = room[POINT, i]
+            room[TAN, i] = towards * (t + shift) / (1.0 - t * shift)
+            room[TURN_RE, i], room[TURN_IM, i] = 1.0, 0.0
+            room[F_RE, i], room[F_IM, i] = 0.0, 0.0
+        for b in range(sources):
+            add_far(0, points, 0, S_PLACE, S_A_RE, b, form, sizes, room)
+        for i in range(points):
+            re, im = room[F_RE, i], towards * room[F_IM, i]
+            room[HALF_SQUARE, i] = re if turn == 0 else room[HALF_SQUARE, i] + re
+            room[CHANCE, i] = im if turn == 0 else room[CHANCE, i] + im
+    for i in range(points):
+        re, im = room[HALF_SQUARE, i], room[CHANCE, i]
+        room[HALF_SQUARE, i] = max(re, 0.0) if power else re * re + im * im
 
 
-@borrowing()
+@njit(cache=True, error_model="numpy")
 def _near_end(side, count, chance, exempt):
     """Correction of an integral at its near end, its last term's size, -d ln f / dq; if there."""
     step = 1 if side > 0 else -1
@@ -281,54 +314,68 @@ def _near_end(side, count, chance, exempt):
     return terms[0] + terms[1] + terms[2], last, steepness, True
 
 
-@borrowing()
-def _points_beyond(side, low, count, centre, steepness, image, kernel, room, points):
-    """Adds the points and weights of one side's integral to rows 9 and 10.
+@njit(cache=True, error_model="numpy")
+def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
+    """Adds cotangents and weights of one side's integral to rows POINT and WEIGHT.
 
-    With images the spectrum is even about DC and Nyquist; without, it goes on, and the integral
-    out to half a bin beyond is corrected by the first difference there.
+    The integral begins half a bin beyond ``last``, counted from ``centre``. With images the
+    spectrum is even about DC and Nyquist; without, it goes on, and the integral out to half a bin
+    beyond is corrected by the first difference there.
     """
-    fft_size, half_size, tangent = kernel[0][0], kernel[0][0] // 2, kernel[4]
-    odd = 2 * half_size != fft_size
-    if side < 0:
-        last, far_bin, half = centre - low - APRON, 0, False
-    else:
-        last, far_bin, half = low + count - 1 - APRON - centre, half_size, odd
-    v, weight = room[9], room[10]
+    fft_size, half_size = sizes[0], sizes[0] // 2
+    far_bin = 0 if side < 0 else half_size
+    half = side > 0 and 2 * half_size != fft_size
     last_bin = abs(far_bin - centre)
-    goes_on = not image and last_bin < half_size
+    goes_on = sizes[6] != IMAGED and last_bin < half_size
     half = half or goes_on
-    far = max(far_field.half_bin_cotangent(abs(far_bin - centre), half, fft_size, tangent), 1e-9)
-    points = far_field.far_points(
-        float(side), far_field.half_bin_cotangent(last, True, fft_size, tangent), far,
-        steepness * (last + 0.5), v, weight, points,
-    )  # fmt: skip
+    far = max(_cotangent(last_bin, half, fft_size, tangent), 1e-9)
+    near = _cotangent(last, True, fft_size, tangent)
+    start, least = near, max(far, 0.5)
+    while start > far:
+        if start > 8.0 * least:
+            end = start * (0.125 if start > 32.0 * least else 0.25)
+        else:
+            end = 0.5 * start if start > 2.2 * least else far
+        order = _order(steepness * (last + 0.5), start / near)
+        middle, width = 0.5 * (start + end), 0.5 * (start - end)
+        for i in range(order):
+            room[POINT, points] = side * (middle + width * _GAUSS[0, order, i])
+            room[WEIGHT, points] = width * _GAUSS[1, order, i]
+            points += 1
+        start = end
     bin_ = math.pi / fft_size
     if goes_on:
         for k in range(2):
-            at = far_field.half_bin_cotangent(last_bin + k, False, fft_size, tangent)
-            v[points] = side * at
-            weight[points] = (1.0 - 2.0 * k) / 24.0 * bin_ * (1.0 + at * at)
+            at = _cotangent(last_bin + k, False, fft_size, tangent)
+            room[POINT, points] = side * at
+            room[WEIGHT, points] = (1.0 - 2.0 * k) / 24.0 * bin_ * (1.0 + at * at)
             points += 1
     elif not half:  # the far end is a bin: half of it lies beyond the integral
-        v[points] = side * far
-        weight[points] = 0.5 * bin_ * (1.0 + far * far)
+        room[POINT, points] = side * far
+        room[WEIGHT, points] = 0.5 * bin_ * (1.0 + far * far)
         points += 1
     return points
 
 
-@borrowing()
-def _far_chances(points, field, scale, beta, power, kernel, room, series):
-    """Added chances at the points of the integrals, into row 4; the largest a^2/2 there."""
-    _, _, _, edge_re, edge_im, _ = field
-    t, re, im, x = room[9, :points], room[11, :points], room[12, :points], room[3]
-    re[:] = edge_re
-    im[:] = edge_im
-    add_afar(t, False, field, power, kernel, room, re, im)
-    add_afar(t, True, field, power, kernel, room, re, im)
-    for i in range(points):
-        square = re[i] if power else re[i] * re[i] + im[i] * im[i]
-        x[i] = scale * (square if square > 0.0 else 0.0)
-    largest_beyond = largest(x[:points])
-    added_crossings(x, points, beta, series, room[4])
-    return largest_beyond
+@njit(cache=True, error_model="numpy")
+def _cotangent(whole, half, fft_size, tangent):
+    """cot(pi q / N) for q = whole, or half a bin more, 0 < q <= N/2."""
+    t = tangent[whole]
+    if not half:
+        return 1.0 / t
+    small = 0.5 * math.pi / fft_size
+    small *= 1.0 + small * small / 3.0
+    return (1.0 - t * small) / (t + small)
+
+
+@njit(cache=True, error_model="numpy")
+def _order(steepness, share):
+    """Gauss points of a stretch that begins at a share of the near end's v."""
+    order = 4 + int(0.6 * steepness * share)
+    if share > 0.9:
+        order += 5
+    elif share > 0.06:
+        order += 4
+    elif share > 0.008:
+        order += 2
+    return min(order, _LARGEST_ORDER)

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from sweep.model.elementary import fma
+from sweep.model.elementary import exact_product
 
 _LARGEST_SERIES_PRODUCT = 30.0
 _STEP = 0.7
@@ -112,7 +112,7 @@ def marcum_q1_pair(a, b):
     if b == 0.0 or d * d > _NOTHING_LEFT:
         return (1.0, 0.0) if b == 0.0 or is_p else (0.0, 1.0)
     high = 0.5 * d * d
-    low = fma(0.5 * d, d, -high) + d * ((max(a, b) - d) - min(a, b))
+    low = exact_product(0.5 * d, d)[1] + d * ((max(a, b) - d) - min(a, b))
     decay = math.exp(-high)
     decay -= decay * low
     if a * b < _LARGEST_SERIES_PRODUCT:
@@ -121,12 +121,12 @@ def marcum_q1_pair(a, b):
         xx = x * x
         n, older, total, exponential = 1.0, 0.0, 0.0, 0.0
         for k in range(min(int(7.0 + 9.0 * math.sqrt(max(x, square))), 52), 0, -1):
-            total = fma(square, total, n)
-            exponential = fma(x, exponential, n)
-            n, older = fma(2.0 * k, n, xx * older), n
-        norm = 1.0 / fma(2.0 * x, exponential, n)
+            total = square * total + n
+            exponential = x * exponential + n
+            n, older = (2.0 * k * n + xx * older), n
+        norm = 1.0 / (2.0 * x * exponential + n)
         # One b multiplies last: a tiny one would underflow when squared.
-        tail = b * (b * (total * norm) * decay) if is_p else fma(square, total, n) * norm * decay
+        tail = b * (b * (total * norm) * decay) if is_p else (square * total + n) * norm * decay
     else:
         shift, half = d * math.sqrt(b / a), 0.5 / (math.sqrt(a) * math.sqrt(b))
         if is_p:
@@ -157,7 +157,7 @@ def excess_crossing(a, b):
     x = 0.5 * a * a
     w = 0.25 * (a * b) * (a * b)
     high = 0.5 * b * b
-    low = fma(0.5 * b, b, -high) if high < 1e3 else 0.0
+    low = exact_product(0.5 * b, b)[1] if high < 1e3 else 0.0
     if x <= 2.0 and w <= 16.0:
         terms = _LONGEST_EXCESS
         if x <= 1e-2 and w <= 2.6e-2:
@@ -170,7 +170,7 @@ def excess_crossing(a, b):
         decay = math.exp(-(high + x))
         kummer, total = 1.0, 0.0
         for m in range(terms, 0, -1):  # from the last on, M by its recurrence
-            kummer = fma(x * _HARMONIC[m], kummer, 1.0)
+            kummer = x * _HARMONIC[m] * kummer + 1.0
             total = (w * _INVERSE_SQUARE[m]) * (kummer + total)
         return (decay - decay * low) * total
     q, p = marcum_q1_pair(a, b)

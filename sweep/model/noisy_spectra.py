@@ -4,7 +4,7 @@ Noise is drawn as the receiver makes it: white Gaussian in the record, which is 
 transformed; so bins are alike as far as window and padding make them, and DC and Nyquist are what
 they are. Every sample is addressed by point, draw, segment and place (:mod:`sweep.model.philox`).
 
-The signal has the magnitudes that :func:`sweep.model.spectra.segment_spectrum` gives, with all
+The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, with all
 effects. Where beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
 is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make.
@@ -31,7 +31,7 @@ from sweep.model.estimators import ESTIMATORS, PEAK_BIN, Estimator
 from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.philox import STREAM_RECORD, normals
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.spectra import segment_spectrum
+from sweep.model.segments import spectrum as segment_spectrum
 
 DETECTOR, ESTIMATOR = "instrument.processing.detector.", "instrument.processing.estimator."
 DEFAULTS: dict[str, float | int | str] = {

@@ -26,7 +26,7 @@ from scipy import fft
 from sweep.model import window as windows
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
-from sweep.model.lines import segment_lines
+from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
 
 CELLS = 16
@@ -137,7 +137,7 @@ def _magnitudes(
     deposit = _put_nearest if degree == 0 else _share_out
     deposit(
         np.ascontiguousarray(table[:, index]), shots.row[index], shots.footprint, segment,
-        (shots.fft_size, length), power, shots.image, _WEIGHTS, origin,
+        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, _WEIGHTS, origin,
         grid.view(float).reshape(index.size, cells, -1),
     )  # fmt: skip
     kernel = _kernel(shots.window.name, length, shots.fft_size, cells, power, real)
@@ -195,15 +195,13 @@ _WEIGHTS = _lagrange()
 
 
 @njit(cache=True, error_model="numpy")
-def _lines(i, p, row, footprint, segment, sizes, power, delta, re, im):
-    """Lines of one point's segment; see :func:`sweep.model.lines.segment_lines`."""
-    sign = 1.0 - segment
-    return segment_lines(
-        (sign, p[9, i] if segment == 2 else p[8, i]), (p[2, i], p[0, i], p[1, i], p[3, i]),
-        (p[4, i], p[5, i]), (p[6, i], sizes[0], sizes[1], p[7, i]), footprint[0][row[i]],
-        footprint[1][row[i]], footprint[2][row[i]], footprint[3][segment, row[i]], delta, re, im,
-        power,
-    )  # fmt: skip
+def _lines(i, p, row, footprint, segment, sizes, room):
+    """Lines of one point's segment where they are seen, at 0 .. N/2; their origin."""
+    origin = place_lines(p[:, i].copy(), segment, footprint, row[i], sizes, room)
+    if origin < 0:
+        for b in range(footprint.shape[2]):
+            room[PLACE, b], room[IM, b] = -room[PLACE, b], -room[IM, b]
+    return abs(origin)
 
 
 @njit(cache=True, error_model="numpy")
@@ -217,13 +215,14 @@ def _image(origin, delta, re, im, sizes, centre):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_nearest(p, row, footprint, segment, sizes, power, image, weights, origin, grid):
+def _put_nearest(p, row, footprint, segment, sizes, image, weights, origin, grid):
     """Lines of m points, each into the nearest cell of its grid, (m, cells, 2 or 1)."""
-    n, cells = footprint[0].shape[1], grid.shape[1]
-    delta, re, im = np.empty(n), np.empty(n), np.empty(n)
+    n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
+    room = np.empty((BLOCK + 1, n))
+    delta, re, im = room[PLACE], room[RE], room[IM]
     centre = cells // 2
     for i in range(row.size):
-        origin[i] = _lines(i, p, row, footprint, segment, sizes, power, delta, re, im)
+        origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
         for b in range(n):
             _add(grid, i, int(np.rint(centre + CELLS * delta[b])), re[b], im[b])
             if image:
@@ -233,14 +232,15 @@ def _put_nearest(p, row, footprint, segment, sizes, power, image, weights, origi
 
 
 @njit(cache=True, error_model="numpy")
-def _share_out(p, row, footprint, segment, sizes, power, image, weights, origin, grid):
+def _share_out(p, row, footprint, segment, sizes, image, weights, origin, grid):
     """The same, each shared out among ten cells."""
-    n, cells = footprint[0].shape[1], grid.shape[1]
-    delta, re, im = np.empty(n), np.empty(n), np.empty(n)
+    n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
+    room = np.empty((BLOCK + 1, n))
+    delta, re, im = room[PLACE], room[RE], room[IM]
     centre = cells // 2
     share = np.empty(10)
     for i in range(row.size):
-        origin[i] = _lines(i, p, row, footprint, segment, sizes, power, delta, re, im)
+        origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
         for b in range(n):
             _add_shared(grid, i, centre + CELLS * delta[b], re[b], im[b], weights, share)
             if image:

@@ -19,8 +19,6 @@ from sweep.model import detection, link, noise, receiver, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.ground import Ground
-from sweep.model.mode_kernels import with_modes
-from sweep.model.spectrum import tangents
 from sweep.model.window import Window, canonical_name, window
 
 _CURRENTS = (
@@ -94,7 +92,7 @@ CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
-LINE_STEPS = 3
+LINE_STEPS = 2
 """Steps that take few lines for many, at the most: each may err by as much of the whole."""
 
 
@@ -144,7 +142,7 @@ class Shots:
     detector_bandwidth: np.ndarray
     amplifier_bandwidth: np.ndarray
     leakage_floor: np.ndarray
-    """Of :attr:`_floor`; :data:`AUTOMATIC` where it follows from the chance below."""
+    """Of :attr:`floor`; :data:`AUTOMATIC` where it follows from the chance below."""
     leakage_tolerance: np.ndarray
     """Chance of leakage, of all bins far from the lines, that need not be looked for."""
     line_tolerance: np.ndarray
@@ -248,7 +246,7 @@ class Shots:
         return detection.threshold(tnr=self.tnr, bin_deviation=self._deviation(self.quiet_variance))
 
     @property
-    def _floor(self) -> np.ndarray:
+    def floor(self) -> np.ndarray:
         """Signal over sigma below which bins that are taken one by one count as noise alone."""
         given, bins = self.leakage_floor, self.fft_size // 2 + 1
         if not np.any(given == AUTOMATIC):
@@ -262,10 +260,13 @@ class Shots:
         energy = np.asarray(self.window.energy)
         return noise.bin_deviation(noise_variance=variance, window_energy=energy)
 
-    @property
-    def footprint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude (rows, beamlets); phases."""
-        return self.offset, self.doppler, self.amplitude, self.phase
+    @cached_property
+    def footprint(self) -> np.ndarray:
+        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases by segment where there are
+        any: (3 or 6, rows, beamlets).
+        """
+        phases = self.phase if self.phase.size else ()
+        return np.stack([self.offset, self.doppler, self.amplitude, *phases])
 
     @property
     def segments(self) -> np.ndarray:
@@ -273,29 +274,19 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Columns of :func:`sweep.model.segments.evaluate_segments`, (16, n)."""
+        """Numbers of each point as compiled code takes them, (16 + 2 segments, n).
+
+        What all segments share, and of each segment the signed chirp rate [Hz/s] and the carrier.
+        """
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
-            self.carriers[2], self.bin_deviation, self.threshold, self._floor,
+            self.carriers[2], self.bin_deviation, self.threshold, self.floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
-        return in_rows(columns, (self.size,))
-
-    def kernel(self) -> tuple:
-        """What the spectrum needs to know of window and FFT, as the compiled code takes it.
-
-        The last is the thread's own: kernels that are worked out when they are met.
-        """
-        w = self.window
-        return (
-            (self.fft_size, w.length),
-            (w.coefficients, w.numerator, w.poles, w.edge, w.table),
-            (w.sum, w.envelope, w.reach, w.beyond),
-            w.node_limits(self.incoherent),
-            tangents(self.fft_size),
-            with_modes(self.fft_size, w.length, w.coefficients, w.edge, self.incoherent),
-        )
+        by_segment = zip(waveform.SIGNS, self.carriers, strict=True)
+        further = (x for sign, carrier in by_segment for x in (sign * self.chirp_rate, carrier))
+        return in_rows((*columns, *further), (self.size,))
 
     def counted_bins(self, exempted: np.ndarray) -> np.ndarray:
         """Bins that can raise a false alarm, given those that the detection occupies."""

@@ -149,15 +149,15 @@ def draw_returns(
     )  # fmt: skip
     tables = interpolator(shots.window, shots.fft_size)
     counted = np.nan_to_num(shots.counted_bins(found.exempted))
-    nothing = slice(0, n), Seen.nothing(n)._replace(others=counted)
+    nothing = np.arange(n), Seen.nothing(n)._replace(others=counted)
     for part, seen in seen_spectra(shots) if noisy else [nothing]:
         some = Known(*(column[part] for column in known))
         quiet = 1 - at_least_one(one[part], seen.others)
         alarm = 1 - quiet if noisy else 1 - quiet * (1 - some.alarm)
-        _draw(
-            keys[part], how, some._replace(alarm=alarm), seen, tables,
-            Drawn(*(column[part] for column in drawn)),
-        )  # fmt: skip
+        own = Drawn(*(column[part] for column in drawn))
+        _draw(keys[part], how, some._replace(alarm=alarm), seen, tables, own)
+        for column, values in zip(drawn, own, strict=True):
+            column[part] = values
     return _measured(shots, found, drawn)
 
 

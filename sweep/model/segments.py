@@ -1,302 +1,520 @@
-"""The compiled loop over points: three segments each, from lines to detections."""
+"""Segments of shots: from lines to runs of bins, detections and leakage, point by point.
+
+A run holds |X| without noise in every bin around a segment's lines that may matter. Whoever looks
+at spectra (detection, groups, draws, pictures) looks at runs.
+"""
 
 import math
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from sweep.model.bundles import (
-    DELTA,
-    ROOM,
-    STRENGTH_IM,
-    STRENGTH_RE,
-    WIDTH,
-    as_lines,
-    take_bundles,
+from sweep.model import line_shape
+from sweep.model.crossings import MOST_TERMS, crossing_series
+from sweep.model.effects.gaussian_line import gaussian_shifts
+from sweep.model.leakage import MOST_POINTS, inspect, of_bins
+from sweep.model.line_shape import Shapes
+from sweep.model.lines import (
+    IM,
+    LEAST_WIDTH,
+    MOST_NODES,
+    PLACE,
+    RE,
+    X,
+    nodes_for,
+    place_lines,
+    put_on_nodes,
+    relative_error,
+    survey,
 )
-from sweep.model.compiling import borrowing, inlined, owning
-from sweep.model.crossings import MOST_TERMS, crossing_series, largest
-from sweep.model.detection import assess, mark
-from sweep.model.elementary import borrowed
-from sweep.model.equivalent import MOST_NODES
-from sweep.model.far_field import MOST_POINTS
-from sweep.model.leakage import inspect
-from sweep.model.lending import lend
-from sweep.model.lines import folding, segment_lines
 from sweep.model.marcum import marcum_q1_pair
-from sweep.model.mode_bundles import take_modes
-from sweep.model.modulation import is_whole, modulate, reduce_lines, take_few
-from sweep.model.preparation import LINE_STEPS
-from sweep.model.runs import detect, smooth
-from sweep.model.single_bins import bins_above, extent_of, magnitudes_of, parts_at
+from sweep.model.preparation import LINE_STEPS, Shots
+from sweep.model.spectrum import (
+    A_IM,
+    A_RE,
+    COMPLEX,
+    F_IM,
+    F_RE,
+    FOLDED,
+    IMAGED,
+    MOST_CELLS,
+    OUT,
+    ROOM,
+    detect,
+    field,
+)
+from sweep.model.waveform import SIGNS
+from sweep.model.window import Window
 
-SIGNS = (1.0, 0.0, -1.0)
+POINTS = 256
+"""Points that are prepared together."""
 
-LEAKING = (True, False, True)
-"""Segments whose leakage is looked at: no output tells that of the Doppler segment, 0 here."""
+ROOM_FOR_RUNS = 1 << 21
+"""Bins of runs that are kept at a time, at least."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
-"""Rows of the result: what is found in each segment's spectrum."""
+"""What is found in each segment's spectrum."""
+
+NO_LEAKAGE, INTEGRAL, BIN_BY_BIN = range(3)
+"""Ways to look at leakage: not at all; all bins, those far away as an integral; those of the run
+that stand above a floor."""
 
 
-@borrowing()
-def segment_spectrum(segment, p, scene, at, level, choices, kernel, room):
-    """|X| of the bins in which a segment's lines stand above a level, into room's first row.
+class Runs(NamedTuple):
+    """Runs of bins around the lines of some points' segments, and what stands in them.
+
+    Arrays are (segments, m) for m points; count is 0 in segments that there are not.
+    """
+
+    part: np.ndarray
+    """(m,): which points of the shots these are."""
+    low: np.ndarray
+    """First bin; N more or less where a complex record's run passes its ends."""
+    bins: np.ndarray
+    """Bins in the run."""
+    peak: np.ndarray
+    """Place of the largest bin in the run."""
+    exempted: np.ndarray
+    """Bins that can't raise a false alarm."""
+    pd: np.ndarray
+    miss: np.ndarray
+    magnitude: np.ndarray
+    """|X| of the largest bin."""
+    leakage: np.ndarray
+    """Probability that leaked signal raises at least one extra group, over noise alone."""
+    start: np.ndarray
+    """Where each run begins in what follows."""
+    magnitudes: np.ndarray
+    """|X| of all runs, one after the other."""
+    exempt: np.ndarray
+    """Bins of them that can't raise a false alarm, bool."""
+
+    def run(self, segment: int, i: int) -> np.ndarray:
+        """|X| of one run, (count,)."""
+        start = self.start[segment, i]
+        return self.magnitudes[start : start + self.bins[segment, i]]
+
+
+class Together(NamedTuple):
+    """Points whose line shapes are made of the same modes."""
+
+    part: np.ndarray
+    """(m,): which points."""
+    which: np.ndarray
+    """(m,): shape of each."""
+    shapes: Shapes
+    centre: np.ndarray
+    """(segments, u): shift of the lines [bins of fs/L]."""
+    modes: np.ndarray
+    """(segments, u, 2, k): real and imaginary parts."""
+    number: np.ndarray
+    """(segments, u): modes that count."""
+
+
+def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
+    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
+
+    ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
+    """
+    found = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
+    width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
+    for runs in runs_of(shots, every_bin=every_bin, keep=False):
+        for s in np.flatnonzero(shots.segments):
+            found[s][:, runs.part] = (
+                runs.pd[s], runs.miss[s], runs.magnitude[s],
+                (runs.low[s] + runs.peak[s]) * width[runs.part], runs.exempted[s], runs.leakage[s],
+            )  # fmt: skip
+    return found
+
+
+def runs_of(
+    shots: Shots,
+    *,
+    points: np.ndarray | None = None,
+    least: np.ndarray | None = None,
+    leakage: bool = True,
+    every_bin: bool = False,
+    keep: bool = True,
+) -> Iterator[Runs]:
+    """Runs of all points, some points at a time, which are not in their order.
 
     Parameters
     ----------
-    segment : int
-        0 up, 1 Doppler, 2 down.
-    p : (16,) float64
-        The point's column of :meth:`sweep.model.preparation.Shots.point_table`.
-    scene, at : tuple, (int, int)
-        Footprint, parts and shifts of :class:`sweep.model.modulation.Stretch`; the point's row in
-        the first, and its place in the others.
+    shots : Shots
+        Prepared points.
+    points : (m,) ndarray, optional
+        Numbers of the points to look at, by default all.
+    least : (n,) ndarray, optional
+        Level [V, summed over the record] below which bins may be left out, by default the
+        threshold; 0 gives all.
+    leakage : bool
+        Look at leakage where shots have it.
+    every_bin : bool
+        Look at each bin by itself where leakage could be summed as an integral.
+    keep : bool
+        Hand the bins' magnitudes on.
+    """
+    table = shots.point_table()
+    levels = table[11] if least is None else np.broadcast_to(least, shots.size)
+    some = np.arange(shots.size) if points is None else points
+    for together in _together(shots, some):
+        leaks = _way_to_leakage(shots, together.shapes, every_bin) if leakage else NO_LEAKAGE
+        floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
+        lowest, done = np.minimum(levels, floor), 0
+        while done < together.part.size:
+            runs, number = _some(shots, table, lowest, together, leaks, done, keep)
+            yield runs
+            done += number
+
+
+def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
+    """Bins of a segment in which the signal stands above a level, and |X| there, without noise.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared points.
+    i, segment : int
+        Point; 0 up, 1 Doppler, 2 down.
     level : float
-        Bins in which lines stay below it, and their images too, may be left out; 0 keeps all. If
-        none is above it, bins that the largest is known to exceed are.
-    choices : (bool, bool, bool, bool)
-        :func:`sweep.model.modulation.choices`.
-    kernel : tuple
-        :meth:`sweep.model.preparation.Shots.kernel`.
-    room : (ROOM, >= width of :func:`workspace`) float64
-        Scratch; the result in row 0.
+        Magnitude [V, summed over the record] below which bins may be left out; 0 gives all.
 
     Returns
     -------
-    low, count : int
-        First bin, number of bins.
+    bins : (m,) int ndarray
+    magnitude : (m,) ndarray
     """
-    power, image = choices[0], choices[1]
-    origin, n, fold = _lines_of(segment, p, scene, at, power, True, kernel, room)
-    few = reduce_lines(n, power, allowed(p), n - 1, kernel, room)
-    split, further = parts_at(segment, at[1], fold, scene, power, kernel)
-    reach = extent_of(at[1], few, split, further, scene[2], power, kernel, room)
-    low, high = bins_above(level, reach, origin, kernel)
-    while True:
-        magnitudes_of(low, high, origin, few, at[1], fold, split, scene[2], choices, kernel, room)
-        most = largest(room[0, : high - low + 1])
-        if most >= level:
-            break
-        level = most
-        first, last = bins_above(level * (0.5 if image else 1.0), reach, origin, kernel)
-        if first >= low and last <= high:
-            break
-        low, high = min(low, first), max(high, last)
-    return low, high - low + 1
+    (runs,) = runs_of(shots, points=np.array([i]), least=np.array([level]), leakage=False)
+    low = int(runs.low[segment, 0])
+    magnitude = runs.run(segment, 0).copy()
+    return np.arange(low, low + magnitude.size), magnitude
 
 
-@borrowing()
-def allowed(p):
-    """Error of a bin that one step of taking few lines for many may make, and the threshold."""
-    return p[15] * p[10] / LINE_STEPS, p[11]
-
-
-@borrowing()
-def _lines_of(segment, p, scene, at, power, split, kernel, room):
-    """Lines of a segment as :mod:`sweep.model.spectrum` takes them, into rows DELTA ..
-
-    Those that add as amplitudes are replaced by their parts, if asked for. Returns their origin,
-    their number, and -1 where they are seen as their images, else 1.
-    """
-    footprint, parts, shifts = scene[0], scene[1], scene[2]
-    row, sizes = at[0], kernel[0]
-    offset, doppler, amplitude = footprint[0][row], footprint[1][row], footprint[2][row]
-    phase = footprint[3][segment, row]  # without phases a row of none
-    which = SIGNS[segment], p[9] if segment == 2 else p[8]
-    chirp, record = (p[2], p[0], p[1], p[3]), (p[6], sizes[0], sizes[1], p[7])
-    origin = segment_lines(
-        which, chirp, (p[4], p[5]), record, offset, doppler, amplitude, phase, room[DELTA],
-        room[STRENGTH_RE], room[STRENGTH_IM], power,
-    )  # fmt: skip
-    n, fold = offset.size, 1.0
-    if parts[0].size or shifts[0].size:
-        fold = folding(which, chirp, record)
-        if power or split:
-            n = modulate(
-                segment, at[1], n, fold, scene, power, allowed(p), kernel, room
-            )  # fmt: skip
-    return origin, n, fold
-
-
-@borrowing()
-def inspect_segment(segment, p, scene, at, choices, kernel, room, exempt, series):
-    """What a segment's spectrum shows, without noise.
-
-    Parameters
-    ----------
-    segment, p, scene, at, choices, kernel, room
-        As of :func:`segment_spectrum`.
-    exempt : (room's width,) bool
-        Result: bins of the run that can't raise a false alarm.
-    series : (MOST_TERMS,) float64
-        :func:`sweep.model.crossings.crossing_series` of the threshold.
-
-    Returns
-    -------
-    low, count : int
-        Run of bins that holds every bin above the threshold and its neighbours; |X| in row 0.
-    peak, exempted : int
-        Index of the largest bin; number of exempt bins.
-    leakage : float
-        Of all bins; where the window has no closed form or the record is padded, where the
-        spectrum is a mean of several, or for ``every_bin``, of those above the leakage floor.
-        0 where leakage is left out.
-
-    Notes
-    -----
-    Means of several spectra are those of amplitudes over shifts: their bins are looked at one by
-    one. So are those of lines in parts that are too many or spread too wide for bundles.
-    """
-    power, _, leakage, every_bin = choices
-    if smooth(kernel) and not every_bin and (power or not scene[2][0].size):
-        origin, n, kind = _smooth_lines(segment, p, scene, at, power, kernel, room)
-        count, chance = 0, 0.0
-        if leakage and n:
-            low, count, peak, exempted, chance = inspect(
-                origin, n, kind, (p[10], p[11], p[14]), choices, kernel, room, exempt, series
-            )
-        elif n:
-            low, count, peak, exempted = detect(
-                origin, n, kind, p[11], choices, kernel, room, exempt
-            )  # fmt: skip
-        if count:
-            return low, count, peak, exempted, chance
-    return inspect_bins(segment, p, scene, at, choices, kernel, room, exempt)
-
-
-@inlined()
-def _smooth_lines(segment, p, scene, at, power, kernel, room):
-    """As :func:`_lines_of`: origin, number, and of what kind they are (:func:`inspect`).
-
-    Lines in parts that many points share are bundles. Those of a point by itself would not be
-    worth its kernels: parts of amplitudes are lines of their own, and of powers there are none
-    here, as where they are too many or spread too wide for bundles.
-    """
-    parts, own = scene[1], -1
-    if parts[0].size and not is_whole(segment, at[1], scene, power):
-        own = parts[4][at[1]]
-    alone = own >= 0 and math.isnan(parts[5][segment, own])
-    origin, n, fold = _lines_of(segment, p, scene, at, power, alone, kernel, room)
-    if alone and power:
-        if parts[3][segment, own] > 0:
-            return origin, 0, as_lines()
-        n, kind = take_modes(
-            n, (segment, own, fold), parts[1], allowed(p), kernel, room
-        )  # fmt: skip
-        return origin, n, kind
-    own = -1 if alone else own
-    if own >= 0 or (n > 1 and p[15] > 0.0):
-        n, kind = take_bundles(
-            n, power, (segment, own, fold), parts, allowed(p), kernel, room
-        )  # fmt: skip
-        if own >= 0 or kind[0] >= 0:
-            return origin, n, kind
-    several = alone or (power and scene[2][0].size > 0)
-    most = n - 1 if several else (n // 2 if p[15] > 0.0 else 0)
-    if most > 0:
-        n = take_few(n, power, allowed(p), most, kernel, room)
-    return origin, n, as_lines()
-
-
-@borrowing()
-def inspect_bins(segment, p, scene, at, choices, kernel, room, exempt):
-    """The same, bin by bin."""
-    sigma, level, floor = p[10], p[11], p[12]
-    if choices[2]:
-        low, count = segment_spectrum(
-            segment, p, scene, at, floor * sigma, choices, kernel, room
-        )  # fmt: skip
-        peak, exempted, leakage = assess(room[0], count, sigma, level, floor, exempt)
-        return low, count, peak, exempted, leakage
-    least = level * (0.5 if choices[1] else 1.0)
-    low, count = segment_spectrum(segment, p, scene, at, least, choices, kernel, room)
-    peak, exempted = mark(room[0], count, level, exempt)
-    return low, count, peak, exempted, 0.0
-
-
-def workspace(lines: int, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scratch of :func:`inspect_segment`: room (ROOM, width), exempt (width,), series.
-
-    ``lines`` as of :class:`sweep.model.modulation.Stretch`.
-    """
-    width = max(lines, MOST_NODES, fft_size // 2 + 1, 2 * MOST_POINTS, WIDTH) + 16
-    return np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)
-
-
-@borrowing()
-def lent(scene, kernel, work):
-    """Scene, kernel and workspace for the length of a call, their use uncounted."""
-    (offset, doppler, amplitude, phase), parts, (shift, share) = scene
-    apart, re, im, number, which, digest = parts
-    sizes, shape, sidelobes, limits, tangent, known = kernel
-    coefficients, numerator, poles, edge, table = shape
-    window_sum, envelope, reach, beyond = sidelobes
-    room, exempt, series = work
-    return (
-        (
-            (borrowed(offset), borrowed(doppler), borrowed(amplitude), borrowed(phase)),
-            (
-                borrowed(apart),
-                borrowed(re),
-                borrowed(im),
-                borrowed(number),
-                borrowed(which),
-                borrowed(digest),
-            ),
-            (borrowed(shift), borrowed(share)),
-        ),
-        (
-            sizes,
-            (coefficients, numerator, poles, edge, borrowed(table)),
-            (window_sum, borrowed(envelope), borrowed(reach), borrowed(beyond)),
-            borrowed(limits),
-            borrowed(tangent),
-            borrowed(known),
-        ),
-        (borrowed(room), borrowed(exempt), borrowed(series)),
+def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: int) -> np.ndarray:
+    """|W| that lone tones at places of bin 0 show in bins ``first`` .., (count, m)."""
+    shapes = (
+        line_shape.shapes(window, fft_size, False, 0)
+        if line_shape.has_modes(window, fft_size)
+        else _plain(window, fft_size, False)
     )
+    room, found = (
+        np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16)),
+        np.empty((count, place.size)),
+    )
+    table, form = np.empty((2, 0)), np.zeros((7, shapes.reach.size))
+    if shapes.sizes[5]:
+        table = shapes.whole[0]
+    else:
+        table, one = np.empty((2, shapes.modes.shape[1])), np.ones(1)
+        line_shape.build(one, 0 * one, 1, shapes, table, form[3:, :14], form[1:3])
+    room[RE, 0], room[IM, 0] = 1.0, 0.0
+    for i, at in enumerate(place):
+        room[PLACE, 0] = at
+        field(first, count, (1, at, at, 0), table, form, shapes.sizes, tangents(fft_size), room)
+        found[:, i] = np.hypot(room[F_RE, :count], room[F_IM, :count])
+    return found
 
 
-@owning(nogil=True)
-def evaluate_segments(points, row, scene, segments, choices, kernel, work, out):
-    """Every point's segments: detection probability, peak, exempt bins, leakage.
+def view(shots: Shots) -> int:
+    """How shots see a spectrum."""
+    return IMAGED if shots.image else FOLDED
+
+
+def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
+    if not shots.leakage:
+        return NO_LEAKAGE
+    averaged = shots.gaussian_width is not None and not shots.incoherent
+    smooth = shapes.sizes[0] == shapes.sizes[1] and not shapes.sizes[5]
+    if smooth and not averaged and not every_bin and view(shots) != COMPLEX:
+        return INTEGRAL
+    return BIN_BY_BIN
+
+
+def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
+    """Some points in groups whose shapes can be told together, in an order of any kind."""
+    window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
+    simple = line_shape.has_modes(window, fft_size)
+    segments = len(SIGNS)
+    if not shots.phase_errors:
+        shapes = line_shape.shapes(window, fft_size, power, 0) if simple else _plain(
+            window, fft_size, power
+        )  # fmt: skip
+        modes = np.zeros((segments, 1, 2, 1))
+        modes[:, :, 0] = 1.0
+        number = np.ones((segments, 1), np.int64)
+        centre = np.zeros((segments, 1))
+        step = max(points.size if shots.gaussian_width is None else POINTS, 1)
+        for first in range(0, points.size, step):
+            some = points[first : first + step]
+            yield Together(some, 0 * some, shapes, centre, modes, number)
+        return
+    for first in range(0, points.size, POINTS):
+        some = points[first : first + POINTS]
+        point, which = _different(shots, some)
+        left = np.arange(point.size)
+        for tier in range(len(line_shape.TIERS) if simple else 0):
+            nodes = 2 * line_shape.TIERS[tier][0]
+            phase = _phases(shots, point[left], line_shape.record_places(nodes))
+            centre = np.zeros(phase.shape[:2])
+            number = np.zeros(phase.shape[:2], np.int64)
+            modes = np.zeros((*phase.shape[:2], 2, nodes // 2))
+            line_shape.find_modes(phase, line_shape.to_modes(nodes), centre, modes, number)
+            told = (number > 0).all(axis=0)
+            place = np.full(point.size, -1)
+            place[left[told]] = np.arange(np.count_nonzero(told))
+            these = place[which] >= 0
+            if these.any():
+                yield _sorted(
+                    some[these], place[which[these]],
+                    line_shape.shapes(window, fft_size, power, tier),
+                    centre[:, told], modes[:, told], number[:, told],
+                )  # fmt: skip
+            left = left[~told]
+            if not left.size:
+                break
+        for each in left:  # tables of all bins, one after the other
+            places = 2 * np.arange(window.length) / window.length - 1
+            phase = _phases(shots, point[each : each + 1], places)[:, 0]
+            these = some[which == each]
+            yield Together(
+                these, 0 * these, line_shape.whole_shapes(window, fft_size, power, phase),
+                np.zeros((segments, 1)), np.zeros((segments, 1, 2, 1)),
+                np.ones((segments, 1), np.int64),
+            )  # fmt: skip
+
+
+@lru_cache(maxsize=2)
+def _plain(window: Window, fft_size: int, power: bool) -> Shapes:
+    """Tables of all bins of lines without a phase error."""
+    return line_shape.whole_shapes(window, fft_size, power, np.zeros((len(SIGNS), window.length)))
+
+
+def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndarray) -> Together:
+    """Points by their shapes, so that each of these is made once."""
+    order = np.argsort(which, kind="stable")
+    return Together(part[order], which[order], shapes, *map(np.ascontiguousarray, modes))
+
+
+def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of which no two have the same phase errors; which of these each of some points has."""
+    values = [
+        np.broadcast_to(np.asarray(one, float), shots.size)[some]
+        for error in shots.phase_errors
+        for value in error.values.values()
+        for one in (value if isinstance(value, tuple) else (value,))
+    ]
+    varying = [v for v in values if (v != v[0]).any()]
+    if not varying:
+        return some[:1], np.zeros(some.size, np.int64)
+    if not shots.alike:
+        return some, np.arange(some.size)
+    _, first, which = np.unique(np.stack(varying), axis=1, return_index=True, return_inverse=True)
+    return some[first], which.ravel()
+
+
+def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Phase errors [cycles] of points at places x of the record, (segments, points, places)."""
+    found = np.zeros((len(SIGNS), points.size, x.size))
+    for segment in np.flatnonzero(shots.segments):
+        for error in shots.phase_errors:
+            values = error.chosen(int(segment), points)
+            found[segment] += error.phase(x, sign=SIGNS[segment], **values)
+    return found
+
+
+def _some(
+    shots: Shots, table: np.ndarray, levels: np.ndarray, together: Together, leaks: int,
+    first: int, keep: bool,
+) -> tuple[Runs, int]:  # fmt: skip
+    """Runs of as many points from ``first`` on as there is room for; how many these are."""
+    part = together.part[first:]
+    segments, m = len(SIGNS), part.size
+    bins = shots.fft_size // 2 + 1 if view(shots) != COMPLEX else shots.fft_size
+    shifts = _shifts(shots, part)
+    lines = max(shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
+    width = max(lines, bins, 2 * MOST_POINTS, LEAST_WIDTH, MOST_CELLS) + 16
+    size = max(ROOM_FOR_RUNS, segments * bins) if keep else 0
+    numbers = np.zeros((5, segments, m), np.int64)
+    values = np.full((4, segments, m), np.nan)
+    magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
+    shapes = together.shapes
+    columns, known = shapes.modes.shape[1], shapes.reach.size
+    if shapes.sizes[5]:
+        columns = shapes.whole.shape[2]
+    done = _inspect_points(
+        np.ascontiguousarray(table[:, part]),
+        np.stack([shots.row[part], together.which[first:]]),
+        shots.footprint,
+        (together.centre, together.modes, together.number, shifts),
+        shapes._replace(sizes=np.append(shapes.sizes, view(shots))),
+        (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
+        (shots.segments, levels[part], leaks, shots.window.sum),
+        (np.empty((segments, 2, columns)), np.zeros((segments, 7, known))),
+        (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
+        (numbers, values, magnitudes, exempt),
+    )  # fmt: skip
+    low, count, peak, exempted, start = numbers[:, :, :done]
+    pd, miss, magnitude, leakage = values[:, :, :done]
+    return Runs(
+        part[:done], low, count, peak, exempted, pd, miss, magnitude, leakage, start, magnitudes,
+        exempt,
+    ), done  # fmt: skip
+
+
+@lru_cache(maxsize=4)
+def tangents(fft_size: int) -> np.ndarray:
+    """tan(pi k / N) for k = 0 .. N/2, (N // 2 + 1,)."""
+    return np.tan(np.pi * np.arange(fft_size // 2 + 1) / fft_size)
+
+
+def _shifts(shots: Shots, part: np.ndarray) -> np.ndarray:
+    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, 2, shifts)."""
+    if shots.gaussian_width is None:
+        return np.empty((part.size, 2, 0))
+    duration = np.broadcast_to(shots.record_duration, shots.size)[part]
+    shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
+    bins = shots.fft_size / shots.window.length
+    return np.stack([bins * shifts.offset, shifts.weight], axis=1)
+
+
+@njit(cache=True, error_model="numpy")
+def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, room):
+    """Lines of a point's segment into rows PLACE .., few for many; origin, number, survey."""
+    segment, row = where
+    power = sizes[4] != 0
+    origin = place_lines(p, segment, footprint, row, sizes, room)
+    n = footprint.shape[2]
+    apart = centre * sizes[0] / sizes[1]
+    for b in range(n):
+        room[PLACE, b] += apart
+    whole, squares, lowest, highest = survey(room, n, power)
+    total = math.sqrt(whole) if power else whole
+    copies = shift.shape[1] if power else 0
+    for turn in range(2 if copies else 1):
+        if turn == 1:  # copies of the lines at each shift
+            for m in range(copies - 1, -1, -1):
+                for b in range(n):
+                    room[PLACE, m * n + b] = room[PLACE, b] + shift[0, m]
+                    room[RE, m * n + b] = room[RE, b] * shift[1, m]
+                    room[IM, m * n + b] = 0.0
+            n *= copies
+            whole, squares, lowest, highest = survey(room, n, power)
+        half = 0.5 * (highest - lowest)
+        if n > 2 and p[15] > 0.0:
+            error = relative_error(
+                whole, squares, n, power, window_sum, p[15] * p[10] / LINE_STEPS, p[11]
+            )
+            band = np.pi * sizes[1] / sizes[0] * (2.0 if power else 1.0)
+            nodes = nodes_for(band * half, error, limits)
+            if 4 * nodes < 3 * n and nodes <= MOST_NODES:
+                middle = 0.5 * (lowest + highest)
+                n = put_on_nodes(room, RE, IM, n, nodes, (middle, half), A_RE, A_IM)
+                for b in range(n):
+                    room[PLACE, b] = room[X, b]
+                    room[RE, b], room[IM, b] = room[A_RE, b], room[A_IM, b]
+    return origin, n, total, lowest, highest
+
+
+@njit(cache=True, error_model="numpy")
+def _make_shapes(which, segments, modes, shapes, table, form):
+    """Tables and outlines of a shape in all segments."""
+    _, mode, number, _ = modes
+    for s in range(segments.size):
+        if not segments[s]:
+            continue
+        ends, envelope = form[s, 3:7, :14], form[s, 1:3]
+        if shapes[0][5]:
+            table[s] = shapes[5][s]
+            line_shape.put_envelope(table[s], ends, shapes[0], shapes[4], envelope)
+        else:
+            line_shape.build(
+                mode[s, which, 0], mode[s, which, 1], number[s, which], shapes, table[s], ends,
+                envelope,
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _keep(at, count, room, exempt, magnitudes, exempts):
+    """Hands a run on, from ``at`` on; where the next one begins."""
+    for k in range(count):
+        magnitudes[at + k], exempts[at + k] = room[OUT, k], exempt[k]
+    return at + count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
+    """Runs of points; how many points there was room for.
 
     Parameters
     ----------
-    points, row, scene
-        Of a :class:`sweep.model.modulation.Stretch` of m points.
-    segments : (3,) bool
-        Segments to evaluate.
-    choices, kernel
-        As in :func:`inspect_segment`.
-    work : tuple
-        :func:`workspace`.
-    out : (3, 6, m) float64
-        Result by segment and :data:`SEGMENT_FIELDS`; what is not evaluated is left as it is.
+    points : (COMMON + 2 segments, m) float64
+        :meth:`sweep.model.preparation.Shots.point_table`.
+    where : (2, m) int64
+        Rows in the footprints; shapes.
+    footprint : (3 or 3 + segments, rows, beamlets) float64
+    modes, shapes
+        Of :class:`Together`, with shifts (m, 2, k); sizes with the view at their end.
+    tables : tuple
+        Limits of nodes; tangents.
+    how : tuple
+        Segments that there are; levels below which bins may be left out; way to look at leakage;
+        the window's sum.
+    made, work : tuple
+        Room for shapes; for spectra.
+    out : tuple
+        Results: low, count, peak, exempted and start (5, segments, m); pd, miss, magnitude and
+        leakage (4, segments, m); magnitudes and exempt bins of runs, which may have no room at all.
     """
-    fft_size = kernel[0][0]
-    seen, known, (room, exempt, series) = lent(scene, kernel, work)
-    scene, kernel = lend(seen), lend(known)
-    power, image, leakage_too, every_bin = choices
+    centre, shifts = modes[0], modes[3]
+    sizes, limits, tangent = shapes[0], tables[0], tables[1]
+    segments, levels, leaks, window_sum = how
+    table, form = made
+    room, exempt, series = work
+    numbers, values, magnitudes, exempts = out
+    keep, at = magnitudes.size > 0, 0
     p = np.empty(points.shape[0])
-    before = -1.0
+    before, made_of = -1.0, -1
+    form[:, 0, : shapes[4].size] = shapes[4]
     for i in range(points.shape[1]):
         p[:] = points[:, i]
+        row, which = where[0, i], where[1, i]
+        if which != made_of:
+            made_of = which
+            _make_shapes(which, segments, modes, shapes, table, form)
         sigma, level = p[10], p[11]
-        if leakage_too and level / sigma != before:
+        if leaks != NO_LEAKAGE and level / sigma != before:
             before = level / sigma
             crossing_series(before, series)
-        for s in range(3):
+        for s in range(segments.size):
             if not segments[s]:
                 continue
-            own = power, image, leakage_too and LEAKING[s], every_bin
-            low, _, peak, exempted, leakage = inspect_segment(
-                s, p, scene, (row[i], i), own, kernel, room, exempt, series
+            origin, n, total, lowest, highest = _take_lines(
+                p, (s, row), footprint, centre[s, which], shifts[i], window_sum, limits, sizes, room
             )
-            found, missed = marcum_q1_pair(room[0, peak] / p[13], level / p[13])
-            out[s, 0, i] = found
-            out[s, 1, i] = missed
-            out[s, 2, i] = room[0, peak]
-            out[s, 3, i] = (low + peak) * p[6] / fft_size
-            out[s, 4, i] = exempted
-            out[s, 5, i] = leakage
+            lines, noise, leakage = (n, lowest, highest, total), (sigma, level, p[14]), 0.0
+            if leaks == INTEGRAL and s != 1:
+                low, count, peak, exempted, leakage = inspect(
+                    origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
+                )
+            else:
+                shift = shifts[i, :, : (0 if sizes[4] else shifts.shape[2])]
+                low, count, peak, exempted = detect(
+                    origin, lines, (level, levels[i]), shift, table[s], form[s], sizes, tangent,
+                    room, exempt,
+                )  # fmt: skip
+            if keep:
+                if at + count > magnitudes.size:
+                    return i
+                numbers[4, s, i] = at
+                at = _keep(at, count, room, exempt, magnitudes, exempts)
+            if leaks == BIN_BY_BIN and s != 1:
+                leakage = of_bins(count, noise, p[12], room, exempt, series)
+            found, missed = marcum_q1_pair(room[OUT, peak] / p[13], level / p[13])
+            numbers[0, s, i], numbers[1, s, i] = low, count
+            numbers[2, s, i], numbers[3, s, i] = peak, exempted
+            values[0, s, i], values[1, s, i] = found, missed
+            values[2, s, i], values[3, s, i] = room[OUT, peak], leakage
+    return points.shape[1]

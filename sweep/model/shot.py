@@ -11,29 +11,11 @@ from sweep.model import waveform
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.marcum import log_at_least_one
-from sweep.model.modulation import choices, stretches
 from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.segments import evaluate_segments, workspace
+from sweep.model.segments import find
 
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
-
-
-def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
-    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
-
-    ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
-    """
-    found = []
-    for stretch in stretches(shots):
-        out = np.full((3, 6, stretch.row.size), np.nan)
-        evaluate_segments(
-            stretch.points, stretch.row, stretch.scene, shots.segments,
-            choices(shots, every_bin=every_bin), shots.kernel(),
-            workspace(stretch.lines, shots.fft_size), out,
-        )  # fmt: skip
-        found.append(out)
-    return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
 
 
 def evaluate(

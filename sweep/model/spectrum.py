@@ -1,324 +1,463 @@
-"""Spectrum of a sum of tones at the bins that matter, without the record or its FFT.
+"""Spectrum of a segment's lines at the bins that matter, without the record or its FFT.
 
-Each beamlet is a tone a cos(2 pi nu n / N + phi) of nu bins. With the window's transform W over
-its L samples (:mod:`sweep.model.window`) and r = L/N, the DFT at bin k is
+With C_b the lines, nu_b their places and G their shape (:mod:`sweep.model.line_shape`),
 
-    X[k] = 1/2 sum_b a_b [ e^{i phi_b} W((k - nu_b) r) + e^{-i phi_b} W((k + nu_b) r) ]
+    F(k) = sum_b C_b G(k - nu_b),    X[k] = F(k) + conj F(-k)
 
-(PHYSICS section 5). Three things make it fast without approximation that matters:
+for a real record, whose second term are the images; a complex record shows F alone (PHYSICS
+section 5). The factor e^{-i pi r k} that all terms share is dropped. Lines that add as powers have
+|C_b|^2 |G|^2 instead.
 
-- The factor e^{-i pi k r} is common to all terms and is dropped; what depends on the line alone
-  is taken out of the loop over bins, which leaves one real kernel value for a (line, bin) pair.
-- Lines close to each other are replaced by few (:mod:`sweep.model.equivalent`).
-- Next to a line the kernel is summed term by term from exact differences; elsewhere it is one
-  fraction (the far sidelobes keep their digits).
-
-Here C_b stands for 1/2 a_b e^{i (phi_b + pi nu_b r)}.
+Bins near the lines take each from the table of G; bins far from all of them take few sources that
+stand for the lines, by what the ends of the record make of them. Only a run of bins is looked at:
+all that lines can lift to a level, and what it takes to be sure of the largest.
 """
 
 import math
-from functools import lru_cache
 
 import numpy as np
+from numba import njit
 
-from sweep.model.compiling import borrowing
-from sweep.model.elementary import fma, sincos_cycles
-from sweep.model.window import OVERSAMPLING
+from sweep.model.detection import mark
+from sweep.model.elementary import sincos_cycles
+from sweep.model.line_shape import CELLS
+from sweep.model.lines import BLOCK, BLOCK_SIZE, IM, PLACE, RE, X, put_on_nodes
 
-_TABLE_PAD = 8
+CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = range(7, 13)
+"""Rows of scratch: cells; strengths of lines as the record's two ends see them."""
 
+S_PLACE, S_A_RE, S_A_IM, S_B_RE, S_B_IM = range(13, 18)
+"""The same of sources, and their places."""
 
-@lru_cache(maxsize=4)
-def tangents(fft_size: int) -> np.ndarray:
-    """tan(pi q / N) for q = 0 .. N/2, (N // 2 + 1,): what the kernel's fraction is made of."""
-    return np.tan(np.pi * np.arange(fft_size // 2 + 1) / fft_size)
+F_RE, F_IM, OUT, OUT_IM = range(18, 22)
+"""F in a run of bins that rise; |X| of the run."""
 
+TAN, TURN_RE, TURN_IM, COT, P_RE, P_IM, Q_RE, Q_IM = range(22, 30)
+"""Of bins far away: tan(pi k / N), exp(i pi r k), and scratch."""
 
-@borrowing()
-def _cotangent(theta):
-    """cot(theta), by its series where that is exact to rounding."""
-    if abs(theta) < 0.1:
-        z = theta * theta
-        series = z * (1.0 / 45.0 + z * (2.0 / 945.0 + z * (1.0 / 4725.0 + z * (2.0 / 93555.0))))
-        return 1.0 / theta - theta * (1.0 / 3.0 + series)
-    return 1.0 / math.tan(theta)
+SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT, SHARES = range(30, 36)
+"""Of averages; of leakage; of lines among cells."""
 
+ROOM = 36
+"""Rows in all."""
 
-@borrowing()
-def _closed_kernel(y, sine, length, coefficients):
-    """S(y) term by term from exact differences: right next to the line, given sin(pi y)."""
-    step = math.pi / length
-    total = 0.0
-    sign = 1.0
-    for m in range(len(coefficients)):
-        for z in (y - m, y + m):
-            # sin(pi z) cot(pi z / L), the rectangular window's S, is L at z = 0
-            term = sign * sine * _cotangent(step * z) if z != 0.0 else float(length)
-            total += 0.5 * coefficients[m] * term
-        sign = -sign
-    return total
+STRIP = 128
+"""Bins far away that are done together."""
 
+FOLDED, IMAGED, COMPLEX = range(3)
+"""Views of a spectrum: bins 0 .. N/2 of a real record, without images and with them; all N bins
+of a complex record, numbered on past 0 and N."""
 
-@borrowing()
-def _table_kernel(y, table):
-    """S(y) for |y| <= L/2 by a ten-point Lagrange polynomial through the table: about 4e-14."""
-    position = abs(y) * OVERSAMPLING
-    index = math.floor(position)
-    t = position - index
-    start = int(index) + _TABLE_PAD - 4
-    if t < 1e-30:  # on it, or so close that the weight beside it would be past all numbers
-        return table[start + 4]
-    top, bottom, weight = 0.0, 0.0, 1.0
-    for j in range(10):
-        term = weight / (t + (4.0 - j))  # t alone where j is 4, however small
-        top += term * table[start + j]
-        bottom += term
-        weight *= (j - 9.0) / (j + 1.0)
-    return top / bottom
+_SOURCE_DIGITS = 28.0
+"""ln of the accuracy of sources, and a little for the poles of a window on either side."""
 
+POINTS = 10
+"""Cells among which a line is shared out: -4 .. 5 beside its place between 0 and 1."""
 
-@borrowing()
-def _near(first, count, delta, fft_size, margin):
-    """Bins [low, high) of first .. first + count - 1 within a margin of q = -delta, modulo N."""
-    turn = math.floor((first + 0.5 * count + delta) / fft_size + 0.5)
-    centre = turn * fft_size - delta - first
-    low = max(0, min(math.ceil(centre - margin), count))
-    return low, max(low, min(math.floor(centre + margin) + 1, count))
+WINDOW = 8
+"""Bins within which lines are shared out together; these share the bins that tables hold."""
+
+MOST_CELLS = WINDOW * CELLS[1] + POINTS
+
+_PART, _CELL, _RE, _IM = (BLOCK_SIZE * k for k in range(4))
+"""Of a block of lines: places beyond their cell, cells, and weights."""
+
+_n = np.arange(-4, 6)
+BASIS = np.array(
+    [
+        np.polynomial.polynomial.polyfromroots(np.delete(_n, j)) / np.prod(j - 4 - np.delete(_n, j))
+        for j in range(POINTS)
+    ]
+).T.copy()
+"""Lagrange's polynomials of degree 9 through ten cells: by power and cell."""
 
 
-@borrowing()
-def _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, power, out_re, out_im):
-    """Adds n lines at q = -mirror delta to the bins near each, every kernel value by itself.
+@njit(cache=True, error_model="numpy")
+def add_near(first, count, lines, table, sizes, room):
+    """Adds n lines to F in bins ``first`` .. where their shape's table holds these.
 
-    Bin i is q = first + i. The argument is y = (q + mirror delta) r, brought into +-L/2;
-    ``mirror`` -1 is the line itself, +1 its image. ``power`` adds |.|^2 to out_re instead.
+    Each line is shared out among ten cells, by Lagrange's polynomials; each cell has a row of the
+    table.
     """
-    fft_size, length = sizes
-    coefficients, _, _, edge, table = shape
-    ratio = length / fft_size
-    odd = length & 1 == 1
-    for j in range(n):
-        low, high = 0, count
-        if not table.size:
-            low, high = _near(first, count, mirror * delta[j], fft_size, margin)
-        a, b = re[j], -mirror * im[j]
-        for i in range(low, high):
-            turn = fft_size if 2 * (first + i) > fft_size else 0
-            y = (first + i - turn + mirror * delta[j]) * ratio
-            rounds = math.floor(y / length + 0.5)
-            y -= rounds * length
-            parity = -1.0 if odd and (turn > 0) != (int(rounds) & 1 == 1) else 1.0
-            sine, _ = sincos_cycles(0.5 * y)
-            if table.size:
-                real = _table_kernel(y, table)
-            else:
-                real = _closed_kernel(y, sine, length, coefficients)
-            imaginary = edge * sine
-            if power:
-                out_re[i] += a * (real * real + imaginary * imaginary)
-            else:
-                out_re[i] += parity * (a * real - b * imaginary)
-                out_im[i] += parity * (b * real + a * imaginary)
-
-
-@borrowing()
-def fraction(tangent, offset, numerator, poles):
-    """K at tan(a + b), given the two tangents, as one fraction (one division)."""
-    n = tangent + offset
-    d = fma(-tangent, offset, 1.0)
-    n2, d2 = n * n, d * d
-    scale = 1.0
-    top = numerator[len(poles)]
-    bottom = n
-    for m in range(len(poles)):
-        scale *= d2
-        top = fma(top, n2, numerator[len(poles) - 1 - m] * scale)
-        bottom *= fma(-poles[m], d2, n2)
-    return d * top / bottom
-
-
-@borrowing()
-def _add_far(
-    first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge, power,
-    t, sine_q, cosine_q, out_re, out_im,
-):  # fmt: skip
-    """The same for all other bins, as loops over the bins that vectorise.
-
-    sin(pi (q + delta) r) is split into what depends on q and on the line. Bins near the line,
-    where the fraction has its poles, are computed and not taken: a select, not a branch.
-    """
-    fft_size, length = sizes
-    for j in range(n):
-        position = mirror * delta[j]
-        low, high = _near(first, count, position, fft_size, margin)
-        sine, cosine = sincos_cycles(0.5 * position / fft_size)
-        tangent = sine / cosine
-        sine, cosine = sincos_cycles(0.5 * position * (length / fft_size))
-        a, b = re[j], -mirror * im[j]
-        if power:
-            for i in range(count):
-                side = sine_q[i] * cosine + cosine_q[i] * sine
-                kernel = fraction(t[i], tangent, numerator, poles)
-                value = a * side * side * (kernel * kernel + edge * edge)
-                out_re[i] += 0.0 if low <= i < high else value
-        else:
-            a_edge, b_edge = a * edge, b * edge
-            for i in range(count):
-                side = sine_q[i] * cosine + cosine_q[i] * sine
-                kernel = side * fraction(t[i], tangent, numerator, poles)
-                near = low <= i < high
-                out_re[i] += 0.0 if near else a * kernel - b_edge * side
-                out_im[i] += 0.0 if near else b * kernel + a_edge * side
-
-
-@borrowing()
-def set_tangents(first, count, fft_size, tangent, t):
-    """tan(pi q / N) for q = first .. first + count - 1, from the table of :func:`tangents`."""
-    if first >= -(fft_size // 2) and first + count <= tangent.size:
-        below = min(max(-first, 0), count)
-        for i in range(below):
-            t[i] = -tangent[-first - i]
-        for i in range(below, count):
-            t[i] = tangent[first + i]
-        return
-    q = first % fft_size
-    for i in range(count):
-        t[i] = tangent[q] if 2 * q <= fft_size else -tangent[fft_size - q]
-        q = q + 1 if q + 1 < fft_size else 0
-
-
-@borrowing()
-def _prepare_bins(first, count, sizes, tangent, t, sine_q, cosine_q):
-    """tan(pi q / N), sin(pi q r), cos(pi q r) for q = first .. first + count - 1."""
-    fft_size, length = sizes
-    set_tangents(first, count, fft_size, tangent, t)
-    sign = -1.0 if first & 1 else 1.0
-    for i in range(count):
-        sine_q[i] = 0.0
-        cosine_q[i] = sign
-        sign = -sign
-    if length < fft_size:
-        for i in range(count):
-            turns = (first + i) * length % (2 * fft_size) / (2.0 * fft_size)
-            sine_q[i], cosine_q[i] = sincos_cycles(turns)
-
-
-@borrowing()
-def bin_magnitudes(
-    low, high, origin, delta, re, im, n, sizes, shape, power, tangent, out_re, out_im, work,
-    image=True,
-):  # fmt: skip
-    """|X[k]| for k = low .. high (0 <= low, high <= N/2), lines and their images, into out_re.
-
-    Parameters
-    ----------
-    low, high : int
-        First and last bin.
-    origin : int
-        Bin from which delta counts; 0 <= origin <= N/2.
-    delta, re, im : (>= n,) float64
-        Positions of the lines [bins from origin] and C_b; for ``power`` re holds |C_b|^2.
-    sizes : (int, int)
-        FFT size N and window length L <= N.
-    shape : tuple
-        (coefficients, numerator, poles, edge, table) of the :class:`~sweep.model.window.Window`.
-    power : bool
-        False: beamlets add as amplitudes. True: they add as powers, and so do line and image,
-        which is the mean over independent uniform phases.
-    tangent : (N // 2 + 1,) float64
-        :func:`tangents`.
-    out_re, out_im : (>= high - low + 1,) float64
-        Result; scratch.
-    work : (3, >= high - low + 1) float64
-        Scratch.
-    image : bool
-        Whether the lines' images are summed; if not, nothing of them is computed.
-
-    Notes
-    -----
-    Within 1e-12 of the largest magnitude (Hann and Hamming, N = 2^17, tests/model).
-    """
-    count = high - low + 1
-    for i in range(count):
-        out_re[i] = 0.0
-        out_im[i] = 0.0
-    for mirror in (-1, 1):  # the lines, then their images
-        if mirror < 0 or image:
-            first = low + mirror * origin
-            _prepare(first, count, sizes, shape, tangent, work)
-            _add(
-                first, count, mirror, delta, re, im, n, sizes, shape, power, work, out_re, out_im
-            )  # fmt: skip
-    for i in range(count):
-        if power:
-            out_re[i] = math.sqrt(max(out_re[i], 0.0))
-        else:
-            out_re[i] = math.sqrt(out_re[i] * out_re[i] + out_im[i] * out_im[i])
-
-
-@borrowing()
-def split_magnitudes(
-    low, high, origin, delta, weight, n, parts, fold, sizes, shape, tangent, out, room, image
-):
-    """|X[k]| of lines that add as powers, each of them split into parts that add as amplitudes.
-
-    Parameters
-    ----------
-    low, high, origin, sizes, shape, tangent, image
-        As of :func:`bin_magnitudes`.
-    delta, weight : (>= n,) float64
-        Positions of the lines [bins from origin]; |C_b|^2.
-    parts : tuple of (k,) float64
-        Places from their line [bins of fs/N], real and imaginary weight.
-    fold : float
-        -1 to conjugate the weights.
-    out : (>= high - low + 1,) float64
-        Result.
-    room : (7, >= max(k, high - low + 1)) float64
-        Scratch.
-    """
-    count = high - low + 1
-    place, other, re, im, work = room[0], room[1], room[2], room[3], room[4:7]
-    for i in range(count):
-        out[i] = 0.0
-    for k in range(parts[0].size):
-        other[k] = fold * parts[2][k]
-    for mirror in (-1, 1):
-        if mirror > 0 and not image:
-            break
-        first = low + mirror * origin
-        _prepare(first, count, sizes, shape, tangent, work)
+    n, lowest, highest, _ = lines
+    cells, last = sizes[3], math.floor(highest)
+    for start in range(math.floor(lowest), last + 1, WINDOW):
+        number = min(WINDOW, last + 1 - start) * cells + POINTS
+        for c in range(number):
+            room[CELL_RE, c], room[CELL_IM, c] = 0.0, 0.0
+        taken = 0
         for b in range(n):
-            for k in range(parts[0].size):
-                place[k] = delta[b] + parts[0][k]
-            for i in range(count):
-                re[i] = 0.0
-                im[i] = 0.0
-            _add(
-                first, count, mirror, place, parts[1], other, parts[0].size, sizes, shape, False,
-                work, re, im,
-            )  # fmt: skip
-            for i in range(count):
-                out[i] += weight[b] * (re[i] * re[i] + im[i] * im[i])
+            if start <= room[PLACE, b] < start + WINDOW:
+                place = (room[PLACE, b] - start) * cells
+                room[BLOCK, _PART + taken] = place - math.floor(place)
+                room[BLOCK, _CELL + taken] = math.floor(place)
+                room[BLOCK, _RE + taken], room[BLOCK, _IM + taken] = room[RE, b], room[IM, b]
+                taken += 1
+            if taken == BLOCK_SIZE or (b == n - 1 and taken > 0):
+                _share_out(taken, room)
+                taken = 0
+        for lap in range(-1, 2):
+            _add_cells(first, count, (start, number, lap), table, sizes, room)
+
+
+@njit(cache=True, error_model="numpy")
+def _share_out(number, room):
+    """Adds a block of lines to cells, ten of them each."""
+    for j in range(POINTS):
+        for i in range(number):
+            weight, part = BASIS[POINTS - 1, j], room[BLOCK, _PART + i]
+            for d in range(POINTS - 2, -1, -1):
+                weight = weight * part + BASIS[d, j]
+            room[SHARES, j * BLOCK_SIZE + i] = weight
+    for i in range(number):
+        cell = np.uint64(room[BLOCK, _CELL + i])
+        re, im = room[BLOCK, _RE + i], room[BLOCK, _IM + i]
+        for j in range(np.uint64(POINTS)):
+            share = room[SHARES, j * np.uint64(BLOCK_SIZE) + np.uint64(i)]
+            room[CELL_RE, cell + j] += re * share
+            room[CELL_IM, cell + j] += im * share
+
+
+@njit(cache=True, error_model="numpy")
+def held_of(start, lap, sizes):
+    """First bin, and one past the last, that tables hold of all lines of a window."""
+    beside, start = sizes[2], start + lap * sizes[0]
+    return start + WINDOW - beside, start + beside
+
+
+@njit(cache=True, error_model="numpy")
+def _add_cells(first, count, window, table, sizes, room):
+    """Adds a window's cells, which begin four before it, to F; as of :func:`add_near`."""
+    start, number, lap = window
+    cells, power = sizes[3], sizes[4]
+    columns = table.shape[1] // cells
+    turned = -1.0 if lap != 0 and sizes[1] & 1 and not power else 1.0
+    low, high = held_of(start, lap, sizes)
+    low, high = max(first, low), min(first + count, high)
+    begin = start + lap * sizes[0] - sizes[2]
+    if not sizes[5] and low >= high:
+        return
+    for c in range(number):
+        re, im = turned * room[CELL_RE, c], turned * room[CELL_IM, c]
+        bin_, row = begin + (c - 4) // cells, (c - 4) % cells
+        if sizes[5]:
+            low, high = max(first, bin_), min(first + count, bin_ + columns)
+        if low >= high or (re == 0.0 and im == 0.0):
+            continue
+        # unsigned, for else each index is looked at whether it counts from an array's end
+        at, to = np.uint64(row * columns + low - bin_), np.uint64(low - first)
+        if power:
+            for i in range(np.uint64(high - low)):
+                room[F_RE, to + i] += re * table[0, at + i]
+        else:
+            for i in range(np.uint64(high - low)):
+                g, h = table[0, at + i], table[1, at + i]
+                room[F_RE, to + i] += re * g - im * h
+                room[F_IM, to + i] += re * h + im * g
+
+
+@njit(cache=True, error_model="numpy")
+def take_sources(n, lowest, highest, sizes, room):
+    """Strengths of n lines as the record's ends see them, and sources that stand for them.
+
+    Sources serve bins that tables do not hold. Returns their number.
+    """
+    power, half_ratio = sizes[4] != 0, 0.5 * sizes[1] / sizes[0]
+    for b in range(n):
+        sine, cosine = sincos_cycles((2.0 if power else 1.0) * half_ratio * room[PLACE, b])
+        re, im = room[RE, b], room[IM, b]
+        room[A_RE, b] = re if power else re * cosine + im * sine
+        room[A_IM, b] = 0.0 if power else im * cosine - re * sine
+        room[B_RE, b] = re * cosine if power else re * cosine - im * sine
+        room[B_IM, b] = -re * sine if power else im * cosine + re * sine
+    middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
+    number = n
+    if half > 0.0:
+        z = 1.0 + (sizes[2] - WINDOW) / half
+        number = 2 + int(_SOURCE_DIGITS / math.log(z + math.sqrt(z * z - 1.0)))
+    elif n > 1:
+        number = 1
+    put_on_nodes(room, A_RE, A_IM, n, number, (middle, half), S_A_RE, S_A_IM)
+    number = put_on_nodes(room, B_RE, B_IM, n, number, (middle, half), S_B_RE, S_B_IM)
+    for j in range(number):
+        room[S_PLACE, j] = room[X, j]
+    return number
+
+
+@njit(cache=True, error_model="numpy")
+def weight_afar(total, sources, sizes, room):
+    """Summed weight of lines as bins beyond the table see them; for powers its root."""
+    first, last = 0.0, 0.0
+    for b in range(sources):
+        first += math.hypot(room[S_A_RE, b], room[S_A_IM, b])
+        last += math.hypot(room[S_B_RE, b], room[S_B_IM, b])
+    first = max(first, last)
+    return min(total, math.sqrt(first) if sizes[4] else first)
+
+
+@njit(cache=True, error_model="numpy")
+def tangent_of(k, fft_size, tangent):
+    """tan(pi k / N) for any whole k; ``tangent`` holds those of 0 .. N/2."""
+    k %= fft_size
+    return tangent[k] if 2 * k <= fft_size else -tangent[fft_size - k]
+
+
+@njit(cache=True, error_model="numpy")
+def prepare_far(first, count, sizes, tangent, room):
+    """Tangents and turns of bins ``first`` .., count <= STRIP, into rows TAN and TURN."""
+    fft_size, whole = sizes[0], sizes[0] == sizes[1]
     for i in range(count):
-        out[i] = math.sqrt(max(out[i], 0.0))
+        room[TAN, i] = tangent_of(first + i, fft_size, tangent)
+        if whole:
+            room[TURN_RE, i], room[TURN_IM, i] = -1.0 if (first + i) & 1 else 1.0, 0.0
+        else:
+            turn = sincos_cycles(0.5 * (first + i) * sizes[1] / fft_size)
+            room[TURN_RE, i], room[TURN_IM, i] = turn[1], turn[0]
 
 
-@borrowing()
-def _prepare(first, count, sizes, shape, tangent, work):
-    """What far kernels need to know of bins; a tabulated window has none of them."""
-    if not shape[4].size:
-        _prepare_bins(first, count, sizes, tangent, work[0], work[1], work[2])
+@njit(cache=True, error_model="numpy")
+def add_far(start, end, at, place, strength, b, form, sizes, room):
+    """Adds line or source b to F, from ``at`` on, in prepared bins start .. end - 1.
+
+    ``place`` and ``strength`` are rows: PLACE and A_RE, or S_PLACE and S_A_RE.
+    """
+    power = sizes[4] != 0
+    a_re, a_im = room[strength, b], room[strength + 1, b]
+    b_re, b_im = room[strength + 2, b], room[strength + 3, b]
+    t, nearest = math.tan(math.pi * room[place, b] / sizes[0]), 0.0
+    begin, stop, to = np.uint64(start), np.uint64(end), np.uint64(at - start)
+    for i in range(begin, stop):
+        room[COT, i] = (1.0 + room[TAN, i] * t) / (room[TAN, i] - t)
+    for i in range(begin, stop):
+        nearest = max(nearest, abs(room[COT, i]))
+    degree, factor, most = 0, 1.0, 0.0
+    for d in range(14):
+        size = factor * (abs(form[3, d]) + abs(form[4, d]) + abs(form[5, d]) + abs(form[6, d]))
+        most = max(most, size)
+        degree = d if size > 1e-17 * most else degree
+        factor *= nearest
+    for i in range(begin, stop):
+        room[P_RE, i], room[P_IM, i] = form[3, degree], form[4, degree]
+        room[Q_RE, i], room[Q_IM, i] = form[5, degree], form[6, degree]
+    for d in range(degree - 1, -1, -1):
+        one, other, three, four = form[3, d], form[4, d], form[5, d], form[6, d]
+        for i in range(begin, stop):
+            c = room[COT, i]
+            room[P_RE, i] = room[P_RE, i] * c + one
+            room[P_IM, i] = room[P_IM, i] * c + other
+            room[Q_RE, i] = room[Q_RE, i] * c + three
+            room[Q_IM, i] = room[Q_IM, i] * c + four
+    if power:
+        for i in range(begin, stop):
+            p, q, r, s = room[P_RE, i], room[P_IM, i], room[Q_RE, i], room[Q_IM, i]
+            u, v = room[TURN_RE, i], room[TURN_IM, i]
+            u, v = u * u - v * v, 2.0 * u * v
+            u, v = u * b_re - v * b_im, u * b_im + v * b_re
+            room[F_RE, to + i] += a_re * (p * p + q * q + r * r + s * s) - 2.0 * (
+                u * (p * r + q * s) - v * (q * r - p * s)
+            )
+        return
+    for i in range(begin, stop):
+        u_re = a_re * room[P_RE, i] - a_im * room[P_IM, i]
+        u_im = a_re * room[P_IM, i] + a_im * room[P_RE, i]
+        v_re = b_re * room[Q_RE, i] - b_im * room[Q_IM, i]
+        v_im = b_re * room[Q_IM, i] + b_im * room[Q_RE, i]
+        c, s = room[TURN_RE, i], room[TURN_IM, i]
+        room[F_RE, to + i] += c * (u_re - v_re) - s * (u_im + v_im)
+        room[F_IM, to + i] += c * (u_im - v_im) + s * (u_re + v_re)
 
 
-@borrowing()
-def _add(first, count, mirror, delta, re, im, n, sizes, shape, power, work, out_re, out_im):
-    """Adds n lines, or their images, to prepared bins."""
-    _, numerator, poles, edge, table = shape
-    margin = (len(poles) + 0.5) * sizes[0] / sizes[1]
-    if not table.size:
-        _add_far(
-            first, count, mirror, delta, re, im, n, sizes, margin, numerator, poles, edge, power,
-            work[0], work[1], work[2], out_re, out_im,
+@njit(cache=True, error_model="numpy")
+def field(first, count, lines, table, form, sizes, tangent, room):
+    """F in bins ``first`` .., counted from the lines' origin, into rows F_RE and F_IM.
+
+    ``lines``: their number, lowest and highest place, and how many sources stand for them, 0 if
+    there are none yet. Returns how many there are then.
+    """
+    n, lowest, highest, sources = lines
+    whole = sizes[5] != 0
+    count = (count + 7) // 8 * 8  # whole vectors: a rest takes as long
+    for i in range(count):
+        room[F_RE, i], room[F_IM, i] = 0.0, 0.0
+    add_near(first, count, lines, table, sizes, room)
+    reach = sizes[2] - WINDOW - 1  # of tables from any line
+    if whole or (highest - first < reach and first + count - lowest < reach):
+        return sources
+    if sources == 0:
+        sources = take_sources(n, lowest, highest, sizes, room)
+    # Bins of which tables hold some lines, if not all; but for these, sources do.
+    begun = math.floor(lowest)
+    last = begun + (math.floor(highest) - begun) // WINDOW * WINDOW
+    at, end = first, first + count
+    while at < end:
+        stop, amid = min(at + STRIP, end), False
+        for lap in range(-1, 2):
+            low, _ = held_of(begun, lap, sizes)
+            _, high = held_of(last, lap, sizes)
+            amid |= low <= at < high
+            stop = min(stop, low) if low > at else (min(stop, high) if high > at else stop)
+        if not amid:
+            prepare_far(at, stop - at, sizes, tangent, room)
+            for b in range(sources):
+                add_far(0, stop - at, at - first, S_PLACE, S_A_RE, b, form, sizes, room)
+        elif last > begun:
+            prepare_far(at, stop - at, sizes, tangent, room)
+            for b in range(n):  # what the table does not hold of each line
+                window = begun + int(room[PLACE, b] - begun) // WINDOW * WINDOW
+                start = at
+                for lap in range(-1, 3):
+                    held, past = held_of(window, lap, sizes)
+                    until = min(held, stop) if lap < 2 else stop
+                    if start < until:
+                        add_far(
+                            start - at, until - at, start - first, PLACE, A_RE, b, form, sizes,
+                            room,
+                        )  # fmt: skip
+                    start = max(start, past)
+        at = stop
+    return sources
+
+
+@njit(cache=True, error_model="numpy")
+def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, room):
+    """|X| of bins ``low`` .. of what is seen, into row OUT; as of :func:`field`.
+
+    ``shifts`` (2, m): places [bins] and weights over which |X|^2 is averaged; m may be 0.
+    """
+    power, view = sizes[4] != 0, sizes[6]
+    n, lowest, highest, sources = lines
+    sign = -1 if origin < 0 and view != COMPLEX else 1
+    many = shifts.shape[1] > 0
+    if many:
+        room[SUM, :count] = 0.0
+    for m in range(max(shifts.shape[1], 1)):
+        apart = shifts[0, m] if many else 0.0
+        if many:
+            for b in range(n):
+                room[PLACE, b] += apart
+            sources = 0
+        for turn in range(2 if view == IMAGED else 1):  # the lines, then their images
+            way = sign if turn == 0 else -sign
+            first = low - origin if way > 0 else 1 - low - count - origin
+            moved = n, lowest + apart, highest + apart, sources
+            sources = field(first, count, moved, table, form, sizes, tangent, room)
+            for i in range(count):
+                j = i if way > 0 else count - 1 - i
+                re, im = room[F_RE, j], way * room[F_IM, j]
+                room[OUT, i] = re if turn == 0 else room[OUT, i] + re
+                room[OUT_IM, i] = im if turn == 0 else room[OUT_IM, i] + im
+        for i in range(count):
+            re, im = room[OUT, i], room[OUT_IM, i]
+            room[OUT, i] = re if power else re * re + im * im
+        if many:
+            for i in range(count):
+                room[SUM, i] += shifts[1, m] * room[OUT, i]
+            for b in range(n):
+                room[PLACE, b] -= apart
+    row = SUM if many else OUT
+    for i in range(count):
+        room[OUT, i] = math.sqrt(max(room[row, i], 0.0))
+    return sources
+
+
+@njit(cache=True, error_model="numpy")
+def reach_of(level, weight, form):
+    """Bins beyond which lines of the given summed weight stay below ``level``."""
+    if not weight > 0.0:
+        return 1.0
+    low, high = 0, form.shape[1] - 1
+    if form[1, high] * weight > level:
+        return np.inf
+    while low < high:
+        middle = (low + high) // 2
+        if form[1, middle] * weight > level:
+            low = middle + 1
+        else:
+            high = middle
+    return form[0, low]
+
+
+@njit(cache=True, error_model="numpy")
+def seen(origin, lowest, highest, sizes):
+    """Lowest and highest place at which lines are seen, in bins; 0 .. N/2 where they fold."""
+    if origin < 0 and sizes[6] != COMPLEX:
+        return -origin - highest, -origin - lowest
+    return origin + lowest, origin + highest
+
+
+@njit(cache=True, error_model="numpy")
+def run_of(beyond, place, sizes):
+    """First and last bin ``beyond`` the places of lines, folded back at DC and Nyquist."""
+    half = sizes[0] // 2
+    beyond = min(beyond, 2.0 * sizes[0])
+    low, high = math.floor(place[0] - beyond), math.ceil(place[1] + beyond)
+    if sizes[6] == COMPLEX:
+        return low, min(high, low + sizes[0] - 1)
+    if low < 0:
+        high = max(high, -low)
+    if high > half:
+        low = min(low, sizes[0] - high)
+    return min(max(low, 0), half), max(min(high, half), 0)
+
+
+@njit(cache=True, error_model="numpy")
+def stays_below(level, weight, place, form, sizes):
+    """Bins beyond which lines and images of a summed weight stay below a level."""
+    crossing = reach_of(level, weight, form)
+    if sizes[6] == IMAGED:
+        edge = min(place[0], 0.5 * sizes[0] - place[1])
+        if edge < 32.0 * crossing:  # else images add less than a tenth
+            return reach_of(0.5 * level, weight, form) + 1.0
+        return reach_of(0.9 * level, weight, form) + 1.0
+    return crossing + 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exempt):
+    """Run of bins around a segment's lines, and the detection in it.
+
+    Parameters
+    ----------
+    origin, lines
+        Bin from which lines count, and as of :func:`field` with their summed weight at the end.
+    levels : (float, float)
+        Threshold; level below which bins may be left out. If none is above it, bins that the
+        largest is known to exceed are.
+    exempt : (width,) bool
+        Result: bins of the run that can't raise a false alarm.
+
+    Returns
+    -------
+    low, count, peak, exempted : int
+        First bin of the run, number of bins, index of the largest, number of exempt ones; |X| in
+        row OUT.
+    """
+    n, lowest, highest, total = lines
+    room_for = sizes[0] if sizes[6] == COMPLEX else sizes[0] // 2 + 1
+    before, after = 0.0, 0.0
+    for m in range(shifts.shape[1]):
+        before, after = min(before, shifts[0, m]), max(after, shifts[0, m])
+    place = seen(origin, lowest + before, highest + after, sizes)
+    level, sources, weight = levels[1], 0, total
+    beyond = stays_below(level, weight, place, form, sizes)
+    if not level > 0.0:
+        beyond = np.inf
+    elif not sizes[5] and beyond > 2 * sizes[2] and n > 1 and shifts.shape[1] == 0:
+        sources = take_sources(n, lowest, highest, sizes, room)
+        weight = weight_afar(total, sources, sizes, room)
+        beyond = max(stays_below(level, weight, place, form, sizes), 2.0 * sizes[2])
+    while True:
+        low, high = run_of(beyond, place, sizes)
+        count = high - low + 1
+        sources = magnitudes(
+            low, count, origin, (n, lowest, highest, sources), shifts, table, form, sizes, tangent,
+            room,
         )  # fmt: skip
-    _add_near(first, count, mirror, delta, re, im, n, sizes, margin, shape, power, out_re, out_im)
+        peak, exempted = mark(room[OUT], count, levels[0], exempt)
+        most = room[OUT, peak]
+        if most >= level or count >= room_for:
+            return low, count, peak, exempted
+        needed = stays_below(most, total, place, form, sizes)
+        if needed <= beyond:
+            return low, count, peak, exempted
+        beyond = needed

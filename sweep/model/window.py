@@ -1,26 +1,13 @@
-"""Windows and their transforms: closed form for cosine sums, a tabulated kernel for any other.
+"""Windows: samples, sums, and the envelope of their transforms."""
 
-The transform W(y) = sum_n w[n] exp(-2 pi i n y / L) of a DFT-even window of L samples, at y bins
-of width fs/L, is
-
-    W(y) = exp(-i pi y) [ S(y) + i w[0] sin(pi y) ]
-
-with S real and even. For w[n] = sum_m (-1)^m c_m cos(2 pi m n / L) and t = tan(pi y / L),
-
-    S(y) = sin(pi y) K(t),   K = c_0 / t + sum_m (-1)^m c_m t (1 + A_m) / (t^2 - A_m)
-
-with A_m = tan(pi m / L)^2. Brought onto one fraction, with coefficients found in 60 digits, K
-keeps its relative accuracy in the far sidelobes, where its terms cancel.
-"""
-
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
-import mpmath
 import numpy as np
 
-from sweep.model.equivalent import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
+from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 
 COSINE_SUMS: dict[str, tuple[str, ...]] = {
     "rectangular": ("1", "0"),
@@ -40,7 +27,6 @@ OVERSAMPLING = 16
 
 _SHORTEST_CLOSED_FORM = 64
 _STAND_IN = 256
-_TABLE_PAD = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,45 +37,29 @@ class Window:
     ----------
     name, length
         Canonical name; number of samples L.
-    coefficients : tuple of float
-        c_m of a cosine sum, two at least; without meaning where the kernel is tabulated.
-    numerator, poles : tuple of float
-        K = (sum_i numerator[i] T^i) / (t prod_m (T - poles[m])), T = t^2.
     edge : float
         First sample w[0].
     sum, energy : float
         sum w (W at its peak) and E_w = sum w^2.
-    table : (n,) ndarray
-        S at multiples of 1/16 bin from -8/16; empty for a closed form.
     reach, envelope : (m,) ndarray
         max |W(y)| / sum over |y| >= reach [bins of fs/L].
     """
 
     name: str
     length: int
-    coefficients: tuple[float, ...]
-    numerator: tuple[float, ...]
-    poles: tuple[float, ...]
     edge: float
     sum: float
     energy: float
-    table: np.ndarray
     reach: np.ndarray
     envelope: np.ndarray
-
-    @cached_property
-    def beyond(self) -> np.ndarray:
-        """At least the integral of envelope^2 from each reach to L/2 [bins of fs/L], (m,)."""
-        steps = np.append(np.diff(self.reach), 0.0) * self.envelope**2
-        return np.cumsum(steps[::-1])[::-1].copy()
 
     @cached_property
     def band_weights(self) -> tuple[float, ...]:
         """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
 
-        All at the end for a window whose kernel is tabulated: an upper bound.
+        All at the end for other windows than sums of cosines: an upper bound.
         """
-        if self.table.size:
+        if self.name not in COSINE_SUMS:
             return 0.0, 1.0
         w = np.abs(samples(self.name, min(self.length, _STAND_IN) // 2 * 2))
         half = w.size // 2
@@ -98,7 +68,7 @@ class Window:
     @cached_property
     def power_band_weights(self) -> tuple[float, ...]:
         """The same of |w|'s autocorrelation, whose transform |W|^2 is: t is the lag over L."""
-        if self.table.size:
+        if self.name not in COSINE_SUMS:
             return 0.0, 1.0
         w = np.abs(samples(self.name, min(self.length, _STAND_IN)))
         correlation = np.correlate(w, w, "full")[w.size - 1 :]
@@ -106,7 +76,7 @@ class Window:
         return _shares(np.append(correlation, 0.0))
 
     def node_limits(self, power: bool) -> np.ndarray:
-        """How few lines stand for many under this window (:mod:`sweep.model.equivalent`)."""
+        """How few lines stand for many under this window (:mod:`sweep.model.lines`)."""
         if power:
             return node_limits(self.power_band_weights, POWER_TOLERANCES)
         return node_limits(self.band_weights, AMPLITUDE_TOLERANCES)
@@ -183,48 +153,17 @@ def transform(window: Window, y: np.ndarray) -> np.ndarray:
 
 
 def _closed_form(name: str, length: int) -> Window:
-    texts = COSINE_SUMS[name]
-    coefficients = tuple(float(t) for t in texts)
-    numerator, poles = _fraction(texts, length)
-    reach, envelope = _sidelobe_envelope(coefficients, length)
-    with mpmath.workdps(60):
-        edge = float(mpmath.fsum((-1) ** m * mpmath.mpf(t) for m, t in enumerate(texts)))
+    c = tuple(float(t) for t in COSINE_SUMS[name])
+    reach, envelope = _sidelobe_envelope(c, length)
     return Window(
         name=name,
         length=length,
-        coefficients=coefficients,
-        numerator=numerator,
-        poles=poles,
-        edge=edge,
-        sum=length * coefficients[0],
-        energy=length * (coefficients[0] ** 2 + sum(c * c for c in coefficients[1:]) / 2),
-        table=np.empty(0),
+        edge=math.fsum((-1) ** m * x for m, x in enumerate(c)),
+        sum=length * c[0],
+        energy=length * (c[0] ** 2 + sum(x * x for x in c[1:]) / 2),
         reach=reach,
         envelope=envelope,
     )
-
-
-def _fraction(texts: tuple[str, ...], length: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Numerator (lowest power first) and poles of K in T = tan^2, found in 60 digits."""
-    with mpmath.workdps(60):
-        c = [mpmath.mpf(t) for t in texts]
-        order = len(c) - 1
-        poles = [mpmath.tan(mpmath.pi * m / length) ** 2 for m in range(1, order + 1)]
-        numerator = [c[0] * p for p in _product(poles)]
-        for m in range(1, order + 1):
-            rest = _product([a for i, a in enumerate(poles, 1) if i != m])
-            for i, p in enumerate(rest):
-                numerator[i + 1] += (-1) ** m * c[m] * (1 + poles[m - 1]) * p
-        return tuple(float(x) for x in numerator), tuple(float(a) for a in poles)
-
-
-def _product(roots: list) -> list:
-    """Coefficients of prod (T - root), lowest power first."""
-    result = [mpmath.mpf(1)]
-    for root in roots:
-        shifted = [mpmath.mpf(0), *result]
-        result = [s - root * r for s, r in zip(shifted, [*result, mpmath.mpf(0)], strict=True)]
-    return result
 
 
 def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -256,22 +195,15 @@ def _tabulated(name: str, length: int) -> Window:
     w = samples(name, length)
     size = OVERSAMPLING * length
     y = np.arange(size // 2 + 1) / OVERSAMPLING
-    spectrum = np.fft.rfft(w, size) * np.exp(1j * np.pi * (y % 2.0))
-    real = spectrum.real
-    parity = -1.0 if length % 2 else 1.0
-    beyond = parity * real[size - np.arange(size // 2 + 1, size // 2 + 1 + _TABLE_PAD)]
+    spectrum = np.fft.rfft(w, size)
     magnitude = np.abs(spectrum) / w.sum()
     reach, envelope = _thinned(y[1:], np.maximum.accumulate(magnitude[::-1])[::-1][1:])
     return Window(
         name=name,
         length=length,
-        coefficients=(1.0, 0.0),
-        numerator=(0.0, 0.0),
-        poles=(0.0,),
         edge=float(w[0]),
         sum=float(w.sum()),
         energy=float((w**2).sum()),
-        table=np.concatenate([real[_TABLE_PAD:0:-1], real, beyond]),
         reach=reach,
         envelope=envelope,
     )

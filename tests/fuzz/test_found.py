@@ -12,7 +12,6 @@ from spoilt_specs import dumped
 
 from sweep.cli import main
 from sweep.model.effects.gaussian_line import MOST_BINS, gaussian_shifts
-from sweep.model.effects.line_splitting import split_lines
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
 from sweep.model.geometry.terrain import Terrain, smooth
@@ -85,8 +84,6 @@ def test_the_limits_of_the_model_are_where_they_are_said_to_be():
     assert gaussian_shifts(fwhm=width, duration=np.ones(1)).weight.sum() == pytest.approx(1)
     with pytest.raises(UnsupportedShot, match="line_width"):
         gaussian_shifts(fwhm=width * 1.02, duration=np.ones(1))
-    with pytest.raises(UnsupportedShot, match="fft_size"):
-        split_lines(lambda x: 1e6 * x[None] ** 2)
     assert MOST_BEYOND**2 < 1e15  # what is left of 16 digits by variances that cancel
 
 

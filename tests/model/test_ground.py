@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sweep.model import chain, shot, spectra, truth
+from sweep.model import chain, segments, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.solar_background import sunlight
@@ -37,7 +37,7 @@ def test_doppler_spread_against_the_truth(table_4_1, phases):
     assert spread == pytest.approx(2 / 1550e-9 * 100 * 1.4 * 50e-6 * 2**14 / 600e6, rel=0.1)
     for segment in range(3):
         exact = truth.spectrum(shots, 0, segment, range_walk=False)
-        bins, fast = spectra.segment_spectrum(shots, 0, segment)
+        bins, fast = segments.spectrum(shots, 0, segment)
         assert np.abs(fast - exact[bins]).max() < 1e-9 * exact.max()
 
 

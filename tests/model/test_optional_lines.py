@@ -5,17 +5,17 @@ from itertools import product
 
 import numpy as np
 import pytest
+from engine import lines_of
 from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD, held
 from test_leakage import drawn_bundles as bundles
 
-from sweep.model import draws, philox, returns, segments, spectra, truth
+from sweep.model import draws, philox, returns, segments, truth
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
 from sweep.model.groups import groups
-from sweep.model.lines import segment_lines
-from sweep.model.modulation import POINTS, stretches
 from sweep.model.preparation import PhaseError
+from sweep.model.segments import POINTS
 from sweep.model.shot import evaluate, find
 from sweep.model.waveform import SIGNS
 from sweep.model.window import samples, transform
@@ -55,22 +55,14 @@ def scene(table_4_1, **changes):
 
 def plain_sum(shots, i, segment, bins):
     """|X| of some bins with the folded lines' own kernels only: plain sums over the window."""
-    p = shots.point_table()[:, i].copy()
-    offset, doppler, amplitude, _ = (
-        part[shots.row[i]] if part.ndim == 2 else np.empty(0) for part in shots.footprint
-    )
-    delta, re, im = np.empty((3, offset.size))
-    origin = segment_lines(
-        (segments.SIGNS[segment], p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]),
-        (p[4], p[5]), (p[6], shots.fft_size, shots.window.length, p[7]),
-        offset, doppler, amplitude, np.empty(0), delta, re, im,
-    )  # fmt: skip
+    origin, delta, weight = lines_of(shots, i, segment)
+    way = -1 if origin < 0 else 1
     total = np.zeros(len(bins), complex)
-    for b in range(offset.size):
-        y = (bins - origin - delta[b]) * shots.window.length / shots.fft_size
-        kernel = transform(shots.window, y) * (re[b] + 1j * im[b])
-        # C_b holds half of the turn pi y already, bins and origin the other
-        total += abs(kernel) ** 2 if shots.incoherent else kernel * np.exp(1j * np.pi * y)
+    for place, c in zip(delta, weight, strict=True):
+        y = (way * bins - origin - place) * shots.window.length / shots.fft_size
+        # C_b counts its phase from the middle of the record, the transform from its beginning
+        line = transform(shots.window, y) * c * np.exp(1j * np.pi * y)
+        total += abs(line) ** 2 if shots.incoherent else line
     return np.sqrt(total.real) if shots.incoherent else abs(total)
 
 
@@ -87,7 +79,7 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
             without=("image",),
         )  # fmt: skip
         for segment in range(3):
-            bins, fast = spectra.segment_spectrum(shots, 0, segment)
+            bins, fast = segments.spectrum(shots, 0, segment)
             slow = plain_sum(shots, 0, segment, bins)
             assert np.abs(fast - slow).max() < 1e-11 * slow.max()
         if distance < 1:  # beats next to DC: images are there, and were left out
@@ -234,9 +226,9 @@ def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, 
     parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
     shots, plain = prepared(parameters, *effects), prepared(parameters)
     for segment in range(3):
-        bins, fast = spectra.segment_spectrum(shots, 0, segment)
+        bins, fast = segments.spectrum(shots, 0, segment)
         slow = exact(shots, 0, segment, width_by_hermite(shots, 0))
-        peak = spectra.segment_spectrum(plain, 0, segment)[1].max()
+        peak = segments.spectrum(plain, 0, segment)[1].max()
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
         assert np.abs(fast - slow).max() < AGREEMENT * peak
 
@@ -247,7 +239,7 @@ def test_the_drift_of_the_truth_itself_is_that_of_range_walk(table_4_1):
         parameters = scene(table_4_1, phases=phases, radial_velocity=-400.0, duration=70e-6)
         shots = prepared(parameters, "range_walk")
         for segment in range(3):
-            _, fast = spectra.segment_spectrum(shots, 0, segment)
+            _, fast = segments.spectrum(shots, 0, segment)
             slow = truth.spectrum(shots, 0, segment)
             assert np.abs(fast - slow).max() < AGREEMENT * slow.max()
             still = truth.spectrum(shots, 0, segment, range_walk=False)
@@ -273,7 +265,7 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
     above = 0
     for i in range(40):
         for segment in range(3):
-            bins, magnitude = spectra.segment_spectrum(shots, i, segment)
+            bins, magnitude = segments.spectrum(shots, i, segment)
             level = shots.threshold[i]
             best = magnitude.argmax()
             assert found[segment, MAGNITUDE, i] == pytest.approx(magnitude[best], rel=1e-9)
@@ -337,16 +329,6 @@ def test_no_drift_and_no_width_are_what_is_without_them(window, phases, table_4_
         np.testing.assert_allclose(a[:, MAGNITUDE], b[:, MAGNITUDE], rtol=1e-10)
         np.testing.assert_allclose(a[:, LEAKAGE], b[:, LEAKAGE], rtol=2e-6, atol=1e-20)
         np.testing.assert_array_equal(a[:, FREQUENCY], b[:, FREQUENCY])
-
-
-def test_what_points_lack_takes_no_memory_and_no_stretches(table_4_1):
-    parameters = scene(table_4_1) | {"target.range": np.linspace(10.0, 900.0, 3 * POINTS)}
-    (whole,) = stretches(prepared(parameters))
-    assert all(not array.size for part in whole.scene[1:] for array in part)
-    parts = list(stretches(prepared(parameters, "range_walk", "line_width")))
-    assert [stretch.row.size for stretch in parts] == 3 * [POINTS]
-    joined = np.concatenate([stretch.points for stretch in parts], axis=1)
-    assert np.array_equal(joined, whole.points)
 
 
 @pytest.mark.parametrize("phases", PHASES)

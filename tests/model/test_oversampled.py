@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model import oversampled, spectra, truth
+from sweep.model import oversampled, segments, truth
 from sweep.model.chain import prepare
 from sweep.model.shot import evaluate, find
 
@@ -51,7 +51,7 @@ def error(shots, degree):
         peak = np.sqrt((peak**2).sum()) if shots.incoherent else peak.sum()
         peak *= np.broadcast_to(shots.beat_scale, shots.size)[i] * shots.window.sum / 2 * gain
         for segment in range(3):
-            _, exact = spectra.segment_spectrum(shots, i, segment)
+            _, exact = segments.spectrum(shots, i, segment)
             bins, found = oversampled.spectrum(shots, i, segment, degree=degree)
             inner = slice(bins.size // 4, -bins.size // 4)
             apart = np.abs(found**order - exact[bins] ** order) / peak**order
@@ -84,11 +84,11 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
         )  # fmt: skip
         ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
         for i in range(2):
-            _, exact = spectra.segment_spectrum(shots, i, 1)
+            _, exact = segments.spectrum(shots, i, 1)
             bins, found = oversampled.spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
-            without = spectra.segment_spectrum(replace(shots, image=False), i, 1)[1]
+            without = segments.spectrum(replace(shots, image=False), i, 1)[1]
             assert np.abs(without - exact).max() > 0.01 * exact.max()
 
 
@@ -124,7 +124,7 @@ def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
     assert list(oversampled.grid_sizes(shots)) == [2**13, 2**12]
     assert list(oversampled.grid_sizes(shots, 2**11)) == [2**13, 2**11]
     bins, found = oversampled.spectrum(shots, 0, 0, degree=9)
-    _, exact = spectra.segment_spectrum(shots, 0, 0)
+    _, exact = segments.spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.constants import c as speed_of_light
-from windows import SLOW
 
-from sweep.model import spectra, truth
+from sweep.model import segments, truth
 from sweep.model.chain import prepare
 
 AGREEMENT = 1e-9
@@ -59,30 +58,19 @@ def disagreement(shots):
     """Largest | |X_fast| - |X_truth| | over the peak, all segments, all bins 0..N/2."""
     worst = 0.0
     for segment in np.flatnonzero(shots.segments):
-        bins, fast = spectra.segment_spectrum(shots, 0, int(segment))
+        bins, fast = segments.spectrum(shots, 0, int(segment))
         exact = truth.spectrum(shots, 0, int(segment), range_walk=False)
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
         worst = max(worst, np.abs(fast - exact).max() / exact.max())
     return worst
 
 
-def held(numbers, table_4_1, *, slow):
-    """Scenes whose windows have, or have not, kernels of their own to be compiled first."""
-    for scene in map(drawn_scene, numbers):
-        if (scene["window"] in SLOW) == slow:
-            assert disagreement(prepared(table_4_1(**scene))) < AGREEMENT, scene
-
-
 @pytest.mark.parametrize(
     "batch", [pytest.param(b, marks=[pytest.mark.slow] * (b % 2)) for b in range(BATCHES)]
 )
 def test_the_fast_path_is_the_truth_over_the_whole_range_of_every_parameter(batch, table_4_1):
-    held(range(batch * BATCH, (batch + 1) * BATCH), table_4_1, slow=False)
-
-
-@pytest.mark.slow
-def test_the_fast_path_is_the_truth_with_windows_of_every_number_of_terms(table_4_1):
-    held(range(BATCHES * BATCH), table_4_1, slow=True)
+    for scene in map(drawn_scene, range(batch * BATCH, (batch + 1) * BATCH)):
+        assert disagreement(prepared(table_4_1(**scene))) < AGREEMENT, scene
 
 
 def test_the_drawn_scenes_meet_every_case_of_sign_order_folding_and_padding():
@@ -169,8 +157,8 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
         shots = prepared(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
         own = replace(shots, doppler=rng.uniform(-1e-8, 1e-8, shots.offset.shape))
         assert disagreement(own) < AGREEMENT
-        _, with_shifts = spectra.segment_spectrum(own, 0, 1)
-        _, without = spectra.segment_spectrum(shots, 0, 1)
+        _, with_shifts = segments.spectrum(own, 0, 1)
+        _, without = segments.spectrum(shots, 0, 1)
         assert np.abs(with_shifts - without).max() > 0.01 * without.max()
 
 

@@ -10,7 +10,7 @@ from cases import EPS, Family
 from exact_spectrum import magnitudes, peak
 from table_shots import shots, velocity_for
 
-from sweep.model import spectra, truth
+from sweep.model import segments, truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.preparation import Shots
 from sweep.model.waveform import beat_frequency, resolve
@@ -46,7 +46,7 @@ def of_the_peak(frequency: float, allowed: float, cycles: float = 0.0) -> dict[s
 
 def looked_at(one: Shots, segment: int) -> list[int]:
     """Bins about the line, at both ends of the spectrum and in between."""
-    _, found = spectra.segment_spectrum(one, 0, segment)
+    _, found = segments.spectrum(one, 0, segment)
     centre, half = int(np.argmax(found)), one.fft_size // 2
     near = range(centre - 8, centre + 9)
     return sorted({k for k in (0, 1, 2, *near, half - 1, half, 77, 1234) if 0 <= k <= half})
@@ -57,7 +57,7 @@ def departure(one: Shots) -> float:
     worst = 0.0
     for segment in np.flatnonzero(one.segments):
         bins = looked_at(one, int(segment))
-        _, found = spectra.segment_spectrum(one, 0, int(segment))
+        _, found = segments.spectrum(one, 0, int(segment))
         with mp.workdps(40):
             exact = magnitudes(one, 0, int(segment), bins)
             errors = [abs(mp.mpf(float(found[k])) - x) for k, x in zip(bins, exact, strict=True)]
@@ -203,7 +203,7 @@ def time_domain() -> float:
             v = velocity_for(bins * RATE / 1024, 1)
             one = shots(radial_velocity=v, window=window, fft_size=1024)
             for segment in range(3):
-                _, found = spectra.segment_spectrum(one, 0, segment)
+                _, found = segments.spectrum(one, 0, segment)
                 exact = truth.spectrum(one, 0, segment, range_walk=False)
                 worst = max(worst, float(np.abs(found - exact).max()) / peak(one, 0, segment))
     return worst

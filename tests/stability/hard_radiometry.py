@@ -12,8 +12,8 @@ from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.effects.gaussian_line import gaussian_shifts
 from sweep.model.effects.line_width import coherent_share, pedestal_density, pedestal_power
 from sweep.model.effects.saturation import clipping
+from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import evaluate
-from sweep.model.spectra import segment_spectrum
 from sweep.model.window import samples, window
 
 FAMILY = Family(

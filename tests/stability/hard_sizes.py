@@ -11,7 +11,7 @@ from exact_spectrum import magnitudes, peak
 from hard_beats import departure
 from table_shots import shots, velocity_for
 
-from sweep.model import spectra, truth
+from sweep.model import segments, truth
 from sweep.model.preparation import Shots
 
 FAMILY = Family(
@@ -32,7 +32,7 @@ def place(frequency: float, size: int, rate: float = RATE) -> float:
 def few_bins(one: Shots, segment: int, level: float) -> float:
     """Worst error over the peak of the bins next to a line."""
     height = peak(one, 0, segment)
-    bins, found = spectra.segment_spectrum(one, 0, segment, level=level * height)
+    bins, found = segments.spectrum(one, 0, segment, level=level * height)
     top = int(np.argmax(found))
     chosen = sorted({0, len(bins) - 1, *range(max(top - 4, 0), min(top + 5, len(bins)))})
     with mp.workdps(40):
@@ -147,8 +147,8 @@ def of_one(phases: str, number: int) -> float:
     whole = math.fsum(weights) if phases == "coherent" else math.sqrt(math.fsum(weights**2))
     worst = 0.0
     for segment in range(3):
-        _, single = spectra.segment_spectrum(one, 0, segment)
-        _, found = spectra.segment_spectrum(many, 0, segment)
+        _, single = segments.spectrum(one, 0, segment)
+        _, found = segments.spectrum(many, 0, segment)
         worst = max(worst, float(np.abs(found / whole - single).max() / single.max()))
     return worst
 
@@ -185,7 +185,7 @@ def against_the_record(
     for number in numbers:
         one = shots(beamlets=number, fft_size=512, window="hann", **changes)
         for segment in segments:
-            _, found = spectra.segment_spectrum(one, 0, segment)
+            _, found = segments.spectrum(one, 0, segment)
             exact = truth.spectrum(one, 0, segment, range_walk=False)
             worst = max(worst, float(np.abs(found - exact).max() / exact.max()))
     return worst

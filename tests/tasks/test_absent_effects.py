@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small import STUDY, small
 
-from sweep.model import footprint, modulation
+from sweep.model import footprint, line_shape
 from sweep.model.chain import nodes, prepare
 from sweep.model.effects import atmosphere, turbulence
 from sweep.model.effects.catalogue import EFFECTS, NAMES
@@ -40,7 +40,7 @@ def calls(monkeypatch):
     watch(footprint, "plane_footprint", "plane_footprint")
     watch(atmosphere, "optical_depth", "optical_depth")
     watch(turbulence, "rytov_variance", "rytov_variance")
-    watch(modulation, "split", "split")
+    watch(line_shape, "find_modes", "find_modes")
     yield counted
     for effect, plain in acts:
         object.__setattr__(effect, "act", plain)
@@ -70,7 +70,7 @@ def test_a_hovering_lidar_sees_no_doppler_shift(calls):
     still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
     called = evaluated(small(axes=MOON, target=still))
     assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
-    assert calls["doppler"] == calls["range_walk"] == calls["split"] == 0
+    assert calls["doppler"] == calls["range_walk"] == calls["find_modes"] == 0
 
 
 def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):

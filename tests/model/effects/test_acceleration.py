@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from sweep.model.effects import acceleration
-from sweep.model.effects.line_splitting import split_lines
 
 LIGHT = mpmath.mpf(299792458)
 
@@ -63,12 +62,3 @@ def scenes(n, rng, sign):
         "start": rng.uniform(0, 1e-4, n),
         "duration": 10 ** rng.uniform(-4, -3.3, n),
     }
-
-
-def test_its_lines_are_its_phase():
-    scene = scenes(40, np.random.default_rng(22), 1)
-    scene["acceleration"] = scene["acceleration"] / 10
-    split = split_lines(lambda x: acceleration.phase(x, **scene))
-    x = np.linspace(-1, 1, 301)
-    found = (split.weight[:, :, None] * np.exp(1j * np.pi * split.offset[:, :, None] * x)).sum(1)
-    assert np.abs(found - np.exp(2j * np.pi * acceleration.phase(x, **scene))).max() < 2e-9

@@ -5,7 +5,6 @@ import pytest
 from scipy.special import jv
 
 from sweep.model.effects import chirp_nonlinearity
-from sweep.model.effects.line_splitting import split_lines
 
 LIGHT = 299792458.0
 CHIRP, START, RECORD = 500e-6, 3e-5, 300e-6
@@ -94,15 +93,3 @@ def test_the_down_chirp_runs_through_the_error_backwards():
             for sign in (1, -1)
         )
         np.testing.assert_allclose(down[::-1], up, atol=1e-6 * np.abs(up).max())
-
-
-def test_its_lines_are_its_phase():
-    for scene in (
-        error_of(1, quadratic=3e5, cubic=1e5),
-        error_of(-1, sinusoidal=2e4, periods=4.0, radial_velocity=np.array([100.0])),
-    ):
-        split = split_lines(lambda x, s=scene: chirp_nonlinearity.phase(x, **s))
-        x = np.linspace(-1, 1, 301)
-        found = split.weight[0] @ np.exp(1j * np.pi * np.outer(split.offset[0], x))
-        exact = np.exp(2j * np.pi * chirp_nonlinearity.phase(x, **scene)[0])
-        assert np.abs(found - exact).max() < 2e-9

@@ -1,0 +1,118 @@
+"""What one line shows: its table, ends and envelope against direct sums, with any phase error."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from engine import shape_of
+
+from sweep.model.line_shape import has_modes, record_places, to_modes
+from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
+from sweep.model.segments import tangents, tones
+from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
+from sweep.model.window import COSINE_SUMS, samples, window
+
+WINDOWS = (*COSINE_SUMS, "kaiser(8)")
+
+SIZES = (4096, 4096), (4099, 4099), (8195, 4097), (8192, 5003), (512, 500), (301, 77)
+"""FFT and record: even and odd, with padding and without; the last two have no modes."""
+
+ACCURACY = 1e-11
+"""Largest error, relative to the peak of all lines in phase and without a phase error."""
+
+
+def wandering(bins, x):
+    """A phase error [cycles] whose slope covers some bins; with a cubic part, beside the middle."""
+    return bins * x * x / 8 + bins * x**3 / 60 + 0.2 * bins**0.5 * x + 0.13 * bool(bins)
+
+
+def transform(name, sizes, phase, y):
+    """Direct sums over the record, its middle the phase's origin, (n,)."""
+    fft_size, length = sizes
+    x = 2 * np.arange(length) / length - 1
+    record = samples(name, length) * np.exp(2j * np.pi * phase(x))
+    return np.exp(-1j * np.pi * length / fft_size * np.outer(y, x)) @ record
+
+
+def seen(sizes, power, places, weights, first, count, shape):
+    """F of some bins as the model has it, (count,)."""
+    table, form, numbers, shift, _ = shape
+    n, places = places.size, places + shift
+    room = np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16))
+    room[PLACE, :n], room[RE, :n], room[IM, :n] = places, weights.real, weights.imag
+    lines = n, places.min(), places.max(), 0
+    field(first, count, lines, table, form, numbers, tangents(sizes[0]), room)
+    return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
+
+
+@pytest.mark.parametrize("power", [False, True], ids=["amplitudes", "powers"])
+@pytest.mark.parametrize("sizes", SIZES)
+@pytest.mark.parametrize("name", WINDOWS)
+def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
+    """Near the lines and far from them, on either side; no line exceeds its envelope."""
+    fft_size = sizes[0]
+    rng = np.random.default_rng((90, *sizes))
+    bins = np.unique([*range(-28, 29, 3), *rng.integers(-fft_size // 2, fft_size // 2, 9)])
+    for drift in (0.0, 0.7, 4.0, 30.0):
+        phase = partial(wandering, drift)
+        shape = shape_of(window(name, sizes[1]), fft_size, power=power, phase=phase)
+        places = rng.uniform(-3, 3, 2)
+        weights = rng.normal(size=2) + 1j * rng.normal(size=2)
+        weights = abs(weights) + 0j if power else weights
+        whole = abs(transform(name, sizes, np.zeros_like, np.zeros(1))[0]) ** (1 + power)
+        lines = transform(name, sizes, phase, np.ravel(bins[:, None] - places))
+        lines = lines.reshape(bins.size, 2)
+        exact = (abs(lines) ** 2 if power else lines) @ weights
+        first = -(fft_size // 2)
+        found = seen(sizes, power, places, weights, first, fft_size, shape)[bins - first]
+        assert abs(found - exact).max() < ACCURACY * whole * abs(weights).sum(), drift
+        away = (bins[:, None] - places - shape[3] + fft_size / 2) % fft_size - fft_size / 2
+        form = shape[1]
+        envelope = form[1, np.searchsorted(form[0], abs(away), "right").clip(1) - 1]
+        assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * whole ** (1 / (1 + power))).all()
+
+
+@pytest.mark.parametrize("name", COSINE_SUMS)
+def test_few_modes_serve_small_phase_errors_and_tables_of_all_bins_the_large(name):
+    shape = window(name, 4096)
+    numbers = [shape_of(shape, 4096, phase=partial(wandering, d))[4] for d in (0, 0.1, 3, 20, 900)]
+    assert numbers[0] == 1 and numbers[-1] == 0
+    assert numbers[:4] == sorted(numbers[:4]) and numbers[1] < 24 < numbers[3]
+    assert not has_modes(window(name, 512), 512) and not has_modes(shape, 65536)
+
+
+def test_modes_are_chebyshevs_coefficients():
+    x = record_places(48)
+    wave = np.polynomial.chebyshev.chebval(x, [0.3, -1.0, 0.0, 0.25, 0, 0, 0, 2.0])
+    expected = np.zeros(48)
+    expected[[0, 1, 3, 7]] = 0.3, -1.0, 0.25, 2.0
+    np.testing.assert_allclose(to_modes(48).T @ wave, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+def test_tones_are_the_transform_of_the_window(name):
+    for fft_size, length in ((4096, 4096), (700, 512)):
+        place = np.array([0.0, 0.25, -0.5, 0.999])
+        found = tones(window(name, length), fft_size, place, -40, 81)
+        y = np.arange(-40, 41)[:, None] - place
+        exact = abs(transform(name, (fft_size, length), np.zeros_like, y.ravel())).reshape(y.shape)
+        assert abs(found - exact).max() < ACCURACY * exact.max()
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "flattop", "kaiser(8)"])
+@pytest.mark.parametrize("drift", [0.0, 2.0, 30.0])
+def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
+    size = 4096
+    phase = partial(wandering, drift)
+    _, form, _, shift, _ = shape_of(window(name, size), size, phase=phase)
+    y = np.linspace(-2048, 2048, 2 * 4096 + 1)
+    exact = abs(
+        np.fft.fft(
+            samples(name, size) * np.exp(2j * np.pi * phase(2 * np.arange(size) / size - 1)),
+            2 * size,
+        )
+    )
+    magnitude = exact[np.rint(2 * y).astype(int) % (2 * size)]
+    for level in 10.0 ** np.arange(-1, -8, -0.5) * magnitude.max():
+        reach = reach_of(level, 1.0, form)
+        assert magnitude[abs(y - shift) >= reach].max(initial=0.0) <= level
