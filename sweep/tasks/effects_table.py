@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sweep.tasks.flight_study import FlightStudy
 
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
-MOST_TILES = 4096
+MOST_TILES = 1024
 
 #: Tiles of a flight that are looked at, of each scanner.
 FLIGHT_TILES = 16
