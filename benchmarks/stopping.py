@@ -6,7 +6,7 @@ looking after every batch. Writes the table in docs/draws.md.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,9 +77,8 @@ class Trials:
         """Draws of each of so many points that one `take` is for."""
         return PIECE
 
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> None:
+    def take(self, points: np.ndarray, more: int) -> None:
         """Draw on, a stretch of points at a time [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""
-        more = sum(batch_sizes)
         for some in np.array_split(points, -(-points.size * more // VALUES)):
             values = self._values((some.size, more))
             mean, had = values.mean(axis=1), self.number[some]

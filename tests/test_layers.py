@@ -29,7 +29,7 @@ NOT_IN_THE_MODEL = {
 }  # fmt: skip
 """Pure physics: arrays in, arrays out."""
 
-LARGEST_HOUSE = {"lines": 52_660, "modules": 312, "compiled functions": 112}
+LARGEST_HOUSE = {"lines": 52_563, "modules": 312, "compiled functions": 109}
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600
 LARGEST_FUNCTION = 50

@@ -11,24 +11,21 @@ when to stop.
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from sweep.model import philox
-from sweep.model.chain import prepare
-from sweep.model.effects.catalogue import CORE
 from sweep.model.marcum import at_least_one
-from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.philox import (
     STREAM_DETECTION,
     STREAM_FALSE_ALARM,
     STREAM_NOISE,
     STREAM_NOISE_MAXIMUM,
 )
-from sweep.model.preparation import Parameters, Shots
+from sweep.model.preparation import Shots
 from sweep.model.segments import runs_of
 
 METHODS = ("probabilities", "noise")
@@ -47,50 +44,8 @@ class Rows(NamedTuple):
     """int64: number after the last."""
 
 
-def draw(
-    parameters: Parameters,
-    outputs: Mapping[str, np.ndarray],
-    *,
-    keys: np.ndarray,
-    first_draw: int,
-    batch_sizes: Sequence[int],
-    method: str,
-    effects: Collection[str] = CORE,
-) -> dict[str, np.ndarray]:
-    """Counts of detections and false alarms over batches of draws, nothing but noise random.
-
-    Parameters
-    ----------
-    parameters, effects
-        As for :func:`sweep.model.shot.evaluate`; random effects have no effect here.
-    outputs : mapping
-        What that gave, (n,) each.
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw : int
-        Number of the first draw; draws are numbered through all batches.
-    batch_sizes : sequence of int
-        Draws in each batch.
-    method : str
-        ``probabilities`` or ``noise``.
-
-    Returns
-    -------
-    dict of (n, batches) int64 ndarray
-        By the names of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
-    """
-    ends = first_draw + np.cumsum([0, *batch_sizes])
-    counts = no_counts(len(keys), len(batch_sizes), method)
-    if method == "probabilities":
-        count_by_chance(_all_draws(np.arange(len(keys)), keys, ends), ends, outputs, counts)
-    else:
-        for index, shots in prepare(parameters, effects):
-            count_in_noise(_all_draws(index, keys[index], ends), ends, shots, counts)
-    return dict(zip(DRAW_OUTPUTS, counts, strict=True))
-
-
-def no_counts(points: int, batches: int, method: str) -> np.ndarray:
-    """Counts of 0, (names, points, batches), in the order of DRAW_OUTPUTS.
+def is_noisy(method: str) -> bool:
+    """Whether a way to draw adds noise.
 
     Raises
     ------
@@ -99,12 +54,7 @@ def no_counts(points: int, batches: int, method: str) -> np.ndarray:
     """
     if method not in METHODS:
         raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
-    return np.zeros((len(DRAW_OUTPUTS), points, batches), np.int64)
-
-
-def _all_draws(point: np.ndarray, keys: np.ndarray, ends: np.ndarray) -> Rows:
-    """Each point's one spectrum for all of its draws."""
-    return Rows(point, keys, np.full(point.size, ends[0]), np.full(point.size, ends[-1]))
+    return method == "noise"
 
 
 def count_by_chance(
@@ -120,8 +70,8 @@ def count_by_chance(
         Numbers of draws between batches.
     outputs : mapping
         Of each row.
-    counts : (names, points, batches) ndarray
-        As of :func:`no_counts`.
+    counts : (names, points, batches) int64 ndarray
+        In the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
     size, chances = rows.point.size, np.array(_chances(outputs))
     _count(rows, ends, np.zeros((2, size)), chances, False, Seen.nothing(size), counts)

@@ -29,7 +29,7 @@ from sweep.model.cramer_rao import Deviation, beat_deviation, resolved_deviation
 from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN, Estimator
 from sweep.model.interpolation import interpolator, phasors, sub_bin
-from sweep.model.philox import STREAM_RECORD, normals
+from sweep.model.philox import STREAM_RECORD, normals, records
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
 
@@ -112,10 +112,11 @@ def noise_of(
     Where noise stands under the lines only (:attr:`Shots.pedestal`), the bins that the signal
     occupies have more of it.
     """
-    records = normals(key, draws, STREAM_RECORD[segment], shots.window.length)
-    records *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
+    length, stream = shots.window.length, STREAM_RECORD[segment]
+    record = normals(records(key, draws, stream, length + length % 2))[:, :length]
+    record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
-    noise = np.array([fft.rfft(record, shots.fft_size) for record in records])
+    noise = np.array([fft.rfft(each, shots.fft_size) for each in record])
     more = float(shots.line_deviation[i] / shots.bin_deviation[i])
     if more != 1.0:
         noise[:, signal.first : signal.last + 1] *= more

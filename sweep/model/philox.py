@@ -103,20 +103,47 @@ def normal_pair(key0, key1, draw, stream, index):
     return radius * math.cos(angle), radius * math.sin(angle)
 
 
-def normals(key: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:
-    """The first so many numbers of `normal_pair` in each draw (m, number), but for a last bit."""
+def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:
+    """The first so many of `uniform`, (m, number), in a draw (m,) of each key (m, 2)."""
+    out = np.empty((draws.size, (number + 3) // 4 * 4))
+    _fill(np.ascontiguousarray(keys), np.asarray(draws, np.int64), stream, out)
+    return out[:, :number]
+
+
+@njit(cache=True, nogil=True)
+def _fill(keys, draws, stream, out):
+    """Blocks of four uniforms, from the first on, in a draw of each key."""
+    for i in range(draws.size):
+        for block in range(out.shape[1] // 4):
+            u = uniform4(keys[i, 0], keys[i, 1], draws[i], stream, block)
+            for lane in range(4):
+                out[i, 4 * block + lane] = u[lane]
+
+
+def normals(uniforms: np.ndarray) -> np.ndarray:
+    """Independent standard normal numbers of as many uniforms, an even number in a row (m, k).
+
+    Pair by pair those of `normal_pair`, but for a last bit.
+    """
+    # In one piece each: bits do not depend on how many rows there are.
+    first, second = (np.ascontiguousarray(uniforms[:, lane::2]) for lane in range(2))
+    radius, angle = np.sqrt(-2.0 * np.log(first)), 2.0 * np.pi * second
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(
+        len(uniforms), -1
+    )
+
+
+def records(key: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:
+    """So many `uniforms` in some draws of one key, (m, number): by numpy, for long rows."""
     generator = np.random.Philox(0)
-    state, cells = generator.state, np.empty((draws.size, number + number % 2), np.uint64)
+    state, cells = generator.state, np.empty((draws.size, number), np.uint64)
     for row, draw in enumerate(draws.tolist()):
         # numpy raises its counter by 1 before it draws
         before = [_ALL, _ALL, draw - 1 if draw else _ALL, stream if draw else stream - 1]
         state["state"] = {"counter": np.array(before, np.uint64), "key": key}
         generator.state = state
-        cells[row] = generator.random_raw(cells.shape[1])
-    uniforms = ((cells >> _12) + 0.5) * 2.0**-52
-    radius, angle = np.sqrt(-2.0 * np.log(uniforms[:, ::2])), 2.0 * np.pi * uniforms[:, 1::2]
-    uniforms[:, ::2], uniforms[:, 1::2] = radius * np.cos(angle), radius * np.sin(angle)
-    return uniforms[:, :number]
+        cells[row] = generator.random_raw(number)
+    return np.asarray(((cells >> _12) + 0.5) * 2.0**-52)
 
 
 def point_keys(rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:

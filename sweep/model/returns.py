@@ -35,7 +35,7 @@ from numba import njit
 
 from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.draws import METHODS, Seen, noise_levels, seen_spectra
+from sweep.model.draws import Seen, is_noisy, noise_levels, seen_spectra
 from sweep.model.groups import BIN, FIRST, LAST, Groups, groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
 from sweep.model.marcum import at_least_one
@@ -133,15 +133,14 @@ def draw_returns(
     ValueError
         `method` is neither of the two.
     """
-    if method not in METHODS:
-        raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
+    noisy = is_noisy(method)
     n, _, most = found.bin.shape
     drawn = Drawn(
         np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
         np.full((n, draws, most, 3), ABSENT, np.int8),
         np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
     )  # fmt: skip
-    noisy, known = method == "noise", _known(shots, found)
+    known = _known(shots, found)
     one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
     how = How(
         int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,

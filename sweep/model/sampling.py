@@ -28,7 +28,7 @@ import numpy as np
 
 from sweep.model.accuracy import Accuracy
 from sweep.model.chain import prepare
-from sweep.model.draws import Rows, count_by_chance, count_in_noise, draw, no_counts
+from sweep.model.draws import Rows, count_by_chance, count_in_noise, is_noisy
 from sweep.model.intervals import COUNTED, bounded_mean, half_width
 from sweep.model.noisy_spectra import DEFAULTS, VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
@@ -68,31 +68,39 @@ class Drawn(ABC):
 
     Parameters
     ----------
-    parameters, size, before
-        Theirs; number of points; what was drawn of them before.
+    parameters, effects, keys, before
+        As of :func:`simulate`.
+    ends : (batches + 1,) ndarray
+        Numbers of draws between batches, the first of them that of the first draw.
     """
 
-    def __init__(self, parameters: Parameters, size: int, before: Before | None) -> None:
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
+        ends: np.ndarray, before: Before | None = None,
+    ) -> None:  # fmt: skip
         self.parameters: dict[str, Any] = dict(parameters)
-        self.number = np.zeros(size, np.int64)
-        self.counts = np.zeros((len(DRAW_OUTPUTS), size), np.int64)
+        self.effects, self.keys, self.ends = effects, keys, ends
+        self.number = np.zeros(len(keys), np.int64)
+        self.counts = np.zeros((len(DRAW_OUTPUTS), len(keys), ends.size - 1), np.int64)
         if before is not None:
             self.number += before.number
-            self.counts += before.counts.sum(axis=-1)
+            self.counts += before.counts
 
     @abstractmethod
     def at_once(self, points: int) -> int:
         """Draws of each of so many points that one `take` is for: a few seconds at the most."""
 
-    @abstractmethod
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
-        """Draw some of the points, from draw `first` on.
+    def take(self, points: np.ndarray, number: int) -> None:
+        """Draw some points, of which there are equally many draws, so many times more."""
+        first = self.ends[0] + self.number[points[0]]
+        counts = np.zeros((len(DRAW_OUTPUTS), points.size, self.ends.size - 1), np.int64)
+        self.count(points, first, first + number, counts)
+        self.counts[:, points] += counts
+        self.number[points] += number
 
-        Returns
-        -------
-        (names, points, batches) int64 ndarray
-            Counts of these draws, in the order of DRAW_OUTPUTS.
-        """
+    @abstractmethod
+    def count(self, points: np.ndarray, first: int, last: int, counts: np.ndarray) -> None:
+        """Draws `first` to before `last` of some points into (names, points, batches) counts."""
 
     @abstractmethod
     def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
@@ -112,9 +120,13 @@ class Drawn(ABC):
             for path, v in self.parameters.items()
         }
 
+    def found(self) -> np.ndarray:
+        """Draws with a detection, (4, n), by the names of PROMISED."""
+        return np.asarray(self.counts.sum(axis=-1)[COUNT_OF])
+
     def counted_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """Half-widths of the shares of draws with a detection."""
-        counts, n = self.counts[COUNT_OF][:, points], self.number[points]
+        counts, n = self.found()[:, points], self.number[points]
         confidence = accuracy.at(points, self.number.size).confidence
         interval = COUNTED[accuracy.interval](successes=counts, trials=n, confidence=confidence)
         return half_width(counts / n, interval)
@@ -176,8 +188,10 @@ def simulate(
         As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
         are means over the same draws that are counted. For whole spectra, parameters also by the
         names of :data:`sweep.model.noisy_spectra.DEFAULTS`.
-    keys, first_draw
-        As of :func:`sweep.model.draws.draw`.
+    keys : (n, 2) uint64
+        Random key of each point.
+    first_draw : int
+        Number of the first draw.
     method : str
         ``probabilities``, ``noise`` or ``spectra``.
     batch_sizes : sequence of int
@@ -204,62 +218,34 @@ def simulate(
         count without batches); where random effects or whole spectra are simulated RUNNING,
         (n, columns).
     """
+    ends = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
+    given: dict[str, Any] = {"keys": keys, "ends": ends, "before": before}
     sample: Drawn
     if method == SPECTRA:
-        sample = SpectraSample(parameters, effects, keys=keys, methods=methods, before=before)
+        sample = SpectraSample(parameters, effects, methods=methods, **given)
     else:
-        sample = Sample(parameters, effects, keys=keys, method=method, before=before)
+        sample = Sample(parameters, effects, method=method, **given)
+    points = np.arange(len(keys))
     if batch_sizes:
-        counts = fill(sample, batch_sizes, first_draw=first_draw, before=before, stop=stop)
-    else:
-        settle(sample, np.arange(len(keys)), looks(batch, limit), accuracy, stop)
+        settle(sample, points, [sum(batch_sizes)], None, stop)
         counts = sample.counts
+    else:
+        settle(sample, points, looks(batch, limit), accuracy, stop)
+        counts = sample.counts[..., 0]
     return sample.results(accuracy) | dict(zip(DRAW_OUTPUTS, counts, strict=True))
-
-
-def fill(
-    sample: Drawn,
-    batch_sizes: Sequence[int],
-    *,
-    first_draw: int = 0,
-    before: Before | None,
-    stop: Callable[[], bool],
-) -> np.ndarray:
-    """Draw all points as often as batches hold, or until told to stop.
-
-    Returns
-    -------
-    (names, points, batches) int64 ndarray
-        Counts, in the order of DRAW_OUTPUTS.
-    """
-    number, ends = sample.number.copy(), np.cumsum([0, *batch_sizes])
-    room = len(DRAW_OUTPUTS), number.size, len(batch_sizes)
-    counts = before.counts.copy() if before else np.zeros(room, np.int64)
-    drawn = False
-    for done in np.unique(number):
-        points = np.flatnonzero(number == done)
-        step = sample.at_once(points.size)
-        for start in range(done, ends[-1], step):
-            if drawn and stop():
-                return counts
-            last = min(start + step, ends[-1])
-            batches = slice(np.searchsorted(ends, start, "right") - 1, np.searchsorted(ends, last))
-            sizes = np.diff(ends[batches.start : batches.stop + 1].clip(start, last))
-            counts[:, points, batches] += sample.take(points, first_draw + start, sizes.tolist())
-            drawn = True
-    return counts
 
 
 def settle(
     sample: Drawn,
     points: np.ndarray,
     ends: Iterable[int],
-    accuracy: Accuracy,
+    accuracy: Accuracy | None,
     stop: Callable[[], bool] = never,
 ) -> None:
     """Draw points until the promise is kept of each, numbers to look at end, or told to stop.
 
-    One that has more draws than a look is at was looked at there before, or need not be.
+    One that has more draws than a look is at was looked at there before, or need not be. Without
+    an accuracy nothing is promised.
     """
     drawn = False
     for last in ends:
@@ -270,14 +256,15 @@ def settle(
             for start in range(done, last, step):
                 if drawn and stop():
                     return
-                sample.take(alike, start, [min(step, last - start)])
+                sample.take(alike, min(step, last - start))
                 drawn = True
-        looked_at = number <= last
-        is_open = ~looked_at
-        is_open[looked_at] = sample.missed(points[looked_at], accuracy) > 0
-        points = points[is_open]
-        if not points.size:
-            return
+        if accuracy is not None:
+            looked_at = number <= last
+            is_open = ~looked_at
+            is_open[looked_at] = sample.missed(points[looked_at], accuracy) > 0
+            points = points[is_open]
+            if not points.size:
+                return
 
 
 class Sample(Drawn):
@@ -285,21 +272,20 @@ class Sample(Drawn):
 
     Parameters
     ----------
-    parameters, effects, keys, method, before
-        As of :func:`simulate`.
+    method : str
+        ``probabilities`` or ``noise``.
     """
 
     def __init__(
-        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray, method: str,
-        before: Before | None = None,
+        self, parameters: Parameters, effects: Collection[str], *, method: str,
+        before: Before | None = None, **given: Any,
     ) -> None:  # fmt: skip
-        super().__init__(parameters, len(keys), before)
-        self._effects = effects
-        self._keys, self._method = keys, method
-        self._means = Means(len(keys)) if random_effects(effects) else None
+        super().__init__(parameters, effects, before=before, **given)
+        self._noisy, size = is_noisy(method), self.number.size
+        self._means = Means(size) if random_effects(effects) else None
         if self._means is None:
             values = evaluate(parameters, effects)
-            self._outputs = {name: np.broadcast_to(v, (len(keys),)) for name, v in values.items()}
+            self._outputs = {name: np.broadcast_to(v, (size,)) for name, v in values.items()}
         elif before is not None:
             self._means.go_on_from(before.means)
 
@@ -307,38 +293,29 @@ class Sample(Drawn):
         """As of :class:`Drawn`."""
         return PIECE if self._means is None else max(LEAST, 4 * ROWS // points)
 
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
-        """As of :class:`Drawn`."""
-        if self._means is None:
-            found = draw(
-                self.some(points), {name: v[points] for name, v in self._outputs.items()},
-                keys=self._keys[points], first_draw=first, batch_sizes=batch_sizes,
-                method=self._method, effects=self._effects,
-            )  # fmt: skip
-            counts = np.stack(list(found.values()))
-        else:
-            counts = self._realised(self._means, points, first, batch_sizes)
-        self.counts[:, points] += counts.sum(axis=-1)
-        self.number[points] += sum(batch_sizes)
-        return counts
-
-    def _realised(
-        self, means: Means, points: np.ndarray, first: int, batch_sizes: Sequence[int]
-    ) -> np.ndarray:
-        """Draws of random effects: added to the means, and counted."""
-        keys, ends = self._keys[points], first + np.cumsum([0, *batch_sizes])
-        counts = no_counts(len(points), len(batch_sizes), self._method)
-        for point, number, shots in realise(
-            self.some(points), self._effects, keys=keys, first_draw=first, draws=ends[-1] - first
-        ):
-            found = statistics(shots)
-            means.add(points[point], found)
-            rows = Rows(point, keys[point], number, number + 1)
-            if self._method == "probabilities":
-                count_by_chance(rows, ends, found, counts)
-            else:
-                count_in_noise(rows, ends, shots, counts)
-        return counts
+    def count(self, points: np.ndarray, first: int, last: int, counts: np.ndarray) -> None:
+        """As of :class:`Drawn`: of random effects, draws are added to the means as well."""
+        some, keys = self.some(points), self.keys[points]
+        if self._means is not None:
+            for point, number, shots in realise(
+                some, self.effects, keys=keys, first_draw=first, draws=last - first
+            ):
+                found = statistics(shots)
+                self._means.add(points[point], found)
+                rows = Rows(point, keys[point], number, number + 1)
+                if self._noisy:
+                    count_in_noise(rows, self.ends, shots, counts)
+                else:
+                    count_by_chance(rows, self.ends, found, counts)
+            return
+        ends = np.full((2, points.size), [[first], [last]])
+        rows = Rows(np.arange(points.size), keys, *ends)
+        if not self._noisy:
+            outputs = {name: v[points] for name, v in self._outputs.items()}
+            count_by_chance(rows, self.ends, outputs, counts)
+            return
+        for index, shots in prepare(some, self.effects):
+            count_in_noise(Rows(*(v[index] for v in rows)), self.ends, shots, counts)
 
     def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
         """As of :class:`Drawn`."""
@@ -350,9 +327,7 @@ class Sample(Drawn):
             )
             return half_width(mean, interval)
         exact = np.stack([0.0 * self._outputs[name][points] for name in PROMISED])
-        if self._method == "probabilities":
-            return exact
-        return exact + self.counted_widths(points, accuracy)
+        return exact + (self.counted_widths(points, accuracy) if self._noisy else 0.0)
 
     def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """As of :class:`Drawn`."""
@@ -367,22 +342,14 @@ _NO_LOGARITHMS = np.zeros(len(VALUES), bool)
 
 
 class SpectraSample(Drawn):
-    """Draws of whole spectra.
-
-    Parameters
-    ----------
-    parameters, effects, keys, methods, before
-        As of :func:`simulate`.
-    """
+    """Draws of whole spectra, looked at by detectors and estimators of given names."""
 
     def __init__(
-        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
-        methods: Methods, before: Before | None,
+        self, parameters: Parameters, effects: Collection[str], *, methods: Methods,
+        before: Before | None = None, **given: Any,
     ) -> None:  # fmt: skip
-        size = len(keys)
-        super().__init__({**DEFAULTS, **parameters}, size, before)
-        self._effects = effects
-        self._keys, self._methods = keys, methods
+        super().__init__({**DEFAULTS, **parameters}, effects, before=before, **given)
+        self._methods, size = methods, self.number.size
         self._count = np.zeros((len(VALUES), size), np.int64)
         self._mean, self._square = np.zeros((2, len(VALUES), size))  # the latter about the mean
         self._fixed = Means(size)
@@ -409,36 +376,31 @@ class SpectraSample(Drawn):
         sizes = np.unique(self.parameters[FFT_SIZE])
         return max(1, 4 // points) * math.lcm(*(max(1, SAMPLES // int(n)) for n in sizes))
 
-    def take(self, points: np.ndarray, first: int, batch_sizes: Sequence[int]) -> np.ndarray:
-        """As of :class:`Drawn`."""
-        ends = first + np.cumsum([0, *batch_sizes])
-        counts = np.zeros((len(DRAW_OUTPUTS), points.size, len(batch_sizes)), np.int64)
+    def count(self, points: np.ndarray, first: int, last: int, counts: np.ndarray) -> None:
+        """As of :class:`Drawn`: and values are added to running means."""
         for place, point in enumerate(points):
-            for view, draws in self._views(int(point), int(ends[0]), int(ends[-1])):
-                batch = np.searchsorted(ends, draws, "right") - 1
+            for view, draws in self._views(int(point), int(first), int(last)):
+                batch = np.searchsorted(self.ends, draws, "right") - 1
                 found, values = counted(view, draws)
                 np.add.at(counts[:, place].T, batch, found.T)
-                place_of = np.full(draws.size, point)
-                add(place_of, values, _NO_LOGARITHMS, self._count, self._mean, self._square)
-        self.counts[:, points] += counts.sum(axis=-1)
-        self.number[points] += ends[-1] - ends[0]
-        return counts
+                sums = self._count, self._mean, self._square
+                add(np.full(draws.size, point), values, _NO_LOGARITHMS, *sums)
 
     def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
         """What is looked at of a point, with the numbers of draws that are looked at together."""
         p = self.some(point)
         if self._prepared:
-            view = view_of(*self._prepared[point], p, self._keys[point], self._methods)
+            view = view_of(*self._prepared[point], p, self.keys[point], self._methods)
             step = max(1, SAMPLES // view.setting.fft_size)
             for start in range(first, last, step):
                 yield view, np.arange(start, min(start + step, last))
             return
         for stretch in realise(
-            p, self._effects, keys=self._keys[[point]], first_draw=first, draws=last - first
+            p, self.effects, keys=self.keys[[point]], first_draw=first, draws=last - first
         ):
             self._fixed.add(np.full(stretch.draw.size, point), statistics(stretch.shots))
             for i, number in enumerate(stretch.draw):
-                view = view_of(stretch.shots, i, p, self._keys[point], self._methods)
+                view = view_of(stretch.shots, i, p, self.keys[point], self._methods)
                 yield view, np.array([number])
 
     def _there(self) -> np.ndarray:
@@ -459,7 +421,7 @@ class SpectraSample(Drawn):
         )
         fixed = self._fixed.results()
         outputs = {name: fixed[name] for name in KEPT}
-        shares = self.counts[COUNT_OF] / self.number + self._there()
+        shares = self.found() / self.number + self._there()
         outputs |= dict(zip(PROMISED, shares, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             error = {name: np.sqrt(square[name] / (n[name] * (n[name] - 1))) for name in VALUES}

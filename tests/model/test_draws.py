@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sweep.model import philox
-from sweep.model.draws import draw
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.model.realisations import realise
@@ -41,9 +40,7 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
     parameters = _points(table_4_1, tnr=7.0)
     outputs = evaluate(parameters)
     assert ((outputs["pd_up"] > 0.02) & (outputs["pd_up"] < 0.98)).sum() >= 2
-    counts = draw(
-        parameters, outputs, keys=_keys(6), first_draw=0, batch_sizes=[DRAWS], method=method
-    )
+    counts = simulate(parameters, CORE, keys=_keys(6), batch_sizes=[DRAWS], method=method)
     for segment in ("up", "down", "doppler", "shot"):
         found = counts[f"n_detected_{segment}"][:, 0]
         assert _within_5_sigma(found, outputs[f"pd_{segment}"]).all(), segment
@@ -55,28 +52,24 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 def test_batches_split_the_same_draws(table_4_1, method):
     parameters = _points(table_4_1, tnr=7.0)
-    outputs = evaluate(parameters)
-    whole = draw(parameters, outputs, keys=_keys(6), first_draw=0, batch_sizes=[300], method=method)
-    parts = draw(
-        parameters, outputs, keys=_keys(6), first_draw=0, batch_sizes=[100, 150, 50], method=method
-    )
-    later = draw(
-        parameters, outputs, keys=_keys(6), first_draw=100, batch_sizes=[150], method=method
-    )
-    for name, counts in parts.items():
+    chosen = {"keys": _keys(6), "method": method}
+    whole = simulate(parameters, CORE, batch_sizes=[300], **chosen)
+    parts = simulate(parameters, CORE, batch_sizes=[100, 150, 50], **chosen)
+    later = simulate(parameters, CORE, first_draw=100, batch_sizes=[150], **chosen)
+    for name in DRAW_OUTPUTS:
+        counts = parts[name]
         assert np.array_equal(counts.sum(axis=1), whole[name][:, 0]), name
         assert np.array_equal(counts[:, 1], later[name][:, 0]), name
 
 
 def test_a_points_draws_do_not_depend_on_its_neighbours(table_4_1):
     parameters = _points(table_4_1, tnr=7.0)
-    outputs, keys = evaluate(parameters), _keys(6)
-    together = draw(parameters, outputs, keys=keys, first_draw=0, batch_sizes=[200], method="noise")
+    chosen = {"batch_sizes": [200], "method": "noise"}
+    together = simulate(parameters, CORE, keys=_keys(6), **chosen)
     alone = parameters | {"target.range": parameters["target.range"][4:5]}
-    single = draw(
-        alone, evaluate(alone), keys=keys[4:5], first_draw=0, batch_sizes=[200], method="noise"
-    )
-    for name, counts in single.items():
+    single = simulate(alone, CORE, keys=_keys(6)[4:5], **chosen)
+    for name in DRAW_OUTPUTS:
+        counts = single[name]
         assert counts[0, 0] == together[name][4, 0], name
 
 
@@ -86,10 +79,7 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         "target.range": np.array([20.0]),
     }
     for method in ("probabilities", "noise"):
-        counts = draw(
-            parameters, evaluate(parameters), keys=_keys(1), first_draw=0, batch_sizes=[50],
-            method=method,
-        )  # fmt: skip
+        counts = simulate(parameters, CORE, keys=_keys(1), batch_sizes=[50], method=method)
         assert counts["n_detected_doppler"].sum() == 0
         assert counts["n_detected_up"].sum() == 50
 
@@ -172,4 +162,4 @@ def test_batches_split_the_same_draws_of_random_effects(method, table_4_1):
 
 def test_an_unknown_method_is_refused(table_4_1):
     with pytest.raises(ValueError, match="probabilities, noise"):
-        draw(table_4_1(), {}, keys=_keys(1), first_draw=0, batch_sizes=[1], method="guess")
+        simulate(table_4_1(), CORE, keys=_keys(1), batch_sizes=[1], method="guess")

@@ -9,12 +9,13 @@ from engine import lines_of
 from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD, held
 from test_leakage import drawn_bundles as bundles
 
-from sweep.model import draws, philox, returns, segments, truth
+from sweep.model import philox, returns, segments, truth
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
 from sweep.model.groups import groups
 from sweep.model.preparation import PhaseError
+from sweep.model.sampling import simulate
 from sweep.model.segments import POINTS
 from sweep.model.shot import evaluate, find
 from sweep.model.waveform import SIGNS
@@ -152,10 +153,7 @@ def test_without_leakage_only_noise_raises_false_peaks(table_4_1):
     shares = {}
     for name, effects in (("with", CORE), ("without", set(CORE) - {"leakage"})):
         outputs = evaluate(parameters, effects)
-        counts = draws.draw(
-            parameters, outputs, keys=keys, first_draw=0, batch_sizes=[4000], method="noise",
-            effects=effects,
-        )  # fmt: skip
+        counts = simulate(parameters, effects, keys=keys, batch_sizes=[4000], method="noise")
         shares[name] = counts["n_false_alarm_up"][0, 0] / 4000, outputs["pfa_segment"][0]
     assert shares["with"][0] > 0.5
     found, expected = shares["without"]
@@ -294,16 +292,13 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
     ) | {"instrument.laser.line_width": 3e4, "target.range": np.array([300.0, 400.0])}  # fmt: skip
     outputs = evaluate(parameters, effects)
     keys = philox.point_keys(np.arange(2.0)[:, None], domain="tests", seed=2)
-    counts = draws.draw(
-        parameters, outputs, keys=keys, first_draw=0, batch_sizes=[number], method="noise",
-        effects=effects,
-    )  # fmt: skip
+    counts = simulate(parameters, effects, keys=keys, batch_sizes=[number], method="noise")
     pd = outputs["pd_up"]
     sigma = np.sqrt(pd * (1 - pd) / number)
     assert (abs(counts["n_detected_up"][:, 0] / number - pd) < 5 * sigma).all()
     assert (abs(evaluate(parameters)["pd_up"] - pd) > 10 * sigma).any()
     ((_, shots),) = prepare(parameters, effects)
-    for method in returns.METHODS:
+    for method in ("probabilities", "noise"):
         drawn = returns.draw_returns(
             shots, groups(shots), keys=keys, draws=4000, method=method
         ).group[..., 0]  # fmt: skip

@@ -8,7 +8,15 @@ from numba import njit
 from scipy import stats
 
 from sweep.model import philox
-from sweep.model.philox import normal_pair, normals, point_keys, uniform, uniform4
+from sweep.model.philox import (
+    normal_pair,
+    normals,
+    point_keys,
+    records,
+    uniform,
+    uniform4,
+    uniforms,
+)
 
 FIVE_SIGMA = 5.73e-7  # two-sided chance of a normal variable beyond 5
 without_deadline = settings(deadline=None)  # the first call may compile
@@ -25,7 +33,7 @@ def numpys_block(key, counter):
 
 
 @njit
-def uniforms(key0, key1, first_draw, stream, n_draws, n_indices):
+def rows_of_uniforms(key0, key1, first_draw, stream, n_draws, n_indices):
     values = np.empty((n_draws, n_indices))
     for i in range(n_draws):
         for j in range(n_indices):
@@ -71,13 +79,15 @@ def test_a_uniform_is_addressed_by_block_draw_and_stream(key, draw, stream, inde
 @given(st.tuples(words, words), numbers, st.integers(1, 100), st.integers(0, 9))
 @without_deadline
 def test_a_record_of_normal_numbers_is_that_of_pairs_one_by_one(key, draw, stream, number):
-    pairs = [normal_pair(*key, draw, stream, i) for i in range((number + 1) // 2)]
-    found = normals(np.array(key), np.array([7, draw]), stream, number)[1]
-    np.testing.assert_allclose(found, np.ravel(pairs)[:number], rtol=1e-14, atol=1e-15)
+    pairs = [normal_pair(*key, draw, stream, i) for i in range(number)]
+    draws = np.array([7, draw])
+    drawn = records(np.array(key), draws, stream, 2 * len(pairs))
+    np.testing.assert_array_equal(drawn, uniforms(np.array([key, key]), draws, stream, 2 * number))
+    np.testing.assert_allclose(normals(drawn)[1], np.ravel(pairs), rtol=1e-14, atol=1e-15)
 
 
 def test_uniforms_are_uniform_over_draws_and_over_indices():
-    values = uniforms(*KEY, 10**6, philox.STREAM_DETECTION[0], 50_000, 4)
+    values = rows_of_uniforms(*KEY, 10**6, philox.STREAM_DETECTION[0], 50_000, 4)
     for sample in (values[:, 0], values[:, 3], values[:40].ravel(), values.ravel()):
         assert stats.kstest(sample, "uniform").pvalue > FIVE_SIGMA
 
@@ -85,13 +95,13 @@ def test_uniforms_are_uniform_over_draws_and_over_indices():
 @pytest.mark.parametrize("lag", [1, 2, 4, 16])
 def test_neighbours_in_draw_index_stream_and_key_are_uncorrelated(lag):
     n = 30_000
-    base = uniforms(*KEY, 0, 1, n, 1).ravel()
+    base = rows_of_uniforms(*KEY, 0, 1, n, 1).ravel()
     others = [
-        uniforms(*KEY, lag, 1, n, 1).ravel(),
-        uniforms(*KEY, 0, 1, n, lag + 1)[:, lag],
-        uniforms(*KEY, 0, 1 + lag, n, 1).ravel(),
-        uniforms(KEY[0] + np.uint64(lag), KEY[1], 0, 1, n, 1).ravel(),
-        uniforms(KEY[0], KEY[1] ^ np.uint64(lag), 0, 1, n, 1).ravel(),
+        rows_of_uniforms(*KEY, lag, 1, n, 1).ravel(),
+        rows_of_uniforms(*KEY, 0, 1, n, lag + 1)[:, lag],
+        rows_of_uniforms(*KEY, 0, 1 + lag, n, 1).ravel(),
+        rows_of_uniforms(KEY[0] + np.uint64(lag), KEY[1], 0, 1, n, 1).ravel(),
+        rows_of_uniforms(KEY[0], KEY[1] ^ np.uint64(lag), 0, 1, n, 1).ravel(),
     ]
     for other in others:
         # The correlation coefficient of n independent pairs has a deviation of 1/sqrt(n).

@@ -8,7 +8,7 @@ from scipy import ndimage, stats
 
 from sweep.model import philox, truth, waveform
 from sweep.model.chain import prepare
-from sweep.model.draws import Seen, draw
+from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
 from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
@@ -25,6 +25,7 @@ from sweep.model.returns import (
     judge,
     largest_of,
 )
+from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate, find, report
 from sweep.model.window import samples, window
 
@@ -203,10 +204,9 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
     """
     parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
     shots = _prepared(parameters)
-    counts = draw(
-        parameters, evaluate(parameters), keys=_keys(4), first_draw=3, batch_sizes=[2000],
-        method=method,
-    )  # fmt: skip
+    counts = simulate(
+        parameters, CORE, keys=_keys(4), first_draw=3, batch_sizes=[2000], method=method
+    )
     got = _drawn(shots, first_draw=3, draws=2000, method=method)
     both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
     np.testing.assert_array_equal(both.any(2).sum(1), counts["n_detected_shot"][:, 0])

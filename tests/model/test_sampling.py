@@ -183,10 +183,10 @@ class Coins:
     def at_once(self, points):
         return sampling.PIECE
 
-    def take(self, points, first, batch_sizes):
-        assert (self.number[points] == first).all()
-        self.hits[points] += self.random.binomial(sum(batch_sizes), self.pd, points.size)
-        self.number[points] += sum(batch_sizes)
+    def take(self, points, number):
+        assert np.unique(self.number[points]).size == 1
+        self.hits[points] += self.random.binomial(number, self.pd, points.size)
+        self.number[points] += number
 
     def widths(self, points):
         pairs = np.stack([self.hits[points], self.number[points]])

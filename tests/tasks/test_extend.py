@@ -199,13 +199,13 @@ CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
 def drawn(monkeypatch, computed):
     """Draws that the model takes, call by call."""
     calls: list[int] = []
-    real = sampling.Sample.take
+    real = sampling.Drawn.take
 
-    def counted(self, points, first, batch_sizes):
-        calls.append(len(points) * sum(batch_sizes))
-        return real(self, points, first, batch_sizes)
+    def counted(self, points, number):
+        calls.append(len(points) * number)
+        real(self, points, number)
 
-    monkeypatch.setattr(sampling.Sample, "take", counted)
+    monkeypatch.setattr(sampling.Drawn, "take", counted)
     return calls
 
 

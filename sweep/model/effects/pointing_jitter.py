@@ -22,14 +22,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Size
 from sweep.model.effects.footprint import by_power
 from sweep.model.effects.points import Points, Smear
 from sweep.model.effects.spread import NO_SPREAD, reach_of
-from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair
+from sweep.model.philox import STREAM_POINTING_JITTER, normals, uniforms
 
 RARE = 1e-6
 """Chance of a draw whose beam is further off than its size takes it to be."""
@@ -50,16 +49,8 @@ class Turned(NamedTuple):
 
 def angles(realisation: Realisation, sigma: np.ndarray) -> np.ndarray:
     """Angles (a, b) by which beams of this standard deviation are off, (n, 2) [rad]."""
-    values = np.empty((realisation.draw.size, 2))
-    _draw(realisation.keys, realisation.draw, STREAM_POINTING_JITTER, values)
-    return values * np.asarray(sigma, float)[..., None]
-
-
-@njit(cache=True, nogil=True)
-def _draw(keys, draw, stream, out):
-    """One pair of standard normal numbers for each point's draw."""
-    for i in range(draw.size):
-        out[i, 0], out[i, 1] = normal_pair(keys[i, 0], keys[i, 1], draw[i], stream, 0)
+    draws = uniforms(realisation.keys, realisation.draw, STREAM_POINTING_JITTER, 2)
+    return normals(draws) * np.asarray(sigma, float)[..., None]
 
 
 def turned(

@@ -17,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from scipy import special
 
 from sweep.model import philox
@@ -55,8 +54,7 @@ def factors(
     realisation : Realisation
         Which draws.
     """
-    uniforms = np.empty((realisation.draw.size, 4))
-    _fill(realisation.keys, realisation.draw, uniforms)
+    uniforms = philox.uniforms(realisation.keys, realisation.draw, philox.STREAM_SCINTILLATION, 4)
     total = np.ones(realisation.draw.size)
     for i, variance in enumerate(_parts(legs, total.size)):
         total *= _inverse(distribution, uniforms[:, i], variance)
@@ -105,13 +103,6 @@ def _inverse(
     inverse = special.gammainccinv if upper else special.gammaincinv
     cube = (1 - spread / 9 + np.sqrt(spread) / 3 * z) ** 3
     return np.where(spread > _LEAST_SPREAD, inverse(shape, chance) / shape, cube)
-
-
-@njit(cache=True)
-def _fill(keys, draw, out):
-    """The first four uniforms of the stream for each point's draw, out (n, 4)."""
-    for i in range(draw.size):
-        out[i] = philox.uniform4(keys[i, 0], keys[i, 1], draw[i], philox.STREAM_SCINTILLATION, 0)
 
 
 _TURBULENCE, _CONSTANT = "atmosphere.turbulence", "atmosphere.structure_constant"

@@ -27,7 +27,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from sweep.model import philox
@@ -75,32 +74,24 @@ def factors(
         Whether the coherent share has an independent uniform phase in each beamlet.
     """
     share = np.asarray(coherent_share, float) + np.zeros(realisation.draw.size)
-    magnitude, cycles = np.empty((2, share.size, beamlets))
-    streams = philox.STREAM_SPECKLE, philox.STREAM_FOOTPRINT_PHASE
-    _fill(realisation.keys, realisation.draw, streams, share, random_phases, magnitude, cycles)
-    return magnitude, cycles
-
-
-@njit(cache=True, nogil=True)
-def _fill(keys, draw, streams, share, random_phases, magnitude, cycles):
-    """Diffuse part of every factor as Box and Muller have it, and the steady part on top."""
-    for i in range(draw.size):
-        a, b = keys[i]
-        steady, diffuse = math.sqrt(share[i]), math.sqrt(1.0 - share[i])
-        for k in range(magnitude.shape[1]):
-            if k % 2 == 0:
-                u0, u1, u2, u3 = philox.uniform4(a, b, draw[i], streams[0], k // 2)
-            else:
-                u0, u1 = u2, u3
-            radius, turn = diffuse * math.sqrt(-math.log(u0)), u1
-            if steady > 0.0:
-                angle = 0.0
-                if random_phases:
-                    angle = 2.0 * math.pi * philox.uniform(a, b, draw[i], streams[1], k)
-                re = radius * math.cos(2.0 * math.pi * turn) + steady * math.cos(angle)
-                im = radius * math.sin(2.0 * math.pi * turn) + steady * math.sin(angle)
-                radius, turn = math.hypot(re, im), math.atan2(im, re) / (2.0 * math.pi)
-            magnitude[i, k], cycles[i, k] = radius, turn
+    keys, draw = realisation.keys, realisation.draw
+    drawn = philox.uniforms(keys, draw, philox.STREAM_SPECKLE, 2 * beamlets)
+    # In one piece each: bits do not depend on how many draws there are.
+    chance, cycles = (np.ascontiguousarray(drawn[:, lane::2]) for lane in range(2))
+    steady, diffuse = np.sqrt(share)[:, None], np.sqrt(1.0 - share)[:, None]
+    radius = diffuse * np.sqrt(-np.log(chance))
+    if not steady.any():
+        return radius, cycles
+    angle = np.zeros(())
+    if random_phases:
+        phases = philox.uniforms(keys, draw, philox.STREAM_FOOTPRINT_PHASE, beamlets)
+        angle = 2.0 * np.pi * np.ascontiguousarray(phases)
+    re = radius * np.cos(2.0 * np.pi * cycles) + steady * np.cos(angle)
+    im = radius * np.sin(2.0 * np.pi * cycles) + steady * np.sin(angle)
+    return (
+        np.where(steady > 0, np.hypot(re, im), radius),
+        np.where(steady > 0, np.arctan2(im, re) / (2.0 * np.pi), cycles),
+    )
 
 
 def turns(*, carrier: ArrayLike, doppler: np.ndarray, interval: np.ndarray) -> np.ndarray:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
-from sweep.model.philox import STREAM_POINTING_JITTER, normal_pair, point_keys
+from sweep.model.philox import STREAM_POINTING_JITTER, normals, point_keys, uniforms
 
 DOMAIN = "sweep.jitter"
 """Domain of the random key, so that no other use of the same seed meets its numbers."""
@@ -80,15 +79,7 @@ class PointingJitter(NamedTuple):
 
     def turned(self, attitude: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Attitudes (n, 4) of shots by number (n,), turned; any stretch is the same bit for bit."""
-        ((a, b),) = point_keys(np.empty((1, 0)), domain=DOMAIN, seed=self.seed)
-        draws = np.empty((len(index), 3))
-        _draw(a, b, np.asarray(index, np.int64), STREAM_POINTING_JITTER, draws)
+        key = point_keys(np.empty((1, 0)), domain=DOMAIN, seed=self.seed)
+        keys = np.broadcast_to(key, (len(index), 2))  # a shot's number stands for that of a draw
+        draws = normals(uniforms(keys, np.asarray(index), STREAM_POINTING_JITTER, 4))[:, :3]
         return multiply(attitude, from_rotation_vector(draws * self.sigma))
-
-
-@njit(cache=True, nogil=True)
-def _draw(key0, key1, index, stream, draws):
-    """Three standard normal numbers for each shot, whose number stands for that of a draw."""
-    for i in range(index.size):
-        draws[i, 0], draws[i, 1] = normal_pair(key0, key1, index[i], stream, 0)
-        draws[i, 2], _ = normal_pair(key0, key1, index[i], stream, 1)
