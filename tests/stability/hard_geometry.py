@@ -11,9 +11,9 @@ from table_shots import parameters, shots
 from sweep.model import footprint
 from sweep.model.elementary import product_fraction, quotient, sincos_cycles
 from sweep.model.geometry import quaternion
-from sweep.model.lines import segment_lines
+from sweep.model.lines import IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
-from sweep.model.waveform import SIGNS
+from sweep.model.spectrum import ROOM
 
 FAMILY = Family(
     "Geometry",
@@ -94,13 +94,9 @@ def normal_incidence() -> float:
 def lines(one: Shots, segment: int) -> tuple[int, np.ndarray, np.ndarray]:
     """Origin, places and weights of a shot's lines."""
     p, n = one.point_table()[:, 0], one.offset.shape[1]
-    delta, re, im = np.empty(n), np.empty(n), np.empty(n)
-    origin = segment_lines(
-        (float(SIGNS[segment]), p[9] if segment == 2 else p[8]), (p[2], p[0], p[1], p[3]),
-        (p[4], p[5]), (p[6], one.fft_size, one.window.length, p[7]), one.offset[0],
-        one.doppler[0], one.amplitude[0], np.empty(0), delta, re, im,
-    )  # fmt: skip
-    return origin, delta, re + 1j * im
+    room, sizes = np.empty((ROOM, n)), np.array([one.fft_size, one.window.length, 0, 0, 0, 0])
+    origin = place_lines(p, segment, one.footprint, 0, sizes, room)
+    return origin, room[PLACE], room[RE] + 1j * room[IM]
 
 
 def line_errors(one: Shots) -> tuple[float, float, float]:
