@@ -6,6 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 COMPILING = ("numba",)
 """Modules whose names, as decorators, make compiled functions."""
+INTERNALS = ("intrinsic(", "register_model", "lower_builtin", "_nrt", "forceinline", "llvmlite.ir")
 
 
 def modules(folder: str) -> list[Path]:
@@ -25,6 +26,22 @@ def compiled(folder: str) -> int:
 
 def compiled_in(tree: ast.Module) -> int:
     """Functions of a module, likewise."""
+    return len(_compiled(tree))
+
+
+def most_arguments(folder: str) -> int:
+    """Most arguments that any of them has."""
+    functions = [f for path in modules(folder) for f in _compiled(ast.parse(path.read_text()))]
+    return max(len(function.args.args) for function in functions)
+
+
+def internals(folder: str) -> set[str]:
+    """Names of numba's and llvmlite's inner workings that occur in any module."""
+    text = "".join(path.read_text() for path in modules(folder))
+    return {name for name in INTERNALS if name in text}
+
+
+def _compiled(tree: ast.Module) -> list[ast.FunctionDef]:
     names: set[str] = set()
     for node in tree.body:
         if isinstance(node, ast.Import | ast.ImportFrom):
@@ -36,7 +53,7 @@ def compiled_in(tree: ast.Module) -> int:
         elif isinstance(node, ast.Assign) and _names(node.value) & names:
             names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    return sum(any(_names(d) & names for d in function.decorator_list) for function in functions)
+    return [f for f in functions if any(_names(d) & names for d in f.decorator_list)]
 
 
 def _names(node: ast.AST) -> set[str]:
@@ -47,3 +64,5 @@ if __name__ == "__main__":
     for folder in ("sweep", "sweep/model", "tests"):
         print(f"{folder:12}{lines(folder):8,} lines {len(modules(folder)):5} modules")
     print(f"compiled    {compiled('sweep'):8,} functions of sweep, by numba")
+    print(f"            {most_arguments('sweep'):8,} arguments of one of these, at the most")
+    print(f"internals   {', '.join(internals('sweep')) or 'none':>8} of numba or llvmlite")
