@@ -168,11 +168,11 @@ def _all_beyond(weight, first, mirror, noise, form):
 
 @njit(cache=True, error_model="numpy")
 def _envelope_beyond(first, form):
-    """Envelope ``first`` bins away; sum of its squares in all bins from there on, both sides."""
+    """Envelope ``first`` bins away; half the sum of its squares in all bins from there on."""
     place = 0
     while place + 1 < form.shape[1] and form[0, place + 1] <= first - 1.5:
         place += 1
-    return form[1, place], 2.0 * (form[1, place] * form[1, place] + form[2, place])
+    return form[1, place], form[1, place] * form[1, place] + form[2, place]
 
 
 @njit(cache=True, error_model="numpy")

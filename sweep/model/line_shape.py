@@ -320,7 +320,7 @@ def put_envelope(table, ends, sizes, reach, envelope):
     """Envelope of a table, and of what is beyond it; as of :func:`build`."""
     bins, cells, power = sizes[2], sizes[3], sizes[4]
     columns = table.shape[1] // cells
-    most, area = 0.0, 0.0
+    most, area, before = 0.0, 0.0, 0.0
     for i in range(reach.size - 1, -1, -1):
         if i <= bins:
             for row in range(0, cells, cells // 4):
@@ -341,5 +341,6 @@ def put_envelope(table, ends, sizes, reach, envelope):
                 b_im = b_im * c + ends[3, d]
             most = max(most, math.hypot(a_re, a_im) + math.hypot(b_re, b_im))
         further = reach[i + 1] - reach[i] if i + 1 < reach.size else 0.0
-        area += further * most * most
+        area += further * 0.5 * (most * most + before)  # an upper sum, where it falls ever slower
+        before = most * most
         envelope[0, i], envelope[1, i] = most, area

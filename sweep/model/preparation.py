@@ -187,6 +187,8 @@ class Shots:
     """Noise variance at the ADC [V^2] that stands under the lines, and nowhere else."""
     noise_gain: np.ndarray | float = 1.0
     """Factor on the noise variance by what happens to the record after the threshold was set."""
+    complex_record: bool = False
+    """Whether the record is I and Q, and its spectrum has signed bins and no images."""
     image: bool = False
     """Whether the lines' images at negative frequencies are summed."""
     leakage: bool = False
@@ -269,6 +271,16 @@ class Shots:
         return np.stack([self.offset, self.doppler, self.amplitude, *phases])
 
     @property
+    def waveform(self) -> tuple[waveform.Segment, ...]:
+        """Segments of the waveform, one after the other; no output tells of Doppler's leakage."""
+        return tuple(
+            waveform.Segment(name, sign, sign * self.chirp_rate, carrier, sign != 0)
+            for name, sign, carrier in zip(
+                waveform.SEGMENTS, waveform.SIGNS, self.carriers, strict=True
+            )
+        )
+
+    @property
     def segments(self) -> np.ndarray:
         """Which of up, Doppler and down segment exist, (3,) bool."""
         return np.array([True, self.architecture != "direct", True])
@@ -284,8 +296,7 @@ class Shots:
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
-        by_segment = zip(waveform.SIGNS, self.carriers, strict=True)
-        further = (x for sign, carrier in by_segment for x in (sign * self.chirp_rate, carrier))
+        further = (x for each in self.waveform for x in (each.chirp_rate, each.carrier))
         return in_rows((*columns, *further), (self.size,))
 
     def counted_bins(self, exempted: np.ndarray) -> np.ndarray:

@@ -46,7 +46,6 @@ from sweep.model.spectrum import (
     detect,
     field,
 )
-from sweep.model.waveform import SIGNS
 from sweep.model.window import Window
 
 POINTS = 256
@@ -125,7 +124,8 @@ def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
         for s in np.flatnonzero(shots.segments):
             found[s][:, runs.part] = (
                 runs.pd[s], runs.miss[s], runs.magnitude[s],
-                (runs.low[s] + runs.peak[s]) * width[runs.part], runs.exempted[s], runs.leakage[s],
+                _bin(shots, runs.low[s] + runs.peak[s]) * width[runs.part], runs.exempted[s],
+                runs.leakage[s],
             )  # fmt: skip
     return found
 
@@ -198,7 +198,7 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
     shapes = (
         line_shape.shapes(window, fft_size, False, 0)
         if line_shape.has_modes(window, fft_size)
-        else _plain(window, fft_size, False)
+        else _plain(window, fft_size, False, 1)
     )
     room, found = (
         np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16)),
@@ -218,9 +218,17 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
     return found
 
 
+def _bin(shots: Shots, number: np.ndarray) -> np.ndarray:
+    """Bins by their frequency: of complex records -N/2 .. N/2."""
+    if not shots.complex_record:
+        return number
+    half = shots.fft_size // 2
+    return (number + half) % shots.fft_size - half
+
+
 def view(shots: Shots) -> int:
     """How shots see a spectrum."""
-    return IMAGED if shots.image else FOLDED
+    return COMPLEX if shots.complex_record else IMAGED if shots.image else FOLDED
 
 
 def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
@@ -237,11 +245,10 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
     """Some points in groups whose shapes can be told together, in an order of any kind."""
     window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
     simple = line_shape.has_modes(window, fft_size)
-    segments = len(SIGNS)
+    segments = len(shots.waveform)
     if not shots.phase_errors:
-        shapes = line_shape.shapes(window, fft_size, power, 0) if simple else _plain(
-            window, fft_size, power
-        )  # fmt: skip
+        plain = line_shape.shapes if simple else _plain
+        shapes = plain(window, fft_size, power, 0 if simple else segments)
         modes = np.zeros((segments, 1, 2, 1))
         modes[:, :, 0] = 1.0
         number = np.ones((segments, 1), np.int64)
@@ -287,9 +294,9 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
 
 
 @lru_cache(maxsize=2)
-def _plain(window: Window, fft_size: int, power: bool) -> Shapes:
+def _plain(window: Window, fft_size: int, power: bool, segments: int) -> Shapes:
     """Tables of all bins of lines without a phase error."""
-    return line_shape.whole_shapes(window, fft_size, power, np.zeros((len(SIGNS), window.length)))
+    return line_shape.whole_shapes(window, fft_size, power, np.zeros((segments, window.length)))
 
 
 def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndarray) -> Together:
@@ -317,11 +324,11 @@ def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Phase errors [cycles] of points at places x of the record, (segments, points, places)."""
-    found = np.zeros((len(SIGNS), points.size, x.size))
+    found = np.zeros((len(shots.waveform), points.size, x.size))
     for segment in np.flatnonzero(shots.segments):
         for error in shots.phase_errors:
             values = error.chosen(int(segment), points)
-            found[segment] += error.phase(x, sign=SIGNS[segment], **values)
+            found[segment] += error.phase(x, sign=shots.waveform[segment].sign, **values)
     return found
 
 
@@ -331,7 +338,7 @@ def _some(
 ) -> tuple[Runs, int]:  # fmt: skip
     """Runs of as many points from ``first`` on as there is room for; how many these are."""
     part = together.part[first:]
-    segments, m = len(SIGNS), part.size
+    segments, m = len(shots.waveform), part.size
     bins = shots.fft_size // 2 + 1 if view(shots) != COMPLEX else shots.fft_size
     shifts = _shifts(shots, part)
     lines = max(shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
@@ -351,7 +358,8 @@ def _some(
         (together.centre, together.modes, together.number, shifts),
         shapes._replace(sizes=np.append(shapes.sizes, view(shots))),
         (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
-        (shots.segments, levels[part], leaks, shots.window.sum),
+        (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
+         shots.window.sum),
         (np.empty((segments, 2, columns)), np.zeros((segments, 7, known))),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
@@ -460,8 +468,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     tables : tuple
         Limits of nodes; tangents.
     how : tuple
-        Segments that there are; levels below which bins may be left out; way to look at leakage;
-        the window's sum.
+        Segments that there are; levels below which bins may be left out; each segment's way to look
+        at leakage; the window's sum.
     made, work : tuple
         Room for shapes; for spectra.
     out : tuple
@@ -485,7 +493,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             made_of = which
             _make_shapes(which, segments, modes, shapes, table, form)
         sigma, level = p[10], p[11]
-        if leaks != NO_LEAKAGE and level / sigma != before:
+        if leaks.any() and level / sigma != before:
             before = level / sigma
             crossing_series(before, series)
         for s in range(segments.size):
@@ -495,7 +503,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 p, (s, row), footprint, centre[s, which], shifts[i], window_sum, limits, sizes, room
             )
             lines, noise, leakage = (n, lowest, highest, total), (sigma, level, p[14]), 0.0
-            if leaks == INTEGRAL and s != 1:
+            if leaks[s] == INTEGRAL:
                 low, count, peak, exempted, leakage = inspect(
                     origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
                 )
@@ -510,7 +518,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     return i
                 numbers[4, s, i] = at
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
-            if leaks == BIN_BY_BIN and s != 1:
+            if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
             found, missed = marcum_q1_pair(room[OUT, peak] / p[13], level / p[13])
             numbers[0, s, i], numbers[1, s, i] = low, count

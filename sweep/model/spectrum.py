@@ -392,6 +392,8 @@ def run_of(beyond, place, sizes):
     beyond = min(beyond, 2.0 * sizes[0])
     low, high = math.floor(place[0] - beyond), math.ceil(place[1] + beyond)
     if sizes[6] == COMPLEX:
+        if high - low >= sizes[0]:
+            low = (low + high + 1 - sizes[0]) // 2
         return low, min(high, low + sizes[0] - 1)
     if low < 0:
         high = max(high, -low)

@@ -27,6 +27,20 @@ SIGNS = (1, 0, -1)
 """Sign s of the chirp rate in each segment."""
 
 
+class Segment(NamedTuple):
+    """One stretch of a waveform, in which the frequency rises or falls evenly or stands still."""
+
+    name: str
+    sign: int
+    """Of the chirp rate: 1, 0 or -1."""
+    chirp_rate: np.ndarray
+    """[Hz/s], signed, (n,) or scalar."""
+    carrier: np.ndarray
+    """Frequency that the delay turns into phase [Hz], (n,) or scalar."""
+    leaks: bool
+    """Tell whether leakage in it is looked at."""
+
+
 class Resolution(NamedTuple):
     """Range and radial velocity that three peaks report, (n,) each."""
 

@@ -8,6 +8,7 @@ from scipy.constants import c as speed_of_light
 
 from sweep.model import segments, truth
 from sweep.model.chain import prepare
+from sweep.model.window import samples
 
 AGREEMENT = 1e-9
 """Largest difference of |X| over the peak between fast path and truth, all bins."""
@@ -294,3 +295,27 @@ def test_range_walk_smears_the_line_and_keeps_its_energy(table_4_1):
     assert with_walk.sum() == pytest.approx(without.sum(), rel=1e-3)
     # 2 S beta T = 1.17 kHz = 0.13 bins of 9155 Hz: a few per mil of the power leave the peak.
     assert 1e-3 < 1 - with_walk.max() / without.max() < 0.3
+
+
+@pytest.mark.parametrize("velocity", [-40.0, 0.02, 90.0])
+@pytest.mark.parametrize("window", ["hann", "kaiser(8.6)"])
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, window, velocity):
+    """Against the FFT of the beamlets' analytic records, all N bins; peaks keep their sign."""
+    scene = table_4_1(
+        window=window, phases=phases, fft_size=4096, beamlets=7, range=30.0,
+        radial_velocity=velocity,
+    )  # fmt: skip
+    shots = replace(prepared(scene), complex_record=True, phase_errors=())
+    w, half = samples(window, 4096), 2048
+    found = segments.find(shots)
+    for segment in range(3):
+        records = [truth.analytic_record(shots, 0, segment, b, range_walk=False) for b in range(7)]
+        spectra = np.fft.fft(w * np.array(records)) / 2
+        coherent = abs(spectra.sum(axis=0))
+        exact = coherent if phases == "coherent" else np.sqrt((abs(spectra) ** 2).sum(axis=0))
+        bins, magnitude = segments.spectrum(shots, 0, segment)
+        assert bins.size == 4096
+        assert abs(magnitude - exact[bins % 4096]).max() <= AGREEMENT * exact.max()
+        peak = (exact.argmax() + half) % 4096 - half
+        assert found[segment, 3, 0] == peak * shots.sample_rate / 4096
