@@ -24,6 +24,7 @@ no sum of cosines, and short or much padded records have a table of all bins, by
 """
 
 import math
+from fractions import Fraction
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -89,7 +90,7 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int) -> Shapes:
         w.sum(axis=1) * weight * length / 2
     )
     modes = _integrals(strength, x, ratio * y)
-    taylor = _taylor(cosines, number)
+    taylor = _taylor(COSINE_SUMS[window.name], number)
     modes += _corrections(taylor, ratio * y, length)
     edge = float(taylor[0, 0])
     return Shapes(
@@ -173,14 +174,17 @@ def _integrals(strength, x, y):
     return found
 
 
-def _taylor(cosines: np.ndarray, modes: int) -> np.ndarray:
-    """Taylor's coefficients of w T_j at the record's end x = 1, (modes, DERIVATIVES + 1)."""
+def _taylor(cosines: tuple[str, ...], modes: int) -> np.ndarray:
+    """Taylor's coefficients of w T_j at the record's end x = 1, (modes, DERIVATIVES + 1).
+
+    What the cosines add up to there may be next to nothing: their sums are exact.
+    """
     order = np.arange(DERIVATIVES + 1)
-    factorial = np.array([math.factorial(int(i)) for i in order], float)
-    m = np.pi * np.arange(cosines.size)
     even = np.where(order % 2 == 0, (-1.0) ** (order // 2), 0.0)
-    sign = (-1.0) ** np.arange(cosines.size)  # cos(pi m)
-    w = even * (m[:, None] ** order * (cosines * sign)[:, None]).sum(axis=0) / factorial
+    exact = [
+        sum((-1) ** m * m**i * Fraction(c) for m, c in enumerate(cosines)) for i in order.tolist()
+    ]
+    w = even * np.array([float(x) / math.factorial(i) for i, x in enumerate(exact)]) * np.pi**order
     j = np.arange(modes, dtype=float)[:, None]
     ratio = (j * j - order[:-1] ** 2) / (2 * order[:-1] + 1) / (order[:-1] + 1)
     polynomial = np.cumprod(np.hstack([np.ones((modes, 1)), ratio]), axis=1)

@@ -5,15 +5,14 @@ import math
 import mpmath as mp
 import numpy as np
 from cases import EPS, Family
+from engine import lines_of
 from exact_spectrum import Line
 from table_shots import parameters, shots
 
 from sweep.model import footprint
 from sweep.model.elementary import product_fraction, quotient, sincos_cycles
 from sweep.model.geometry import quaternion
-from sweep.model.lines import IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
-from sweep.model.spectrum import ROOM
 
 FAMILY = Family(
     "Geometry",
@@ -91,27 +90,17 @@ def normal_incidence() -> float:
 # Lines
 
 
-def lines(one: Shots, segment: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Origin, places and weights of a shot's lines."""
-    p, n = one.point_table()[:, 0], one.offset.shape[1]
-    room, sizes = np.empty((ROOM, n)), np.array([one.fft_size, one.window.length, 0, 0, 0, 0])
-    origin = place_lines(p, segment, one.footprint, 0, sizes, room)
-    return origin, room[PLACE], room[RE] + 1j * room[IM]
-
-
 def line_errors(one: Shots) -> tuple[float, float, float]:
     """Worst place [bins], the same over nu eps / 2, and worst phase [rad] of all lines."""
     place = relative = turn = 0.0
     with mp.workdps(50):
         for segment in range(3):
-            origin, delta, weight = lines(one, segment)
+            origin, delta, weight = lines_of(one, 0, segment)
             for b, value in enumerate(weight):
                 line = Line(one, 0, segment, b)
                 turns = mp.nint(line.bins / one.fft_size) * one.fft_size
                 folded, exact = line.bins - turns, line.weight
                 exact *= mp.expjpi(folded * one.window.length / one.fft_size)
-                if folded < 0 and origin + delta[b] > 0:
-                    folded, exact = -folded, mp.conj(exact)
                 apart = abs(float(folded - origin - delta[b]))
                 place = max(place, apart)
                 relative = max(relative, apart / (float(abs(line.bins)) * EPS / 2 + 1e-300))
