@@ -405,13 +405,11 @@ def run_of(beyond, place, sizes):
 @njit(cache=True, error_model="numpy")
 def stays_below(level, weight, place, form, sizes):
     """Bins beyond which lines and images of a summed weight stay below a level."""
-    crossing = reach_of(level, weight, form)
     if sizes[6] == IMAGED:
-        edge = min(place[0], 0.5 * sizes[0] - place[1])
-        if edge < 32.0 * crossing:  # else images add less than a tenth
-            return reach_of(0.5 * level, weight, form) + 1.0
-        return reach_of(0.9 * level, weight, form) + 1.0
-    return crossing + 1.0
+        edge = min(place[0], 0.5 * sizes[0] - place[1])  # no bin is nearer to an image
+        share = 0.5 if edge < reach_of(0.1 * level, weight, form) else 0.9
+        return reach_of(share * level, weight, form) + 1.0
+    return reach_of(level, weight, form) + 1.0
 
 
 @njit(cache=True, error_model="numpy")
