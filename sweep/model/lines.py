@@ -172,6 +172,16 @@ def place_lines(p, segment, footprint, row, sizes, room):
 
 
 @njit(cache=True, error_model="numpy")
+def fold_lines(room, n, sizes):
+    """Moves n lines by whole FFT lengths to within half of one from the origin."""
+    for b in range(n):
+        turns = math.floor(room[PLACE, b] / sizes[0] + 0.5)
+        room[PLACE, b] -= turns * sizes[0]
+        if turns & 1 and sizes[1] & 1 and not sizes[4]:  # phases count from the record's middle
+            room[RE, b], room[IM, b] = -room[RE, b], -room[IM, b]
+
+
+@njit(cache=True, error_model="numpy")
 def survey(room, n, power):
     """Sum of n lines' magnitudes, or a little more, and of their squares; the ends of their places.
 

@@ -24,6 +24,7 @@ from sweep.model.lines import (
     PLACE,
     RE,
     X,
+    fold_lines,
     nodes_for,
     place_lines,
     put_on_nodes,
@@ -399,6 +400,9 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     for b in range(n):
         room[PLACE, b] += apart
     whole, squares, lowest, highest = survey(room, n, power)
+    if max(-lowest, highest) > 0.5 * sizes[0]:  # lines further apart than there are bins
+        fold_lines(room, n, sizes)
+        whole, squares, lowest, highest = survey(room, n, power)
     total = math.sqrt(whole) if power else whole
     copies = shift.shape[1] if power else 0
     for turn in range(2 if copies else 1):

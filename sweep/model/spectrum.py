@@ -96,7 +96,9 @@ def add_near(first, count, lines, table, sizes, room):
             if taken == BLOCK_SIZE or (b == n - 1 and taken > 0):
                 _share_out(taken, room)
                 taken = 0
-        for lap in range(-1, 2):
+        near = sizes[2] + WINDOW
+        least, most = (first - start - near) // sizes[0], (first + count - start + near) // sizes[0]
+        for lap in range(least, most + 1):
             _add_cells(first, count, (start, number, lap), table, sizes, room)
 
 
@@ -131,7 +133,7 @@ def _add_cells(first, count, window, table, sizes, room):
     start, number, lap = window
     cells, power = sizes[3], sizes[4]
     columns = table.shape[1] // cells
-    turned = -1.0 if lap != 0 and sizes[1] & 1 and not power else 1.0
+    turned = -1.0 if lap & 1 and sizes[1] & 1 and not power else 1.0
     low, high = held_of(start, lap, sizes)
     low, high = max(first, low), min(first + count, high)
     begin = start + lap * sizes[0] - sizes[2]

@@ -21,6 +21,7 @@ from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
+from sweep.model.segments import spectrum
 from sweep.model.shot import find
 from sweep.model.spectrum import OUT, ROOM, take_sources, weight_afar
 from sweep.model.window import COSINE_SUMS, samples, transform, window
@@ -255,6 +256,16 @@ def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_s
     """Among them bundles as wide as the band, and all of whose lines lie past DC or Nyquist."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         held(drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart))
+
+
+@pytest.mark.parametrize("fft_size", [64, 255, 1023, 5000])
+def test_lines_further_apart_than_there_are_bins_fold_into_the_spectrum(table_4_1, fft_size):
+    for seed in range(6):
+        shots = drawn_bundles(table_4_1, 1000 + seed, fft_size, 2.0 * fft_size)
+        for segment in np.flatnonzero(shots.segments):
+            _, found = spectrum(shots, seed, int(segment))
+            exact = truth.spectrum(shots, seed, int(segment), range_walk=False)
+            assert np.abs(found - exact).max() < 1e-8 * exact.max()
 
 
 @pytest.mark.parametrize("place", [0.0, 300e6])
