@@ -22,10 +22,10 @@ from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
+from sweep.model.outputs import POINTS, STATISTICS, Output
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.ray_error import ray_error
 from sweep.model.returns import Returns, draw_returns
-from sweep.model.scene_outputs import POINTS, STATISTICS, SceneOutput
 
 STRETCH = 1 << 20
 """Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
@@ -77,8 +77,8 @@ def cloud(
     Returns
     -------
     dict of ndarray
-        By the names, units and types of :data:`sweep.model.scene_outputs.STATISTICS`, (n,), and
-        :data:`sweep.model.scene_outputs.POINTS`, (n, draws, returns[, 3]). ``surfaces_seen`` is
+        By the names, units and types of :data:`sweep.model.outputs.STATISTICS`, (n,), and
+        :data:`sweep.model.outputs.POINTS`, (n, draws, returns[, 3]). ``surfaces_seen`` is
         `returns` at the most. ``surface``, ``true_range`` and ``true_radial_velocity`` are those
         of the beamlet that a true or a misread point has seen; the error of a misread one shows.
 
@@ -111,7 +111,7 @@ def cloud(
     return results
 
 
-def _room(output: SceneOutput, sizes: Mapping[str, int]) -> np.ndarray:
+def _room(output: Output, sizes: Mapping[str, int]) -> np.ndarray:
     return np.empty(tuple(sizes[name] for name in output.dims), output.dtype)
 
 

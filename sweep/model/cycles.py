@@ -25,8 +25,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from sweep.model.navigation import LEAST_SINE, Altitude, Velocity, altitude, velocity
+from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import UNCONFIRMED
-from sweep.model.scene_outputs import NAVIGATION
 
 STRETCH = 1 << 16
 """Beams solved for at once."""
@@ -55,10 +55,10 @@ def solve(
     ----------
     shots : mapping
         ``platform_position``, ``platform_velocity`` and ``beam_direction`` of
-        :data:`sweep.model.scene_outputs.SHOTS`, (n, 3).
+        :data:`sweep.model.outputs.SHOTS`, (n, 3).
     points : mapping
         Interpolated ranges and radial velocities, their standard errors and the flags of
-        :data:`sweep.model.scene_outputs.POINTS`, (n, draws, returns).
+        :data:`sweep.model.outputs.POINTS`, (n, draws, returns).
     shots_a_cycle : int
         Shots of a cycle, in the order of the arrays; n is a multiple of it.
     test_level : float or None
@@ -72,7 +72,7 @@ def solve(
     Returns
     -------
     dict of ndarray
-        By the names, units and types of :data:`sweep.model.scene_outputs.NAVIGATION`, (cycles,
+        By the names, units and types of :data:`sweep.model.outputs.NAVIGATION`, (cycles,
         draws[, 3[, 3]]); the numbers of beams are 0 where there is no solution.
 
     Raises

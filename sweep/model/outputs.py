@@ -1,45 +1,49 @@
-"""What an evaluation yields for each point, and sampling by whole spectra: units and meaning."""
+"""Results of grids, of whole spectra, of flights and of scenes: units, meaning, dimensions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 NO_DOPPLER = "nan for direct detection, which has no optical Doppler segment"
 NO_ECHO = "nan where no light comes back"
 NO_BIN = "-inf where the detection occupies every bin, so that none is left to raise an alarm"
+CLOSING = "positive when closing"
+
+XYZ, XYZ_AGAIN = "xyz", "xyz_again"
 
 
 @dataclass(frozen=True)
 class Output:
-    """A quantity: its units ("1" where it has none), its name in words, a further comment."""
+    """A quantity: its units ("1" where it has none), its name in words, a further comment.
+
+    Floats are nan where there is nothing, signed integers -1, flags 0.
+    """
 
     units: str
     long_name: str
     comment: str = ""
-    whole: bool = False
-    """Whether it is counted: an integer."""
+    dtype: str = "float64"
+    dims: tuple[str, ...] = ()
+    """Dimensions beside the study's axes: ``shot``, ``beamlet``, ``cycle``, ``draw`` and
+    ``return_number`` count from 0; ``xyz`` are the world's axes."""
 
 
-def _pd(segment: str, comment: str = "") -> Output:
-    return Output("1", f"probability of detection, {segment}", comment)
-
-
-def _miss(segment: str, comment: str = "") -> Output:
-    return Output("1", f"probability of a miss, {segment}", f"1 - pd with its digits. {comment}")
-
-
-def _snr(segment: str, comment: str = "") -> Output:
-    text = "power of the strongest bin over the mean noise power of a bin, after the FFT"
-    return Output("1", f"signal-to-noise ratio, {segment}", f"{text}. {comment}".strip())
+def _by_segment(
+    name: str, quantity: str, comment: str = "", *, joint: str = " ", shot: str | None = ""
+) -> dict[str, Output]:
+    """Output of each segment and of the shot, with its own comment; None for none of the shot."""
+    words = {"up": "up-chirp", "down": "down-chirp", "doppler": "Doppler segment", "shot": "shot"}
+    own = {"up": "", "down": "", "doppler": NO_DOPPLER, "shot": shot}
+    return {
+        name.format(key): Output(
+            "1", f"{quantity}, {words[key]}", joint.join(filter(None, (comment, further)))
+        )
+        for key, further in own.items()
+        if further is not None
+    }
 
 
 OUTPUTS: dict[str, Output] = {
-    "pd_up": _pd("up-chirp"),
-    "pd_down": _pd("down-chirp"),
-    "pd_doppler": _pd("Doppler segment", NO_DOPPLER),
-    "pd_shot": _pd("shot", "up- and down-chirp both detected"),
-    "miss_up": _miss("up-chirp"),
-    "miss_down": _miss("down-chirp"),
-    "miss_doppler": _miss("Doppler segment", NO_DOPPLER),
-    "miss_shot": _miss("shot"),
+    **_by_segment("pd_{}", "probability of detection", shot="up- and down-chirp both detected"),
+    **_by_segment("miss_{}", "probability of a miss", "1 - pd with its digits."),
     "pfa_bin": Output("1", "probability of false alarm in one bin, from noise alone"),
     "pfa_segment": Output(
         "1",
@@ -60,9 +64,10 @@ OUTPUTS: dict[str, Output] = {
     "p_leakage_down": Output(
         "1", "probability that leaked signal raises a further group, down-chirp", "over noise alone"
     ),
-    "snr_up": _snr("up-chirp"),
-    "snr_down": _snr("down-chirp"),
-    "snr_doppler": _snr("Doppler segment", NO_DOPPLER),
+    **_by_segment(
+        "snr_{}", "signal-to-noise ratio", shot=None,
+        comment="power of the strongest bin over the mean noise power of a bin, after the FFT.",
+    ),
     "beamlets": Output("1", "number of beamlets that were simulated"),
     "beamlets_error": Output(
         "1",
@@ -76,65 +81,47 @@ OUTPUTS: dict[str, Output] = {
         f"peak bins of the three segments resolved; {NO_ECHO}",
     ),
     "radial_velocity_error": Output(
-        "m s-1",
-        "reported less true radial velocity, without noise",
-        f"positive when closing; {NO_ECHO}",
+        "m s-1", "reported less true radial velocity, without noise", f"{CLOSING}; {NO_ECHO}"
     ),
-}
+}  # fmt: skip
 
 WITHOUT_ECHO = tuple(name for name, output in OUTPUTS.items() if NO_ECHO in output.comment)
 """What has no value where no light comes back."""
 
-
-def _count(what: str) -> Output:
-    return Output("1", f"number of draws with {what}", whole=True)
-
-
+_PLACES = {
+    "up": "the up-chirp segment",
+    "down": "the down-chirp segment",
+    "doppler": "the Doppler segment",
+    "shot": "both chirp segments",
+}
 DRAW_OUTPUTS: dict[str, Output] = {
-    "n_detected_up": _count("a detection in the up-chirp segment"),
-    "n_detected_down": _count("a detection in the down-chirp segment"),
-    "n_detected_doppler": _count("a detection in the Doppler segment"),
-    "n_detected_shot": _count("a detection in both chirp segments"),
-    "n_false_alarm_up": _count("a false alarm in the up-chirp segment"),
-    "n_false_alarm_down": _count("a false alarm in the down-chirp segment"),
-    "n_false_alarm_shot": _count("a false alarm in both chirp segments"),
+    f"n_{name}_{segment}": Output("1", f"number of draws with a {event} in {place}", dtype="int64")
+    for name, event in (("detected", "detection"), ("false_alarm", "false alarm"))
+    for segment, place in _PLACES.items()
+    if (name, segment) != ("false_alarm", "doppler")
 }
 
-
-def _error(segment: str, comment: str = "") -> Output:
-    text = "over draws; 0 where nothing random is simulated, nan with a single draw"
-    name = f"standard error of the mean probability of detection, {segment}"
-    return Output("1", name, "; ".join(filter(None, (text, comment))))
-
-
-ERROR_OUTPUTS: dict[str, Output] = {
-    "pd_up_error": _error("up-chirp"),
-    "pd_down_error": _error("down-chirp"),
-    "pd_doppler_error": _error("Doppler segment", NO_DOPPLER),
-    "pd_shot_error": _error("shot"),
-}
+ERROR_OUTPUTS: dict[str, Output] = _by_segment(
+    "pd_{}_error",
+    "standard error of the mean probability of detection",
+    "over draws; 0 where nothing random is simulated, nan with a single draw",
+    joint="; ",
+)
 """Floats, one a point, of studies with draws; each of the output that it is named after."""
 
 PROMISED = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 """Outputs of which the accuracy is promised."""
 
-
-def _half_width(segment: str, comment: str = "") -> Output:
-    text = (
+ACCURACY_OUTPUTS: dict[str, Output] = {
+    "n_draws": Output("1", "number of draws", dtype="int64"),
+    **_by_segment(
+        "pd_{}_half_width",
+        "half-width of the interval of the probability of detection",
         "pd plus and minus this holds the true one with the confidence promised: of the mean over "
         "draws where random effects are simulated; of the share of draws with a detection where "
-        "noise alone is drawn; 0 where pd is exact"
-    )
-    name = f"half-width of the interval of the probability of detection, {segment}"
-    return Output("1", name, "; ".join(filter(None, (text, comment))))
-
-
-ACCURACY_OUTPUTS: dict[str, Output] = {
-    "n_draws": Output("1", "number of draws", whole=True),
-    "pd_up_half_width": _half_width("up-chirp"),
-    "pd_down_half_width": _half_width("down-chirp"),
-    "pd_doppler_half_width": _half_width("Doppler segment", NO_DOPPLER),
-    "pd_shot_half_width": _half_width("shot"),
+        "noise alone is drawn; 0 where pd is exact",
+        joint="; ",
+    ),
     "accuracy_missed": Output(
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
@@ -153,39 +140,30 @@ RUNNING_OUTPUTS: dict[str, Output] = {
 KEPT = ("snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance")
 """Of :data:`OUTPUTS`, what does not depend on the detector."""
 
-_FOUND = "over draws in which every segment has a detection; nan with none"
 _AT_FAULT = "adjacent flagged bins, none of them among those that the signal occupies"
-
-
-def _share(segment: str, comment: str = "") -> Output:
-    what = "share of draws with a detection at the strongest bin or beside it"
-    return Output("1", f"probability of detection, {segment}", f"{what}. {comment}".strip())
-
-
-def _mean(units: str, name: str) -> Output:
-    return Output(units, name, _FOUND)
 
 
 def _resolved(quantity: str, name: str, units: str) -> dict[str, Output]:
     """Bias, its error, RMSE and bound of what is reported."""
+    found = "over draws in which every segment has a detection; nan with none"
     bound = (
         "Cramer-Rao bound for lone tones of the signal's power in the up- and the down-chirp "
         "segment, of which it is resolved; rms over draws where random effects are simulated"
     )
     return {
-        f"{quantity}_bias": _mean(units, f"mean of reported less true {name}"),
-        f"{quantity}_bias_error": _mean(units, f"standard error of the bias of {name}"),
-        f"{quantity}_rmse": _mean(units, f"root mean square of reported less true {name}"),
+        f"{quantity}_bias": Output(units, f"mean of reported less true {name}", found),
+        f"{quantity}_bias_error": Output(units, f"standard error of the bias of {name}", found),
+        f"{quantity}_rmse": Output(units, f"root mean square of reported less true {name}", found),
         f"{quantity}_bound": Output(units, f"least standard deviation of {name}", bound),
     }
 
 
 SPECTRA_OUTPUTS: dict[str, Output] = {
     **{name: OUTPUTS[name] for name in KEPT},
-    "pd_up": _share("up-chirp"),
-    "pd_down": _share("down-chirp"),
-    "pd_doppler": _share("Doppler segment", NO_DOPPLER),
-    "pd_shot": _share("shot", "Up- and down-chirp both detected"),
+    **_by_segment(
+        "pd_{}", "probability of detection", shot="Up- and down-chirp both detected",
+        comment="share of draws with a detection at the strongest bin or beside it.",
+    ),
     "pfa_bin": Output("1", "share of bins with a false alarm", f"those in groups of {_AT_FAULT}"),
     "pfa_bin_error": Output("1", "standard error of pfa_bin over draws"),
     "false_alarms": Output(
@@ -193,6 +171,133 @@ SPECTRA_OUTPUTS: dict[str, Output] = {
     ),
     "false_alarms_error": Output("1", "standard error of false_alarms over draws"),
     **_resolved("range", "range", "m"),
-    **_resolved("radial_velocity", "radial velocity, positive when closing", "m s-1"),
-}
+    **_resolved("radial_velocity", f"radial velocity, {CLOSING}", "m s-1"),
+}  # fmt: skip
 """Floats, one a point; beside them stand ACCURACY_OUTPUTS and DRAW_OUTPUTS."""
+
+
+def _over(dims: tuple[str, ...], outputs: dict[str, Output]) -> dict[str, Output]:
+    """Outputs with these dimensions before their own."""
+    return {name: replace(each, dims=(*dims, *each.dims)) for name, each in outputs.items()}
+
+
+_VECTOR = (XYZ,)
+
+SHOTS: dict[str, Output] = _over(("shot",), {
+    "time": Output("s", "start of the measurement"),
+    "beam": Output("1", "number of the beam", dtype="int32"),
+    "shot_cycle": Output("1", "number of the measurement cycle", dtype="int32"),
+    "platform_position": Output("m", "position of the instrument", dims=_VECTOR),
+    "platform_velocity": Output("m s-1", "velocity of the instrument", dims=_VECTOR),
+    "beam_direction": Output(
+        "1", "unit vector along the beam, as commanded", "without pointing jitter", dims=_VECTOR
+    ),
+    "beam_range": Output("m", "true range of the reference beamlet", "inf: nothing is seen"),
+    "beam_radial_velocity": Output(
+        "m s-1", "true radial velocity of the reference beamlet", CLOSING
+    ),
+    "beam_surface": Output("1", "surface that the reference beamlet hits", dtype="int16"),
+})  # fmt: skip
+"""Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""
+
+CYCLES: dict[str, Output] = _over(("cycle",), {
+    "cycle_time": Output("s", "start of the measurement cycle"),
+    "true_velocity": Output(
+        "m s-1", "velocity of the instrument, mean over the cycle's shots", dims=_VECTOR
+    ),
+    "true_altitude": Output(
+        "m", "height of the instrument above the ground straight below it",
+        "at the cycle's start; inf where there is none",
+    ),
+})  # fmt: skip
+"""Truth of each measurement cycle."""
+
+BEAMLETS: dict[str, Output] = _over(("shot", "beamlet"), {
+    "offset": Output("m", "range less that of the reference beamlet"),
+    "velocity_offset": Output(
+        "m s-1", "radial velocity less that of the reference beamlet", CLOSING
+    ),
+    "cos_incidence": Output("1", "cosine of the incidence angle"),
+    "surface": Output("1", "surface hit", dtype="int16"),
+})  # fmt: skip
+"""What an eyepoint store holds of each beamlet, beside SHOTS and CYCLES."""
+
+WEIGHT = Output("1", "power fraction of the beamlet", dims=("beamlet",))
+
+STATISTICS: dict[str, Output] = _over(("shot",), {
+    "pd_up": Output("1", "probability of detection, up-chirp, strongest surface"),
+    "pd_down": Output("1", "probability of detection, down-chirp, strongest surface"),
+    "pd_doppler": Output("1", "probability of detection, Doppler segment, strongest surface"),
+    "pd_shot": Output("1", "probability that up- and down-chirp both detect the strongest surface"),
+    "pfa_up": Output("1", "probability of a false alarm, up-chirp, noise and leakage"),
+    "pfa_down": Output("1", "probability of a false alarm, down-chirp, noise and leakage"),
+    "snr_up": Output("1", "signal-to-noise ratio, up-chirp, strongest bin"),
+    "surfaces_seen": Output("1", "groups of bins above the threshold, up-chirp", dtype="int16"),
+    "beamlets": Output("1", "beamlets, each a ray that was cast", dtype="int32"),
+    "beamlets_error": Output(
+        "1", "largest change by more beamlets",
+        "of pd in all three segments, or of a relative magnitude, whichever is more; "
+        "estimated from the shot's own rays, where accuracy.tolerance says how many they are; "
+        "else 0",
+    ),
+})  # fmt: skip
+"""Probabilities of each shot, before any draw.
+
+Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
+``pd_doppler`` of direct detection, which has no optical Doppler segment.
+"""
+
+SIMULATED: dict[str, Output] = _over(("shot",), {
+    "effects": Output("1", "effects that were simulated", dtype="uint32"),
+    "effects_error": Output(
+        "1", "largest change by effects that were left out",
+        "sum over them of what each may change: of pd in all three segments, of log10 of "
+        "the probability of a false alarm, or of a relative magnitude, whichever is most",
+    ),
+})  # fmt: skip
+"""What was simulated of each shot; none of the effects where nothing is seen."""
+
+_FALSE = "nan: a false one"
+
+POINTS: dict[str, Output] = _over(("shot", "draw", "return_number"), {
+    "position": Output(
+        "m", "position of the point", "from the interpolated range", dims=_VECTOR
+    ),
+    "range": Output("m", "range by whole bins"),
+    "range_interpolated": Output("m", "range interpolated between bins"),
+    "radial_velocity": Output("m s-1", "radial velocity by whole bins", CLOSING),
+    "radial_velocity_interpolated": Output(
+        "m s-1", "radial velocity interpolated between bins", CLOSING
+    ),
+    "range_standard_error": Output("m", "standard error of the range by whole bins"),
+    "range_interpolated_standard_error": Output("m", "standard error of the interpolated range"),
+    "radial_velocity_standard_error": Output(
+        "m s-1", "standard error of the radial velocity by whole bins"
+    ),
+    "radial_velocity_interpolated_standard_error": Output(
+        "m s-1", "standard error of the interpolated radial velocity"
+    ),
+    "snr": Output("1", "signal-to-noise ratio of the weaker of up and down peak"),
+    "pd": Output("1", "probability that both peaks are detected", "nan for a false peak"),
+    "surface": Output("1", "surface seen", "-1: none, or no true return", "int16"),
+    "flags": Output("1", "what the point is", "0: no point", "uint8"),
+    "true_range": Output("m", "true range of what the point has seen", _FALSE),
+    "true_radial_velocity": Output(
+        "m s-1", "true radial velocity of what the point has seen", _FALSE
+    ),
+})  # fmt: skip
+"""Points of a cloud, up to a study's number of returns of each shot and draw."""
+
+NAVIGATION: dict[str, Output] = _over(("cycle", "draw"), {
+    "velocity": Output("m s-1", "velocity vector of the instrument", dims=_VECTOR),
+    "velocity_covariance": Output(
+        "m2 s-2", "covariance of the velocity's error", dims=(XYZ, XYZ_AGAIN)
+    ),
+    "velocity_status": Output("1", "how the velocity was solved", dtype="int8"),
+    "velocity_beams": Output("1", "beams in the velocity's solution", dtype="int16"),
+    "altitude": Output("m", "height of the instrument above the ground"),
+    "altitude_variance": Output("m2", "variance of the altitude's error"),
+    "altitude_status": Output("1", "how the altitude was solved", dtype="int8"),
+    "altitude_beams": Output("1", "beams in the altitude's solution", dtype="int16"),
+})  # fmt: skip
+"""Navigation from each measurement cycle and draw; only where a cycle has three shots or more."""

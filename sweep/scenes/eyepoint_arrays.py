@@ -1,6 +1,6 @@
 """Eyepoints as the arrays of a store, and back.
 
-The names are those of :mod:`sweep.model.scene_outputs`. Nothing is lost on the way: a shot read
+The names are those of :mod:`sweep.model.outputs`. Nothing is lost on the way: a shot read
 back gives the same radiometry, bit for bit, as the one that was cast.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sweep.model.eyepoints import Eyepoints
-from sweep.model.scene_outputs import BEAMLETS, SHOTS
+from sweep.model.outputs import BEAMLETS, SHOTS
 
 _FIELDS = {
     "time": "time",

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sweep.model.ground import pattern as pattern_of
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.spec.axes import Axis
 from sweep.spec.mistakes import ABSENT, Finding, Location
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 import sweep.spec.quantities as of
-from sweep.model.scene_outputs import POINTS, SHOTS, STATISTICS, XYZ
+from sweep.model.outputs import POINTS, SHOTS, STATISTICS, XYZ
 from sweep.spec.figures import STEM, TITLE, WHERE, Selection
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import Either, Flag, Interval, Names

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS
+from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS
 from sweep.storage.locations import Location
 from sweep.storage.opening import open_group
 from sweep.tasks.study import Results

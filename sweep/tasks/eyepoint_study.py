@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.scene_outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, SceneOutput
+from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, Output
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks.calling import TILE_SHOTS
@@ -127,7 +127,7 @@ class EyepointStudy:
         return beamlets(self.beamlets, self.spec.pattern)[1]
 
     @property
-    def _outputs(self) -> dict[str, SceneOutput]:
+    def _outputs(self) -> dict[str, Output]:
         return SHOTS | BEAMLETS | CYCLES
 
     def _array(self, name: str) -> ArrayLayout:
@@ -250,7 +250,7 @@ def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray
 
 def scene_array(
     name: str,
-    output: SceneOutput,
+    output: Output,
     shape: tuple[int, ...],
     chunks: tuple[int, ...],
     *,

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.model.effects.flags import flag_attributes
-from sweep.model.scene_outputs import (
+from sweep.model.outputs import (
     CYCLES,
     NAVIGATION,
     POINTS,
     SHOTS,
     SIMULATED,
     STATISTICS,
-    SceneOutput,
+    Output,
 )
 from sweep.tasks.calling import EFFECTS
 from sweep.tasks.eyepoint_study import SIZES, scene_array
@@ -67,7 +67,7 @@ def belongs(name: str, part: Part) -> bool:
     return part.draws == 0 and (once or not any(part.axes))
 
 
-def _outputs(stretches: Stretches) -> dict[str, SceneOutput]:
+def _outputs(stretches: Stretches) -> dict[str, Output]:
     own = SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS
     return own | (NAVIGATION if stretches.navigates else {})
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.scene_outputs import POINTS, SHOTS
+from sweep.model.outputs import POINTS, SHOTS
 from sweep.tasks.patches import Patch
 
 if TYPE_CHECKING:

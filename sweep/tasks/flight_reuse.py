@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sweep.model.outputs import NAVIGATION, POINTS, STATISTICS
 from sweep.model.resolution import by_tolerance
-from sweep.model.scene_outputs import NAVIGATION, POINTS, STATISTICS
 from sweep.scenes.errors import SceneError
 from sweep.spec import Spec
 from sweep.storage import opening

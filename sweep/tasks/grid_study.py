@@ -136,15 +136,15 @@ class GridStudy:
         from sweep.model.outputs import ACCURACY_OUTPUTS
 
         output = outputs_of(self.spec)[name]
-        further = self._further.get(name)
-        promise = self._promise() if name in ACCURACY_OUTPUTS and not output.whole else {}
+        further, whole = self._further.get(name), output.dtype == "int64"
+        promise = self._promise() if name in ACCURACY_OUTPUTS and not whole else {}
         return ArrayLayout(
             name=name,
             shape=self.grid.shape + ((further[1],) if further else ()),
             chunks=self.grid.block_shape + ((further[1],) if further else ()),
             dims=self.grid.dims + ((further[0],) if further else ()),
-            dtype="int64" if output.whole else "float64",
-            fill=NO_COUNT if output.whole else float("nan"),
+            dtype=output.dtype,
+            fill=NO_COUNT if whole else float("nan"),
             attributes=described(output.units, output.long_name, output.comment) | promise,
         )
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.scene_outputs import STATISTICS
+from sweep.model.outputs import STATISTICS
 from sweep.tasks.study import Results
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import rasterio
 from drawn_studies import INSTRUMENT
 
-from sweep.model.scene_outputs import CYCLES, SHOTS
+from sweep.model.outputs import CYCLES, SHOTS
 from sweep.spec import SceneSpec
 from sweep.tasks import driver
 

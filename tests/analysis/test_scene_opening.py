@@ -14,7 +14,7 @@ from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
 from sweep.analysis.scenes.opening import open_scene, stretches
 from sweep.model.eyepoints import observe
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 
 
 @pytest.fixture(scope="module")

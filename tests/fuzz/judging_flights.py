@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from judging import Verdict, kind_of, look_at_mistake, strictly
 
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.unsupported import UnsupportedShot
 from sweep.scenes.errors import SceneError
 from sweep.scenes.eyepoint_arrays import from_arrays

@@ -14,8 +14,8 @@ from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle, cone
 from sweep.model.groups import groups
+from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
-from sweep.model.scene_outputs import POINTS, STATISTICS
 from sweep.model.shot import evaluate
 
 DRAWS = 20_000

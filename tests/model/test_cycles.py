@@ -13,8 +13,8 @@ from sweep.model.geometry.platform import Fixed
 from sweep.model.geometry.pointing import PointingJitter
 from sweep.model.geometry.scanner import BeamCycle, cone, corners, squares
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
-from sweep.model.scene_outputs import NAVIGATION
 from sweep.spec.scene_sections import Navigation
 
 DRAWS = 20_000

@@ -8,7 +8,7 @@ from sweep.model.geometry.mesh import clean
 from sweep.model.geometry.platform import ConstantAcceleration, Flight, Nadir
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import cone, fixed
-from sweep.model.scene_outputs import BEAMLETS, SHOTS
+from sweep.model.outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays, to_arrays
 
 

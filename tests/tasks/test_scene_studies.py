@@ -13,7 +13,7 @@ from small_flights import SCENE, small_scene
 from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
-from sweep.model.scene_outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 from sweep.spec import SpecError
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run

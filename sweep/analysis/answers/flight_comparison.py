@@ -9,9 +9,8 @@ import xarray as xr
 from sweep.analysis.answers.comparison import differences, titled
 from sweep.analysis.answers.physical import study_of
 from sweep.model.intervals import clopper_pearson, half_width
-from sweep.model.outputs import PROMISED
+from sweep.model.outputs import PROMISED, STATISTICS
 from sweep.model.pairing import TRUE
-from sweep.model.scene_outputs import STATISTICS
 
 SAME_TIME = 1e-9
 """Difference [s] up to which shots of a beam are at the same time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -12,12 +13,80 @@ import xarray as xr
 from sweep.analysis.scenes.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
 from sweep.model.navigation import EXCLUDED, SOLVED
-from sweep.model.navigation_tally import Tally, merge, tally
 
 VELOCITY, ALTITUDE = "velocity", "altitude"
 
 STRETCH = 65_536
 """Solutions that are read at a time, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """Errors of a vector of m components, by bin of altitude: counts, means, squared deviations.
+
+    Tallies of parts add up to that of the whole. Sums of floats depend on their order: see
+    :func:`merge`.
+
+    Parameters
+    ----------
+    attempts, count : (...,) int64 ndarray
+        Solutions asked for, and those that there were.
+    mean : (..., m) ndarray
+        Mean error; 0 where there was none.
+    deviation : (..., m, m) ndarray
+        Sum of the products of deviations from the mean.
+    predicted : (..., m, m) ndarray
+        Mean of the covariances that the solutions came with; 0 where there was none.
+    """
+
+    attempts: np.ndarray
+    count: np.ndarray
+    mean: np.ndarray
+    deviation: np.ndarray
+    predicted: np.ndarray
+
+    def __add__(self, other: Tally) -> Tally:
+        """Tally of both, of two sets of draws that share none.
+
+        The update of Chan, Golub and LeVeque (1983), which never subtracts large sums.
+        """
+        count = self.count + other.count
+        share = (other.count / np.maximum(count, 1))[..., None]
+        apart = other.mean - self.mean
+        between = (self.count[..., None] * share * apart)[..., None] * apart[..., None, :]
+        return Tally(
+            self.attempts + other.attempts,
+            count,
+            self.mean + share * apart,
+            self.deviation + other.deviation + between,
+            self.predicted + share[..., None] * (other.predicted - self.predicted),
+        )
+
+    @property
+    def availability(self) -> np.ndarray:
+        """Share of attempts with a solution (...,), 0..1; nan without attempts."""
+        return _over(self.count, self.attempts)
+
+    @property
+    def bias(self) -> np.ndarray:
+        """Mean error (..., m); nan without solutions."""
+        return np.where(self.count[..., None] > 0, self.mean, np.nan)
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """Root mean square error of each component (..., m), bias included; nan without any."""
+        square = np.diagonal(self.deviation, axis1=-2, axis2=-1)
+        return np.sqrt(_over(square, self.count[..., None]) + self.mean**2)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Unbiased covariance of the errors (..., m, m); nan with fewer than two solutions."""
+        return _over(self.deviation, self.count[..., None, None] - 1)
+
+    @property
+    def predicted_covariance(self) -> np.ndarray:
+        """Mean covariance that the solutions stated (..., m, m); nan without any."""
+        return np.where(self.count[..., None, None] > 0, self.predicted, np.nan)
 
 
 @dataclass(frozen=True)
@@ -135,10 +204,8 @@ def _tallies(dataset: xr.Dataset, quantity: str, edges: np.ndarray) -> Iterator[
         altitude = np.broadcast_to(np.asarray(part["true_altitude"].values)[:, None], solved.shape)
         computed = np.asarray(part[f"{quantity}_status"].values).ravel() >= SOLVED
         cell = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), edges) - 1
-        yield tally(
-            error, covariance, available=solved.ravel(), cells=[np.where(computed, cell, -1)],
-            shape=[edges.size - 1],
-        )  # fmt: skip
+        cell = np.where(computed, cell, -1)
+        yield tally(error, covariance, solved.ravel(), cell, edges.size - 1)
 
 
 def _errors(part: xr.Dataset, quantity: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -150,3 +217,67 @@ def _errors(part: xr.Dataset, quantity: str) -> tuple[np.ndarray, np.ndarray, np
     stated = "velocity_covariance" if quantity == VELOCITY else "altitude_variance"
     size = 3 if quantity == VELOCITY else 1
     return solved, error.reshape(-1, size), np.asarray(part[stated].values).reshape(-1, size, size)
+
+
+def tally(
+    error: np.ndarray, covariance: np.ndarray, available: np.ndarray, cell: np.ndarray, cells: int
+) -> Tally:
+    """Tally of n solutions by cell, in two passes for the digits' sake.
+
+    Parameters
+    ----------
+    error : (n, m) ndarray
+        Solution less truth; ignored where not available.
+    covariance : (n, m, m) ndarray
+        Covariance that each solution states.
+    available : (n,) bool ndarray
+        Mask of the solutions that exist.
+    cell : (n,) int ndarray
+        Cell of each, 0..cells - 1; a solution elsewhere is left out.
+    cells : int
+        Number of cells.
+    """
+    inside = (cell >= 0) & (cell < cells)
+    attempts = np.bincount(cell[inside], minlength=cells)
+    held = inside & available
+    error, covariance, cell = error[held], covariance[held], cell[held]
+    count = np.bincount(cell, minlength=cells)
+    some = np.maximum(count, 1)
+    mean = _add_up(error, cell, cells) / some[:, None]
+    apart = error - mean[cell]
+    rest = _add_up(apart, cell, cells) / some[:, None]  # what rounding left in the mean
+    deviation = _add_up(apart[:, :, None] * apart[:, None, :], cell, cells)
+    predicted = _add_up(covariance, cell, cells) / some[:, None, None]
+    return Tally(attempts, count, mean + rest, deviation, predicted)
+
+
+def merge(tallies: Sequence[Tally]) -> Tally:
+    """Tally of all, added pair by pair: first and second, third and fourth, ..., then again.
+
+    The tree depends on the number of tallies alone, so the same tallies in the same order give
+    the same bits, and rounding grows with the logarithm of their number.
+
+    Raises
+    ------
+    ValueError
+        There is none.
+    """
+    if not tallies:
+        raise ValueError("there is no tally to merge")
+    level = list(tallies)
+    while len(level) > 1:
+        pairs = [a + b for a, b in zip(level[::2], level[1::2], strict=False)]
+        level = pairs + level[2 * len(pairs) :]
+    return level[0]
+
+
+def _add_up(values: np.ndarray, cell: np.ndarray, size: int) -> np.ndarray:
+    """Sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
+    sums = [np.bincount(cell, weights=column, minlength=size) for column in columns]
+    return np.stack(sums, axis=-1).reshape(size, *values.shape[1:])
+
+
+def _over(total: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Quotient, nan where the number is not positive."""
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)

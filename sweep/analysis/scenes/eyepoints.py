@@ -7,7 +7,7 @@ import xarray as xr
 
 from sweep.analysis.opening import read_attributes
 from sweep.model.eyepoints import Eyepoints
-from sweep.model.scene_outputs import BEAMLETS, SHOTS
+from sweep.model.outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, zarr_store

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sweep.analysis import labels
+from sweep.model.outputs import CYCLES, POINTS, SHOTS, STATISTICS, XYZ
 from sweep.model.pairing import FLAGS
-from sweep.model.scene_outputs import CYCLES, POINTS, SHOTS, STATISTICS, XYZ
 
 QUANTISED, INTERPOLATED = "quantised", "interpolated"
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sweep.analysis.scenes.errors_over_altitude import Tally, merge, tally
 from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
-from sweep.model.navigation_tally import merge, tally
 
 FIELDS = ("attempts", "count", "mean", "deviation", "predicted")
 
@@ -21,13 +21,17 @@ def _draws(n, *, bias=(3.0, -2.0, 0.5), seed=1):
     return error, covariance, rng.random(n) < 0.9
 
 
+def _of_all(error, covariance, available):
+    """Tally of all solutions in one cell."""
+    found = tally(error, covariance, available, np.zeros(len(error), np.int64), 1)
+    return Tally(*(getattr(found, name)[0] for name in FIELDS))
+
+
 def _units(sizes):
     """Tallies of stretches of the same draws, and the draws."""
     error, covariance, available = _draws(sum(sizes))
     ends = np.cumsum([0, *sizes])
-    parts = [
-        tally(error[a:b], covariance[a:b], available=available[a:b]) for a, b in pairwise(ends)
-    ]
+    parts = [_of_all(error[a:b], covariance[a:b], available[a:b]) for a, b in pairwise(ends)]
     return parts, (error, covariance, available)
 
 
@@ -37,7 +41,7 @@ def _same_bits(one, other):
 
 def test_a_tally_says_what_numpy_says_of_all_draws():
     error, covariance, available = _draws(5000)
-    result = tally(error, covariance, available=available)
+    result = _of_all(error, covariance, available)
     held = error[available]
     assert result.count == available.sum() and result.attempts == 5000
     assert result.availability == available.mean()
@@ -52,7 +56,7 @@ def test_a_tally_says_what_numpy_says_of_all_draws():
 @pytest.mark.parametrize("sizes", [[2000, 3000], [1, 0, 999, 17, 2500, 1483], [500] * 10])
 def test_merged_tallies_equal_one_pass(sizes):
     parts, (error, covariance, available) = _units(sizes)
-    whole, merged = tally(error, covariance, available=available), merge(parts)
+    whole, merged = _of_all(error, covariance, available), merge(parts)
     assert merged.attempts == whole.attempts and merged.count == whole.count
     for name in FIELDS[2:]:
         np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
@@ -76,38 +80,28 @@ def test_a_bias_far_above_the_spread_costs_no_digits_of_the_spread():
     error, covariance, available = _draws(8000, bias=(1e6, -1e6, 1e6))
     available[:] = True
     ends = np.arange(0, 8001, 1000)
-    parts = [
-        tally(error[a:b], covariance[a:b], available=available[a:b]) for a, b in pairwise(ends)
-    ]
+    parts = [_of_all(error[a:b], covariance[a:b], available[a:b]) for a, b in pairwise(ends)]
     mean = [math.fsum(column) / 8000 for column in error.T]
     apart = error - mean
     exact = [[math.fsum(p * q) / 7999 for q in apart.T] for p in apart.T]
     # a mean rounds to 1e-10; times the 0.1 between means of parts, that is 1e-11 of the spread
     np.testing.assert_allclose(merge(parts).covariance, exact, rtol=3e-11)
-    np.testing.assert_allclose(
-        tally(error, covariance, available=available).covariance, exact, rtol=1e-12
-    )
+    whole = _of_all(error, covariance, available).covariance
+    np.testing.assert_allclose(whole, exact, rtol=1e-12)
 
 
-def test_cells_of_altitude_and_pattern_hold_their_own_draws():
+def test_cells_of_altitude_hold_their_own_draws():
     error, covariance, available = _draws(3000)
-    rng = np.random.default_rng(2)
-    altitude, pattern = rng.uniform(0, 700, 3000), rng.integers(0, 2, 3000)
+    altitude = np.random.default_rng(2).uniform(0, 700, 3000)
     edges = np.array([100.0, 200.0, 400.0, 500.0])
-    result = tally(
-        error,
-        covariance,
-        available=available,
-        cells=(np.digitize(altitude, edges) - 1, pattern),
-        shape=(3, 2),
-    )
-    assert result.attempts.shape == (3, 2) and result.covariance.shape == (3, 2, 3, 3)
-    for i, j in np.ndindex(3, 2):
-        here = (altitude >= edges[i]) & (altitude < edges[i + 1]) & (pattern == j)
-        alone = tally(error[here], covariance[here], available=available[here])
+    result = tally(error, covariance, available, np.digitize(altitude, edges) - 1, 3)
+    assert result.attempts.shape == (3,) and result.covariance.shape == (3, 3, 3)
+    for i in range(3):
+        here = (altitude >= edges[i]) & (altitude < edges[i + 1])
+        alone = _of_all(error[here], covariance[here], available[here])
         for name in FIELDS:
             np.testing.assert_allclose(
-                getattr(result, name)[i, j], getattr(alone, name), rtol=1e-12, err_msg=name
+                getattr(result, name)[i], getattr(alone, name), rtol=1e-12, err_msg=name
             )
     assert result.attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
 
@@ -117,13 +111,13 @@ def test_what_is_not_there_is_nan_and_never_a_warning():
     error[1:] = np.nan
     here = np.array([True, False, False, False])
     with np.errstate(all="raise"):
-        result = tally(error, covariance, available=here, cells=([0, 0, 1, 1],), shape=(3,))
+        result = tally(error, covariance, here, np.array([0, 0, 1, 1]), 3)
         result = result + result
         assert result.availability[:2].tolist() == [0.5, 0.0] and np.isnan(result.availability[2])
         assert np.isfinite(result.bias[0]).all() and np.isnan(result.bias[1:]).all()
         assert np.isfinite(result.rmse[0]).all() and np.isnan(result.rmse[1:]).all()
         assert np.isnan(result.predicted_covariance[1:]).all()
-        once = tally(error, covariance, available=here)
+        once = _of_all(error, covariance, here)
         assert np.isnan(once.covariance).all()  # one draw has no spread
 
 
@@ -133,7 +127,7 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_covarian
     measured = beams @ moving + rng.normal(0, 0.01, (n, 4))
     measured[rng.random((n, 4)) >= pd] = np.nan
     found = velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
-    result = tally(found.velocity - moving, found.covariance, available=found.available)
+    result = _of_all(found.velocity - moving, found.covariance, found.available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
     stated = np.diag(result.predicted_covariance)
@@ -148,11 +142,6 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_covarian
     )
 
 
-def test_tallies_that_can_not_be_are_refused():
-    error, covariance, available = _draws(5)
-    with pytest.raises(ValueError, match="tally needs"):
-        tally(error, covariance[:, :2], available=available)
-    with pytest.raises(ValueError, match="tally needs"):
-        tally(error, covariance, available=available, cells=([0] * 5,), shape=(1, 1))
+def test_no_tallies_can_not_be_merged():
     with pytest.raises(ValueError, match="no tally"):
         merge([])
