@@ -18,10 +18,9 @@ from sweep.model.effects.catalogue import CORE
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import Flight, State
-from sweep.model.geometry.pointing import PointingJitter, beamlet_rays
 from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
-from sweep.model.geometry.scanner import Scanner
+from sweep.model.geometry.scanner import PointingJitter, Scanner, beamlet_rays
 from sweep.model.ground import Cast, Footprints
 from sweep.model.preparation import Parameters, Shots
 

@@ -40,8 +40,7 @@ from sweep.spec.study import Study
 if TYPE_CHECKING:
     from sweep.model.geometry.mesh import Surface
     from sweep.model.geometry.platform import Flight
-    from sweep.model.geometry.pointing import PointingJitter
-    from sweep.model.geometry.scanner import Scanner
+    from sweep.model.geometry.scanner import PointingJitter, Scanner
     from sweep.spec.world import World
 
 FILES = "files"
@@ -206,7 +205,7 @@ class SceneSpec(Study):
 
     def pointing_jitter(self) -> PointingJitter | None:
         """Random turns of the beams; None where there are none."""
-        from sweep.model.geometry.pointing import PointingJitter
+        from sweep.model.geometry.scanner import PointingJitter
 
         sigma = self.platform.jitter
         return PointingJitter(sigma, self.seed) if sigma else None

@@ -10,8 +10,7 @@ from sweep.model.clouds import cloud
 from sweep.model.cycles import solve
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import Fixed
-from sweep.model.geometry.pointing import PointingJitter
-from sweep.model.geometry.scanner import BeamCycle, cone, corners, squares
+from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners, squares
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED

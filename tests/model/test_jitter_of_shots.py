@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 from small_scenes import DOWN, flight, observed
 
 from sweep.model.geometry.platform import Nadir
-from sweep.model.geometry.pointing import PointingJitter
-from sweep.model.geometry.scanner import BeamCycle, cone, corners
+from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners
 
 SHOTS = 20_000
 """A standard deviation is known to 1/sqrt(2 SHOTS) = 0.5 %: at 5 sigma an error of 2.5 % shows.

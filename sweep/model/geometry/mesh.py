@@ -1,4 +1,10 @@
-"""What scenes are made of: surfaces, soups of triangles, and meshes that rays can be cast at."""
+"""Surfaces, soups of triangles, meshes that rays can be cast at, and the planes of their facets.
+
+A micrometre of wavelength at kilometres of range asks for the last bits of float64, and grazing
+incidence divides them away. So a facet's normal, the ray's origin relative to a corner and their
+products are carried as two float64 each (high + low, Dekker's and Knuth's exact sums and
+products); what remains is the rounding of the range itself, half a unit in its last place.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.geometry.quaternion import rotate
-from sweep.model.geometry.ray_plane import normals
 from sweep.model.reflectance import LAWS
 
 
@@ -100,11 +105,8 @@ class Report:
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
-        said = [
-            words.format(getattr(self, name))
-            for name, words in _WORDS.items()
-            if getattr(self, name)
-        ]
+        counts = {words: getattr(self, name) for name, words in _WORDS.items()}
+        said = [words.format(count) for words, count in counts.items() if count]
         given = f"{self.faces} faces on {self.vertices} vertices"
         return "; ".join([given, *(said or ["nothing to mend"])])
 
@@ -148,26 +150,27 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
     _require_shapes(points, corners, kinds)
     given = {"vertices": len(points), "faces": len(corners)}
-    is_finite = np.asarray(np.isfinite(points).all(axis=1))
-    has_data = is_finite[corners].all(axis=1)
+    has_data = np.isfinite(points)[corners].all(axis=(1, 2))
     corners, kinds = corners[has_data], kinds[has_data]
     _require_faces(len(corners), len(has_data))
-    points, corners, merged, unused = _compact(points, corners)
+    used = np.unique(corners)
+    points = points[used] + 0.0  # -0 and 0 are one place
+    kept, place = _distinct(points)
+    corners, merged = place[np.searchsorted(used, corners)], len(used) - len(kept)
+    points = points[kept]
     origin = _round_centre(points)
     points -= origin
-    has_area = _have_area(points, corners)
-    first = np.zeros(len(corners), dtype=bool)
-    first[np.flatnonzero(has_area)[_first_of_duplicates(corners[has_area])]] = True
-    _require_faces(int(first.sum()), len(has_data))
+    has_area = np.flatnonzero(_have_area(points, corners))
+    first = has_area[_distinct(np.sort(corners[has_area], axis=1))[0]]
+    _require_faces(len(first), len(has_data))
     kept = np.unique(corners[first])
-    corners = np.searchsorted(kept, corners[first])
-    mesh = Mesh(points[kept], corners, kinds[first], origin)
+    mesh = Mesh(points[kept], np.searchsorted(kept, corners[first]), kinds[first], origin)
     counts = {
         "non_finite": int((~has_data).sum()),
-        "degenerate": int((~has_area).sum()),
-        "duplicate": int(has_area.sum() - first.sum()),
+        "degenerate": len(corners) - len(has_area),
+        "duplicate": len(has_area) - len(first),
         "merged": merged,
-        "unreferenced": unused + len(points) - len(kept),
+        "unreferenced": given["vertices"] - merged - len(kept),
     }
     return mesh, Report(**given, **counts, **_edge_counts(mesh))
 
@@ -209,20 +212,15 @@ def _require_faces(left: int, given: int) -> None:
         raise ValueError(f"of {given} faces none is left that a ray could hit")
 
 
-def _compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Used vertices, each place once in the order given; numbers merged and unused."""
-    used = np.unique(faces)
-    places = vertices[used] + 0.0  # -0 and 0 are one place
-    by_place = np.lexsort(places.T)
-    is_new = np.ones(len(used), dtype=bool)
-    is_new[1:] = (np.diff(places[by_place], axis=0) != 0.0).any(axis=1)
-    group = np.cumsum(is_new) - 1
-    # lexsort is stable, so the first of a place is the first given.
-    kept = np.sort(by_place[is_new])
-    position = np.empty(len(used), dtype=np.int64)
-    position[by_place] = np.searchsorted(kept, by_place[is_new])[group]
-    faces = position[np.searchsorted(used, faces)]
-    return places[kept], faces, len(used) - len(kept), len(vertices) - len(used)
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that repeat no earlier one, by index, rising; and the place of every row among them."""
+    order = np.lexsort(rows.T)  # stable: the first of those alike is the first given
+    is_new = np.ones(len(rows), dtype=bool)
+    is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    kept = np.sort(order[is_new])
+    place = np.empty(len(rows), dtype=np.int64)
+    place[order] = np.searchsorted(kept, order[is_new])[np.cumsum(is_new) - 1]
+    return kept, place
 
 
 def _round_centre(vertices: np.ndarray) -> np.ndarray:
@@ -243,7 +241,7 @@ def _round_centre(vertices: np.ndarray) -> np.ndarray:
 
 
 def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Whether the corners of each face (m, 3) are apart and not in one line, exactly."""
+    """Mask of the faces (m, 3) whose corners are apart and not in one line, exactly."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
@@ -252,15 +250,6 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     exact, _ = normals(vertices[faces[doubtful]].transpose(1, 2, 0))
     has_area[doubtful] = exact.any(axis=0)
     return has_area
-
-
-def _first_of_duplicates(faces: np.ndarray) -> np.ndarray:
-    """Indices, ascending, of the faces that repeat no earlier one's corners."""
-    corners = np.sort(faces, axis=1)
-    by_corners = np.lexsort(corners.T)
-    is_new = np.ones(len(faces), dtype=bool)
-    is_new[1:] = (np.diff(corners[by_corners], axis=0) != 0).any(axis=1)
-    return np.sort(by_corners[is_new])
 
 
 def _edge_counts(mesh: Mesh) -> dict[str, int]:
@@ -272,20 +261,14 @@ def _edge_counts(mesh: Mesh) -> dict[str, int]:
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     number = np.diff(first, append=len(key))
     sense = np.add.reduceat(np.where(start < end, 1, -1)[order], first)
-    opposed = int(((number == 2) & (sense != 0)).sum())
     counts = {
         "open_edges": int((number == 1).sum()),
         "crowded_edges": int((number > 2).sum()),
-        "opposed_edges": opposed,
+        "opposed_edges": int(((number == 2) & (sense != 0)).sum()),
     }
-    closed = not any(counts.values())
-    return counts | {"inside_out": int(closed and _volume(mesh) < 0.0)}
-
-
-def _volume(mesh: Mesh) -> float:
-    """Signed volume that a closed mesh encloses, positive with its normals outwards."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    inwards = np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0  # six times the volume enclosed
+    return counts | {"inside_out": int(inwards and not any(counts.values()))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,3 +349,122 @@ def join(parts: Sequence[Facets]) -> Facets:
         np.concatenate([part.surface for part in parts]),
         origin,
     )
+
+
+Pair = tuple[np.ndarray, np.ndarray]
+"""Numbers as sums of two float64, high and low; of vectors, components along the first axis."""
+
+_HALVES = 2.0**27 + 1
+"""Factor that parts a float64 into two of half as many digits."""
+
+_FLAT = 1e-6
+"""Sine of the angle to a facet under which its plane may run through it within rounding."""
+
+
+def exact(values: np.ndarray) -> Pair:
+    """Pair of numbers that float64 holds."""
+    return values, np.zeros_like(values)
+
+
+def _two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
+    """Sum and what its rounding left."""
+    s = a + b
+    part = s - a
+    return s, (a - (s - part)) + (b - part)
+
+
+def _quick_two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
+    """Sum and what its rounding left, for abs(a) >= abs(b)."""
+    s = a + b
+    return s, b - (s - a)
+
+
+def _halves(a: np.ndarray) -> Pair:
+    wide = a * _HALVES
+    high = wide - (wide - a)
+    return high, a - high
+
+
+def product(a: Pair, b: Pair) -> Pair:
+    """Product of two pairs."""
+    p = a[0] * b[0]
+    (ah, al), (bh, bl) = _halves(a[0]), _halves(b[0])
+    rest = ((ah * bh - p) + ah * bl + al * bh) + al * bl
+    return _quick_two_sum(p, rest + (a[0] * b[1] + a[1] * b[0]))
+
+
+def add(a: Pair, b: Pair) -> Pair:
+    """Sum of two pairs, accurate also where the high parts cancel."""
+    s, e = _two_sum(a[0], b[0])
+    t, f = _two_sum(a[1], b[1])
+    s, e = _quick_two_sum(s, e + t)
+    return _quick_two_sum(s, e + f)
+
+
+def less(a: Pair, b: Pair) -> Pair:
+    """Difference of two pairs."""
+    return add(a, (-b[0], -b[1]))
+
+
+def dot(a: Pair, b: Pair) -> Pair:
+    """Scalar product of two vectors; of a vector (3, 1, n) and a matrix (3, 3, n), a vector."""
+    x, y, z = zip(*product(a, b), strict=True)
+    return add(add(x, y), z)
+
+
+def _cross(a: Pair, b: Pair) -> Pair:
+    """Vector product."""
+    (ay, az), (by, bz) = (
+        [(v[0][turn], v[1][turn]) for turn in ([1, 2, 0], [2, 0, 1])] for v in (a, b)
+    )
+    return less(product(ay, bz), product(az, by))
+
+
+def normals(corners: np.ndarray) -> Pair:
+    """Normals (3, n) of facets, of twice their areas' lengths, by their winding.
+
+    Parameters
+    ----------
+    corners : (3, 3, n) float64
+        First, second and third corner; their x, y, z.
+    """
+    a, b, c = (exact(corner) for corner in corners)
+    return _cross(less(b, a), less(c, a))
+
+
+def distances(corners: np.ndarray, normal: Pair, height: Pair, o: Pair, d: Pair) -> Pair:
+    """Distances of facets' planes along rays, in lengths of `d`.
+
+    A plane seen so flatly that it runs through the facet within rounding is met somewhere
+    on the facet: the distance stays between those of its corners.
+
+    Parameters
+    ----------
+    corners, normal
+        As of :func:`normals`.
+    height : Pair
+        Products (n,) of the normals with a corner less the origin.
+    o, d : Pair
+        Origins and directions (3, n) of the rays.
+    """
+    along = dot(normal, d)
+    with np.errstate(all="ignore"):  # parallel to a plane
+        high = height[0] / along[0]
+        rest, low = less(height, product(exact(high), along))
+        high, low = _quick_two_sum(high, (rest + low) / along[0])
+    x, y, z = np.abs(normal[0])
+    flat = np.flatnonzero(~(np.abs(along[0]) > _FLAT * (x + y + z)))
+    if flat.size:
+        origin, ray = (o[0][:, flat], o[1][:, flat]), d[0][:, flat]
+        length = ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2
+        reach = []
+        for corner in corners[:, :, flat]:
+            x, y, z = less(exact(corner), origin)[0] * ray
+            reach.append((x + y + z) / length)
+        nearest, farthest = np.min(reach, axis=0), np.max(reach, axis=0)
+        outside = ~((high[flat] >= nearest) & (high[flat] <= farthest))
+        low[flat[outside]] = 0.0
+        high[flat] = np.where(
+            outside, np.where(high[flat] < nearest, nearest, farthest), high[flat]
+        )
+    return high, low

@@ -52,10 +52,8 @@ class Nadir:
         """Attitude and angular velocity."""
         if self.heading is not None:
             return np.tile(quat.about(2, self.heading), (len(t), 1)), np.zeros((len(t), 3))
-        unit, scale = _scaled(velocity)
-        heading, yaw_rate, _ = _track(unit, acceleration)
-        yaw_rate = _rate(yaw_rate, scale)
-        return quat.about(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
+        _, heading, yaw_rate, scale = _track(velocity, acceleration)
+        return quat.about(2, heading), _rate(yaw_rate, scale)[:, None] * [0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True)
@@ -72,8 +70,8 @@ class AlongTrack:
 
     def turn(self, t: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> Turn:
         """Attitude and angular velocity."""
-        unit, scale = _scaled(velocity)
-        heading, yaw_rate, level = _track(unit, acceleration)
+        unit, heading, yaw_rate, scale = _track(velocity, acceleration)
+        level = np.hypot(unit[:, 0], unit[:, 1])
         speed2 = (unit**2).sum(axis=1)
         pitch = np.arctan2(unit[:, 2], level)
         level_rate = (unit[:, :2] * acceleration[:, :2]).sum(axis=1) / level
@@ -84,11 +82,22 @@ class AlongTrack:
         return quat.from_heading(heading=heading, pitch=pitch, roll=self.roll), rate
 
 
-def _scaled(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities times powers of two, so that their squares are numbers however slow; and these."""
+def _track(
+    velocity: np.ndarray, acceleration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Velocities times powers of two, heading [rad], its rate for these, and the powers.
+
+    So scaled, squares of velocities are numbers however slow the movement is.
+    """
     _, exponent = np.frexp(np.abs(velocity).max(axis=1))
     scale = np.ldexp(1.0, np.clip(-exponent, -_MOST_SCALED, _MOST_SCALED))
-    return velocity * scale[:, None], scale
+    unit = velocity * scale[:, None]
+    vx, vy = unit[:, 0], unit[:, 1]
+    level = np.hypot(vx, vy)
+    if not (level > _VERTICAL * np.linalg.norm(unit, axis=1)).all():
+        raise ValueError("a vertical movement (or none) has no heading to follow: state one")
+    rate = (vx * acceleration[:, 1] - vy * acceleration[:, 0]) / level**2
+    return unit, np.arctan2(vy, vx), rate, scale
 
 
 def _rate(rate: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -98,18 +107,6 @@ def _rate(rate: np.ndarray, scale: np.ndarray) -> np.ndarray:
     if not np.isfinite(found).all():
         raise ValueError("so slow a movement that turns has no heading to follow: state one")
     return found
-
-
-def _track(
-    velocity: np.ndarray, acceleration: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heading [rad], its rate and the horizontal speed, each (n,), in the velocities' unit."""
-    vx, vy = velocity[:, 0], velocity[:, 1]
-    level = np.hypot(vx, vy)
-    if not (level > _VERTICAL * np.linalg.norm(velocity, axis=1)).all():
-        raise ValueError("a vertical movement (or none) has no heading to follow: state one")
-    rate = (vx * acceleration[:, 1] - vy * acceleration[:, 0]) / level**2
-    return np.arctan2(vy, vx), rate, level
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +172,9 @@ class Track:
     _steps: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        t, q = np.asarray(self.time, float), np.asarray(self.quaternion, float)
-        if t.ndim != 1 or len(t) < 2 or q.shape != (len(t), 4) or not (np.diff(t) > 0).all():
-            raise ValueError("a quaternion track needs rising times with four numbers each")
+        t, q = rising_times(self.time), np.asarray(self.quaternion, float)
+        if q.shape != (len(t), 4):
+            raise ValueError(f"a quaternion track needs four numbers a time, not {q.shape}")
         q = quat.normalise(q)
         steps = quat.to_rotation_vector(quat.multiply(quat.conjugate(q[:-1]), q[1:]))
         for name, value in (("time", t), ("quaternion", q), ("_steps", steps)):
@@ -291,9 +288,7 @@ class ConstantAcceleration:
     def motion(self, t: np.ndarray) -> Motion:
         """Movement at times (n,) [s] from start to stop."""
         t = _within(t, 0.0, self.duration)[:, None]
-        x0, v0, a = (
-            np.asarray(v, float) for v in (self.position, self.velocity, self.acceleration)
-        )
+        x0, v0, a = np.array([self.position, self.velocity, self.acceleration], float)
         return Motion(x0 + (v0 + 0.5 * a * t) * t, v0 + a * t, a + 0 * t)
 
 

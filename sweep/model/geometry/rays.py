@@ -2,7 +2,7 @@
 
 Coordinates are taken relative to a mesh's own origin exactly, the nearest triangle is found by
 tests that leave no crack between neighbours (:mod:`sweep.model.geometry.bvh`), and its
-plane is met in twice float64's precision (:mod:`sweep.model.geometry.ray_plane`): a range is the
+plane is met in twice float64's precision (:mod:`sweep.model.geometry.mesh`): a range is the
 exact one of the numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body
 that moves is met in its own frame, so its mesh is never rebuilt.
 """
@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry import quaternion, ray_plane
+from sweep.model.geometry import quaternion
 from sweep.model.geometry.bvh import build, nearest
-from sweep.model.geometry.mesh import Mesh
+from sweep.model.geometry.mesh import Mesh, distances, dot, exact, less, normals
 
 _UNIT_TOLERANCE = 1e-9
 
@@ -214,20 +214,20 @@ class _Frame(NamedTuple):
 
     def origins(self, origins, rows):
         """Origins of rays (m, 3) by their places (m,) as a vector of pairs (3, m)."""
-        x, anchor = ray_plane.exact(origins.T), ray_plane.exact(self.anchor[:, None])
+        x, anchor = exact(origins.T), exact(self.anchor[:, None])
         if self.rotation is None:
-            return ray_plane.less(x, anchor)
-        away = ray_plane.less(x, ray_plane.exact(self.position[rows].T))
-        return ray_plane.less(self._back(away, rows), anchor)
+            return less(x, anchor)
+        away = less(x, exact(self.position[rows].T))
+        return less(self._back(away, rows), anchor)
 
     def directions(self, directions, rows):
         """Directions of rays, likewise."""
-        d = ray_plane.exact(directions.T)
+        d = exact(directions.T)
         return d if self.rotation is None else self._back(d, rows)
 
     def _back(self, v, rows):
         turns = self.rotation[rows].transpose(1, 2, 0)
-        return ray_plane.dot((v[0][:, None], v[1][:, None]), ray_plane.exact(turns))
+        return dot((v[0][:, None], v[1][:, None]), exact(turns))
 
     def rounded(self, origins, directions):
         """Origins (n, 3) and directions (n, b, 3) in the mesh's frame, rounded to float64."""
@@ -255,13 +255,13 @@ def _met_on(mesh, frame, bundle, origins, directions, face):
     first, of = np.flatnonzero(is_new), np.cumsum(is_new) - 1
     corners = mesh.vertices[mesh.faces[face[first]]].transpose(1, 2, 0)
     o = frame.origins(origins[first], bundle[first])
-    n = ray_plane.normals(corners)
-    height = ray_plane.dot(n, ray_plane.less(ray_plane.exact(corners[0]), o))
+    n = normals(corners)
+    height = dot(n, less(exact(corners[0]), o))
     length = np.sqrt(n[0][0] * n[0][0] + n[0][1] * n[0][1] + n[0][2] * n[0][2])
     unit = frame.out(n[0] / length, bundle[first])[:, of]
     n, height, o = (tuple(part[..., of] for part in pair) for pair in (n, height, o))
     d = frame.directions(directions, bundle)
-    high, low = ray_plane.distances(corners[..., of], n, height, o, d)
+    high, low = distances(corners[..., of], n, height, o, d)
     x, y, z = unit * directions.T
     return np.concatenate([[high, low], unit, [x + y + z]])
 

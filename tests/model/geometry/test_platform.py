@@ -19,7 +19,7 @@ from sweep.model.geometry.platform import (
     Waypoints,
     straight,
 )
-from sweep.model.geometry.pointing import transverse_of
+from sweep.model.geometry.scanner import transverse_of
 
 TIMES = np.array([0.0, 2.0, 3.5, 7.0, 8.0, 11.0])
 PLACES = np.array(
