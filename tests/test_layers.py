@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_628, "modules": 312, "lines of the model": 17_817, "modules of the model": 97,
+    "lines": 52_497, "modules": 308, "lines of the model": 17_557, "modules of the model": 93,
     "compiled functions": 111, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
