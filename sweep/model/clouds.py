@@ -11,7 +11,7 @@ are counted: drawn like those of any other shot, from the same addresses.
 Results of a shot do not depend on the shots and draws that are computed with it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -20,12 +20,11 @@ from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
-from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
-from sweep.model.outputs import POINTS, STATISTICS, Output
+from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.ray_error import ray_error
-from sweep.model.returns import Returns, draw_returns
+from sweep.model.returns import Groups, Returns, draw_returns, groups
 
 STRETCH = 1 << 20
 """Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
@@ -90,7 +89,7 @@ def cloud(
     n = len(eyepoints.time)
     sizes = {"shot": n, "draw": draws, "return_number": returns, "xyz": 3}
     table = STATISTICS | POINTS
-    results = {name: _room(output, sizes) for name, output in table.items()}
+    results = {name: output.empty(sizes) for name, output in table.items()}
     step = max(1, STRETCH // (12 * draws * returns + 12 * eyepoints.weight.size))
     for first in range(0, n, step):
         part = slice(first, first + step)
@@ -109,10 +108,6 @@ def cloud(
         for name, values in computed.items():
             results[name][part] = values
     return results
-
-
-def _room(output: Output, sizes: Mapping[str, int]) -> np.ndarray:
-    return np.empty(tuple(sizes[name] for name in output.dims), output.dtype)
 
 
 def _groups(

@@ -1,28 +1,53 @@
-"""Velocity vector and altitude from one measurement cycle, with what they are uncertain by.
+"""Velocity and altitude of each measurement cycle and draw, with their uncertainties.
 
 Each beam measures the platform's velocity along itself, ``v_r = u . v`` (closing is positive),
 and a point of the ground, ``R u``. Weighted least squares over the beams that returned gives the
 velocity; a plane through the ground points gives the altitude. Standard errors are those of
 single beams, uncorrelated; covariances follow by linear propagation.
 
-Every function takes any number of cycles and draws at once: the leading dimensions "..." of its
-arrays broadcast, so that directions (cycles, 1, b, 3) serve velocities (cycles, draws, b).
-Arrays are expanded to their common shape: pass flights in blocks.
+The instrument does not know which of its points are true. Of each shot it takes the first that a
+Doppler peak confirms (:mod:`sweep.model.pairing`), which is the strongest of these, and nothing
+of a shot without one: range and velocity of an unconfirmed point may be exchanged, in which case
+neither is of use. False alarms that pass as confirmed, mispaired and misread points are used as
+if they were true; the test for one false beam is there to find them.
 
-Beams fire one after another. That belongs in the directions (each at its own attitude) and, for
-the altitude, in `offset`; the velocity is that which fits the cycle as a whole.
+Values are the interpolated ones with their standard errors. A point whose standard error is not a
+number is left out; one under a millionth of a bin counts as that, to which the interpolation
+itself is good.
+
+The instrument is taken to know, from inertial sensors, how it is turned and how its place and
+velocity have changed within a cycle: so the altitude is that at the cycle's first shot, over the
+ground straight below it, and the velocity the mean over the cycle's shots, in the world's axes.
+
+Of pointing jitter it knows the standard deviation. To first order a beam thrown off by sigma in
+each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity,
+v_perp the velocity across it (by a first solution without jitter), and sigma R tan(angle from
+nadir) to that of its range, on level ground.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.special import chdtri
 
+from sweep.model.outputs import NAVIGATION
+from sweep.model.pairing import UNCONFIRMED
+
+STRETCH = 1 << 16
+"""Beams solved for at once."""
+
 LEAST_SINE = 0.05
 """A beam that grazes the ground at less than about 3 deg is weighted as if at that angle."""
+
+_LARGEST_CONDITION = 1e6
+"""Condition number above which beams count as lying in a plane: it only refuses what rounding
+would spoil; the covariance tells a weak geometry."""
+
+_INTERPOLATION = 1e-6
+"""Least error of a place between bins, over that of a place by whole bins."""
 
 _ORTHOGONAL = 1e-15
 _MOST_SWEEPS = 40
@@ -35,62 +60,27 @@ EXCLUDED = 1
 WITHHELD = 2
 """The beams contradict each other and it can not be told which one is false: no solution."""
 UNDETERMINED = 3
-"""Too few beams, or too near to a plane or a line of them: no solution."""
+"""Too few beams, or too near to a plane: no solution."""
+
+Arrays = Mapping[str, np.ndarray]
+
+Fit = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""First four fields of :class:`Solution`, of n cycles."""
 
 
-def _flat_cycles(
-    direction: np.ndarray,
-    value: np.ndarray,
-    standard_error: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Directions (n, b, 3), values, errors and mask (n, b), and the shape that n stands for."""
-    u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
-    if u.shape[-1:] != (3,):
-        raise ValueError(f"directions have three components: (..., b, 3), not {u.shape}")
-    mask = np.isfinite(value)
-    shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape, mask.shape)
-    if not shape:
-        raise ValueError("a cycle of beams has a dimension for them, the last: (..., b)")
-    u = np.ascontiguousarray(np.broadcast_to(u, (*shape, 3))).reshape(-1, shape[-1], 3)
-    value, error, mask = (
-        np.ascontiguousarray(np.broadcast_to(a, shape)).reshape(-1, shape[-1])
-        for a in (value, error, mask)
-    )
-    if not (np.isfinite(error[mask]) & (error[mask] > 0)).all():
-        raise ValueError("a valid beam has a standard error that is not positive and finite")
-    if not (np.abs(np.linalg.norm(u[mask], axis=-1) - 1) < 1e-6).all():
-        raise ValueError("a valid beam has a direction whose length is not 1")
-    return u, value, error, mask, shape[:-1]
+class Solution(NamedTuple):
+    """Velocities in the frame of the directions, or altitudes; nan where not available."""
 
-
-class Fit(NamedTuple):
-    """Least squares of n cycles."""
-
-    solved: np.ndarray
-    """(n,) bool: whether there is a solution."""
-    chi_square: np.ndarray
-    """(n,): weighted sum of squared residuals."""
-    degrees: np.ndarray
-    """(n,) int64: observations beyond what the solution needs; its expectation."""
-    quantities: tuple[np.ndarray, ...]
-    """What is solved for, (n, ...) each."""
-
-
-class Velocity(NamedTuple):
-    """Velocity vectors, in the frame of the directions; nan where not available."""
-
-    velocity: np.ndarray
-    """(..., 3): of the platform relative to the ground [m/s]."""
+    value: np.ndarray
+    """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above
+    the ground's plane along the vertical [m]."""
     covariance: np.ndarray
-    """(..., 3, 3): of its error [m^2/s^2]."""
-    condition: np.ndarray
-    """(...,): standard error of the worst known direction of velocity over that of the best known,
-    1..inf: the condition number of the directions, each over its standard error. Given where
-    the velocity is not, too; inf with fewer than three beams."""
+    """(..., 3, 3) [m^2/s^2] or (...,) [m^2]: of its error."""
     chi_square: np.ndarray
     """(...,): weighted sum of squared residuals; of all valid beams where withheld."""
     degrees: np.ndarray
-    """(...,) int64: beams more than three, the chi-square's expectation; 0 where undetermined."""
+    """(...,) int64: observations beyond what the solution needs, the chi-square's expectation; 0
+    where undetermined."""
     used: np.ndarray
     """(..., b) bool: beams in the solution."""
     status: np.ndarray
@@ -98,33 +88,7 @@ class Velocity(NamedTuple):
 
     @property
     def available(self) -> np.ndarray:
-        """(...,) bool: whether there is a solution."""
-        return self.status <= EXCLUDED
-
-
-class Altitude(NamedTuple):
-    """Altitudes above a locally flat ground; nan where not available."""
-
-    altitude: np.ndarray
-    """(...,): from the plane to the platform along the vertical [m]."""
-    variance: np.ndarray
-    """(...,): of its error [m^2]."""
-    normal: np.ndarray
-    """(..., 3): the plane's upward unit normal, in the frame of the directions."""
-    slopes: np.ndarray
-    """(...,) int8: slopes of the plane that were fitted, 0..2; ground is level along others."""
-    chi_square: np.ndarray
-    """(...,): weighted sum of squared residuals; of all valid beams where withheld."""
-    degrees: np.ndarray
-    """(...,) int64: the chi-square's expectation; 0 where undetermined."""
-    used: np.ndarray
-    """(..., b) bool: beams in the solution."""
-    status: np.ndarray
-    """(...,) int8: SOLVED, EXCLUDED, WITHHELD or UNDETERMINED."""
-
-    @property
-    def available(self) -> np.ndarray:
-        """(...,) bool: whether there is a solution."""
+        """(...,) bool: there is a solution."""
         return self.status <= EXCLUDED
 
 
@@ -134,9 +98,10 @@ def velocity(
     radial_velocity: np.ndarray,
     standard_error: np.ndarray,
     level: float | None = None,
-    largest_condition: float = 1e6,
-) -> Velocity:
+) -> Solution:
     """Velocity vector and covariance of each cycle of b beams.
+
+    Leading dimensions broadcast: directions (cycles, 1, b, 3) serve velocities (cycles, draws, b).
 
     Parameters
     ----------
@@ -146,37 +111,33 @@ def velocity(
         Closing velocity along each beam, not finite where it has not returned, and its standard
         error > 0 [m/s].
     level : float or None
-        Level of the test for one false beam (:func:`screen`), which needs
+        Level of the test for one false beam (:func:`_screened`), which needs
         five beams to find it; with four it withholds the solution. None: no test.
-    largest_condition : float
-        Condition number above which beams count as lying in a plane. The default only refuses
-        what rounding would spoil; the covariance tells a weak geometry.
 
     Raises
     ------
     ValueError
-        Shapes do not fit; a valid beam has no finite number, no positive standard error or a
-        direction whose length is not 1; `level` is out of range.
+        Shapes do not fit; a valid beam has no positive standard error or a direction whose length
+        is not 1; `level` is out of range.
     """
-    u, closing, error, mask, shape = _flat_cycles(direction, radial_velocity, standard_error)
+    u, closing, error, shape = _flat_cycles(direction, radial_velocity, standard_error)
 
     def fit(index: np.ndarray, used: np.ndarray) -> Fit:
-        n = index.size
-        solution, condition, chi = np.full((n, 3), np.nan), np.empty(n), np.full(n, np.nan)
-        covariance = np.full((n, 3, 3), np.nan)
-        _fit_velocities(
-            u[index], closing[index], error[index], used, largest_condition,
-            solution, covariance, condition, chi,
-        )  # fmt: skip
-        solved = np.isfinite(chi)
-        degrees = np.where(solved, used.sum(axis=1) - 3, 0)
-        return Fit(solved, chi, degrees, (solution, covariance, condition))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            columns = np.where(used[..., None], u[index] / error[index, :, None], 0.0)
+            residual = np.where(used, closing[index] / error[index], 0.0)
+            turn, square, coordinate = _least_squares(columns, residual)
+            condition = np.sqrt(square.max(axis=1) / square.min(axis=1))
+            solved = (used.sum(axis=1) >= 3) & (condition <= _LARGEST_CONDITION)
+            value = sum(turn[:, :, k] * coordinate[:, k, None] for k in range(3))
+            covariance = sum(
+                turn[:, :, None, k] * turn[:, None, :, k] / square[:, k, None, None]
+                for k in range(3)
+            )
+        chi = np.where(solved, sum(residual.T**2), np.nan)
+        return value, covariance, chi, np.where(solved, used.sum(axis=1) - 3, 0)
 
-    found, used, status = screen(fit, mask, level)
-    solution, covariance, condition = found.quantities
-    solution[status > EXCLUDED] = covariance[status > EXCLUDED] = np.nan
-    arrays = (solution, covariance, condition, found.chi_square, found.degrees, used, status)
-    return Velocity(*(a.reshape(shape + a.shape[1:]) for a in arrays))
+    return _screened(fit, np.isfinite(closing), level, shape)
 
 
 def altitude(
@@ -184,271 +145,176 @@ def altitude(
     direction: np.ndarray,
     range: np.ndarray,
     standard_error: np.ndarray,
+    slope: float,
     offset: np.ndarray | None = None,
-    slope: float = math.inf,
     relief: float = 0.0,
     level: float | None = None,
-    least_spread: float = 1e-3,
-) -> Altitude:
+) -> Solution:
     """Altitude above the plane through each cycle's ground points, and its variance.
 
-    With `slope` inf the plane is free. Three points that are not in line in plan determine it.
-    From two, or from more in line, the ground slopes along that line and is taken as level
-    across it; from one it is level. The variance does not count what such a guess may miss. A
-    finite `slope` does: it weighs the ground's slope, known beforehand to be 0 with that standard
-    deviation, against the points, whatever their number. 0 states level ground; then every
-    second beam is a check on the first, and three are enough to find a false one.
+    The ground's slope, known beforehand to be 0 with the standard deviation `slope`, is weighed
+    against the points, whatever their number. 0 states level ground; then every second beam is a
+    check on the first, and three are enough to find a false one.
 
     Parameters
     ----------
     direction : (..., b, 3) array_like
         Unit vectors from the instrument, z up.
     range, standard_error : (..., b) array_like
-        Range along each beam, likewise [m].
+        Range along each beam, not finite where it has not returned, and its standard error [m].
+    slope : float
+        Standard deviation of the ground's slope along any horizontal [1], >= 0, finite.
     offset : (..., b, 3) array_like or None
         Place of the instrument when each beam fires, from that whose altitude is asked [m].
-    slope : float
-        Standard deviation of the ground's slope along any horizontal [1], 0..inf.
     relief : float
         Standard deviation of heights about the plane [m], which adds to the errors of range. Real
         ground fails the test for a false beam without it.
     level : float or None
-        Level of the test for one false beam (:func:`screen`); None: no test.
-    least_spread : float
-        Points whose spread in plan (rms) is less than this many times their distance do not
-        determine a slope in that direction; only for a `slope` of inf.
+        Level of the test for one false beam (:func:`_screened`); None: no test.
 
     Raises
     ------
     ValueError
-        As for :func:`velocity`; `slope` or `relief` is negative or nan.
+        As for :func:`velocity`; `slope` or `relief` is negative or not finite.
     """
-    if not slope >= 0 or not 0 <= relief < math.inf:
-        raise ValueError("the ground's slope and relief are not negative")
-    u, distance, error, mask, shape = _flat_cycles(direction, range, standard_error)
+    if not (0 <= slope < math.inf and 0 <= relief < math.inf):
+        raise ValueError("the ground's slope and relief are finite and not negative")
+    u, distance, error, shape = _flat_cycles(direction, range, standard_error)
     points = u * distance[..., None]
     if offset is not None:
         moved = np.broadcast_to(np.asarray(offset, float), (*shape, *u.shape[1:]))
         points += moved.reshape(u.shape)
-    ground = slope, relief, least_spread
 
     def fit(index: np.ndarray, used: np.ndarray) -> Fit:
-        n = index.size
-        solution, chi, slopes = np.full((n, 4), np.nan), np.full(n, np.nan), np.zeros(n, np.int8)
-        _fit_planes(points[index], u[index], error[index], used, ground, solution, slopes, chi)
-        solved, needed = np.isfinite(chi), 1 + (0 if math.isfinite(slope) else slopes)
-        degrees = np.where(solved, used.sum(axis=1) - needed, 0)
-        return Fit(solved, chi, degrees, (*solution.T[:2], solution[:, 2:], slopes))
+        some = points[index], u[index], error[index], used
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gradient = _plane(*some, np.zeros((index.size, 2)), slope, relief)[3]
+            height, variance, chi, _ = _plane(*some, gradient, slope, relief)
+        count = used.sum(axis=1)
+        return height, variance, np.where(count > 0, chi, np.nan), np.maximum(count - 1, 0)
 
-    found, used, status = screen(fit, mask, level)
-    height, variance, gradient, slopes = found.quantities
-    height[status > EXCLUDED] = variance[status > EXCLUDED] = np.nan
-    gradient[status > EXCLUDED] = np.nan
-    normal = np.concatenate([-gradient, np.ones((len(gradient), 1))], axis=1)
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    arrays = (height, variance, normal, slopes, found.chi_square, found.degrees, used, status)
-    return Altitude(*(a.reshape(shape + a.shape[1:]) for a in arrays))
+    return _screened(fit, np.isfinite(distance), level, shape)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _orthogonalise(columns, turn, square):
-    """Turn a matrix (b, m) by Jacobi's rotations until its columns are orthogonal.
-
-    This gives the singular values of even a nearly degenerate geometry to full relative accuracy;
-    normal equations would square its condition number.
-
-    Parameters
-    ----------
-    columns : (b, m) ndarray
-        Becomes columns @ turn.
-    turn : (m, m) ndarray
-        Written: orthogonal, its columns the right singular vectors.
-    square : (m,) ndarray
-        Written: squares of the singular values, unsorted.
-    """
-    m = square.size
-    for p in range(m):
-        for q in range(m):
-            turn[p, q] = 1.0 if p == q else 0.0
-    done = False
-    for _ in range(_MOST_SWEEPS):
-        if done:
-            break
-        done = True
-        for pair in range(m * (m - 1) // 2):  # first and second, first and third, second and third
-            p, q = (0, pair + 1) if pair < m - 1 else (1, 2)
-            alpha = beta = gamma = 0.0
-            for i in range(columns.shape[0]):
-                alpha += columns[i, p] * columns[i, p]
-                beta += columns[i, q] * columns[i, q]
-                gamma += columns[i, p] * columns[i, q]
-            if abs(gamma) <= _ORTHOGONAL * math.sqrt(alpha) * math.sqrt(beta):
-                continue
-            done = False
-            zeta = (beta - alpha) / (2.0 * gamma)
-            tangent = math.copysign(1.0 / (abs(zeta) + math.hypot(1.0, zeta)), zeta)
-            cosine = 1.0 / math.hypot(1.0, tangent)
-            sine = cosine * tangent
-            for matrix in (columns, turn):
-                for i in range(matrix.shape[0]):
-                    x, y = matrix[i, p], matrix[i, q]
-                    matrix[i, p], matrix[i, q] = cosine * x - sine * y, sine * x + cosine * y
-    for k in range(m):
-        square[k] = 0.0
-        for i in range(columns.shape[0]):
-            square[k] += columns[i, k] * columns[i, k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _coordinate(columns, k, square, residual):
-    """Coordinate of the residual along one orthogonal column, taken out of the residual."""
-    coordinate = 0.0
-    for i in range(residual.size):
-        coordinate += columns[i, k] * residual[i] / square
-    for i in range(residual.size):
-        residual[i] -= coordinate * columns[i, k]
-    return coordinate
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fit_velocities(
-    directions, closing, errors, used, limit, velocity, covariance, condition, chi
-):  # fmt: skip
-    """Velocity vectors of n cycles of b beams by weighted least squares; the last four are written.
-
-    Parameters
-    ----------
-    directions : (n, b, 3) ndarray
-        Unit vectors.
-    closing, errors : (n, b) ndarray
-        Radial velocities and their standard errors [m/s].
-    used : (n, b) bool ndarray
-        Beams that count; what stands in the others is not looked at.
-    limit : float
-        Condition number above which no solution is given.
-    velocity, covariance : (n, 3), (n, 3, 3) ndarray
-        Written where there is a solution [m/s], [m^2/s^2].
-    condition : (n,) ndarray
-        Ratio of the largest to the smallest singular value; inf with fewer than three beams.
-    chi : (n,) ndarray
-        Sum of the squared residuals over their variances; written where there is a solution.
-    """
-    n, b = closing.shape
-    columns, turn, square, residual = np.empty((b, 3)), np.empty((3, 3)), np.empty(3), np.empty(b)
-    for i in range(n):
-        count = 0
-        for j in range(b):
-            count += used[i, j]
-            residual[j] = closing[i, j] / errors[i, j] if used[i, j] else 0.0
-            for k in range(3):
-                columns[j, k] = directions[i, j, k] / errors[i, j] if used[i, j] else 0.0
-        condition[i] = math.inf
-        if count < 3:
-            continue
-        _orthogonalise(columns, turn, square)
-        least = min(square[0], square[1], square[2])
-        if least > 0.0:
-            condition[i] = math.sqrt(max(square[0], square[1], square[2]) / least)
-        if condition[i] > limit:
-            continue
-        chi[i] = 0.0
-        for k in range(3):
-            coordinate = _coordinate(columns, k, square[k], residual)
-            for p in range(3):
-                velocity[i, p] = turn[p, k] * coordinate + (velocity[i, p] if k else 0.0)
-                for q in range(3):
-                    further = turn[p, k] * turn[q, k] / square[k]
-                    covariance[i, p, q] = further + (covariance[i, p, q] if k else 0.0)
-        for j in range(b):
-            chi[i] += residual[j] * residual[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fit_planes(points, beams, errors, used, ground, solution, slopes, chi):
-    """Planes through the ground points of n cycles of b beams; the last three are written.
+def _plane(
+    points: np.ndarray, beams: np.ndarray, errors: np.ndarray, used: np.ndarray,
+    gradient: np.ndarray, slope: float, relief: float,
+) -> Fit:  # fmt: skip
+    """Altitudes, variances, chi-squares and gradients of planes through n cycles' ground points.
 
     The plane is z = -altitude + gradient . (x, y) with the platform at the zero. Heights are
     fitted at the points' measured places. An error of range moves a point off the plane by
-    the error times ``gradient . (u_x, u_y) - u_z``, so the weights need the plane: a first fit
-    takes level ground for them.
+    the error times ``gradient . (u_x, u_y) - u_z``, so the weights need a gradient beforehand.
 
-    Parameters
-    ----------
-    points, beams : (n, b, 3) ndarray
-        Ground points from the platform [m] and unit vectors of the beams; z up.
-    errors : (n, b) ndarray
-        Standard errors of the ranges [m].
-    used : (n, b) bool ndarray
-        Beams that count.
-    ground : (float, float, float)
-        Standard deviation of the slope known beforehand [1] (inf: unknown; 0: level), that of
-        heights about the plane [m], and the spread of the points in plan over their distance
-        under which an unknown slope is taken as level.
-    solution : (n, 4) ndarray
-        Altitude, its variance and gradient [m], [m^2], [1]; written where any beam is used.
-    slopes, chi : (n,) ndarray
-        Likewise: slopes that were fitted, 0..2, and the weighted sum of squared residuals, that
-        of the slopes known beforehand with it.
+    About the weighted centre of the points, height and slopes do not correlate. Slopes known
+    beforehand are two more observations of 0.
     """
-    weight = np.empty(errors.shape[1])
-    for i in range(errors.shape[0]):
-        count = 0
-        solution[i, 2] = solution[i, 3] = 0.0
-        for _ in range(2):
-            for j in range(weight.size):
-                sine = solution[i, 2] * beams[i, j, 0] + solution[i, 3] * beams[i, j, 1]
-                moved = errors[i, j] * max(sine - beams[i, j, 2], LEAST_SINE)
-                weight[j] = 1.0 / math.hypot(moved, ground[1]) if used[i, j] else 0.0
-                count += used[i, j]
-            if count:
-                slopes[i], chi[i] = _fit_plane(points[i], weight, ground[0], ground[2], solution[i])
+    n, b = used.shape
+    sine = (gradient[:, None] * beams[..., :2]).sum(axis=2) - beams[..., 2]
+    moved = errors * np.maximum(sine, LEAST_SINE)
+    weight = np.where(used, 1.0 / np.hypot(moved, relief), 0.0)
+    total = sum(weight.T**2)
+    share = (weight**2 / total[:, None])[..., None]
+    centre = np.where(used[..., None], points * share, 0.0).sum(axis=1)
+    apart = np.where(used[..., None], weight[..., None] * (points - centre[:, None]), 0.0)
+    residual = np.zeros((n, b + 2))
+    residual[:, :b] = apart[..., 2]
+    height, variance, gradient = -centre[:, 2], 1.0 / total, np.zeros((n, 2))
+    if slope > 0:
+        known = np.broadcast_to(np.eye(2) / slope, (n, 2, 2))
+        columns = np.concatenate([apart[..., :2], known], axis=1)
+        turn, square, coordinate = _least_squares(columns, residual)
+        along = centre[:, :1] * turn[:, 0] + centre[:, 1:2] * turn[:, 1]
+        for k in range(2):
+            height = height + along[:, k] * coordinate[:, k]
+            variance = variance + along[:, k] ** 2 / square[:, k]
+        gradient = (turn * coordinate[:, None]).sum(axis=2)
+    return height, variance, sum(residual.T**2), gradient
+
+
+def _flat_cycles(
+    direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Directions (n, b, 3), values and errors (n, b), and the shape that n stands for."""
+    u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
+    if u.shape[-1:] != (3,):
+        raise ValueError(f"directions have three components: (..., b, 3), not {u.shape}")
+    shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape)
+    u = np.broadcast_to(u, (*shape, 3)).reshape(-1, shape[-1], 3)
+    value, error = (np.broadcast_to(a, shape).reshape(-1, shape[-1]) for a in (value, error))
+    valid = np.isfinite(value)
+    if not (np.isfinite(error[valid]) & (error[valid] > 0)).all():
+        raise ValueError("a valid beam has a standard error that is not positive and finite")
+    if not (np.abs(np.linalg.norm(u[valid], axis=-1) - 1) < 1e-6).all():
+        raise ValueError("a valid beam has a direction whose length is not 1")
+    return u, value, error, shape[:-1]
+
+
+def _least_squares(
+    columns: np.ndarray, residual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right singular vectors (n, m, m), squares of singular values and coordinates (n, m).
+
+    The unknowns of problem i are ``turn[i] @ coordinate[i]``; `residual` (n, b) becomes what they
+    leave, and columns (n, b, m) are turned until they are orthogonal.
+    """
+    n, _, m = columns.shape
+    turn, square, coordinate = np.empty((n, m, m)), np.empty((n, m)), np.empty((n, m))
+    _orthogonalise(columns, residual, turn, square, coordinate)
+    return turn, square, coordinate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fit_plane(points, weight, slope, least_spread, solution):
-    """Number of slopes and chi-square of one plane; the solution (4,) is written.
+def _orthogonalise(every, residuals, turns, squares, coordinates):
+    """Least squares by Jacobi's rotations, as of :func:`_least_squares`.
 
-    About the weighted centre of the points, height and slopes do not correlate. Slopes known
-    beforehand are two more observations of 0 with that standard deviation.
+    This gives the singular values of even a nearly degenerate geometry to full relative accuracy;
+    normal equations would square its condition number.
     """
-    b, total, centre = weight.size, 0.0, np.zeros(3)
-    for j in range(b):
-        total += weight[j] * weight[j]
-    columns, residual = np.zeros((b + 2, 2)), np.zeros(b + 2)
-    for j in range(b):
-        for k in range(3):
-            if weight[j] > 0.0:
-                centre[k] += points[j, k] * (weight[j] * weight[j] / total)
-    for j in range(b):
-        if weight[j] > 0.0:
-            residual[j] = weight[j] * (points[j, 2] - centre[2])
-            for k in range(2):
-                columns[j, k] = weight[j] * (points[j, k] - centre[k]) if slope > 0.0 else 0.0
-    known = 0.0 < slope < math.inf
-    if known:
-        columns[b, 0] = columns[b + 1, 1] = 1.0 / slope
-    turn, square = np.empty((2, 2)), np.empty(2)
-    _orthogonalise(columns, turn, square)
-    solution[0], solution[1], solution[2], solution[3] = -centre[2], 1.0 / total, 0.0, 0.0
-    far = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
-    slopes, chi = 0, 0.0
-    for k in range(2):
-        if known or (slope > 0.0 and math.sqrt(square[k]) > least_spread * math.sqrt(far * total)):
-            slopes += 1
-            coordinate = _coordinate(columns, k, square[k], residual)
-            along = centre[0] * turn[0, k] + centre[1] * turn[1, k]
-            solution[0] += along * coordinate
-            solution[1] += along * along / square[k]
-            solution[2] += turn[0, k] * coordinate
-            solution[3] += turn[1, k] * coordinate
-    for j in range(b + 2):
-        chi += residual[j] * residual[j]
-    return slopes, chi
+    n, b, m = every.shape
+    for i in range(n):
+        columns, turn, residual = every[i], turns[i], residuals[i]
+        for p in range(m):
+            for q in range(m):
+                turn[p, q] = 1.0 if p == q else 0.0
+        done = False
+        for _ in range(_MOST_SWEEPS):
+            if done:
+                break
+            done = True
+            for pair in range(m * (m - 1) // 2):  # first and second, first and third, the others
+                p, q = (0, pair + 1) if pair < m - 1 else (1, 2)
+                alpha = beta = gamma = 0.0
+                for j in range(b):
+                    alpha += columns[j, p] * columns[j, p]
+                    beta += columns[j, q] * columns[j, q]
+                    gamma += columns[j, p] * columns[j, q]
+                if abs(gamma) <= _ORTHOGONAL * math.sqrt(alpha) * math.sqrt(beta):
+                    continue
+                done = False
+                zeta = (beta - alpha) / (2.0 * gamma)
+                tangent = math.copysign(1.0 / (abs(zeta) + math.hypot(1.0, zeta)), zeta)
+                cosine = 1.0 / math.hypot(1.0, tangent)
+                sine = cosine * tangent
+                for matrix in (columns, turn):
+                    for j in range(matrix.shape[0]):
+                        x, y = matrix[j, p], matrix[j, q]
+                        matrix[j, p], matrix[j, q] = cosine * x - sine * y, sine * x + cosine * y
+        for k in range(m):
+            square = coordinate = 0.0
+            for j in range(b):
+                square += columns[j, k] * columns[j, k]
+            for j in range(b):
+                coordinate += columns[j, k] * residual[j] / square
+            for j in range(b):
+                residual[j] -= coordinate * columns[j, k]
+            squares[i, k], coordinates[i, k] = square, coordinate
 
 
-def screen(
-    fit: Callable[[np.ndarray, np.ndarray], Fit], valid: np.ndarray, level: float | None
-) -> tuple[Fit, np.ndarray, np.ndarray]:
+def _screened(
+    fit: Callable[[np.ndarray, np.ndarray], Fit], valid: np.ndarray, level: float | None,
+    shape: tuple[int, ...],
+) -> Solution:  # fmt: skip
     """Solutions of n cycles of b beams, with a beam that contradicts the others left out.
 
     A cycle is suspect where its chi-square exceeds the value that it exceeds with probability
@@ -462,51 +328,168 @@ def screen(
     Parameters
     ----------
     fit : callable
-        Fit of the cycles of index (k,) by the beams of a mask (k, b).
+        Fit of the cycles of index (k,) by the beams of a mask (k, b); a chi-square of nan without
+        a solution.
     valid : (n, b) bool ndarray
         Beams that returned anything.
     level : float or None
         Probability that a cycle of true beams is suspect, 0 < . < 1; None: no test.
+    shape : tuple of int
+        Dimensions that n stands for.
+    """
+    used, b = valid.copy(), valid.shape[1]
+    fitted = fit(np.arange(len(valid)), used)
+    value, covariance, chi, degrees = fitted
+    status = np.where(np.isnan(chi), UNDETERMINED, SOLVED).astype(np.int8)
+    if level is not None:
+        if not 0 < level < 1:
+            raise ValueError(f"the test's level lies between 0 and 1, not {level}")
+        most = np.concatenate([[np.inf], chdtri(np.arange(1, b + 1), level)])
+        suspect = np.flatnonzero(chi > most[degrees])
+        passes = np.zeros((suspect.size, b), bool)
+        for beam in range(b):
+            _, _, trial, left = fit(suspect, used[suspect] & (np.arange(b) != beam))
+            passes[:, beam] = trial <= most[left]
+        one = passes.sum(axis=1) == 1
+        status[suspect] = np.where(one, EXCLUDED, WITHHELD)
+        found = suspect[one]
+        used[found, passes[one].argmax(axis=1)] = False
+        for whole, part in zip(fitted, fit(found, used[found]), strict=True):
+            whole[found] = part
+    value[status > EXCLUDED] = covariance[status > EXCLUDED] = np.nan
+    return Solution(*(a.reshape(shape + a.shape[1:]) for a in (*fitted, used, status)))
+
+
+def solve(
+    shots: Arrays,
+    points: Arrays,
+    *,
+    shots_a_cycle: int,
+    ground_slope: float,
+    test_level: float | None = None,
+    relief: float = 0.0,
+    jitter: float = 0.0,
+) -> dict[str, np.ndarray]:
+    """Velocity and altitude of every cycle and draw.
+
+    Parameters
+    ----------
+    shots : mapping
+        ``platform_position``, ``platform_velocity`` and ``beam_direction`` of
+        :data:`sweep.model.outputs.SHOTS`, (n, 3).
+    points : mapping
+        Interpolated ranges and radial velocities, their standard errors and the flags of
+        :data:`sweep.model.outputs.POINTS`, (n, draws, returns).
+    shots_a_cycle : int
+        Shots of a cycle, in the order of the arrays; n is a multiple of it.
+    ground_slope, relief : float
+        Of :func:`altitude` [1], [m].
+    test_level : float or None
+        Level of the test for one false beam, of :func:`velocity`; None or 0: no test.
+    jitter : float
+        Standard deviation of the pointing jitter, of each angle [rad].
 
     Returns
     -------
-    Fit, (n, b) bool ndarray, (n,) int8 ndarray
-        The solutions, the beams in them and the status.
+    dict of ndarray
+        By the names, units and types of :data:`sweep.model.outputs.NAVIGATION`, (cycles,
+        draws[, 3[, 3]]); the numbers of beams are 0 where there is no solution.
 
     Raises
     ------
     ValueError
-        `level` is out of range.
+        n is no multiple of `shots_a_cycle`; a level, slope or relief is out of range.
     """
-    n, b = valid.shape
-    used = valid.copy()
-    fitted = fit(np.arange(n), used)
-    status = np.where(fitted.solved, SOLVED, UNDETERMINED).astype(np.int8)
-    if level is None:
-        return fitted, used, status
-    if not 0 < level < 1:
-        raise ValueError(f"the test's level lies between 0 and 1, not {level}")
-    most = np.concatenate([[np.inf], chdtri(np.arange(1, b + 1), level)])
-    suspect = np.flatnonzero(fitted.solved & (fitted.chi_square > most[fitted.degrees]))
-    passes = np.zeros((suspect.size, b), bool)
-    for beam in range(b):
-        trial = fit(suspect, _without(used[suspect], beam))
-        passes[:, beam] = trial.solved & (trial.chi_square <= most[trial.degrees])
-    one = passes.sum(axis=1) == 1
-    status[suspect] = np.where(one, EXCLUDED, WITHHELD)
-    found, culprit = suspect[one], passes[one].argmax(axis=1)
-    used[found, culprit] = False
-    _replace(fitted, found, fit(found, used[found]))
-    return fitted, used, status
+    n, draws = points["flags"].shape[:2]
+    if shots_a_cycle < 1 or n % shots_a_cycle:
+        raise ValueError(f"{n} shots are not whole cycles of {shots_a_cycle}")
+    cycles = n // shots_a_cycle
+    room = {"cycle": cycles, "draw": draws, "xyz": 3, "xyz_again": 3}
+    results = {name: output.empty(room) for name, output in NAVIGATION.items()}
+    step = max(1, STRETCH // max(1, shots_a_cycle * draws))
+    for first in range(0, cycles, step):
+        some = slice(first, min(first + step, cycles))
+        part = slice(some.start * shots_a_cycle, some.stop * shots_a_cycle)
+        poses = [
+            shots[name][part].reshape(-1, shots_a_cycle, 3)
+            for name in ("platform_position", "platform_velocity", "beam_direction")
+        ]
+        found = _solved(
+            poses, _beams(points, part, shots_a_cycle), {"level": test_level or None},
+            {"slope": ground_slope, "relief": relief}, jitter,
+        )  # fmt: skip
+        for quantity, spread, solution in found:
+            beams = np.where(solution.available, solution.used.sum(axis=-1), 0)
+            results[quantity][some] = solution.value
+            results[f"{quantity}_{spread}"][some] = solution.covariance
+            results[f"{quantity}_status"][some] = solution.status
+            results[f"{quantity}_beams"][some] = beams
+    return results
 
 
-def _without(used: np.ndarray, beam: int) -> np.ndarray:
-    used = used.copy()
-    used[:, beam] = False
-    return used
+def _beams(points: Arrays, part: slice, each: int) -> dict[str, np.ndarray]:
+    """Values and standard errors of trusted points, (cycles, draws, each); nan without one."""
+    flags = points["flags"][part]
+    pairs: dict[str, np.ndarray] = {}
+    trusted = (flags != 0) & (flags & UNCONFIRMED == 0)
+    for name in ("range", "radial_velocity"):
+        value, error = (
+            points[f"{name}_interpolated{suffix}"][part] for suffix in ("", "_standard_error")
+        )
+        error = np.maximum(error, _INTERPOLATION * points[f"{name}_standard_error"][part])
+        trusted &= np.isfinite(value) & np.isfinite(error) & (error > 0)
+        pairs |= {name: value, f"{name}_standard_error": error}
+    first, lost = trusted.argmax(axis=2)[..., None], ~trusted.any(axis=2)
+    beams = {}
+    for name, values in pairs.items():
+        chosen = np.take_along_axis(values, first, axis=2)[..., 0]
+        chosen[lost] = np.nan
+        beams[name] = chosen.reshape(-1, each, chosen.shape[1]).swapaxes(1, 2)
+    return beams
 
 
-def _replace(whole: Fit, rows: np.ndarray, part: Fit) -> None:
-    """Writes some cycles' fits over those of the whole."""
-    for old, new in zip((*whole[:3], *whole[3]), (*part[:3], *part[3]), strict=True):
-        old[rows] = new
+def _solved(
+    poses: Sequence[np.ndarray], beams: dict[str, np.ndarray], test: dict, ground: dict,
+    jitter: float,
+) -> list[tuple[str, str, Solution]]:  # fmt: skip
+    """Solutions of (cycles, draws) measurement cycles, with what they and their spread are."""
+    place, moving, direction = poses
+    faster = np.einsum("cbi,cbi->cb", direction, moving - moving.mean(axis=1, keepdims=True))
+    beams = beams | {"radial_velocity": beams["radial_velocity"] - faster[:, None]}
+    if jitter > 0:
+        beams = beams | _jittered(direction, beams, jitter)
+    direction, offset = direction[:, None], (place - place[:, :1])[:, None]
+    speed = velocity(
+        direction=direction,
+        radial_velocity=beams["radial_velocity"],
+        standard_error=beams["radial_velocity_standard_error"],
+        **test,
+    )
+    height = altitude(
+        direction=direction,
+        range=beams["range"],
+        standard_error=beams["range_standard_error"],
+        offset=offset,
+        **ground,
+        **test,
+    )
+    return [("velocity", "covariance", speed), ("altitude", "variance", height)]
+
+
+def _jittered(direction: np.ndarray, beams: Arrays, jitter: float) -> dict[str, np.ndarray]:
+    """Standard errors with that of the pointing in them, (cycles, draws, each)."""
+    closing, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
+    first = velocity(
+        direction=direction[:, None], radial_velocity=closing, standard_error=error
+    ).value
+    along = np.einsum("cbi,cdi->cdb", direction, first)
+    square = np.sum(first**2, axis=2)[..., None] - along**2
+    across = np.sqrt(np.maximum(np.nan_to_num(square), 0.0))
+    level = np.linalg.norm(direction[..., :2], axis=2)
+    slant = level / np.maximum(-direction[..., 2], LEAST_SINE)
+    return {
+        "radial_velocity_standard_error": np.hypot(error, jitter * across),
+        "range_standard_error": np.hypot(
+            beams["range_standard_error"], jitter * beams["range"] * slant[:, None]
+        ),
+    }

@@ -1,6 +1,9 @@
 """Results of grids, of whole spectra, of flights and of scenes: units, meaning, dimensions."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 NO_DOPPLER = "nan for direct detection, which has no optical Doppler segment"
 NO_ECHO = "nan where no light comes back"
@@ -24,6 +27,10 @@ class Output:
     dims: tuple[str, ...] = ()
     """Dimensions beside the study's axes: ``shot``, ``beamlet``, ``cycle``, ``draw`` and
     ``return_number`` count from 0; ``xyz`` are the world's axes."""
+
+    def empty(self, sizes: Mapping[str, int]) -> np.ndarray:
+        """Array to be filled, of these sizes by dimension."""
+        return np.empty(tuple(sizes[dim] for dim in self.dims), self.dtype)
 
 
 def _by_segment(

@@ -1,4 +1,4 @@
-"""Returns: what a footprint with several surfaces reports, draw by draw.
+"""Returns of footprints with several surfaces, draw by draw.
 
 :func:`groups` finds in the noiseless spectra of a shot's segments the groups of adjacent bins at
 or above the threshold, each a target (PHYSICS section 6). :func:`draw_returns` draws which of
@@ -36,9 +36,8 @@ from numba import njit
 from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.draws import Seen, is_noisy, noise_levels, seen_spectra
-from sweep.model.groups import BIN, FIRST, LAST, Groups, groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
-from sweep.model.marcum import at_least_one
+from sweep.model.marcum import at_least_one, marcum_q1_pair
 from sweep.model.pairing import (
     FALSE_ALARM,
     MISPAIRED,
@@ -49,21 +48,115 @@ from sweep.model.pairing import (
     UNCONFIRMED,
     pair_peaks,
 )
-from sweep.model.philox import (
-    STREAM_DETECTION,
-    STREAM_FALSE_ALARM,
-    STREAM_NOISE,
-    STREAM_NOISE_MAXIMUM,
-)
 from sweep.model.preparation import Shots
+from sweep.model.segments import runs_of
 
-__all__ = ["Groups", "Returns", "draw_returns", "groups"]
+BIN, FIRST, LAST = range(3)
+"""Bins of a group: the strongest, the first and the last."""
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
 
 FALSE, ABSENT = -1, -2
 """In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
+
+
+class Groups(NamedTuple):
+    """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
+
+    Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
+    none. Where no bin crosses the threshold the strongest is listed, as noise may lift it.
+    """
+
+    bin: np.ndarray
+    """(n, 3, most) int64: strongest bin, 0..N/2."""
+    first: np.ndarray
+    """(n, 3, most) int64: first bin of the group."""
+    last: np.ndarray
+    """(n, 3, most) int64: last bin of the group."""
+    neighbours: np.ndarray
+    """(n, 3, most, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
+    pd: np.ndarray
+    """(n, 3, most): probability that noise leaves the strongest bin above the threshold."""
+    exempted: np.ndarray
+    """(n, 3): bins that cannot raise a false alarm."""
+    leakage: np.ndarray
+    """(n, 3): probability that leaked signal raises a further group, over noise alone."""
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """|X| of the strongest bin, (n, 3, most)."""
+        return self.neighbours[..., 1]
+
+
+def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
+    """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
+
+    ``every_bin`` as of :func:`sweep.model.shot.find`.
+    """
+    n = shots.size
+    bins = np.full((3, n, 3, most), -1, np.int64)
+    neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
+    exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    levels = np.stack([shots.threshold, shots.line_deviation])
+    for runs in runs_of(shots, every_bin=every_bin):
+        _find_groups(
+            runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
+            shots.fft_size // 2, bins, neighbours, pd,
+        )  # fmt: skip
+        some = np.where(runs.bins > 0, runs.exempted, np.nan)
+        exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
+    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_groups(part, runs, magnitudes, levels, half, bins, neighbours, pd):
+    """Groups of every run, into arrays of the shapes of :class:`Groups`."""
+    low, count, peak, start = runs
+    for j in range(part.size):
+        i = part[j]
+        level, deviation = levels[0, i], levels[1, i]
+        for s in range(3):
+            if count[s, j] == 0:
+                continue
+            magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
+            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
+            for g in range(found):
+                k = bins[BIN, i, s, g]
+                pd[i, s, g] = marcum_q1_pair(magnitude[k] / deviation, level / deviation)[0]
+                for side in range(3):
+                    neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
+                bins[:, i, s, g] += low[s, j]
+
+
+@njit(cache=True, error_model="numpy")
+def _beside(magnitude, low, k, half):
+    """Magnitude k of a run that starts at bin ``low``; mirrored at DC and Nyquist, 0 past it."""
+    bin_ = abs(low + k)
+    k = (2 * half - bin_ if bin_ > half else bin_) - low
+    return magnitude[k] if 0 <= k < magnitude.size else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _list_groups(magnitude, peak, level, bins):
+    """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
+    if magnitude[peak] < level:
+        bins[:, 0] = peak
+        return 1
+    spans, found, k = np.empty((3, magnitude.size // 2 + 1), np.int64), 0, 0
+    while k < magnitude.size:
+        if magnitude[k] < level:
+            k += 1
+            continue
+        best = first = k
+        while k < magnitude.size and magnitude[k] >= level:
+            best = k if magnitude[k] > magnitude[best] else best
+            k += 1
+        spans[BIN, found], spans[FIRST, found], spans[LAST, found] = best, first, k - 1
+        found += 1
+    order = np.argsort(-magnitude[spans[BIN, :found]], kind="mergesort")[: bins.shape[1]]
+    bins[:, : order.size] = spans[:, order]
+    return order.size
 
 
 class Returns(NamedTuple):
@@ -161,21 +254,21 @@ def draw_returns(
 
 
 class How(NamedTuple):
-    """The way in which draws are taken."""
+    """Way in which draws are taken."""
 
     first_draw: int
     noisy: bool
     powers: bool
-    """Whether lines add as powers."""
+    """Lines add as powers."""
     doppler: bool
-    """Whether there is a Doppler segment."""
+    """There is a Doppler segment."""
     half: int
     """N/2."""
     tolerance: float
 
 
 class Known(NamedTuple):
-    """What is known of n points, by segment, before any draw."""
+    """Knowledge of n points, by segment, before any draw."""
 
     bins: np.ndarray
     """(n, 3, 3, most) int64: BIN, FIRST and LAST of the groups; -1 for none."""
@@ -186,7 +279,7 @@ class Known(NamedTuple):
     spread: np.ndarray
     """(n, 3, most): standard deviation [bins] of the lines in a group, weighted by power."""
     lines: np.ndarray
-    """(n, 3, beamlets): where each beamlet's line appears [bins, 0..N/2]."""
+    """(n, 3, beamlets): place of each beamlet's line [bins, 0..N/2]."""
     amplitude: np.ndarray
     """(n, beamlets)"""
     levels: np.ndarray
@@ -198,7 +291,7 @@ class Known(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What draws of n points come to."""
+    """Results of the draws of n points."""
 
     peaks: np.ndarray
     """(n, draws, most, 2, 4): up and down peak of each return."""
@@ -232,7 +325,7 @@ def _known(shots: Shots, found: Groups) -> Known:
 
 
 def beamlet_lines(shots: Shots) -> np.ndarray:
-    """Where each beamlet's line appears in the three spectra [bins, 0..N/2], (n, 3, beamlets)."""
+    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets)."""
     distance = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     distance = distance * _columns(shots, shots.range), 1 + shots.offset[shots.row]
     beta = _columns(shots, shots.beta) + shots.doppler[shots.row]
@@ -244,19 +337,13 @@ def beamlet_lines(shots: Shots) -> np.ndarray:
     return lines
 
 
-def _velocities(shots: Shots) -> np.ndarray:
-    """Radial velocity [m/s] of each beamlet, (n, beamlets)."""
-    doppler = SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
-    return np.asarray(_columns(shots, shots.radial_velocity) + doppler)
-
-
 def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndarray:
     """One value a point, with so many dimensions behind it."""
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
 
 
 def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
-    """What pairs of peaks report, and which of them misread their common beamlet."""
+    """Returns from pairs of peaks, those flagged that misread their common beamlet."""
     carrier, bandwidth, duration, rate, deepest, walk = (
         _columns(shots, column, 3)
         for column in (
@@ -281,7 +368,8 @@ def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
     reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
-    offset, truth = shots.offset[shots.row], _velocities(shots)
+    offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
+    truth = _columns(shots, shots.radial_velocity) + doppler
     seen = np.maximum(drawn.beamlet, 0)
     off = distance[..., FINE] - deepest[..., 0] * (1 + offset[point, seen])
     right = abs(off) <= reach * metre
@@ -364,12 +452,12 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
         if how.noisy:
             there = look(address, at, g, how, known, seen, tables, peaks[count])
         else:
-            there = philox.uniform(a, b, draw, STREAM_DETECTION[s], g) < known.pd[i, s, g]
+            there = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g) < known.pd[i, s, g]
             if there:
                 m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
                 delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
                 error = sub_bin_error(delta, ratio / under_lines, tables)
-                normal, _ = philox.normal_pair(a, b, draw, STREAM_NOISE[s], g)
+                normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
         if there:
@@ -377,11 +465,11 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
             count += 1
     place, largest = -1, beta
     for n in range(seen.stretch[i, s, 0], seen.stretch[i, s, 1]):
-        re, im = philox.normal_pair(a, b, draw, STREAM_NOISE[s], seen.aside[n])
+        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], seen.aside[n])
         ratio = math.hypot(seen.leaked[n] + re, im)
         if ratio >= largest:
             place, largest = seen.low[i, s] + seen.aside[n], ratio
-    stream = STREAM_NOISE_MAXIMUM[s] if how.noisy else STREAM_FALSE_ALARM[s]
+    stream = philox.STREAM_NOISE_MAXIMUM[s] if how.noisy else philox.STREAM_FALSE_ALARM[s]
     chance = philox.uniform(a, b, draw, stream, 0)
     if chance < known.alarm[i, s]:
         ratio = max(largest_of(seen.others[i, s], chance), beta)
@@ -398,10 +486,14 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
 
 @njit(cache=True, error_model="numpy")
 def look(address, at, g, how, known, seen, tables, peak):
-    """Whether a group's strongest bin crosses with its noise; the peak of three bins as found."""
+    """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
-    centre, m, stream = known.bins[i, s, BIN, g], known.magnitude[i, s, g] / sigma, STREAM_NOISE[s]
+    centre, m, stream = (
+        known.bins[i, s, BIN, g],
+        known.magnitude[i, s, g] / sigma,
+        philox.STREAM_NOISE[s],
+    )
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
     re, im = re * under_lines, im * under_lines
@@ -449,21 +541,14 @@ def largest_of(number, chance):
 @njit(cache=True, error_model="numpy")
 def free_bin(chance, bins, half):
     """Bin of 1..N/2 outside the groups and the bins beside them, uniformly by a chance."""
-    spans, number, free = np.empty((bins.shape[1], 2), np.int64), 0, half
+    number = 0
     while number < bins.shape[1] and bins[BIN, number] >= 0:
-        first = max(bins[FIRST, number] - 1, 1)
-        end = max(min(bins[LAST, number] + 2, half + 1), first)
-        place = number
-        while place > 0 and spans[place - 1, 0] > first:
-            spans[place] = spans[place - 1]
-            place -= 1
-        spans[place, 0], spans[place, 1] = first, end
         number += 1
-    for g in range(number):  # disjoint
-        before = spans[g - 1, 1] if g else 1
-        spans[g, 0] = max(spans[g, 0], before)
-        spans[g, 1] = max(spans[g, 1], spans[g, 0])
-        free -= spans[g, 1] - spans[g, 0]
+    spans, free, end = np.empty((number, 2), np.int64), half, 1
+    for g, group in enumerate(np.argsort(bins[FIRST, :number])):  # disjoint and rising
+        spans[g, 0] = max(bins[FIRST, group] - 1, end)
+        end = max(min(bins[LAST, group] + 2, half + 1), spans[g, 0])
+        spans[g, 1], free = end, free - (end - spans[g, 0])
     place = 1 + int(chance * free)
     for g in range(number):
         if place >= spans[g, 0]:
@@ -473,7 +558,7 @@ def free_bin(chance, bins, half):
 
 @njit(cache=True, error_model="numpy")
 def judge(group, centres, bins, lines, amplitude):
-    """What a return is, but for its reading; and the beamlet next to its peaks that all hold.
+    """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def solved(
     cycles, draws
         Which of them: numbers of cycles among these, and a run of draws.
     """
-    from sweep.model.cycles import solve
+    from sweep.model.navigation import solve
 
     navigation, each = spec.navigation, stretches.shots_a_cycle
     rows = (cycles[:, None] * each + np.arange(each)).ravel()

@@ -127,13 +127,13 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_covarian
     measured = beams @ moving + rng.normal(0, 0.01, (n, 4))
     measured[rng.random((n, 4)) >= pd] = np.nan
     found = velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
-    result = _of_all(found.velocity - moving, found.covariance, found.available)
+    result = _of_all(found.value - moving, found.covariance, found.available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
     stated = np.diag(result.predicted_covariance)
     assert (np.abs(result.bias) <= 5 * np.sqrt(stated / result.count)).all()
     # draws of three and of four beams mix, so the spread of squares is taken from themselves
-    off = found.velocity[found.available] - moving
+    off = found.value[found.available] - moving
     spread = np.std(off**2, axis=0) / np.sqrt(result.count)
     assert (np.abs(np.diag(result.covariance) - stated) <= 5 * spread).all()
     assert (5 * spread < 0.07 * stated).all()  # a variance 7 % off would show

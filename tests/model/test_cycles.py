@@ -5,13 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_scenes import flight, instrument, observed, plate
 
-from sweep.model import cycles, philox
+from sweep.model import navigation, philox
 from sweep.model.clouds import cloud
-from sweep.model.cycles import solve
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import Fixed
 from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners, squares
-from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, solve
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
 from sweep.spec.scene_sections import Navigation
@@ -61,8 +60,9 @@ def _seen(beams, *, number=6, path=None, rate=2.0, interval=None, **keywords):
     return observed(path, scanner=scanner, index=np.arange(number * each), number=1, **keywords)
 
 
-def _solved(seen, points, beams, **keywords):
-    return solve(_shots(seen), points, shots_a_cycle=len(beams), **keywords)
+def _solved(seen, points, beams, ground_slope=0.0, **keywords):
+    given = {"shots_a_cycle": len(beams), "ground_slope": ground_slope}
+    return solve(_shots(seen), points, **given, **keywords)
 
 
 # Without chance
@@ -173,7 +173,7 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     free, usual, held, rough = (
         _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
         for slope, relief in (
-            (np.inf, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
+            (1e7, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
         )
     )  # fmt: skip
     np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
@@ -200,7 +200,7 @@ def test_any_split_of_cycles_gives_the_same_bytes(monkeypatch):
         got = _solved(seen.some(some), part, FOUR, **options)
         for name in NAVIGATION:
             assert got[name].tobytes() == whole[name][first:last].tobytes(), name
-    monkeypatch.setattr(cycles, "STRETCH", 1)
+    monkeypatch.setattr(navigation, "STRETCH", 1)
     for name, values in _solved(seen, points, FOUR, **options).items():
         assert values.tobytes() == whole[name].tobytes(), name
 

@@ -13,8 +13,8 @@ from sweep.model import philox, returns, segments, truth
 from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
-from sweep.model.groups import groups
 from sweep.model.preparation import PhaseError
+from sweep.model.returns import groups
 from sweep.model.sampling import simulate
 from sweep.model.segments import POINTS
 from sweep.model.shot import evaluate, find
