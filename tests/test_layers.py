@@ -30,8 +30,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_497, "modules": 308, "lines of the model": 17_557, "modules of the model": 93,
-    "compiled functions": 111, "arguments of a compiled function": 10,
+    "lines": 52_245, "modules": 306, "lines of the model": 17_305, "modules of the model": 91,
+    "compiled functions": 106, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600
