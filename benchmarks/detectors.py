@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from sweep.analysis import canvas
-from sweep.model import cramer_rao
+from sweep.model import estimators
 from sweep.model.detectors import (
     CA,
     DETECTORS,
@@ -120,7 +120,7 @@ def masked(s: Setting, apart: float) -> Iterator[np.ndarray]:
 
 def amplitude(decibel: float, s: Setting) -> float:
     """Of a tone of some SNR after the FFT, in noise of variance 1."""
-    cnr = cramer_rao.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=s.window)
+    cnr = estimators.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=s.window)
     return float(np.sqrt(2 * cnr))
 
 
@@ -145,11 +145,11 @@ def errors(name: str) -> dict[str, np.ndarray]:
 def bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Cramer-Rao bound, and what the largest value of the windowed spectrum reaches [bins]."""
     w = window(name, LENGTH)
-    cnr = cramer_rao.carrier_to_noise_ratio(snr=10 ** (DECIBELS / 10), window=w)
+    cnr = estimators.carrier_to_noise_ratio(snr=10 ** (DECIBELS / 10), window=w)
     rate = float(LENGTH)
     return (
-        cramer_rao.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=rate),
-        cramer_rao.windowed_deviation(cnr=cnr, window=w, sample_rate=rate),
+        estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=rate),
+        estimators.windowed_deviation(cnr=cnr, window=w, sample_rate=rate),
     )
 
 

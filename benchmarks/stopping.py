@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
-from sweep.model.accuracy import Accuracy
-from sweep.model.intervals import COUNTED, Interval, bounded_mean, half_width
+from sweep.model.accuracy import COUNTED, Accuracy, Interval, bounded_mean, half_width
 from sweep.model.marcum import marcum_q1
 from sweep.model.sampling import PIECE, looks, settle
 

@@ -20,7 +20,7 @@ A footprint whose lines add as powers and spread by s [bins, standard deviation]
 broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
 
 The error under noise follows to first order from the noise in phase with the signal, which the
-window correlates between bins. The Cramer-Rao bound (:mod:`sweep.model.cramer_rao`) is that of the
+window correlates between bins. The Cramer-Rao bound (:mod:`sweep.model.estimators`) is that of the
 whole record without a window; three magnitudes of a windowed spectrum do not reach it.
 """
 

@@ -25,9 +25,15 @@ import numpy as np
 from scipy import fft
 
 from sweep.model import waveform
-from sweep.model.cramer_rao import Deviation, beat_deviation, resolved_deviation
 from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
-from sweep.model.estimators import ESTIMATORS, PEAK_BIN, Estimator
+from sweep.model.estimators import (
+    ESTIMATORS,
+    PEAK_BIN,
+    Deviation,
+    Estimator,
+    beat_deviation,
+    resolved_deviation,
+)
 from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.philox import STREAM_RECORD, normals, records
 from sweep.model.preparation import Parameters, Shots

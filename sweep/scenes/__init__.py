@@ -1,1 +1,1 @@
-"""Files that scenes are made of, read into the model's arrays."""
+"""Scenes as the model's arrays: files read, ground drawn at random, and the objects on it."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.terrain import Terrain, refine
 from sweep.scenes.degrees import metres_per_degree
+from sweep.scenes.terrain import Terrain, refine
 
 
 def jacksboro(*, size: float | None = None, factor: int = 1) -> Terrain:

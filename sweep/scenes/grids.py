@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.terrain import Terrain
 from sweep.scenes.errors import SceneError, existing
 from sweep.scenes.raster import MOST_CELLS
+from sweep.scenes.terrain import Terrain
 
 Origin = Sequence[float]
 
@@ -116,7 +116,7 @@ def read_image(
     """Terrain of a grey image: black is low, white is high, row 0 is the northern one.
 
     Heights come in steps of one grey level: smooth them before trusting slopes
-    (`sweep.model.geometry.terrain.smooth`).
+    (`sweep.scenes.terrain.smooth`).
 
     Parameters
     ----------

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.mesh import Facets, join
 from sweep.model.geometry.quaternion import about, multiply, normalise
 from sweep.scenes.errors import SceneError, existing
+from sweep.scenes.facets import Facets, join
 from sweep.units import QuantityError, read_unit
 
 _Y_UP_FORMATS = {".glb", ".gltf"}

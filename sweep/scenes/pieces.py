@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sweep.model.geometry.terrain import Terrain
+from sweep.scenes.terrain import Terrain
 
 
 def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.geometry.terrain import Terrain
 from sweep.scenes.degrees import metres_per_degree as degree_of
 from sweep.scenes.errors import SceneError, existing
+from sweep.scenes.terrain import Terrain
 
 MOST_CELLS = 50_000_000
 """Heights read at once at most: 100 million triangles."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sweep.model.geometry.mesh import Facets
+from sweep.scenes.facets import Facets
 
 
 def sphere(*, radius: float, subdivisions: int) -> Facets:

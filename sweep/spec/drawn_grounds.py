@@ -12,7 +12,7 @@ from sweep.spec.grounds import PlacedGround, Relief
 from sweep.spec.streams import generator
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.terrain import Terrain
+    from sweep.scenes.terrain import Terrain
     from sweep.spec.files import Files
 
 MOST_STEPS = 7000
@@ -35,7 +35,7 @@ class SquareGround(PlacedGround):
 
     def flat(self) -> Terrain:
         """The grid, of heights 0."""
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.scenes.terrain import Terrain
 
         self.check()
         step, number = self.own_step(), _nodes(self.size, self.own_step())
@@ -74,7 +74,7 @@ class Plane(SquareGround):
 
     def grid(self, files: Files) -> Terrain:
         """The plane."""
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.scenes.terrain import Terrain
 
         grid = self.flat()
         rise, steps = math.tan(self.slope), np.arange(len(grid.heights))
@@ -91,7 +91,7 @@ class ReliefGround(Relief, SquareGround):
 
     def grid(self, files: Files) -> Terrain:
         """The ground as drawn."""
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.scenes.terrain import Terrain
 
         grid = self.flat()
         shape = len(grid.heights), len(grid.heights)
@@ -117,8 +117,7 @@ class Hills(SquareGround):
 
     def grid(self, files: Files) -> Terrain:
         """The ground as drawn."""
-        from sweep.model.geometry.relief import hills
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.scenes.terrain import Terrain, hills
 
         grid = self.flat()
         heights = hills(

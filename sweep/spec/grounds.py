@@ -18,7 +18,7 @@ from sweep.spec.rules import Choice, Numeric, Text
 from sweep.spec.streams import generator
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.terrain import Terrain
+    from sweep.scenes.terrain import Terrain
     from sweep.spec.files import Files
 
 
@@ -55,7 +55,7 @@ class Relief(Part):
 
     def heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
         """Heights on a grid [m], of mean 0."""
-        from sweep.model.geometry.relief import fractal
+        from sweep.scenes.terrain import fractal
 
         heights = fractal(
             generator("relief", self.seed),
@@ -85,7 +85,7 @@ class Craters(Part):
 
     def carved(self, terrain: Terrain) -> Terrain:
         """Terrain with the craters in it."""
-        from sweep.model.geometry.scattered import carve, draw_craters, lunar_craters
+        from sweep.scenes.scattered import carve, draw_craters, lunar_craters
 
         up_to = math.inf if self.equilibrium_diameter is None else self.equilibrium_diameter
         craters = draw_craters(
@@ -127,7 +127,7 @@ class Ground(Material, ABC):
         ValueError
             For a grid that can not hold what it should.
         """
-        from sweep.model.geometry.terrain import Terrain, refine, smooth
+        from sweep.scenes.terrain import Terrain, refine, smooth
 
         terrain = self.survey(files)
         if terrain.heights.size * self.factor**2 > MOST_CELLS:
@@ -169,7 +169,7 @@ class PlacedGround(Ground):
 
     def survey(self, files: Files) -> Terrain:
         """The ground before anything is done to it."""
-        from sweep.model.geometry.terrain import Terrain
+        from sweep.scenes.terrain import Terrain
 
         grid = self.grid(files)
         (rows, columns), (dx, dy) = grid.heights.shape, grid.spacing

@@ -17,9 +17,9 @@ from sweep.spec.rules import Choice, Numeric, Text
 from sweep.spec.streams import generator
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.mesh import Facets
-    from sweep.model.geometry.scattered import Law
-    from sweep.model.geometry.terrain import Terrain
+    from sweep.scenes.facets import Facets
+    from sweep.scenes.scattered import Law
+    from sweep.scenes.terrain import Terrain
     from sweep.spec.files import Files
 
 Vector = tuple[float, ...]
@@ -115,7 +115,7 @@ class MartianRocks(Part):
 
     def law(self) -> Law:
         """Size-frequency law."""
-        from sweep.model.geometry.scattered import MartianRocks
+        from sweep.scenes.scattered import MartianRocks
 
         return MartianRocks(self.abundance)
 
@@ -133,7 +133,7 @@ class PowerLaw(Part):
 
     def law(self) -> Law:
         """Size-frequency law."""
-        from sweep.model.geometry.scattered import PowerLaws
+        from sweep.scenes.scattered import PowerLaws
 
         return PowerLaws(((self.density, self.exponent),))
 
@@ -169,8 +169,8 @@ class Boulders(Material):
         ValueError
             For too many of them, or none of the ground within the square.
         """
-        from sweep.model.geometry.scattered import Shape, draw_boulders
         from sweep.scenes.pieces import square
+        from sweep.scenes.scattered import Shape, draw_boulders
 
         bounds = None
         if self.within is not None:
@@ -226,7 +226,7 @@ class Trees(Part):
         ValueError
             Where they do not find room, or one would stand beside the ground.
         """
-        from sweep.model.geometry.trees import Tree, clump
+        from sweep.scenes.trees import Tree, clump
 
         return clump(
             generator("trees", self.seed),

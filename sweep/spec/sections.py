@@ -2,8 +2,7 @@
 
 from typing import Annotated
 
-from sweep.model.accuracy import AUTOMATIC
-from sweep.model.intervals import COUNTED
+from sweep.model.accuracy import AUTOMATIC, COUNTED
 from sweep.model.reflectance import LAWS
 from sweep.spec.effect_fields import with_modes, with_parameters
 from sweep.spec.instrument import Part

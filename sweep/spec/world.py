@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.geometry.mesh import Facets, Mesh, Surface, merge
+from sweep.model.geometry.mesh import Mesh, Surface, merge
 from sweep.model.geometry.platform import Flight
 from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.terrain import Terrain
 from sweep.scenes.errors import SceneError
+from sweep.scenes.facets import Facets
+from sweep.scenes.terrain import Terrain
 from sweep.spec.files import Files
 from sweep.spec.grounds import Ground, PlacedGround
 from sweep.spec.motion import Span

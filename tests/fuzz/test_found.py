@@ -14,8 +14,8 @@ from sweep.cli import main
 from sweep.model.effects.gaussian_line import MOST_BINS, gaussian_shifts
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
-from sweep.model.geometry.terrain import Terrain, smooth
 from sweep.model.unsupported import UnsupportedShot
+from sweep.scenes.terrain import Terrain, smooth
 from sweep.spec import SceneSpec, Spec, SpecError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import plan

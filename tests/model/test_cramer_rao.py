@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sweep.model import cramer_rao, waveform
+from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.window import samples, window
 
@@ -27,9 +27,9 @@ def test_the_bound_of_a_beat_is_that_of_the_fisher_information():
         ])  # fmt: skip
         least.append(np.linalg.inv(slopes @ slopes.T / deviation**2)[2, 2])
     cnr = amplitude**2 / (2 * deviation**2)
-    bound = cramer_rao.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=RATE)
+    bound = estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=RATE)
     assert bound**2 == pytest.approx(np.mean(least), rel=1e-3)
-    assert cramer_rao.beat_deviation(cnr=0.0, samples=LENGTH, sample_rate=RATE) == np.inf
+    assert estimators.beat_deviation(cnr=0.0, samples=LENGTH, sample_rate=RATE) == np.inf
 
 
 def test_the_ratio_before_the_fft_follows_from_that_after_it():
@@ -38,7 +38,7 @@ def test_the_ratio_before_the_fft_follows_from_that_after_it():
     tone = 0.3 * np.cos(2 * np.pi * 100 * np.arange(1024) / 1024)
     signal = abs(np.fft.rfft(tone * samples("hamming", 1024))[100]) ** 2
     snr = signal / (w.energy * 0.5**2)
-    found = cramer_rao.carrier_to_noise_ratio(snr=snr, window=w)
+    found = estimators.carrier_to_noise_ratio(snr=snr, window=w)
     assert found == pytest.approx((tone**2).mean() / 0.5**2, rel=1e-9)
 
 
@@ -55,10 +55,10 @@ def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name)
         x = [(turning * (-2j * np.pi * n / LENGTH) ** k).sum(axis=1) for k in range(3)]
         slope = 2 * (x[1] * x[0].conj()).real
         f -= slope / (2 * (abs(x[1]) ** 2 + (x[2] * x[0].conj()).real))
-    expected = cramer_rao.windowed_deviation(
+    expected = estimators.windowed_deviation(
         cnr=cnr, window=window(name, LENGTH), sample_rate=float(LENGTH)
     )
-    bound = cramer_rao.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=float(LENGTH))
+    bound = estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=float(LENGTH))
     assert np.std(f) == pytest.approx(expected, rel=5 / np.sqrt(2 * draws) + 0.02)
     assert expected == pytest.approx(bound, rel=1e-9) if name == "rectangular" else expected > bound
 
@@ -80,7 +80,7 @@ def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler
         (beats(radial_velocity=151.0) - beats(radial_velocity=149.0)) / 2,
     ], axis=1)  # fmt: skip
     expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ np.diag(spread**-2.0) @ slopes)))
-    found = cramer_rao.resolved_deviation(
+    found = estimators.resolved_deviation(
         up=spread[0], doppler=spread[1], down=spread[2], carriers=carriers, chirp_rate=2e12, **where
     )
     assert found == pytest.approx(tuple(expected), rel=1e-6)
@@ -92,8 +92,8 @@ def test_range_and_velocity_take_two_beats():
         "carriers": (2e14,) * 3, "chirp_rate": 2e12, "range": 0.0, "radial_velocity": 0.0,
         "doppler": np.inf,
     }  # fmt: skip
-    found = cramer_rao.resolved_deviation(up=3e3, down=4e3, **given)
+    found = estimators.resolved_deviation(up=3e3, down=4e3, **given)
     assert found.range == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e12))
     assert found.radial_velocity == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e14))
-    blind = cramer_rao.resolved_deviation(up=3e3, down=np.inf, **given)
+    blind = estimators.resolved_deviation(up=3e3, down=np.inf, **given)
     assert np.isinf(blind.range) and np.isinf(blind.radial_velocity)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sweep.model import cramer_rao
+from sweep.model import estimators
 from sweep.model.detectors import Setting, taper
 from sweep.model.estimators import ESTIMATORS, jacobsen_form
 from sweep.model.window import window
@@ -62,12 +62,12 @@ def test_jacobsens_factors_are_those_of_his_table():
 def errors(name, shape, length, decibel):
     """Errors [bins] of tones anywhere between bins, the Cramer-Rao bound, the windowed one."""
     w = window(shape, length)
-    cnr = cramer_rao.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=w)
+    cnr = estimators.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=w)
     delta = np.random.default_rng(9).uniform(-0.5, 0.5, DRAWS)
     spectrum, peak, setting = spectra(shape, length, delta, cnr)
     error = ESTIMATORS[name](spectrum, peak, setting) - BIN - delta
-    bound = cramer_rao.beat_deviation(cnr=cnr, samples=length, sample_rate=float(SIZE))
-    return error, bound, cramer_rao.windowed_deviation(
+    bound = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=float(SIZE))
+    return error, bound, estimators.windowed_deviation(
         cnr=cnr, window=w, sample_rate=float(SIZE)
     )  # fmt: skip
 

@@ -6,11 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.footprint import beamlets
-from sweep.model.geometry.mesh import Surface, clean
+from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight, Nadir, Spin
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import cone, corners, fixed
 from sweep.model.shot import evaluate, statistics
+from sweep.scenes.facets import clean
 
 LEVEL = 1.0, 0.0, 0.0, 0.0
 GROUND = Surface("ground", 0.1, "lambert")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.model.cramer_rao import beat_deviation, carrier_to_noise_ratio
+from sweep.model.estimators import beat_deviation, carrier_to_noise_ratio
 from sweep.model.interpolation import (
     interpolator,
     noise_correlation,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.model.intervals import COUNTED, bounded_mean, clopper_pearson, half_width, wilson
+from sweep.model.accuracy import COUNTED, bounded_mean, clopper_pearson, half_width, wilson
 from sweep.model.marcum import marcum_q1
 
 CONFIDENCE = 0.95

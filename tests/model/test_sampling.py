@@ -7,9 +7,8 @@ import pytest
 from scipy import stats
 
 from sweep.model import philox, realisations, sampling
-from sweep.model.accuracy import Accuracy
+from sweep.model.accuracy import COUNTED, Accuracy, half_width
 from sweep.model.effects.catalogue import CORE
-from sweep.model.intervals import COUNTED, half_width
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_OUTPUTS,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sweep.model.eyepoints import observe
-from sweep.model.geometry.mesh import clean
 from sweep.model.geometry.platform import ConstantAcceleration, Flight, Nadir
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import cone, fixed
 from sweep.model.outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays, to_arrays
+from sweep.scenes.facets import clean
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import numpy as np
 from cases import Family
 from exact_rays import fractions, last_places, nearest, plane_distance
 
-from sweep.model.geometry.mesh import clean
 from sweep.model.geometry.rays import Caster
+from sweep.scenes.facets import clean
 
 FAMILY = Family(
     "Meshes",

@@ -25,7 +25,7 @@ from sweep.analysis.answers import (
 from sweep.analysis.answers.limits import deviate
 from sweep.analysis.answers.physical import coordinate, parameter, spec_of
 from sweep.analysis.answers.probability import named
-from sweep.model import cramer_rao, waveform
+from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.window import transform, window
 from sweep.spec import SceneSpec, Spec
@@ -55,7 +55,7 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         [m], lazy: `reported`, reported less true range without noise, from whole bins;
         `resolution`, the spread that whole bins make on the average, a bin over sqrt(24) as
         two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
-        SNR in the three segments together (:mod:`sweep.model.cramer_rao`). Where noise is
+        SNR in the three segments together (:mod:`sweep.model.estimators`). Where noise is
         taken for signal, below the threshold, no estimate comes near it.
         Of a study that draws whole spectra instead what it stores: `bias`, `rmse` and `bound`.
     """
@@ -76,7 +76,7 @@ def _errors(
     dataset: xr.Dataset,
     words: str,
     stored: str,
-    which: Callable[[cramer_rao.Deviation], np.ndarray],
+    which: Callable[[estimators.Deviation], np.ndarray],
 ) -> xr.Dataset:
     quantity = stored.removesuffix("_error")
     if f"{quantity}_rmse" in dataset:
@@ -125,7 +125,7 @@ def _walks(dataset: xr.Dataset) -> xr.DataArray:
     return (dataset["effects"] & int(masks["range_walk"])) > 0
 
 
-def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao.Deviation:
+def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators.Deviation:
     """Bounds of points that share no more than their order; words and sizes one by one."""
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
     flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
@@ -137,10 +137,10 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> cramer_rao
         mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
         part = {name: a[mask] for name, a in flat.items()}
         spread[:, mask] = _alike([s[mask] for s in seen], part)
-    return cramer_rao.Deviation(*spread.reshape(2, *shape))
+    return estimators.Deviation(*spread.reshape(2, *shape))
 
 
-def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Deviation:
+def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviation:
     """Bounds of points of one architecture, window and record."""
     size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
     length = int(waveform.record_length(
@@ -165,18 +165,18 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> cramer_rao.Deviat
         place = waveform.fold(beat, p["sample_rate"]) / rate * size
         # in bins of fs/L: a padded FFT's bins are finer than the window's
         offset = (place - np.rint(place)) * length / size
-        cnr = cramer_rao.carrier_to_noise_ratio(
+        cnr = estimators.carrier_to_noise_ratio(
             snr=seen / main_lobe(shape.name, length)(np.abs(offset)) ** 2, window=shape
         )
-        deviation = cramer_rao.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
+        deviation = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
-    found = cramer_rao.resolved_deviation(
+    found = estimators.resolved_deviation(
         up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
         range=p["range"], radial_velocity=p["radial_velocity"],
     )  # fmt: skip
     dark = np.isnan(snr[0]) | np.isnan(snr[2])
-    return cramer_rao.Deviation(*(np.where(dark, np.nan, b) for b in found))
+    return estimators.Deviation(*(np.where(dark, np.nan, b) for b in found))
 
 
 @lru_cache(maxsize=32)

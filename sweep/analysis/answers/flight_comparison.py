@@ -8,7 +8,7 @@ import xarray as xr
 
 from sweep.analysis.answers.comparison import differences, titled
 from sweep.analysis.answers.physical import study_of
-from sweep.model.intervals import clopper_pearson, half_width
+from sweep.model.accuracy import clopper_pearson, half_width
 from sweep.model.outputs import PROMISED, STATISTICS
 from sweep.model.pairing import TRUE
 

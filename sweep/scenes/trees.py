@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.model.geometry.mesh import Facets, join
-from sweep.model.geometry.terrain import Terrain
+from sweep.scenes.facets import Facets, join
+from sweep.scenes.terrain import Terrain
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from facet_areas import areas
 
-from sweep.model.geometry import trees
-from sweep.model.geometry.terrain import Terrain
+from sweep.scenes import trees
+from sweep.scenes.terrain import Terrain
 
 TREE = trees.Tree(variation=0.0)
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import exp1
 
-from sweep.model.geometry.mesh import Facets
-from sweep.model.geometry.terrain import Terrain
+from sweep.scenes.facets import Facets
+from sweep.scenes.terrain import Terrain
 
 
 @dataclass(frozen=True)

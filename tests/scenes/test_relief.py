@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from sweep.model.geometry import relief
+from sweep.scenes import terrain as relief
 
 FIVE_SIGMA = 5.0
 

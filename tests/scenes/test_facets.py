@@ -5,7 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from sweep.model.geometry.mesh import Mesh, clean, merge
+from sweep.model.geometry.mesh import Mesh, merge
+from sweep.scenes.facets import clean
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 CUBE = np.array(

@@ -7,11 +7,11 @@ from facet_areas import areas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.geometry.mesh import Facets, join
 from sweep.model.geometry.quaternion import about
-from sweep.model.geometry.terrain import Terrain, refine, smooth
+from sweep.scenes.facets import Facets, join
 from sweep.scenes.grids import read_image
 from sweep.scenes.raster import read_raster
+from sweep.scenes.terrain import Terrain, refine, smooth
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 GALE = DATA / "gale_crater_hirise_1m.tif"

@@ -5,8 +5,8 @@ import pytest
 from facet_areas import areas
 from scipy import integrate
 
-from sweep.model.geometry import scattered
-from sweep.model.geometry.terrain import Terrain
+from sweep.scenes import scattered
+from sweep.scenes.terrain import Terrain
 
 
 def flat(size=200.0, z=0.0, origin=(0.0, 0.0, 0.0)):
