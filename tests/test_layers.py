@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_245, "modules": 306, "lines of the model": 17_305, "modules of the model": 91,
+    "lines": 52_238, "modules": 304, "lines of the model": 16_138, "modules of the model": 85,
     "compiled functions": 106, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
