@@ -30,6 +30,9 @@ from sweep.model.segments import runs_of
 
 METHODS = ("probabilities", "noise")
 
+_AT_ONCE = 256
+"""Draws of a row whose random numbers are made together."""
+
 
 class Rows(NamedTuple):
     """Spectra, (m,) each, that a stretch of draws is taken of."""
@@ -182,33 +185,56 @@ def _count(rows, ends, levels, chances, noisy, seen, counts):
     ``chances`` (2, 3, m) those of a detection, of no meaning in noise, and of a false alarm in
     bins that are not looked at one by one.
     """
-    hit, alarm = np.zeros(3, np.bool_), np.zeros(3, np.bool_)
+    words = np.empty((4, _AT_ONCE), np.uint64)
+    hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
-        a, b = rows.keys[j, 0], rows.keys[j, 1]
-        beta, under_lines = levels[0, j], levels[1, j]
+        threshold, under_lines = levels[0, j] * levels[0, j], levels[1, j]
         i, batch = rows.point[j], 0
-        for number in range(rows.first[j], rows.last[j]):
-            while number >= ends[batch + 1]:
-                batch += 1
+        for first in range(rows.first[j], rows.last[j], _AT_ONCE):
+            number = min(_AT_ONCE, rows.last[j] - first)
+            address = rows.keys[j, 0], rows.keys[j, 1], first, number
+            hits[:], alarms[:] = False, False
             for s in range(3):
+                stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
                 if noisy:
-                    re, im = philox.normal_pair(a, b, number, STREAM_NOISE[s], seen.peak[j, s])
-                    re, im = seen.ratio[j, s] + re * under_lines, im * under_lines
-                    hit[s] = re**2 + im**2 >= beta * beta
+                    _cross(address, stream, peak, ratio, under_lines, threshold, words, hits[s])
                 else:
-                    found = philox.uniform(a, b, number, STREAM_DETECTION[s], 0)
-                    hit[s] = found < chances[0, s, j]
-                alarm[s] = False
+                    _happen(address, STREAM_DETECTION[s], chances[0, s, j], words, hits[s])
                 if chances[1, s, j] > 0.0:
-                    stream = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
-                    alarm[s] = philox.uniform(a, b, number, stream, 0) < chances[1, s, j]
+                    largest = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
+                    _happen(address, largest, chances[1, s, j], words, alarms[s])
                 for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
-                    re, im = philox.normal_pair(a, b, number, STREAM_NOISE[s], seen.aside[k])
-                    alarm[s] |= (seen.leaked[k] + re) ** 2 + im**2 >= beta * beta
-            counts[0, i, batch] += hit[0]
-            counts[1, i, batch] += hit[2]
-            counts[2, i, batch] += hit[1]
-            counts[3, i, batch] += hit[0] & hit[2]
-            counts[4, i, batch] += alarm[0]
-            counts[5, i, batch] += alarm[2]
-            counts[6, i, batch] += alarm[0] & alarm[2]
+                    leaked = seen.leaked[k]
+                    _cross(address, stream, seen.aside[k], leaked, 1.0, threshold, words, alarms[s])
+            for d in range(number):
+                while first + d >= ends[batch + 1]:
+                    batch += 1
+                counts[0, i, batch] += hits[0, d]
+                counts[1, i, batch] += hits[2, d]
+                counts[2, i, batch] += hits[1, d]
+                counts[3, i, batch] += hits[0, d] & hits[2, d]
+                counts[4, i, batch] += alarms[0, d]
+                counts[5, i, batch] += alarms[2, d]
+                counts[6, i, batch] += alarms[0, d] & alarms[2, d]
+
+
+@njit(cache=True, error_model="numpy")
+def _happen(address, stream, chance, words, found):
+    """Mark the draws (key, first, number) in which something of that chance happens."""
+    philox.fill_words(address[:3], stream, 0, (1, 0), address[3], words)
+    for d in range(address[3]):
+        found[d] |= philox.to_uniform(words[0, d]) < chance
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(address, stream, index, ratio, deviation, threshold, words, found):
+    """Mark the draws in which a bin of that |X| / sigma, with its noise, reaches the threshold.
+
+    The threshold is a power; the noise, of that deviation, is pair `index` of the stream.
+    """
+    philox.fill_words(address[:3], stream, index >> 1, (1, 0), address[3], words)
+    lane = 2 * (index & 1)
+    for d in range(address[3]):
+        re, im = philox.to_normals(words[lane, d], words[lane + 1, d])
+        re, im = ratio + re * deviation, im * deviation
+        found[d] |= re**2 + im**2 >= threshold

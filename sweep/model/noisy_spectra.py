@@ -35,7 +35,7 @@ from sweep.model.estimators import (
     resolved_deviation,
 )
 from sweep.model.interpolation import interpolator, phasors, sub_bin
-from sweep.model.philox import STREAM_RECORD, normals, records
+from sweep.model.philox import STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
 
@@ -119,7 +119,8 @@ def noise_of(
     occupies have more of it.
     """
     length, stream = shots.window.length, STREAM_RECORD[segment]
-    record = normals(records(key, draws, stream, length + length % 2))[:, :length]
+    keys = np.broadcast_to(key, (draws.size, 2))
+    record = normals(uniforms(keys, draws, stream, length + length % 2))[:, :length]
     record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
     noise = np.array([fft.rfft(each, shots.fft_size) for each in record])

@@ -12,7 +12,6 @@ from sweep.model.philox import (
     normal_pair,
     normals,
     point_keys,
-    records,
     uniform,
     uniform4,
     uniforms,
@@ -80,9 +79,7 @@ def test_a_uniform_is_addressed_by_block_draw_and_stream(key, draw, stream, inde
 @without_deadline
 def test_a_record_of_normal_numbers_is_that_of_pairs_one_by_one(key, draw, stream, number):
     pairs = [normal_pair(*key, draw, stream, i) for i in range(number)]
-    draws = np.array([7, draw])
-    drawn = records(np.array(key), draws, stream, 2 * len(pairs))
-    np.testing.assert_array_equal(drawn, uniforms(np.array([key, key]), draws, stream, 2 * number))
+    drawn = uniforms(np.array([key, key]), np.array([7, draw]), stream, 2 * number)
     np.testing.assert_allclose(normals(drawn)[1], np.ravel(pairs), rtol=1e-14, atol=1e-15)
 
 
