@@ -131,12 +131,11 @@ class Seen(NamedTuple):
     """|X| / sigma of them."""
 
     @classmethod
-    def nothing(cls, points: int, bins: int = 0) -> "Seen":
-        """No spectra, for what is drawn against probabilities; with room for so many bins."""
-        low, peak = np.zeros((2, points, 3), np.int64)
-        ratio, others = np.full((points, 3), np.nan), np.zeros((points, 3))
-        stretch, aside = np.zeros((points, 3, 2), np.int64), np.empty(bins, np.int64)
-        return cls(low, peak, ratio, others, stretch, aside, np.empty(bins))
+    def nothing(cls, points: int) -> "Seen":
+        """No spectra, for what is drawn against probabilities."""
+        low, stretch = np.zeros((points, 3), np.int64), np.zeros((points, 3, 2), np.int64)
+        none, others = np.full((points, 3), np.nan), np.zeros((points, 3))
+        return cls(low, low, none, others, stretch, np.empty(0, np.int64), np.empty(0))
 
 
 def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
@@ -145,36 +144,28 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
     # Without leakage none but the peak is looked at.
     floor = shots.floor + np.zeros(shots.size) if shots.leakage else np.full(shots.size, np.inf)
     for runs in runs_of(shots, least=np.minimum(shots.threshold, floor * sigma), leakage=False):
-        seen = Seen.nothing(runs.part.size, runs.magnitudes.size)
-        _look(
-            (runs.low, runs.bins, runs.peak, runs.exempted, runs.start), runs.magnitudes,
-            runs.exempt, np.stack([sigma[runs.part], floor[runs.part]]), seen,
-        )  # fmt: skip
-        left = shots.counted_bins(seen.others) - np.diff(seen.stretch)[..., 0]
-        yield runs.part, seen._replace(others=np.maximum(left, 0.0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _look(runs, magnitudes, exempt, levels, seen):
-    """Fills what is seen of some points; in place of the others the exempt bins."""
-    low, count, peak, exempted, start = runs
-    number = 0
-    for i in range(low.shape[1]):
-        sigma, floor = levels[0, i], levels[1, i]
-        for s in range(low.shape[0]):
-            if count[s, i] == 0:
-                continue
-            at = start[s, i]
-            seen.low[i, s], seen.peak[i, s] = low[s, i], peak[s, i]
-            seen.ratio[i, s] = magnitudes[at + peak[s, i]] / sigma
-            seen.others[i, s] = exempted[s, i]
-            seen.stretch[i, s, 0] = number
-            for k in range(count[s, i]):
-                ratio = magnitudes[at + k] / sigma
-                if k != peak[s, i] and not exempt[at + k] and ratio >= floor:
-                    seen.aside[number], seen.leaked[number] = k, ratio
-                    number += 1
-            seen.stretch[i, s, 1] = number
+        count, start, peak = (c.T.ravel() for c in (runs.bins, runs.start, runs.peak))
+        run = np.repeat(np.arange(count.size), count)  # of each bin, point by point
+        number = np.arange(run.size) - (np.cumsum(count) - count)[run]
+        at, point = start[run] + number, runs.part[run // 3]
+        ratio = runs.magnitudes[at] / sigma[point]
+        leaks = (ratio >= floor[point]) & (number != peak[run]) & ~runs.exempt[at]
+        leaking = np.bincount(run[leaks], minlength=count.size).reshape(-1, 3)
+        after = np.cumsum(leaking).reshape(-1, 3)
+        there = runs.bins.T > 0
+        others = shots.counted_bins(np.where(there, runs.exempted.T, 0.0)) - leaking
+        yield (
+            runs.part,
+            Seen(
+                low=np.where(there, runs.low.T, 0),
+                peak=np.where(there, runs.peak.T, 0),
+                ratio=np.where(there, runs.magnitude.T / sigma[runs.part, None], np.nan),
+                others=np.maximum(others, 0.0),
+                stretch=np.stack([after - leaking, after], axis=2),
+                aside=number[leaks],
+                leaked=ratio[leaks],
+            ),
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -51,29 +51,19 @@ def _round(x0, x1, x2, x3, key0, key1):
 
 
 @njit(cache=True)
-def to_uniform(word):
-    """Uniform number in (0, 1) of a word, the centre of one of 2^52 equal cells.
-
-    By the upper 52 bits: with 53 the last centre would round to 1; so 0 and 1 are both impossible,
-    and u and 1-u, both exact, equally likely.
-    """
-    return (np.float64(word >> _12) + 0.5) * 2.0**-52
-
-
-@njit(cache=True)
-def uniform4(key0, key1, draw, stream, block):
-    """Four uniforms in (0, 1) of indices 4 block .. 4 block + 3, for the price of one."""
+def words4(key0, key1, draw, stream, block):
+    """Four words of indices 4 block .. 4 block + 3, for the price of one."""
     k0, k1 = np.uint64(key0), np.uint64(key1)
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
     for _ in range(10):
         x0, x1, x2, x3 = _round(x0, x1, x2, x3, k0, k1)
         k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
-    return to_uniform(x0), to_uniform(x1), to_uniform(x2), to_uniform(x3)
+    return x0, x1, x2, x3
 
 
 @njit(cache=True)
 def fill_words(address, stream, block, steps, number, words):
-    """Words of `uniform4` into the first columns of (4, >= number).
+    """Words of `words4` into the first columns of (4, >= number).
 
     From an address (key0, key1, draw) on, draw and block rise by the steps each time. All take one
     round after the other, which the processor does for several at once: some six times as fast as
@@ -91,36 +81,40 @@ def fill_words(address, stream, block, steps, number, words):
 
 
 @njit(cache=True)
+def to_uniform(word):
+    """Uniform number in (0, 1) of a word, the centre of one of 2^52 equal cells.
+
+    By the upper 52 bits: with 53 the last centre would round to 1; so 0 and 1 are both impossible,
+    and u and 1-u, both exact, equally likely.
+    """
+    return (np.float64(word >> _12) + 0.5) * 2.0**-52
+
+
+@njit(cache=True)
+def to_normals(word0, word1):
+    """Two independent standard normal numbers of two words, by Box and Muller's transform.
+
+    As real and imaginary part, sigma times this pair is one bin's noise (sigma per quadrature).
+    Their magnitude reaches sqrt(2 ln 2^53) = 8.57 at most.
+    """
+    radius, angle = math.sqrt(-2.0 * math.log(to_uniform(word0))), 2.0 * math.pi * to_uniform(word1)
+    return radius * math.cos(angle), radius * math.sin(angle)
+
+
+@njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
     """Number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
 
     A chance below 1.1e-16 can not be drawn by comparison. One block of four costs one evaluation.
     """
-    return uniform4(key0, key1, draw, stream, index >> 2)[index & 3]
+    return to_uniform(words4(key0, key1, draw, stream, index >> 2)[index & 3])
 
 
 @njit(cache=True)
 def normal_pair(key0, key1, draw, stream, index):
-    """Two independent standard normal numbers, pair number `index` of a stream of a draw.
-
-    Box and Muller's transform of uniforms ``2 index`` and ``2 index + 1`` of the same stream; as
-    real and imaginary part, sigma times this pair is one bin's noise (sigma per quadrature).
-    Their magnitude reaches sqrt(2 ln 2^53) = 8.57 at most. Parameters as of `uniform`.
-    """
-    u0, u1, u2, u3 = uniform4(key0, key1, draw, stream, index >> 1)
-    return _box_muller(u2, u3) if index & 1 else _box_muller(u0, u1)
-
-
-@njit(cache=True)
-def to_normals(word0, word1):
-    """Two independent standard normal numbers of two words."""
-    return _box_muller(to_uniform(word0), to_uniform(word1))
-
-
-@njit(cache=True)
-def _box_muller(u0, u1):
-    radius, angle = math.sqrt(-2.0 * math.log(u0)), 2.0 * math.pi * u1
-    return radius * math.cos(angle), radius * math.sin(angle)
+    """Pair `index` of normal numbers: of the uniforms ``2 index`` and ``2 index + 1``."""
+    words = words4(key0, key1, draw, stream, index >> 1)
+    return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])
 
 
 def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:

@@ -470,11 +470,12 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
         if ratio >= largest:
             place, largest = seen.low[i, s] + seen.aside[n], ratio
     stream = philox.STREAM_NOISE_MAXIMUM[s] if how.noisy else philox.STREAM_FALSE_ALARM[s]
-    chance = philox.uniform(a, b, draw, stream, 0)
+    words = philox.words4(a, b, draw, stream, 0)
+    chance = philox.to_uniform(words[0])
     if chance < known.alarm[i, s]:
         ratio = max(largest_of(seen.others[i, s], chance), beta)
         if place < 0 or ratio > largest:
-            place = free_bin(philox.uniform(a, b, draw, stream, 1), bins, how.half)
+            place = free_bin(philox.to_uniform(words[1]), bins, how.half)
             largest = ratio
     if place >= 0:
         error = sub_bin_error(0.0, largest, tables)
