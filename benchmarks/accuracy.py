@@ -107,9 +107,9 @@ that at the bins. Three things would improve it, and stand beside it: half the t
 powers add, which are real (`real`; [T] adds amplitudes, which are not), a way back to the bins
 alone, by an FFT of a sixteenth of the size (`folded`, which is `real` too), and lines shared out
 among ten cells, by which they are where they belong (`degree 9`). All are compiled and transform
-many spectra at once (`sweep/model/oversampled.py`), have no leakage and no range walk to compute,
-and share preparation and detection with the rest. The same beamlets with the same effects in closed
-form stand beside them too.
+many spectra at once (`sweep/tasks/accuracy/thesis_grid.py`), have no leakage and no range walk to
+compute, and share preparation and detection with the rest. The same beamlets with the same effects
+in closed form stand beside them too.
 
 Two things are asked of the adaptive settings, and the answers below are computed: at equal error
 they shall never be slower by more than 10 % than the best single fixed setting; and at least 5

@@ -102,12 +102,13 @@ class Bench(Protocol):
 
 def look_of(rung: Rung) -> Look:
     """What finds a rung's peaks in the spectra."""
-    from sweep.model import oversampled, shot
+    from sweep.model import shot
+    from sweep.tasks.accuracy import thesis_grid
 
     if not rung.cells:
         return shot.find
     return partial(
-        oversampled.find, degree=rung.degree, size=rung.cells, real=rung.real, folded=rung.folded
+        thesis_grid.find, degree=rung.degree, size=rung.cells, real=rung.real, folded=rung.folded
     )
 
 

@@ -89,7 +89,7 @@ class Rung:
     cells, degree, real, folded
         Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit,
         whether powers are transformed as real numbers, and whether it goes back to the bins alone
-        (:mod:`sweep.model.oversampled`); else 0.
+        (:mod:`sweep.tasks.accuracy.thesis_grid`); else 0.
     estimate
         What is read off draws.
     rays_error

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model import oversampled, segments, truth
+from sweep.model import segments, truth
 from sweep.model.chain import prepare
 from sweep.model.shot import evaluate, find
+from sweep.tasks.accuracy import thesis_grid
 
 WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")
 
@@ -52,7 +53,7 @@ def error(shots, degree):
         peak *= np.broadcast_to(shots.beat_scale, shots.size)[i] * shots.window.sum / 2 * gain
         for segment in range(3):
             _, exact = segments.spectrum(shots, i, segment)
-            bins, found = oversampled.spectrum(shots, i, segment, degree=degree)
+            bins, found = thesis_grid.spectrum(shots, i, segment, degree=degree)
             inner = slice(bins.size // 4, -bins.size // 4)
             apart = np.abs(found**order - exact[bins] ** order) / peak**order
             worst = max(worst, apart[inner].max())
@@ -85,7 +86,7 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
         ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
         for i in range(2):
             _, exact = segments.spectrum(shots, i, 1)
-            bins, found = oversampled.spectrum(shots, i, 1, degree=9)
+            bins, found = thesis_grid.spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
             without = segments.spectrum(replace(shots, image=False), i, 1)[1]
@@ -96,10 +97,10 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
 def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1):
     shots = drawn(table_4_1, 12, phases=phases)
     for i, segment in itertools.product(range(shots.size), range(3)):
-        _, whole = oversampled.spectrum(shots, i, segment)
-        _, real = oversampled.spectrum(shots, i, segment, real=True)
-        _, folded = oversampled.spectrum(shots, i, segment, folded=True)
-        _, both = oversampled.spectrum(shots, i, segment, real=True, folded=True)
+        _, whole = thesis_grid.spectrum(shots, i, segment)
+        _, real = thesis_grid.spectrum(shots, i, segment, real=True)
+        _, folded = thesis_grid.spectrum(shots, i, segment, folded=True)
+        _, both = thesis_grid.spectrum(shots, i, segment, real=True, folded=True)
         order = 2 if shots.incoherent else 1  # a root of rounding is much
         for other in (real, folded, both):
             assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
@@ -111,7 +112,7 @@ def test_the_same_detections_come_of_it(table_4_1):
         range=rng.uniform(200.0, 9000.0, 40), grazing_angle=np.radians(rng.uniform(5.0, 90.0, 40))
     )
     exact = evaluate(scene, WITHOUT_LEAKAGE, look=find)
-    found = evaluate(scene, WITHOUT_LEAKAGE, look=lambda s: oversampled.find(s, degree=9))
+    found = evaluate(scene, WITHOUT_LEAKAGE, look=lambda s: thesis_grid.find(s, degree=9))
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
         # Images beyond the grid are left out: 1e-4 of a line at the very most.
         assert found[name] == pytest.approx(exact[name], rel=2e-3, abs=1e-3), name
@@ -121,9 +122,9 @@ def test_the_same_detections_come_of_it(table_4_1):
 def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
     wide = prepare(table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE)
     ((_, shots),) = wide
-    assert list(oversampled.grid_sizes(shots)) == [2**13, 2**12]
-    assert list(oversampled.grid_sizes(shots, 2**11)) == [2**13, 2**11]
-    bins, found = oversampled.spectrum(shots, 0, 0, degree=9)
+    assert list(thesis_grid.grid_sizes(shots)) == [2**13, 2**12]
+    assert list(thesis_grid.grid_sizes(shots, 2**11)) == [2**13, 2**11]
+    bins, found = thesis_grid.spectrum(shots, 0, 0, degree=9)
     _, exact = segments.spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
 
@@ -141,6 +142,6 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
 
 def test_direct_detection_has_no_doppler_segment(table_4_1):
     scene = table_4_1(architecture="direct", range=np.array([20.0, 30.0]), radial_velocity=0.0)
-    for look in (oversampled.find, truth.find):
+    for look in (thesis_grid.find, truth.find):
         found = evaluate(scene | {"instrument.processing.fft_size": 4096}, ("image",), look=look)
         assert np.isnan(found["pd_doppler"]).all() and (found["pd_up"] > 0).all()

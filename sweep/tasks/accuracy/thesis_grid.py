@@ -38,9 +38,6 @@ SIZE = 1 << 12
 ROOM = 16
 """Bins beside the lines that must be free of what comes round the grid's ends."""
 
-DEGREES = 0, 9
-"""Of the polynomial by which a line is shared out: to the nearest cell, or among ten."""
-
 _ROWS = 32
 """Spectra that are transformed together: as many as the processor's cache holds."""
 
@@ -55,7 +52,7 @@ def find(
     shots : Shots
         n points.
     degree : int
-        One of :data:`DEGREES`.
+        Of the polynomial that shares a line out: 0, to the nearest cell, or 9, among ten.
     size : int
         Cells of the grid at the least, a power of two; points whose lines spread too far for it
         get a larger one.
@@ -134,10 +131,9 @@ def _magnitudes(
     real = real and power
     grid = np.zeros((index.size, cells), float if real else complex)
     origin = np.empty(index.size, np.int64)
-    deposit = _put_nearest if degree == 0 else _share_out
-    deposit(
+    _deposit(
         np.ascontiguousarray(table[:, index]), shots.row[index], shots.footprint, segment,
-        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, _WEIGHTS, origin,
+        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, _weights(degree), origin,
         grid.view(float).reshape(index.size, cells, -1),
     )  # fmt: skip
     kernel = _kernel(shots.window.name, length, shots.fft_size, cells, power, real)
@@ -185,13 +181,10 @@ def _kernel(
     return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
 
 
-def _lagrange() -> np.ndarray:
-    """Barycentric weights of ten cells in a row, (10,)."""
-    node = np.arange(10.0)
-    return np.array([1 / np.prod(np.delete(node[j] - node, j)) for j in range(10)])
-
-
-_WEIGHTS = _lagrange()
+def _weights(degree: int) -> np.ndarray:
+    """Barycentric weights of degree + 1 cells in a row."""
+    node = np.arange(degree + 1.0)
+    return np.array([1 / np.prod(np.delete(node[j] - node, j)) for j in range(node.size)])
 
 
 @njit(cache=True, error_model="numpy")
@@ -215,54 +208,39 @@ def _image(origin, delta, re, im, sizes, centre):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_nearest(p, row, footprint, segment, sizes, image, weights, origin, grid):
-    """Lines of m points, each into the nearest cell of its grid, (m, cells, 2 or 1)."""
+def _deposit(p, row, footprint, segment, sizes, image, weights, origin, grid):
+    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1)."""
     n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
     room = np.empty((BLOCK + 1, n))
     delta, re, im = room[PLACE], room[RE], room[IM]
-    centre = cells // 2
+    centre, share = cells // 2, np.empty(weights.size)
+    low, high = (-0.5, cells - 1.0) if weights.size == 1 else (5.0, cells - 6.0)
     for i in range(row.size):
         origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
         for b in range(n):
-            _add(grid, i, int(np.rint(centre + CELLS * delta[b])), re[b], im[b])
+            _share_out(grid, i, centre + CELLS * delta[b], re[b], im[b], weights, share)
             if image:
                 at, a, c = _image(origin[i], delta[b], re[b], im[b], sizes, centre)
-                if -0.5 < at < cells - 1:
-                    _add(grid, i, int(np.rint(at)), abs(a) if power else a, c)
+                if low < at < high:
+                    _share_out(grid, i, at, abs(a) if power else a, c, weights, share)
 
 
 @njit(cache=True, error_model="numpy")
-def _share_out(p, row, footprint, segment, sizes, image, weights, origin, grid):
-    """The same, each shared out among ten cells."""
-    n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
-    room = np.empty((BLOCK + 1, n))
-    delta, re, im = room[PLACE], room[RE], room[IM]
-    centre = cells // 2
-    share = np.empty(10)
-    for i in range(row.size):
-        origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
-        for b in range(n):
-            _add_shared(grid, i, centre + CELLS * delta[b], re[b], im[b], weights, share)
-            if image:
-                at, a, c = _image(origin[i], delta[b], re[b], im[b], sizes, centre)
-                if 5.0 < at < cells - 6.0:
-                    a = abs(a) if power else a
-                    _add_shared(grid, i, at, a, c, weights, share)
-
-
-@njit(cache=True, error_model="numpy")
-def _add_shared(grid, i, at, re, im, weights, share):
-    """Adds a line to ten cells, by Lagrange's polynomial through the middle of them."""
+def _share_out(grid, i, at, re, im, weights, share):
+    """Adds a line to the nearest cell, or to ten by Lagrange's polynomial amid them."""
+    if weights.size == 1:
+        _add(grid, i, int(np.rint(at)), re, im)
+        return
     first = int(np.floor(at)) - 4
     t = at - first
     total = 0.0
-    for j in range(10):
+    for j in range(weights.size):
         if t == j:
             _add(grid, i, first + j, re, im)
             return
         share[j] = weights[j] / (t - j)
         total += share[j]
-    for j in range(10):
+    for j in range(weights.size):
         _add(grid, i, first + j, re * share[j] / total, im * share[j] / total)
 
 
