@@ -13,9 +13,9 @@ from rich.table import Table
 
 import sweep
 from sweep.model import shot, truth
-from sweep.model.chain import prepare
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.shot import prepare
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.reading import read_document
 

@@ -17,7 +17,7 @@ from rich.progress import track
 from rich.table import Table
 
 import sweep
-from sweep.model.effects.flags import names_of
+from sweep.model.effects.catalogue import names_of
 from sweep.tasks.accuracy.rungs import ADAPTIVE, FIXED, Rung, ladder
 from sweep.tasks.calling import Called
 from sweep.tasks.flight_study import FlightStudy

@@ -1,8 +1,8 @@
 """Points that are drawn until a tolerance is met, against the exact means over all draws.
 
 A footprint of one beamlet is one speckle: |g| multiplies all bins of a shot alike, and is Rice
-distributed. So a segment is detected with the closed form of
-:func:`sweep.model.effects.speckle.fixed_bin_detection`, and a shot, whose chirps see the same g,
+distributed. So a segment is detected with Q_1(m / s, b / s), m the steady signal over sigma and
+s^2 = 1 + P/2 with P the mean power of the diffuse one, and a shot, whose chirps see the same g,
 with the mean of Q_1(|g| a_up, b) Q_1(|g| a_down, b), one integral. Nothing is drawn for it.
 """
 
@@ -16,12 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.speckle import coherent_share, fixed_bin_detection
+from sweep.model.effects.speckle import coherent_share
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import PROMISED
-from sweep.model.shot import find
+from sweep.model.shot import find, prepare
 from sweep.spec import Spec, load
 from sweep.tasks.accuracy.rungs import ADAPTIVE, Rung
 from sweep.tasks.grid import Grid
@@ -90,10 +89,9 @@ def exact(spec: Spec) -> tuple[np.ndarray, float]:
             ),
             (grid.points,),
         )[index]
-        closed = fixed_bin_detection(
-            steady=np.sqrt(kappa) * signal, diffuse_power=(1 - kappa) * signal**2,
-            bin_deviation=1.0, threshold=level,
-        )  # fmt: skip
+        # Noise and diffuse light of the bin are one complex normal number.
+        together = np.sqrt(1 + (1 - kappa) * signal**2 / 2)
+        closed = marcum_q1(np.sqrt(kappa) * signal / together, level / together).q
         for i in range(index.size):
             factor, weight = rice(float(kappa[i]))
             each = marcum_q1(factor * signal[:, i, None], level[i]).q

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from sweep.model.chain import DEFAULTS
-from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.flags import flags_of, names_of
+from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
 from sweep.model.effects.planning import plan
 from sweep.model.effects.points import Points
 from sweep.model.resolution import effects_tolerance
+from sweep.model.shot import DEFAULTS
 from sweep.spec import load
 from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid

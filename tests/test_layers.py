@@ -30,8 +30,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_259, "modules": 304, "lines of the model": 16_159, "modules of the model": 85,
-    "compiled functions": 111, "arguments of a compiled function": 10,
+    "lines": 51_686, "modules": 281, "lines of the model": 15_338, "modules of the model": 61,
+    "compiled functions": 110, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600

@@ -9,10 +9,10 @@ import numpy as np
 
 from sweep.model import shot as model
 from sweep.model import waveform, window
-from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE
 from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.shot import prepare
 
 Parameters = Mapping[str, float | int | str]
 

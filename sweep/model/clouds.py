@@ -15,7 +15,6 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
@@ -25,6 +24,7 @@ from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.ray_error import ray_error
 from sweep.model.returns import Groups, Returns, draw_returns, groups
+from sweep.model.shot import prepare_cast
 
 STRETCH = 1 << 20
 """Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
@@ -69,7 +69,7 @@ def cloud(
     effects : collection of str
         Names of the effects that are simulated.
     flags : (n,) uint32 ndarray, optional
-        As of :func:`sweep.model.chain.prepare_cast`.
+        As of :func:`sweep.model.shot.prepare_cast`.
     estimates_rays : bool
         Whether ``beamlets_error`` is estimated, for which powers have to add (0 where not).
 

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model import reflectance
-from sweep.model.chain import prepare_cast
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.atmosphere import PATH_ELEVATION
 from sweep.model.effects.catalogue import CORE
@@ -21,8 +19,9 @@ from sweep.model.geometry.platform import Flight, State
 from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
 from sweep.model.geometry.scanner import PointingJitter, Scanner, beamlet_rays
-from sweep.model.ground import Cast, Footprints
+from sweep.model.ground import Cast, Footprints, backscatter
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.shot import prepare_cast
 
 HEIGHT = "atmosphere.target_height"
 SUNLIGHT = "target.solar_irradiance"
@@ -245,7 +244,7 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
     back = np.zeros_like(sent)
     for law in {each.law for each in surfaces}:
         by_law = np.array([each.law == law for each in surfaces])[surface]
-        scattered = reflectance.backscatter(law, eyepoints.cos_incidence)
+        scattered = backscatter(law, eyepoints.cos_incidence)
         np.copyto(back, scattered, where=hit & by_law)
     echo = sent * back / ((1 + relative) * (1 + relative))
     axis = surface[np.arange(len(surface)), eyepoints.reference]

@@ -10,14 +10,22 @@ they add as amplitudes with the phases of a smooth plane, a lattice cancels: off
 its phases step evenly from row to row, and the sum is nearly nothing but at grating lobes. A
 sunflower has no rows; its sum fades like the random one that rough ground would give, which is
 what [T 4.2] describes (first dips of Pd at some 4 km).
+
+Moments of a plane's lines: with u the angle of a beamlet along the slope times cot(grazing), (1 +
+d)/(1 + u) is R_b/R_0 and ((1 + u)/|d|)^m its echo over that on the axis, d its direction, whose
+length on the axis is 1, and m = 2 for laws that are even in all directions, 3 for Lambert's. The
+pattern has exactly the beam's covariance, so that u has the mean 0 and the rms q = (divergence/4)
+cot(grazing). Where a beamlet may pass over the horizon moments are infinite.
 """
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sweep.model.quadrature import gaussian_rule
+from sweep.model.constants import SPEED_OF_LIGHT
 
 PATTERNS = ("hexagonal", "sunflower", "line", "square")
 
@@ -26,6 +34,30 @@ REACH = 3.0
 
 _TILT = 0.191
 """Rotation [rad] of the lattice against the slope, so that no two rows project onto each other."""
+
+
+HERMITE = 15
+"""Nodes up to which the rule is Gauss and Hermite's."""
+
+RULE_REACH = 7.0
+"""Standard deviations on either side over which more nodes step evenly; 3e-12 is beyond."""
+
+
+@lru_cache(maxsize=64)
+def gaussian_rule(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights for the mean over the standard normal distribution, (number,) each.
+
+    The weights sum to 1; the mean is 0 and, from two nodes on, the variance 1.
+    """
+    if number <= HERMITE:
+        nodes, weights = np.polynomial.hermite_e.hermegauss(number)
+    else:
+        nodes = np.linspace(-RULE_REACH, RULE_REACH, number)
+        weights = np.exp(-0.5 * nodes**2)
+    weights /= weights.sum()
+    if number > HERMITE:
+        nodes /= math.sqrt((weights * nodes**2).sum())
+    return nodes, weights
 
 
 @lru_cache(maxsize=32)
@@ -175,3 +207,104 @@ def velocity_offsets(
     stretch = square / (1 + np.sqrt(1 + square))  # |d| - 1
     closing = np.asarray(transverse)[:, None] * y - np.asarray(radial)[:, None] * stretch
     return np.asarray(closing / (1 + stretch))
+
+
+class Moments(NamedTuple):
+    """Offsets from the beam's axis, weighted by echo power: sizes of mean, rms and extreme."""
+
+    mean: np.ndarray | float
+    rms: np.ndarray | float
+    extreme: np.ndarray | float
+
+    def times(self, factor: np.ndarray) -> "Moments":
+        """The same of what is so many times as far; infinite ones may be multiplied by 0."""
+        return Moments(*(np.minimum(value, 1e200) * factor for value in self))
+
+    def plus(self, other: "Moments") -> "Moments":
+        """Bounds on those of sums."""
+        return Moments(*(one + another for one, another in zip(self, other, strict=True)))
+
+
+NO_SPREAD = Moments(0.0, 0.0, 0.0)
+
+
+def reach_of(number: int, pattern: str) -> float:
+    """Largest angle of a beamlet off the axis, in standard deviations."""
+    points, _ = beamlets(number, pattern)
+    return float(np.sqrt((points**2).sum(axis=0)).max())
+
+
+def plane_range_moments(
+    *, grazing_angle: ArrayLike, beam_divergence: ArrayLike, number: int, pattern: str
+) -> Moments:
+    """Bounds on (R_b - R_0)/R_0 of a beam on a plane, weighted by echo power.
+
+    u has the rms q; the rest bounds Taylor's remainders.
+    """
+    if number == 1:
+        return NO_SPREAD
+    radius, sigma = reach_of(number, pattern), np.asarray(beam_divergence, float) / 4
+    rms = sigma / np.tan(grazing_angle)
+    widest, bulge = radius * rms, (radius * sigma) * (radius * sigma) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inside, side = 1 - widest, 1 + widest
+        heavier = side * side * side * np.exp(6 * bulge)
+        lean = 3 * rms * rms * side * side * np.exp(6 * bulge) + 6 * rms * bulge
+        mean = lean + (rms * rms + sigma * sigma) * heavier / inside
+        far = (rms + sigma * np.sqrt(bulge)) * np.sqrt(heavier) / inside
+        extreme = (widest + bulge) / inside
+    return Moments(*(np.where(widest < 1, value, np.inf) for value in (mean, far, extreme)))
+
+
+def plane_velocity_moments(
+    *,
+    across: ArrayLike,
+    along: ArrayLike,
+    grazing_angle: ArrayLike,
+    beam_divergence: ArrayLike,
+    number: int,
+    pattern: str,
+) -> Moments:
+    """Bounds on the beamlets' radial velocities less the axis's [m/s], at a velocity off the beam.
+
+    A beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1), |d|^2 = 1 + x^2; its
+    weight is that of :func:`plane_range_moments`.
+    """
+    if number == 1:
+        return NO_SPREAD
+    radius, sigma = reach_of(number, pattern), np.asarray(beam_divergence, float) / 4
+    across, along = np.abs(across), np.abs(along)
+    slope = sigma / np.tan(grazing_angle)
+    side, bulge = 1 + np.minimum(radius * slope, 1.0), (radius * sigma) * (radius * sigma) / 2
+    heavier = side * side * side * np.exp(6 * bulge)
+    lean = sigma * (3 * slope * heavier + 8 * radius * bulge)
+    return Moments(
+        across * lean + along * (sigma * sigma) * heavier,
+        (across * sigma + along * sigma * np.sqrt(bulge)) * np.sqrt(heavier),
+        across * radius * sigma + along * bulge,
+    )
+
+
+def plane_echo_ratio(
+    law: str, *, grazing_angle: np.ndarray, beam_divergence: np.ndarray, number: int, pattern: str
+) -> np.ndarray:
+    """Echo of all beamlets on a plane over what they would have on the axis, at the most.
+
+    As u has the mean 0 and this rms, it differs from 1 in the second order, upwards by the slope
+    and downwards by the beamlets' own length: that is taken for more too.
+    """
+    power, sigma = 3 if law == "lambert" else 2, beam_divergence / 4
+    rms = sigma / np.tan(grazing_angle)
+    widest = reach_of(number, pattern) * rms
+    bend = power * (power - 1) / 2 + (widest if power == 3 else 0.0)
+    most = np.minimum(1 + widest, 1 / np.sin(grazing_angle)) ** power
+    more = 1 + bend * rms * rms + power * sigma * sigma
+    return np.asarray(np.where(widest < 1, more, most))
+
+
+def velocity_to_bins(
+    *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
+) -> np.ndarray:
+    """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta stretches."""
+    beat = np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)
+    return np.asarray((2 / SPEED_OF_LIGHT) * (np.asarray(carrier) + beat) / np.asarray(bin_width))

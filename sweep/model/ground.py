@@ -1,13 +1,60 @@
-"""What a beam meets: a flat plane, or whatever rays have found; as one line or as beamlets."""
+"""Ground that a beam meets: a flat plane, or whatever rays have found; as one line or as beamlets.
 
+Reflectance laws: a surface of bidirectional reflectance f [1/sr] that fills a beam of power P at
+incidence i sends the intensity f P cos(i) [W/sr] back along it: the beam spreads over 1/cos(i) of
+its cross-section and the patch, seen from the beam, shrinks to cos(i) of itself again. So Lambert's
+f = rho/pi gives rho cos(i)/pi.
+
+Lommel and Seeliger's law is that of dark, porous ground (regolith), where light that has been
+scattered once outshines all other [Hapke 1981; 2012, ch. 10]:
+
+    f = w / (4 pi) / (cos i + cos e) * p(g) (1 + B(g))
+
+with the single-scattering albedo w, the phase function p and the opposition surge B of shadows
+that hide behind their grains. A lidar looks at the phase angle g = 0 and i = e, where f cos(i) is
+w p(0) (1 + B(0)) / (8 pi) whatever the incidence: a ball of it shines as evenly as the full Moon.
+"""
+
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import footprint, reflectance
+from sweep.model import footprint
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.footprint import Moments
+
+LAWS = ("thesis", "lambert", "lommel_seeliger")
+
+
+def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
+    """Backscattered fraction per steradian of a surface of reflectance 1 [1/sr].
+
+    Parameters
+    ----------
+    law : str
+        ``thesis``: the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence.
+        ``lambert``: cos(incidence)/pi.
+        ``lommel_seeliger``: 1/pi whatever the incidence; the reflectance is the normal albedo
+        w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition surge), which
+        at normal incidence is what Lambert's law means by it.
+    cos_incidence : ndarray
+        Cosine of the incidence angle, 0..1.
+
+    Raises
+    ------
+    ValueError
+        `law` is none of these.
+    """
+    if law == "thesis":
+        return np.full_like(cos_incidence, 0.5 / math.pi)
+    if law == "lambert":
+        return cos_incidence / math.pi
+    if law == "lommel_seeliger":
+        return np.full_like(cos_incidence, 1 / math.pi)
+    raise ValueError(f"no reflectance law {law!r}: choose from {', '.join(LAWS)}")
 
 
 class Footprints(NamedTuple):
@@ -54,7 +101,7 @@ class Plane:
     def axis(self, size: int) -> Footprints:
         """One line for each point: a row for each distinct grazing angle."""
         angles, row = np.unique(self._columns[0], return_inverse=True)
-        echo = reflectance.backscatter(self._law, np.sin(angles))[:, None]
+        echo = backscatter(self._law, np.sin(angles))[:, None]
         nothing = np.zeros_like(echo)
         return Footprints(_rows(row, size), nothing, nothing, echo)
 
@@ -68,7 +115,7 @@ class Plane:
             number=self._number,
             pattern=self._pattern,
         )
-        echo = weights * reflectance.backscatter(self._law, cos_incidence) / (1 + offset) ** 2
+        echo = weights * backscatter(self._law, cos_incidence) / (1 + offset) ** 2
         closing = footprint.velocity_offsets(
             radial=shapes[2], transverse=shapes[3], beam_divergence=shapes[1],
             number=self._number, pattern=self._pattern,
@@ -118,3 +165,49 @@ def pattern(p: Mapping[str, Any]) -> str:
 
 def _rows(row: np.ndarray, size: int) -> np.ndarray:
     return np.broadcast_to(row.ravel(), size).astype(np.int64)
+
+
+class Extent(NamedTuple):
+    """A footprint beside the line on its axis, by point."""
+
+    echo: np.ndarray
+    """Of the bare line, for a reflectance of 1 [1/sr]."""
+    echo_ratio: np.ndarray | float
+    """Echo of all beamlets over that of the bare line."""
+    ranges: Moments
+    """Of (R_b - R_0) / R_0."""
+    own_ranges: Moments
+    """Likewise, of the beamlets on the axis's surface only."""
+    velocities: Moments
+    """Of the beamlets' radial velocities less the axis's [m/s]."""
+    gain: np.ndarray | float = 1.0
+    """Most that all beamlets' amplitudes make over the bare line's: all in phase, or as powers."""
+    beside: np.ndarray | float = 0.0
+    """Share of the echo that comes from other surfaces than the axis's, 0..1."""
+    apart: np.ndarray | float = 0.0
+    """Largest |R_b - R_0| / R_0 there."""
+
+
+def of_rays(cast: Cast) -> Extent:
+    """Footprints that rays have found."""
+    _, offset, doppler, echo = cast.beamlets
+    beside = cast.beside
+    whole = echo.sum(axis=1)
+    share = echo / np.where(whole > 0, whole, 1.0)[:, None]
+    ranges = _moments(offset, share)
+    moved = _moments(doppler, share).times(np.asarray(SPEED_OF_LIGHT / 2))
+    gain = np.sqrt(share).sum(axis=1)
+    if beside is None or not beside.any():
+        return Extent(whole, 1.0, ranges, ranges, moved, gain)
+    other = np.where(beside, share, 0.0)
+    own = share - other
+    rest = own.sum(axis=1)
+    own_ranges = _moments(offset, own / np.where(rest > 0, rest, 1.0)[:, None])
+    apart = np.where(other > 0, np.abs(offset), 0.0).max(axis=1)
+    return Extent(whole, 1.0, ranges, own_ranges, moved, gain, other.sum(axis=1), apart)
+
+
+def _moments(values: np.ndarray, weight: np.ndarray) -> Moments:
+    weighted = weight * values
+    extreme = np.where(weight > 0, np.abs(values), 0.0).max(axis=1)
+    return Moments(np.abs(weighted.sum(axis=1)), np.sqrt((weighted * values).sum(axis=1)), extreme)

@@ -1,7 +1,7 @@
 """Points made ready for the spectrum: link budget, receiver noise, and one line on the beam's axis.
 
 What is prepared here is the least that any shot has. Everything else is an effect
-(:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.chain`.
+(:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.shot`.
 
 Points that share their categories (architecture, window, law, sizes ...) are prepared together; a
 footprint's geometry is worked out once and serves every point that has it, whatever its
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, link, noise, receiver, waveform
+from sweep.model import detection, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.ground import Ground
@@ -61,17 +61,17 @@ def _noise(architecture: str, values: Mapping[str, np.ndarray]) -> ReceiverNoise
     def some(*names: str) -> dict[str, np.ndarray]:
         return {name: values[name] for name in names}
 
-    bandwidth = receiver.electrical_bandwidth(**some("detector_bandwidth", "amplifier_bandwidth"))
+    bandwidth = link.electrical_bandwidth(**some("detector_bandwidth", "amplifier_bandwidth"))
     scale = (
-        noise.current_scale(architecture, noise_figure=values["noise_figure"])
+        link.current_scale(architecture, noise_figure=values["noise_figure"])
         * values["transimpedance"] ** 2
     )
-    per_watt = noise.shot_noise(
+    per_watt = link.shot_noise(
         power=1.0,
         electrical_bandwidth=bandwidth,
         **some("apd_gain", "excess_noise_factor", "responsivity"),
     )
-    currents = noise.receiver_currents(
+    currents = link.receiver_currents(
         architecture, electrical_bandwidth=bandwidth, **some(*_CURRENTS)
     )
     sources = {source: np.asarray(value * scale) for source, value in currents.items()}
@@ -260,7 +260,7 @@ class Shots:
 
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
         energy = np.asarray(self.window.energy)
-        return noise.bin_deviation(noise_variance=variance, window_energy=energy)
+        return link.bin_deviation(noise_variance=variance, window_energy=energy)
 
     @cached_property
     def footprint(self) -> np.ndarray:

@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sweep.model.chain import SHARED, assembled, nodes
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane
 from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.resolution import resolved_categories
+from sweep.model.shot import SHARED, assembled, nodes
 
 ROWS = 4096
 """Draws that are prepared at once, of all points together."""
@@ -66,7 +66,7 @@ def realise(
     Parameters
     ----------
     parameters, effects
-        As of :func:`sweep.model.chain.prepare`.
+        As of :func:`sweep.model.shot.prepare`.
     keys : (n, 2) uint64
         Random key of each point.
     first_draw, draws : int

@@ -27,13 +27,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model.accuracy import COUNTED, Accuracy, bounded_mean, half_width
-from sweep.model.chain import prepare
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, is_noisy
 from sweep.model.noisy_spectra import DEFAULTS, VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.realisations import ROWS, Means, add, certain, random_effects, realise
-from sweep.model.shot import evaluate, statistics
+from sweep.model.shot import evaluate, prepare, statistics
 
 PIECE = 1 << 16
 """Draws of a point that are taken at once where nothing but noise is random."""

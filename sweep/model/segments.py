@@ -14,7 +14,7 @@ from numba import njit
 
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.effects.gaussian_line import gaussian_shifts
+from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.leakage import MOST_POINTS, inspect, of_bins
 from sweep.model.line_shape import Shapes
 from sweep.model.lines import (

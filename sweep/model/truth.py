@@ -10,7 +10,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from sweep.model import receiver, window
+from sweep.model import link, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
 from sweep.model.preparation import Shots
@@ -84,7 +84,7 @@ def analytic_record(
     cycles = -carrier * change + sign * rate * chirped
     start = _start_phase(sign, carrier, rate, range_0, further)
     beat = carrier * beta - sign * rate * delay_0 * (1 + beta)
-    gain = receiver.transfer(
+    gain = link.transfer(
         np.array(beat),
         detector_bandwidth=_at(shots.detector_bandwidth, i),
         amplifier_bandwidth=_at(shots.amplifier_bandwidth, i),

@@ -17,9 +17,8 @@ from sweep.analysis.cells import Side
 from sweep.analysis.cuts import RANGE, coordinate_of
 from sweep.analysis.figures import Study
 from sweep.analysis.selection import Points
-from sweep.model.chain import prepare
-from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.flags import names_of
+from sweep.model.effects.catalogue import EFFECTS, names_of
+from sweep.model.shot import prepare
 from sweep.report import lines, looks, wording
 from sweep.report.choosing import parts
 from sweep.report.page import Chart, Control, when

@@ -16,7 +16,7 @@ from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.quantities import KINDS, kinds, label, shown
 from sweep.analysis.scenes.recording import Thinned
-from sweep.model.effects.flags import names_of
+from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.report import looks, wording
 from sweep.report.clouds import Seen

@@ -10,7 +10,7 @@ import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.effects.solar_background import SUN_RADIUS
+from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.spec.axes import Axis
 from sweep.spec.effect_fields import OFF, ON
 from sweep.spec.fields import rules_of

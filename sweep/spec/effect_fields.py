@@ -74,18 +74,16 @@ def rule_of_parameter(parameter: Parameter) -> Rule:
         return Choice(about=parameter.about, options=parameter.options)
     return Numeric(
         about=parameter.about,
-        si_unit=parameter.si_unit,
+        si_unit=parameter.unit,
         example=parameter.example,
-        above=parameter.above,
-        at_least=parameter.at_least,
-        at_most=parameter.at_most,
-        whole=parameter.whole,
+        at_least=parameter.limits[0],
+        at_most=parameter.limits[1],
     )
 
 
 def _field(parameter: Parameter) -> tuple[Any, float | int | str]:
     """Annotation and default of a field, as pydantic takes them."""
-    kind: Any = str if parameter.options else int if parameter.whole else float
+    kind = str if parameter.options else float
     return Annotated[kind, rule_of_parameter(parameter)], parameter.default
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import numpy as np
 
 import sweep.spec.quantities as of
-from sweep.model.reflectance import LAWS
+from sweep.model.ground import LAWS
 from sweep.scenes.raster import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import File, Several

@@ -3,7 +3,7 @@
 from typing import Annotated
 
 from sweep.model.accuracy import AUTOMATIC, COUNTED
-from sweep.model.reflectance import LAWS
+from sweep.model.ground import LAWS
 from sweep.spec.effect_fields import with_modes, with_parameters
 from sweep.spec.instrument import Part
 from sweep.spec.quantities import count

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.flags import flag_attributes, flags_apart, flags_of, names_of
+from sweep.model.effects.catalogue import FLAGS_APART, flag_attributes, flags_of, names_of
 from sweep.tasks.study import ArrayLayout
 from sweep.tasks.tiles import Alike, Tiles
 
@@ -50,7 +50,7 @@ class Called(NamedTuple):
 
     def together(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
         """Points that are computed together, the effects of all of them, and their flags."""
-        apart = self.flags & flags_apart()
+        apart = self.flags & FLAGS_APART
         for each in np.unique(apart):
             index = np.flatnonzero(apart == each)
             own = self.flags[index]
@@ -203,8 +203,8 @@ class ShotsCalling:
         from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
         from sweep.model.effects.points import Points
-        from sweep.model.effects.spread import of_rays
         from sweep.model.eyepoints import seen_ground
+        from sweep.model.ground import of_rays
 
         shots, ground = seen_ground(eyepoints, DEFAULTS | dict(self._parameters), self._surfaces)
         points = Points(shots, of_rays(ground), rotating=self._rotating)

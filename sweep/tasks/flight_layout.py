@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.effects.flags import flag_attributes
+from sweep.model.effects.catalogue import flag_attributes
 from sweep.model.outputs import (
     CYCLES,
     NAVIGATION,

@@ -107,7 +107,7 @@ class Tiles:
         )
 
     def _is_undivided(self, axis: int) -> bool:
-        from sweep.model.chain import SHARED
+        from sweep.model.shot import SHARED
 
         return any(
             values.dtype.kind in "UO" or path in UNDIVIDED or path in SHARED

@@ -8,7 +8,7 @@ import yaml
 from drawn_studies import study
 
 import sweep
-from sweep.model.effects import relative_intensity_noise
+from sweep.model.effects import noise_sources
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.spec import Spec
 
@@ -60,5 +60,5 @@ def test_the_code_that_reads_flags_runs(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("shown", [b for b in blocks("python") if "flag_masks" not in b])
 def test_the_example_is_the_modules_own_code(shown):
-    source = Path(relative_intensity_noise.__file__).read_text(encoding="utf-8")
+    source = Path(noise_sources.__file__).read_text(encoding="utf-8")
     assert shown in source

@@ -10,7 +10,7 @@ from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
 from sweep.analysis.scenes.opening import opened
 from sweep.analysis.scenes.places import place
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.flags import names_of
+from sweep.model.effects.catalogue import names_of
 from sweep.model.pairing import TRUE
 
 

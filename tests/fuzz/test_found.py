@@ -11,9 +11,9 @@ from smaller import swiftly
 from spoilt_specs import dumped
 
 from sweep.cli import main
-from sweep.model.effects.gaussian_line import MOST_BINS, gaussian_shifts
+from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
+from sweep.model.effects.noise_sources import SUN_RADIUS, sunlight
 from sweep.model.effects.saturation import MOST_BEYOND
-from sweep.model.effects.solar_background import SUN_RADIUS, sunlight
 from sweep.model.unsupported import UnsupportedShot
 from sweep.scenes.terrain import Terrain, smooth
 from sweep.spec import SceneSpec, Spec, SpecError

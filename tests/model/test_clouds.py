@@ -7,8 +7,7 @@ from small_scenes import flight, instrument, observed, plate
 
 from sweep.model import clouds, philox
 from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES
-from sweep.model.effects.flags import flags_of, names_of
+from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES, flags_of, names_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone

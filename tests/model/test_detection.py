@@ -10,12 +10,12 @@ from scipy import integrate, stats
 
 from sweep.model import shot, truth
 from sweep.model.accuracy import AUTOMATIC
-from sweep.model.chain import prepare
 from sweep.model.crossings import MOST_TERMS, crossing_series
 from sweep.model.detection import RAYLEIGH_DEVIATION, mark, quiet_below, threshold
 from sweep.model.leakage import of_bins
 from sweep.model.marcum import excess_crossing, marcum_q1
 from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.shot import prepare
 from sweep.model.spectrum import OUT, ROOM
 from sweep.model.window import samples
 

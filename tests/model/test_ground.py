@@ -1,13 +1,13 @@
-"""Footprints on a plane with a velocity across the beam, and effects of the air in the chain."""
+"""Footprints on a plane with a velocity across the beam, and effects of the air in the shot."""
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sweep.model import chain, segments, shot, truth
+from sweep.model import segments, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.solar_background import sunlight
+from sweep.model.effects.noise_sources import sunlight
 from sweep.model.footprint import beamlets, velocity_offsets
 
 STORM = {"atmosphere.profile": "mars_storm"}
@@ -32,7 +32,7 @@ def test_doppler_spread_against_the_truth(table_4_1, phases):
     """100 m/s across and 50 urad: 1.4 bins, in the Doppler segment too."""
     moving = {"target.transverse_velocity": 100.0}
     parameters = table_4_1(phases=phases, beamlets=19, fft_size=2**14, grazing_angle=1.0) | moving
-    ((_, shots),) = chain.prepare(parameters, (*CORE, "doppler_spread"))
+    ((_, shots),) = shot.prepare(parameters, (*CORE, "doppler_spread"))
     spread = 2 / 1550e-9 * np.ptp(shots.doppler * SPEED_OF_LIGHT / 2) * 2**14 / 600e6
     assert spread == pytest.approx(2 / 1550e-9 * 100 * 1.4 * 50e-6 * 2**14 / 600e6, rel=0.1)
     for segment in range(3):

@@ -9,7 +9,6 @@ from engine import run_of_bins, shape_of
 from scipy.stats import ncx2
 
 from sweep.model import truth
-from sweep.model.chain import prepare, prepare_cast
 from sweep.model.crossings import (
     MOST_TERMS,
     added_crossings,
@@ -22,7 +21,7 @@ from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.returns import groups
 from sweep.model.segments import spectrum
-from sweep.model.shot import find
+from sweep.model.shot import find, prepare, prepare_cast
 from sweep.model.spectrum import OUT, ROOM, take_sources, weight_afar
 from sweep.model.window import COSINE_SUMS, samples, transform, window
 

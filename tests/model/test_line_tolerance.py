@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.shot import find
+from sweep.model.shot import find, prepare
 
 POINTS = 200
 PD, MAGNITUDE = 0, 2

@@ -6,12 +6,17 @@ from scipy import integrate
 from scipy.constants import c as speed_of_light
 
 from sweep.model import shot
-from sweep.model.chain import prepare
+from sweep.model.effects.noise_sources import solar_power
 from sweep.model.footprint import beamlets
-from sweep.model.link import aperture_area, echo_power_scale
-from sweep.model.noise import bin_deviation, solar_power
-from sweep.model.receiver import electrical_bandwidth, transfer
-from sweep.model.reflectance import backscatter
+from sweep.model.ground import backscatter
+from sweep.model.link import (
+    aperture_area,
+    bin_deviation,
+    echo_power_scale,
+    electrical_bandwidth,
+    transfer,
+)
+from sweep.model.shot import prepare
 
 ELECTRON, BOLTZMANN = 1.602176634e-19, 1.380649e-23
 GAIN = 7e3

@@ -10,14 +10,13 @@ from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MI
 from test_leakage import drawn_bundles as bundles
 
 from sweep.model import philox, returns, segments, truth
-from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
 from sweep.model.preparation import PhaseError
 from sweep.model.returns import groups
 from sweep.model.sampling import simulate
 from sweep.model.segments import POINTS
-from sweep.model.shot import evaluate, find
+from sweep.model.shot import evaluate, find, prepare
 from sweep.model.waveform import SIGNS
 from sweep.model.window import samples, transform
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sweep.model.accuracy import Accuracy
-from sweep.model.footprint import beamlets
-from sweep.model.quadrature import COUNTS, Spread, gaussian_rule, nodes_needed
+from sweep.model.footprint import beamlets, gaussian_rule
+from sweep.model.resolution import COUNTS, Spread, nodes_needed
 from sweep.model.window import samples
 
 MOST = Accuracy.most_beamlets

@@ -9,7 +9,7 @@ from scipy import special
 
 from sweep.model import philox, realisations
 from sweep.model.effects import pointing_jitter, scintillation
-from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.model.realisations import realise
@@ -207,10 +207,8 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     stretches = list(realise(parameters, effects, keys=keys(4), draws=DRAWS))
     (plain,) = realise(parameters, CORE, keys=keys(4), draws=1)
     power = np.concatenate([s.shots.echo_power for s in stretches]) / plain.shots.echo_power[0]
-    legs = scintillation.both_ways(
-        scintillation.Turbulence(uniform=1e-14), wavelength=1550e-9, range=3000.0,
-        lidar_height=0.0, target_height=0.0, aperture=25e-3, beam_divergence=50e-6,
-    )  # fmt: skip
+    even = scintillation.Turbulence(uniform=1e-14)
+    legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(3000.0))
     root = np.sqrt(power.size)
     assert power.mean() == pytest.approx(1, abs=5 * power.std() / root)
     square = (power - 1) ** 2

@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate
 
 from sweep.model.geometry.mesh import Surface
-from sweep.model.reflectance import LAWS, backscatter
+from sweep.model.ground import LAWS, backscatter
 
 COSINES = np.array([0.01, 0.1, 0.5, 0.9, 1.0])
 

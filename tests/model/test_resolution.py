@@ -5,10 +5,10 @@ import pytest
 
 from sweep.model import shot
 from sweep.model.accuracy import Accuracy
-from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.footprint import beamlets
+from sweep.model.shot import prepare
 
 NUMBER = 400
 FINE = {"footprint.beamlets": 8192, "footprint.pattern": "line", "accuracy.line_error": 1e-9}

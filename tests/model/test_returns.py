@@ -7,7 +7,6 @@ import pytest
 from scipy import ndimage, stats
 
 from sweep.model import philox, truth, waveform
-from sweep.model.chain import prepare
 from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
 from sweep.model.interpolation import interpolator
@@ -26,7 +25,7 @@ from sweep.model.returns import (
     largest_of,
 )
 from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate, find, report
+from sweep.model.shot import evaluate, find, prepare, report
 from sweep.model.window import samples, window
 
 DRAWS = 20_000

@@ -5,12 +5,11 @@ import pytest
 
 from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
-from sweep.model.chain import prepare
 from sweep.model.interpolation import noise_correlation
 from sweep.model.noisy_spectra import DETECTOR, ESTIMATOR, Methods, noise_of, signal_of
 from sweep.model.outputs import DRAW_OUTPUTS, SPECTRA_OUTPUTS
 from sweep.model.sampling import Before, simulate
-from sweep.model.shot import evaluate
+from sweep.model.shot import evaluate, prepare
 from sweep.model.truth import spectrum
 
 EFFECTS = ("doppler",)

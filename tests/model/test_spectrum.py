@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.constants import c as speed_of_light
 from scipy.special import jv
 
-from sweep.model.chain import prepare
 from sweep.model.lines import (
     AMPLITUDE_TOLERANCES,
     IM,
@@ -27,6 +26,7 @@ from sweep.model.lines import (
 )
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.segments import tangents
+from sweep.model.shot import prepare
 from sweep.model.spectrum import A_IM, A_RE, MOST_CELLS, OUT, ROOM, reach_of
 from sweep.model.spectrum import magnitudes as magnitudes_of
 from sweep.model.window import COSINE_SUMS, samples, window

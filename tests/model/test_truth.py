@@ -7,7 +7,7 @@ import pytest
 from scipy.constants import c as speed_of_light
 
 from sweep.model import segments, truth
-from sweep.model.chain import prepare
+from sweep.model.shot import prepare
 from sweep.model.window import samples
 
 AGREEMENT = 1e-9

@@ -8,7 +8,7 @@ import pytest
 from written_scenes import BOX, RICH, SPHERE, TREES, with_object, written
 from written_specs import written as grid
 
-from sweep.model.reflectance import LAWS
+from sweep.model.ground import LAWS
 from sweep.spec import SceneSpec, json_schema, load
 from sweep.spec.fields import rule_of, written_name
 from sweep.spec.reading import read_document

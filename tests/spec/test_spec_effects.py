@@ -118,8 +118,8 @@ def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data)
 
 def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
     """Both decorators read the catalogue: what is added there is in the sections."""
-    new = Parameter(path="instrument.laser.colours", about="Colours", default=2, whole=True,
-                    example="3", at_least="1")  # fmt: skip
+    new = Parameter(path="instrument.laser.colours", about="Colours", default=2.0,
+                    example="3", limits=("1", None))  # fmt: skip
     monkeypatch.setattr(sweep.spec.effect_fields, "PARAMETERS", (new,))
     monkeypatch.setattr(sweep.spec.effect_fields, "EFFECTS", EFFECTS[:1])
 

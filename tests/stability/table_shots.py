@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.chain import prepare
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.preparation import Shots
+from sweep.model.shot import prepare
 from sweep.spec import Spec
 
 ROOT = Path(__file__).parents[2]

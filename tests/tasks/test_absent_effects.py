@@ -7,10 +7,9 @@ import pytest
 from small import STUDY, small
 
 from sweep.model import footprint, line_shape
-from sweep.model.chain import nodes, prepare
-from sweep.model.effects import atmosphere, turbulence
-from sweep.model.effects.catalogue import EFFECTS, NAMES
-from sweep.model.effects.flags import names_of
+from sweep.model.effects import atmosphere, scintillation
+from sweep.model.effects.catalogue import EFFECTS, NAMES, names_of
+from sweep.model.shot import nodes, prepare
 from sweep.tasks.grid_study import GridStudy
 
 AIR = {"extinction", "backscatter", "scintillation"}
@@ -39,7 +38,7 @@ def calls(monkeypatch):
     acts = [(effect, watch(effect, "act", effect.name)) for effect in EFFECTS if effect.act]
     watch(footprint, "plane_footprint", "plane_footprint")
     watch(atmosphere, "optical_depth", "optical_depth")
-    watch(turbulence, "rytov_variance", "rytov_variance")
+    watch(scintillation, "rytov_variance", "rytov_variance")
     watch(line_shape, "find_modes", "find_modes")
     yield counted
     for effect, plain in acts:

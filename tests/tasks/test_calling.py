@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from small import small
 
-from sweep.model.effects.catalogue import EFFECTS, NAMES
-from sweep.model.effects.flags import flag_attributes, flags_of, names_of
+from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
 from sweep.tasks.calling import Called, Calling, _stretches
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy

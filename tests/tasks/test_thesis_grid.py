@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sweep.model import segments, truth
-from sweep.model.chain import prepare
-from sweep.model.shot import evaluate, find
+from sweep.model.shot import evaluate, find, prepare
 from sweep.tasks.accuracy import thesis_grid
 
 WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")

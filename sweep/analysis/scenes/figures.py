@@ -28,7 +28,7 @@ from sweep.analysis.scenes.quantities import QUANTITIES
 from sweep.analysis.scenes.recording import Interval, Recording
 from sweep.analysis.scenes.terrain import Ground
 from sweep.analysis.tabular import Block, Cell, Page
-from sweep.model.effects.flags import names_of
+from sweep.model.effects.catalogue import names_of
 from sweep.spec import SceneSpec
 from sweep.spec.scene_figures import (
     CloudFigure,

@@ -1,54 +1,47 @@
-"""The list of all effects, in the order in which they act."""
+"""All effects, in the order in which they act, and the flags that stand for them in a store."""
+
+from typing import Any
+
+import numpy as np
 
 from sweep.model.effects import (
-    acceleration,
-    backscatter,
-    chirp_nonlinearity,
+    atmosphere,
     doppler,
-    doppler_spread,
-    extinction,
     footprint,
-    footprint_phase,
-    image,
-    leakage,
     line_width,
+    noise_sources,
+    phase_errors,
     pointing_jitter,
-    quantisation,
-    range_walk,
-    relative_intensity_noise,
-    rotation,
     saturation,
     scintillation,
-    several_returns,
-    signal_shot_noise,
-    solar_background,
+    sidelobes,
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
 
 EFFECTS: tuple[Effect, ...] = (
-    footprint.EFFECT,
-    footprint_phase.EFFECT,
-    several_returns.EFFECT,
-    doppler.EFFECT,
-    doppler_spread.EFFECT,
-    rotation.EFFECT,
-    extinction.EFFECT,
-    signal_shot_noise.EFFECT,
-    solar_background.EFFECT,
-    backscatter.EFFECT,
-    relative_intensity_noise.EFFECT,
-    quantisation.EFFECT,
-    range_walk.EFFECT,
-    acceleration.EFFECT,
-    chirp_nonlinearity.EFFECT,
-    line_width.EFFECT,
-    saturation.EFFECT,
-    image.EFFECT,
-    leakage.EFFECT,
-    pointing_jitter.EFFECT,
-    speckle.EFFECT,
-    scintillation.EFFECT,
+    footprint.FOOTPRINT,
+    footprint.FOOTPRINT_PHASE,
+    footprint.SEVERAL_RETURNS,
+    doppler.DOPPLER,
+    doppler.DOPPLER_SPREAD,
+    doppler.ROTATION,
+    atmosphere.EXTINCTION,
+    noise_sources.SIGNAL_SHOT_NOISE,
+    noise_sources.SOLAR_BACKGROUND,
+    atmosphere.BACKSCATTER,
+    noise_sources.RELATIVE_INTENSITY_NOISE,
+    noise_sources.QUANTISATION,
+    phase_errors.RANGE_WALK,
+    phase_errors.ACCELERATION,
+    phase_errors.CHIRP_NONLINEARITY,
+    line_width.LINE_WIDTH,
+    saturation.SATURATION,
+    sidelobes.IMAGE,
+    sidelobes.LEAKAGE,
+    pointing_jitter.POINTING_JITTER,
+    speckle.SPECKLE,
+    scintillation.SCINTILLATION,
 )
 
 NAMES = tuple(effect.name for effect in EFFECTS)
@@ -65,3 +58,27 @@ CORE = (
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
 """Effects that the model's functions simulate if nothing is said: pure lines and their noise."""
+
+FLAGS_APART = np.uint32(sum(1 << k for k, effect in enumerate(EFFECTS) if effect.apart))
+"""Flags of effects that points with and without them are computed apart by."""
+
+
+def flags_of(kept: np.ndarray) -> np.ndarray:
+    """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
+    masks = np.uint32(1) << np.arange(kept.shape[0], dtype=np.uint32)
+    return np.bitwise_or.reduce(np.where(kept, masks[:, None], np.uint32(0)), axis=0)
+
+
+def names_of(flags: int) -> tuple[str, ...]:
+    """Names of the effects that flags stand for."""
+    return tuple(name for k, name in enumerate(NAMES) if flags >> k & 1)
+
+
+def flag_attributes() -> dict[str, Any]:
+    """Meaning of the flags in the words of the CF conventions."""
+    return {
+        "units": "1",
+        "long_name": "effects that were simulated",
+        "flag_masks": [1 << k for k in range(len(NAMES))],
+        "flag_meanings": " ".join(NAMES),
+    }

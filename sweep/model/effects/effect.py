@@ -1,13 +1,12 @@
-"""What every physical effect is to the rest: where it acts, what it can change, what it does.
+"""Physical effects to the rest of the model: where each acts, what it changes, what it does.
 
-An effect is one module with one :class:`Effect` in it, in :mod:`sweep.model.effects.catalogue`.
-Its parameters become fields of a spec by themselves; the planner asks its size at the points of
-each tile, whether the scene calls for it; :mod:`sweep.model.chain` applies it where it does. Where
-it does not, nothing of it is computed.
+Its parameters become fields of a spec. The planner asks for its size at the points of each tile;
+:mod:`sweep.model.shot` applies it where some point calls for it, and nothing of it is computed
+elsewhere. All effects are listed in :mod:`sweep.model.effects.catalogue`.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,35 +19,36 @@ if TYPE_CHECKING:
     from sweep.model.effects.points import Points, Smear
 
 STAGES = ("lines", "light", "noise", "record", "spectrum", "detection", "draws")
-"""Where in the chain effects act, in this order: on the lines of a footprint; on the light that
-comes back; on the noise; on the record and its phases; on the spectrum; on what is detected in it;
-and, draw by draw, on all of these at random."""
+"""Where effects act, in this order: on the lines of a footprint; on the light that comes back; on
+the noise; on the record and its phases; on the spectrum; on what is detected in it; and, draw by
+draw, on all of these at random."""
 
 MODES = ("auto", "on", "off")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A field that an effect brings into a spec: a number with a unit, or one of several words.
-
-    Bounds are written as a user would write them. The default is SI and means that there is
-    nothing of the effect.
-    """
+    """A field that an effect brings into a spec: a number with a unit, or one of several words."""
 
     path: str
     about: str
-    default: float | int | str
+    default: float | int | str = 0.0
+    """In SI; 0 or ``none`` means that there is nothing of the effect."""
     example: str = ""
-    si_unit: str = ""
-    above: str | None = None
-    at_least: str | None = None
-    at_most: str | None = None
-    whole: bool = False
+    limits: tuple[str, str | None] = ("", None)
+    """Least and largest value, as a user would write them."""
+    si_unit: str | None = None
+    """By default that of the least value."""
     options: tuple[str, ...] = ()
     alone: bool = True
     """Tell whether nothing else can bring the effect."""
     category: bool = False
     """Whether points are computed together only where they share it; words always are."""
+
+    @property
+    def unit(self) -> str:
+        """SI unit, empty for words and plain numbers."""
+        return self.limits[0].partition(" ")[2] if self.si_unit is None else self.si_unit
 
     @property
     def brings(self) -> bool:
@@ -81,7 +81,7 @@ class Scene(NamedTuple):
 
 
 class Realisation(NamedTuple):
-    """Which random draws of some points are asked for: point i has those of its own key."""
+    """Random draws of some points: point i has those of its own key."""
 
     keys: np.ndarray
     """(n, 2) uint64: random key of each point."""
@@ -93,13 +93,13 @@ Sized = np.ndarray | float
 
 
 class Size(NamedTuple):
-    """What leaving an effect out would change at each point, by segment or alike in all."""
+    """Changes by leaving an effect out at each point, by segment or alike in all."""
 
     magnitude: Sized = 0.0
     """Relative change of the largest bin's magnitude; from 1 on nothing is known of it."""
     added: Sized = 0.0
-    """What is besides added to that magnitude, or taken from it, as a share of what all amplitudes
-    make in phase: of sums that may cancel a share cannot be told."""
+    """Besides, what is added to that magnitude or taken from it, as a share of what all amplitudes
+    make in phase: sums that may cancel have no relative change."""
     noise: Sized = 0.0
     """Relative change of a bin's noise variance."""
     threshold_follows: bool = True
@@ -125,8 +125,7 @@ class Effect:
     size: "Callable[[Points], Size | None]"
     """What leaving it out would change at each point. None: the scene has nothing of it."""
     smear: "Callable[[Points], Smear | None] | None" = None
-    """What it does to lines over the record, for those that smear them: it is looked at before any
-    size is."""
+    """What it does to lines over the record; all smears are known before any size is asked for."""
     act: Callable[[Shots, Scene], Shots] | None = None
     """What it does to shots, once."""
     turn: Callable[[dict[str, np.ndarray], Realisation], dict[str, np.ndarray]] | None = None
@@ -154,3 +153,8 @@ class Effect:
         for parameter in brought:
             absent = absent & np.equal(parameters[parameter.path], parameter.default)
         return absent
+
+
+def noisier(shots: Shots, **variances: np.ndarray) -> Shots:
+    """Shots with further sources of noise: variances at the ADC [V^2] by source."""
+    return replace(shots, noise_sources=shots.noise_sources | variances)

@@ -14,31 +14,40 @@ exp(i (theta(t - tau) - theta(t))) has the autocorrelation
 
     exp(-Gamma min(|T|, tau)) = exp(-Gamma tau) + [exp(-Gamma |T|) - exp(-Gamma tau)]_{|T| < tau}
 
-a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest, whose spectrum is
-
-    S(f) = 2 Gamma / (Gamma^2 + w^2) [1 - e^{-Gamma tau} (cos w tau + Gamma / w sin w tau)]
-
-w = 2 pi f, per Hz, two-sided about the line. A record shorter than the delay sees lags below its
+a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest, which is taken at its
+height under the line. A record shorter than the delay sees lags below its
 own length only: there the record's length takes the delay's place in the split.
 """
 
+import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.footprint import by_power
-from sweep.model.effects.gaussian_line import DEVIATION_OF_FWHM
-from sweep.model.effects.phase_sizes import added, means
-from sweep.model.effects.points import Points, Smear
-from sweep.model.preparation import Shots
+from sweep.model.effects.phase_errors import added, means
+from sweep.model.effects.points import Points, Smear, by_power
+from sweep.model.preparation import LASER, Shots
+from sweep.model.unsupported import UnsupportedShot
 from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
+
+DEVIATION_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
+"""Standard deviation of a Gaussian over its full width at half maximum."""
+
+TOLERANCE = 1e-12
+"""Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
+
+MOST_BINS = 500
+"""Standard deviation of a Gaussian line [bins of fs/L] that shifts stand for."""
+
+
+_gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
 _GONE = 40.0
 """Gamma T from where exp(-Gamma T) is nothing."""
@@ -51,6 +60,58 @@ _SIGMAS = 6.0
 
 _MOST_NOISE = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
+
+
+class Shifts(NamedTuple):
+    """Frequencies over which |X|^2 is averaged."""
+
+    offset: np.ndarray
+    """(n, k): shifts of all lines [bins of fs/L]."""
+    weight: np.ndarray
+    """(n, k): weights of the powers, >= 0, sum 1."""
+
+
+def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
+    """Shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
+
+    Parameters
+    ----------
+    fwhm : (n,) ndarray
+        Full width at half maximum of the beat's line [Hz], >= 0.
+    duration : (n,) ndarray
+        Length of the record L/fs [s].
+
+    Raises
+    ------
+    UnsupportedShot
+        For a line of more than :data:`MOST_BINS` bins standard deviation.
+
+    Notes
+    -----
+    One shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
+    deviation; weights of 0 fill rows with fewer than k. With
+    step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
+    summation formula; the Gaussian's tails are cut where they hold as much.
+    """
+    deviation = np.atleast_1d(DEVIATION_OF_FWHM * np.asarray(fwhm, float) * duration)
+    if deviation.max(initial=0.0) > MOST_BINS:
+        raise UnsupportedShot(
+            f"instrument.laser.line_width makes a line of {deviation.max():.3g} bins standard "
+            f"deviation, and {MOST_BINS} can be simulated: lower it, or shorten the record by "
+            "instrument.processing.fft_size"
+        )
+    room = math.sqrt(math.log(2 / TOLERANCE) / 2) / math.pi
+    per_deviation = deviation + room  # s / h
+    reach = math.sqrt(2 * math.log(1 / TOLERANCE))
+    most = int(np.ceil(reach * per_deviation.max(initial=0.0)))
+    place = np.arange(-most, most + 1) / per_deviation[:, None]
+    weight = np.where(
+        np.abs(place) <= reach + 1 / per_deviation[:, None], np.exp(-(place**2) / 2), 0.0
+    )
+    weight[deviation == 0] = np.arange(-most, most + 1) == 0
+    # One after the other, so that zeros beside them, and thus other rows, change no bit.
+    weight /= np.cumsum(weight, axis=1)[:, -1:]
+    return Shifts(deviation[:, None] * place, weight)
 
 
 def coherent_share(
@@ -68,47 +129,32 @@ def coherent_share(
     return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
 
 
-def pedestal_density(
-    frequency: np.ndarray, *, line_width: np.ndarray, delay: np.ndarray
-) -> np.ndarray:
-    """S(f): power density of the pedestal [1/Hz] about a line of power 1, two-sided, >= 0.
+def density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
+    """Power density of the pedestal under a line of power 1, 2 (1 - e^-g (1 + g)) / Gamma [1/Hz].
 
     Parameters
     ----------
-    frequency, line_width, delay : ndarray
-        Distance from the line [Hz], dnu [Hz], tau [s]; they broadcast.
+    line_width, delay : ndarray
+        dnu [Hz], > 0, and tau [s]; g = Gamma tau.
     """
-    # The bracket is summed from small differences: written out, it would cancel.
     gamma = 2 * np.pi * np.asarray(line_width, float)
-    omega = 2 * np.pi * np.asarray(frequency, float)
-    g, angle = gamma * delay, omega * delay
-    grown = -np.expm1(-g) - g * np.exp(-g)  # 1 - e^{-g} (1 + g)
+    g = gamma * delay
+    grown = -np.expm1(-g) - g * np.exp(-g)
+    # the bracket would cancel for small g
     grown = np.where(g < 0.02, g * g * (1 / 2 - g * (1 / 3 - g * (1 / 8 - g / 30))), grown)
-    cosine = 2 * np.sin(angle / 2) ** 2  # 1 - cos
-    sine = np.where(np.abs(angle) < 1e-4, angle**2 / 6, 1 - np.sinc(angle / np.pi))
-    bracket = grown + np.exp(-g) * (cosine + g * sine)
-    square = gamma**2 + omega**2
-    safe = np.where(square > 0, square, 1.0)
-    return np.where(square > 0, 2 * gamma * bracket / safe, 0.0)
+    return np.where(gamma > 0, 2 * gamma * grown / np.where(gamma > 0, gamma**2, 1.0), 0.0)
 
 
-def pedestal_power(
-    y: np.ndarray,
-    *,
-    line_width: np.ndarray,
-    delay: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
+def power_under_line(
+    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
-    """Mean |X|^2 that the pedestal leaves in bins, over |C|^2 of its line, (n, m), >= 0.
+    """Mean |X|^2 that the pedestal leaves in its line's bin, over |C|^2 of the line, (n,), >= 0.
 
-    A line of weight C (|C| = a/2) has mean bin power |C|^2 times (coherent share x |W(y)|^2 +
+    A line of weight C (|C| = a/2) has mean bin power |C|^2 times (coherent share x |W(0)|^2 +
     this). It adds as noise does: circular, and new in every record.
 
     Parameters
     ----------
-    y : (n, m) ndarray
-        Bins from their line [bins of fs/L].
     line_width, delay, duration : (n,) ndarray
         As of :func:`coherent_share`.
     window : Window
@@ -116,39 +162,41 @@ def pedestal_power(
 
     Notes
     -----
-    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}] cos(2 pi y j / L), r the window's autocorrelation,
-    is taken as it stands where few lags are left of it; else as the integral over the lag, by Gauss
-    and Legendre's rule, and what its kinks at no lag and at the delay alias to, in closed form:
-    within 2e-5 of the pedestal's largest for delays from 20 samples, 1 % for a delay of less than
-    one sample.
+    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], r the window's autocorrelation, is taken as it
+    stands where few lags are left of it; else as the integral over the lag, by Gauss and Legendre's
+    rule, and what its kinks at no lag and at the delay alias to, in closed form: within 2e-5 for
+    delays from 20 samples, 1 % for a delay of less than one sample.
     """
-    y = np.atleast_2d(y)
-    y = y - window.length * np.rint(y / window.length)
-    gamma, lag = (np.broadcast_to(a, len(y)) for a in _lag(line_width, delay, duration))
-    power, few = np.empty(y.shape), gamma > _FEW_LAGS * window.length
+    duration = np.asarray(duration, float)
+    gamma = 2 * np.pi * np.asarray(line_width, float) * duration
+    lag = np.minimum(np.asarray(delay, float) / duration, 1.0)
+    gamma, lag = np.broadcast_arrays(np.atleast_1d(gamma), np.atleast_1d(lag))
+    power, few = np.empty(gamma.shape), gamma > _FEW_LAGS * window.length
     for rows, taken in ((few, _by_lags), (~few, _by_integral)):
         if rows.any():
-            power[rows] = taken(y[rows], gamma[rows], lag[rows], window)
+            power[rows] = taken(gamma[rows], lag[rows], window)
     return power
 
 
-def _by_lags(y: np.ndarray, gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
+def _by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
     """The sum over the lags that are left, the first one by one."""
     j = np.arange(min(int(_GONE / _FEW_LAGS), window.length))
     gone = (gamma / window.length)[:, None] * j
     left = np.maximum((gamma * lag)[:, None] - gone, 0.0)
     value = np.exp(-gone) * -np.expm1(-left) * autocorrelation(window)(j)
     value[:, 1:] *= 2
-    turns = 2 * np.pi / window.length * y[:, :, None] * j
-    return np.asarray((value[:, None] * np.cos(turns)).sum(axis=-1))
+    return np.asarray(value.sum(axis=-1))
 
 
-def _by_integral(y: np.ndarray, gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """The integral over the lag, and what its kinks alias to."""
+def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
+    """The integral over the lag, and what its kinks alias to.
+
+    The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with
+    B_2(x) = x^2 - x + 1/6.
+    """
     length = window.length
     reach = np.minimum(lag, _GONE / np.maximum(gamma, 1e-300))
-    nodes = 96 + int(4 * np.abs(y).max(initial=0.0) * reach.max(initial=0.0))
-    x, weight = _gauss_legendre(64 * (nodes // 64 + 1))
+    x, weight = _gauss_legendre(128)
     time = reach[:, None] * (x + 1) / 2
     value = np.exp(-gamma[:, None] * time) * -np.expm1(-gamma[:, None] * (lag[:, None] - time))
     r = autocorrelation(window)
@@ -157,33 +205,9 @@ def _by_integral(y: np.ndarray, gamma: np.ndarray, lag: np.ndarray, window: Wind
     per_sample, left = gamma / length, np.exp(-gamma * lag)
     at_none = 2 * (r(0.0, 1) * (1 - left) - per_sample * r(0.0))
     at_delay = per_sample * left * r(lag * length)
-    power = np.empty(y.shape)
-    for i in range(y.shape[1]):
-        turn = 2 * np.pi * y[:, i]
-        power[:, i] = (value * np.cos(turn[:, None] * time)).sum(axis=1)
-        power[:, i] -= at_none * _aliases(turn / length, np.zeros_like(lag))
-        power[:, i] -= 2 * at_delay * _aliases(turn / length, lag * length)
-    return power
-
-
-@lru_cache(maxsize=32)
-def _gauss_legendre(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.polynomial.legendre.leggauss(nodes)
-
-
-def _aliases(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Sum over m != 0 of cos((k + 2 pi m) x) / (k + 2 pi m)^2, k rad a sample, x samples.
-
-    With m = 0 the sum is the straight line between its values at whole x, for its second
-    derivative is a comb; at no k it is B_2(x - floor(x)) / 2, B_2(x) = x^2 - x + 1/6.
-    """
-    below = np.floor(place)
-    x = place - below
-    plain = np.abs(turn) < 1e-4
-    k = np.where(plain, 1.0, turn)
-    line = (1 - x) * np.cos(k * below) + x * np.cos(k * (below + 1))
-    found = line / (4 * np.sin(k / 2) ** 2) - np.cos(k * place) / k**2
-    return np.where(plain, np.cos(turn * place) * (x * x - x + 1 / 6) / 2, found)
+    past = lag * length - np.floor(lag * length)
+    power = value.sum(axis=1) - at_none * (1 / 6 / 2)
+    return np.asarray(power - 2 * at_delay * ((past * past - past + 1 / 6) / 2))
 
 
 @lru_cache(maxsize=16)
@@ -197,18 +221,7 @@ def autocorrelation(window: Window) -> "CubicSpline":
     return CubicSpline(np.arange(window.length + 1), r)
 
 
-def _lag(
-    line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gamma times the record's length, and the delay over that length, 1 at the most."""
-    duration = np.asarray(duration, float)
-    gamma = 2 * np.pi * np.asarray(line_width, float) * duration
-    lag = np.minimum(np.asarray(delay, float) / duration, 1.0)
-    gamma, lag = np.broadcast_arrays(np.atleast_1d(gamma), np.atleast_1d(lag))
-    return gamma, lag
-
-
-_WIDTH, _SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
+_WIDTH, _SHAPE = LASER + "line_width", LASER + "line_shape"
 
 
 def _deviation(points: Points) -> np.ndarray:
@@ -217,14 +230,14 @@ def _deviation(points: Points) -> np.ndarray:
 
 
 def smear(points: Points) -> Smear | None:
-    """How far a Gaussian line puts light."""
+    """Reach of a Gaussian line."""
     if not points.has(_WIDTH) or points.word(_SHAPE) != "gaussian":
         return None
     return Smear(reach=_SIGMAS * _deviation(points))
 
 
 def size(points: Points) -> Size | None:
-    """What leaving the width out changes of the detecting bins.
+    """Change of the detecting bins by leaving the width out.
 
     The mean power under a Gaussian line departs from |X|^2 by at most (2 pi s)^2 var_w (sum |w|)^2,
     s the deviation and var_w the variance of the place in the record under |w|. A Lorentzian one's
@@ -251,7 +264,7 @@ def _lorentzian(points: Points) -> Size:
     width, delay = points[_WIDTH], np.minimum(points.delay, points.record_duration)
     share = coherent_share(line_width=width, delay=delay, duration=np.asarray(np.inf))
     most = np.minimum(width, _MOST_NOISE / (2 * np.pi * delay))
-    density = pedestal_density(np.array(0.0), line_width=most, delay=delay)
+    density = density_under_line(line_width=most, delay=delay)
     ratio = points.footprint.echo_ratio
     beat = points.beat * (ratio if points.architecture == "direct" else np.sqrt(ratio))
     cnr = beat**2 / points.noise_variance  # with its image
@@ -263,10 +276,7 @@ def _lorentzian(points: Points) -> Size:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """A Gaussian line of the beat; or a pure line, dimmed, over a pedestal of noise.
-
-    The pedestal is taken at its height under the lines.
-    """
+    """A Gaussian line of the beat; or a pure line, dimmed, over a pedestal of noise."""
     width = np.asarray(scene.parameters[_WIDTH], float)
     if str(scene.parameters[_SHAPE]) == "gaussian":
         return replace(shots, gaussian_width=width + np.zeros(shots.size))
@@ -276,7 +286,7 @@ def act(shots: Shots, scene: Scene) -> Shots:
         "delay": delay,
         "duration": shots.record_duration,
     }
-    below = pedestal_power(np.zeros((shots.size, 1)), window=shots.window, **timing)[:, 0]
+    below = power_under_line(window=shots.window, **timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
         shots,
@@ -285,7 +295,7 @@ def act(shots: Shots, scene: Scene) -> Shots:
     )
 
 
-EFFECT = Effect(
+LINE_WIDTH = Effect(
     name="line_width",
     about="width of the laser's line",
     stage="record",
@@ -296,11 +306,8 @@ EFFECT = Effect(
         Parameter(
             path=_WIDTH,
             about="Full width at half maximum of the laser's line; Gaussian: of the beat's",
-            si_unit="Hz",
-            default=0.0,
             example="10 kHz",
-            at_least="0 Hz",
-            at_most="1e15 Hz",
+            limits=("0 Hz", "1e15 Hz"),
         ),
         Parameter(
             path=_SHAPE,

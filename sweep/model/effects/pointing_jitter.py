@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Size
-from sweep.model.effects.footprint import by_power
-from sweep.model.effects.points import Points, Smear
-from sweep.model.effects.spread import NO_SPREAD, reach_of
+from sweep.model.effects.points import Points, Smear, by_power
+from sweep.model.footprint import NO_SPREAD, reach_of
 from sweep.model.philox import STREAM_POINTING_JITTER, normals, uniforms
 
 RARE = 1e-6
@@ -37,7 +36,7 @@ _JITTER = "target.pointing_jitter"
 
 
 class Turned(NamedTuple):
-    """What a turned beam meets, each of the broadcast shape; nan where it misses the plane."""
+    """Geometry of a turned beam, each of the broadcast shape; nan where it misses the plane."""
 
     range: np.ndarray
     """[m]"""
@@ -88,16 +87,11 @@ def turned(
     )
 
 
-class _Turn(NamedTuple):
-    """What the furthest turn but for few makes of beams, down to their lowest beamlets."""
+def _furthest(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Ratio of ranges, less 1, and bins by which lines move, by the furthest turn but for few.
 
-    ratio: np.ndarray
-    """Of ranges, less 1; infinite where a beamlet may pass over the horizon."""
-    bins: np.ndarray
-    """By which lines move, by segment."""
-
-
-def _furthest(points: Points) -> _Turn:
+    Down to the lowest beamlets; infinite where one may pass over the horizon.
+    """
     off = points[_JITTER] * math.sqrt(2 * math.log(1 / RARE))
     rim: np.ndarray | float = 0.0
     if points.number > 1:
@@ -111,18 +105,18 @@ def _furthest(points: Points) -> _Turn:
     doppler = np.abs(points.radial_velocity) * off**2 / 2 + across * off
     ratio = np.where(off > 0, np.maximum(ratio, off**2 / 2), 0.0)
     bins = points.per_range * np.minimum(ratio, 1e6) + points.per_velocity * doppler
-    return _Turn(ratio, bins)
+    return ratio, bins
 
 
 def smear(points: Points) -> Smear | None:
-    """How far draws throw lines off."""
+    """Reach of lines that draws throw off."""
     if not points.has(_JITTER):
         return None
-    return Smear(reach=_furthest(points).bins / points.margin)
+    return Smear(reach=_furthest(points)[1] / points.margin)
 
 
 def size(points: Points) -> Size | None:
-    """What leaving jitter out changes in all draws but few.
+    """Change by leaving jitter out in all draws but few.
 
     Echo powers go by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
     footprint whose phases follow its geometry may fade altogether, or not any more, and so may
@@ -167,7 +161,7 @@ def turn(p: dict[str, np.ndarray], realisation: Realisation) -> dict[str, np.nda
     }
 
 
-EFFECT = Effect(
+POINTING_JITTER = Effect(
     name="pointing_jitter",
     about="a beam that wanders from shot to shot",
     stage="draws",
@@ -178,11 +172,8 @@ EFFECT = Effect(
         Parameter(
             path=_JITTER,
             about="Standard deviation of the beam's direction, on each axis, from shot to shot",
-            si_unit="rad",
-            default=0.0,
             example="20 urad",
-            at_least="0 rad",
-            at_most="10 deg",
+            limits=("0 rad", "10 deg"),
         ),
     ),
 )

@@ -11,12 +11,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, ground, noise, reflectance, resolution, waveform
+from sweep.model import detection, ground, link, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import spread
 from sweep.model.effects.lobes import Lobe, lobe
-from sweep.model.effects.spread import Footprint, Moments
-from sweep.model.footprint import beamlets
+from sweep.model.footprint import (
+    NO_SPREAD,
+    Moments,
+    beamlets,
+    plane_echo_ratio,
+    plane_range_moments,
+    plane_velocity_moments,
+    velocity_to_bins,
+)
+from sweep.model.ground import Extent, backscatter
 from sweep.model.preparation import (
     CHIRP,
     LASER,
@@ -65,6 +72,11 @@ class Smear(NamedTuple):
 NO_SMEAR = Smear()
 
 
+def by_power(change: np.ndarray) -> np.ndarray:
+    """Relative change of a magnitude by that of its power, downwards, which is the larger one."""
+    return np.asarray(1 - np.sqrt(1 - np.minimum(change, 1.0)))
+
+
 class Points:
     """Some points that share every word.
 
@@ -73,7 +85,7 @@ class Points:
     parameters : mapping
         Dotted path to word, number or array, for every parameter, those that effects bring among
         them. Arrays broadcast against each other and have as many axes each.
-    footprint : Footprint, optional
+    footprint : Extent, optional
         What rays have found; by default that of a flat plane.
     rotating : bool
         Whether any surface belongs to a body that turns.
@@ -82,7 +94,7 @@ class Points:
     def __init__(
         self,
         parameters: Mapping[str, np.ndarray | float | str],
-        footprint: Footprint | None = None,
+        footprint: Extent | None = None,
         *,
         rotating: bool = False,
     ) -> None:
@@ -229,7 +241,7 @@ class Points:
     def deviation(self) -> np.ndarray:
         """Noise sigma of a bin, per quadrature [V]."""
         energy = np.asarray(self.window.energy)
-        return noise.bin_deviation(noise_variance=self.noise_variance, window_energy=energy)
+        return link.bin_deviation(noise_variance=self.noise_variance, window_energy=energy)
 
     @cached_property
     def threshold(self) -> np.ndarray:
@@ -261,28 +273,28 @@ class Points:
         return 2 * self.radial_velocity / SPEED_OF_LIGHT
 
     @cached_property
-    def footprint(self) -> Footprint:
+    def footprint(self) -> Extent:
         """What the beams meet, as they all have it or on a plane."""
         if (found := self._footprint) is not None:
             return found if self.by_roots else found._replace(gain=1.0)
         angle = self["target.grazing_angle"]
-        echo = reflectance.backscatter(self.word("target.reflectance_law"), np.sin(angle))
+        echo = backscatter(self.word("target.reflectance_law"), np.sin(angle))
         if self.number == 1:
-            none = spread.NO_SPREAD
-            return Footprint(echo, 1.0, none, none, none)
+            none = NO_SPREAD
+            return Extent(echo, 1.0, none, none, none)
         shape: dict[str, Any] = {
             "grazing_angle": angle, "beam_divergence": self[LASER + "beam_divergence"],
             "number": self.number, "pattern": self.pattern,
         }  # fmt: skip
-        ranges = spread.plane_range_moments(**shape)
-        velocities = spread.plane_velocity_moments(
+        ranges = plane_range_moments(**shape)
+        velocities = plane_velocity_moments(
             across=self["target.transverse_velocity"], along=self.radial_velocity, **shape
         )
-        ratio = spread.plane_echo_ratio(self.word("target.reflectance_law"), **shape)
+        ratio = plane_echo_ratio(self.word("target.reflectance_law"), **shape)
         gain = 1.0
         if self.by_roots:
             gain = float(np.sqrt(beamlets(self.number, self.pattern)[1]).sum())
-        return Footprint(echo, ratio, ranges, ranges, velocities, gain * np.sqrt(ratio))
+        return Extent(echo, ratio, ranges, ranges, velocities, gain * np.sqrt(ratio))
 
     @cached_property
     def scales(self) -> tuple[np.ndarray, np.ndarray]:
@@ -355,15 +367,10 @@ class Points:
     @cached_property
     def per_velocity(self) -> np.ndarray:
         """Bins for 1 m/s, by segment."""
-        return spread.velocity_to_bins(
+        return velocity_to_bins(
             range=self.range, carrier=self.carriers, chirp_rate=self.chirp_rate,
             bin_width=self.bin_width,
         )  # fmt: skip
-
-    @cached_property
-    def doppler_shift(self) -> np.ndarray:
-        """Bins by which the Doppler effect moves lines, by segment."""
-        return np.abs(self.radial_velocity) * self.per_velocity
 
     @cached_property
     def own_spread(self) -> Moments:
@@ -442,7 +449,7 @@ class Points:
         """
         form, tilt, (mean, rms, extreme) = self.lobe, self.tilt, moments
         on_axis = form.near(self.offset) ** 2
-        if moments is spread.NO_SPREAD or self.number == 1:
+        if moments is NO_SPREAD or self.number == 1:
             return on_axis, on_axis * np.where(self.near_image, 2.0, 1.01)
         second = 0.5 * form.curvature * rms * rms
         least = on_axis - np.minimum(form.slope, form.curvature * self.offset) * mean

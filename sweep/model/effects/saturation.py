@@ -5,7 +5,7 @@ sine it leaves [Blachman, IRE Trans. Inf. Theory 10 (1964) 162, in the manner of
 
 - the line, by the gain  2/A <m(A sin t) sin t>, where m(x) is the mean of x + n once clipped and
   < > the mean over the phase t;
-- odd harmonics, amplitudes 2 <m(A sin t) sin(k t)>, folded at Nyquist: the distortion power;
+- odd harmonics, amplitudes 2 <m(A sin t) sin(k t)>, folded at Nyquist, which are left out;
 - noise, white still, by the mean of the clipped noise's variance over s^2.
 
 For s -> 0 and r = V/A < 1 the gain is 2/pi (asin r + r sqrt(1 - r^2)) and noise passes for the
@@ -23,17 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from sweep.model import receiver, waveform
+from sweep.model import link, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import (
-    backscatter,
-    quantisation,
-    relative_intensity_noise,
-    solar_background,
-)
+from sweep.model.effects import atmosphere, noise_sources
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.preparation import Shots
+from sweep.model.preparation import PROCESSING, Shots
 from sweep.model.unsupported import UnsupportedShot
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
@@ -49,18 +44,16 @@ the square of this, and could not be told from the rounding of 1."""
 
 
 class Clipping(NamedTuple):
-    """What clipping makes of a sine with noise, (n,) each."""
+    """A sine with noise once it is clipped, (n,) each."""
 
     signal_gain: np.ndarray
     """Factor on the line's amplitude, 0..1."""
     noise_gain: np.ndarray
     """Factor on the noise variance, 0..1."""
-    distortion: np.ndarray
-    """Mean square of all harmonics together [V^2]."""
 
 
 def clipping(*, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike) -> Clipping:
-    """Gain of line and noise, and power of the harmonics.
+    """Gain of line and noise by clipping.
 
     Parameters
     ----------
@@ -71,37 +64,17 @@ def clipping(*, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLik
     full_scale : array_like
         Largest voltage that does not clip, to either side [V], > 0.
     """
-    a, s, v = _columns(amplitude, deviation, full_scale)
+    given = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
+    a, s, v = (value[..., None] for value in np.broadcast_arrays(*given))
     a = np.maximum(a, _FAINTEST * s)
     phase, weight = _phases(a, s, v)
     sine = np.sin(phase)
     loss, spread = _lost(a * sine, s, v)
     taken = 2 * (weight * loss * sine).sum(axis=-1)  # off the line's amplitude
-    gone = (weight * loss**2).sum(axis=-1)
     return Clipping(
         signal_gain=1 - taken / a[..., 0],
         noise_gain=(weight * spread).sum(axis=-1) / s[..., 0] ** 2,
-        distortion=np.maximum(gone - taken**2 / 2, 0.0),
     )
-
-
-def harmonic_amplitude(
-    order: int, *, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike
-) -> np.ndarray:
-    """Signed amplitude [V] of the harmonic sin(order t) of a clipped A sin t, (n,).
-
-    Odd orders up to 31; there are no even ones. Other parameters as of :func:`clipping`.
-    """
-    a, s, v = _columns(amplitude, deviation, full_scale)
-    phase, weight = _phases(a, s, v)
-    loss, _ = _lost(a * np.sin(phase), s, v)
-    line = a[..., 0] if order == 1 else 0.0
-    return np.asarray(line - 2 * (weight * loss * np.sin(order * phase)).sum(axis=-1))
-
-
-def _columns(*values: ArrayLike) -> tuple[np.ndarray, ...]:
-    """Arrays of one shape with an axis for phases behind."""
-    return tuple(a[..., None] for a in np.broadcast_arrays(*(np.asarray(v, float) for v in values)))
 
 
 def _phases(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,14 +103,14 @@ def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.n
     return s * np.maximum(cut, 0.0), s * s * np.maximum(square - cut * cut, 0.0)
 
 
-_FULL_SCALE = "instrument.processing.full_scale"
+_FULL_SCALE = PROCESSING + "full_scale"
 
 MOST_BEYOND = 1e6
 """Signal or noise over full scale; what clipping leaves has lost as many digits as this has."""
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """Line and noise as clipping leaves them; its harmonics are left out.
+    """Line and noise as clipping leaves them.
 
     The record is taken for one sine with the power of all lines.
 
@@ -184,7 +157,7 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
         )
         for sign, carrier in zip(waveform.SIGNS, shots.carriers, strict=True)
     ]
-    gain = receiver.transfer(
+    gain = link.transfer(
         np.min(np.abs(beats), axis=0),
         detector_bandwidth=shots.detector_bandwidth,
         amplifier_bandwidth=shots.amplifier_bandwidth,
@@ -196,7 +169,7 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
 
 
 def size(points: Points) -> Size | None:
-    """What leaving clipping out changes, whatever else is noise or dims the echo.
+    """Change by leaving clipping out, whatever else is noise or dims the echo.
 
     Line and noise lose no more than the chance that the highest sample is clipped, as the mean
     slope of what is left is one less that chance; the threshold stays.
@@ -207,7 +180,11 @@ def size(points: Points) -> Size | None:
     together = echo if points.architecture == "direct" else np.sqrt(echo)
     amplitude = (points.beat * together * points.transfer).max(axis=0)
     louder = 1 + points.echo_noise
-    for source in (solar_background, backscatter, relative_intensity_noise, quantisation):
+    sources = (
+        noise_sources.SOLAR_BACKGROUND, atmosphere.BACKSCATTER,
+        noise_sources.RELATIVE_INTENSITY_NOISE, noise_sources.QUANTISATION,
+    )  # fmt: skip
+    for source in sources:
         if (other := source.size(points)) is not None:
             louder = louder + other.noise
     deviation = np.sqrt(points.noise_variance * louder)
@@ -219,7 +196,7 @@ def size(points: Points) -> Size | None:
     )
 
 
-EFFECT = Effect(
+SATURATION = Effect(
     name="saturation",
     about="clipping at the ADC's full scale",
     stage="record",
@@ -229,11 +206,8 @@ EFFECT = Effect(
         Parameter(
             path=_FULL_SCALE,
             about="Largest voltage, to either side, that the ADC takes; 0 V for no limit",
-            si_unit="V",
-            default=0.0,
             example="1 V",
-            at_least="0 V",
-            at_most="1e12 V",
+            limits=("0 V", "1e12 V"),
         ),
     ),
 )

@@ -1,9 +1,13 @@
 """Scintillation: turbulent air makes the echo's power twinkle from shot to shot.
 
-The irradiance, of unit mean, is the product of a factor by large and one by small eddies, whose
-log variances :mod:`sweep.model.effects.turbulence` gives: log-normal (weak turbulence) or each
-gamma-distributed, the gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001), for
-any strength.
+The strength of turbulence C_n^2(h) gives the Rytov variance of a plane or a spherical wave over
+the path, and this the variances of the logarithms of large and small eddies' factors, averaged
+over an aperture, at any strength [Andrews and Phillips, Laser Beam Propagation through Random
+Media, 2nd ed. 2005, ch. 9, 10; zero inner scale, infinite outer scale].
+
+The irradiance, of unit mean, is the product of the two factors: log-normal (weak turbulence) or
+each gamma-distributed, the gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001),
+for any strength.
 
 The beam goes there and back. What is taken: on the way out a plane wave twinkles on the target,
 averaged over the footprint; on the way back a spherical wave twinkles in the receiver's aperture;
@@ -13,23 +17,129 @@ a small rough target next to the axis would show as enhanced backscatter, is lef
 spreading of the beam and the loss of mixing over the aperture.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 from sweep.model import philox
 from sweep.model.effects.atmosphere import path_heights
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.effects.turbulence import (
-    HUFNAGEL_VALLEY,
-    LogVariances,
-    Turbulence,
-    both_ways,
-)
-from sweep.model.preparation import Shots
+from sweep.model.preparation import LASER, TELESCOPE, Shots
+
+_ENDS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
+"""Powers of the distances to receiver and source in the integral over the path."""
+_LARGE = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
+
+
+class Turbulence(NamedTuple):
+    """Profile of the refractive index's structure constant over height above the ground."""
+
+    uniform: float = 0.0
+    """Part that is the same at all heights [m^(-2/3)]: alone, a constant C_n^2."""
+    surface: float = 0.0
+    """Hufnagel and Valley's A [m^(-2/3)] on the ground, e-folding over 100 m: 1.7e-14."""
+    wind: float = 0.0
+    """Their rms wind speed aloft [m/s]: 21."""
+    middle: float = 0.0
+    """Their [m^(-2/3)] of e-folding height 1500 m: 2.7e-16."""
+
+
+HUFNAGEL_VALLEY = Turbulence(surface=1.7e-14, wind=21.0, middle=2.7e-16)
+"""The 5/7 model: at 0.5 um 5 cm of coherence and 7 urad of isoplanatic angle [Valley 1980]."""
+
+
+class LogVariances(NamedTuple):
+    """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
+
+    large: np.ndarray
+    small: np.ndarray
+
+
+def structure_constant(turbulence: Turbulence, height: ArrayLike) -> np.ndarray:
+    """C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground that on it."""
+    h = np.maximum(np.asarray(height, float), 0.0)
+    aloft = 0.00594 * (turbulence.wind / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
+    middle = turbulence.middle * np.exp(-h / 1.5e3)
+    return turbulence.uniform + aloft + middle + turbulence.surface * np.exp(-h / 100)
+
+
+def rytov_variance(
+    wave: str,
+    turbulence: Turbulence,
+    *,
+    wavelength: ArrayLike,
+    range: ArrayLike,
+    start_height: ArrayLike,
+    end_height: ArrayLike,
+) -> np.ndarray:
+    """Variance of the log irradiance of weak turbulence along a straight path, (n,).
+
+    2.25 k^(7/6) integral of C_n^2 (L - z)^(5/6) [(z/L)^(5/6) for a spherical wave] over z from
+    source to receiver; 1.23 and 0.50 C_n^2 k^(7/6) L^(11/6) in even turbulence. By a rule of
+    Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height.
+
+    Parameters
+    ----------
+    wave : str
+        ``plane`` or ``spherical``.
+    wavelength, range, start_height, end_height : array_like
+        [m], (n,) or scalar; start is the wave's source.
+    """
+    share, weights = _rule(wave)
+    h0, h1 = (np.asarray(h, float)[..., None] for h in (start_height, end_height))
+    mean = (structure_constant(turbulence, h0 + (h1 - h0) * share) * weights).sum(axis=-1)
+    k = 2 * math.pi / np.asarray(wavelength, float)
+    return np.asarray(2.25 * k ** (7 / 6) * np.asarray(range, float) ** (11 / 6) * mean)
+
+
+@lru_cache(maxsize=2)
+def _rule(wave: str) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of the way from source to receiver and weights that hold the powers."""
+    to_receiver, to_source = _ENDS[wave]
+    x, weights = special.roots_jacobi(64, to_receiver, to_source)
+    return (1 + x) / 2, weights / 2 ** (1 + to_receiver + to_source)
+
+
+def log_variances(
+    wave: str,
+    *,
+    rytov_variance: ArrayLike,
+    wavelength: ArrayLike,
+    range: ArrayLike,
+    aperture: ArrayLike,
+) -> LogVariances:
+    """Log variances of the irradiance averaged over an aperture, by large and small eddies.
+
+    exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
+    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. As it serves any strength
+    the published fit averages too little over wide apertures: in weak turbulence it is 1.3 times
+    Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where it is 10.
+
+    Parameters
+    ----------
+    wave : str
+        ``plane`` or ``spherical``.
+    rytov_variance : array_like
+        Of that wave, >= 0, (n,) or scalar, as all.
+    wavelength, range, aperture : array_like
+        [m]; the diameter of the aperture that averages, 0 for a point.
+    """
+    v = np.asarray(rytov_variance, float)
+    k = 2 * math.pi / np.asarray(wavelength, float)
+    d2 = k * np.asarray(aperture, float) ** 2 / (4 * np.asarray(range, float))
+    strength = v**1.2  # sigma_R^(12/5)
+    by_aperture, by_strength = _LARGE[wave]
+    large = 0.49 * v / (1 + by_aperture * d2 + by_strength * strength) ** (7 / 6)
+    small = 0.51 * v * (1 + 0.69 * strength) ** (-5 / 6)
+    return LogVariances(large, small / (1 + 0.90 * d2 + 0.62 * d2 * strength))
+
 
 DISTRIBUTIONS = ("log_normal", "gamma_gamma")
 _LEAST_SPREAD = 1e-5
@@ -117,24 +227,29 @@ def turbulence_of(p: Mapping[str, np.ndarray]) -> Turbulence | None:
     return HUFNAGEL_VALLEY if name == "hufnagel_valley" else None
 
 
-def _legs(
+def both_ways(
     air: Turbulence, p: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[LogVariances, LogVariances]:
-    """Log variances of points by their parameters."""
+    """Log variances of the way out, averaged over the footprint, and back, over the aperture."""
     lidar, target = path_heights(p, range)
-    return both_ways(
-        air,
-        wavelength=p["instrument.laser.wavelength"],
-        range=range,
-        lidar_height=lidar,
-        target_height=target,
-        aperture=p["instrument.telescope.aperture"],
-        beam_divergence=p["instrument.laser.beam_divergence"],
+    aperture = np.asarray(p[TELESCOPE + "aperture"], float)
+    footprint = aperture + np.asarray(p[LASER + "beam_divergence"], float) * range
+    ways = (("plane", lidar, target, footprint), ("spherical", target, lidar, aperture))
+    beam = {"wavelength": p[LASER + "wavelength"], "range": range}
+    out, back = (
+        log_variances(
+            wave,
+            rytov_variance=rytov_variance(wave, air, start_height=start, end_height=end, **beam),
+            aperture=width,
+            **beam,
+        )
+        for wave, start, end, width in ways
     )
+    return out, back
 
 
 def size(points: Points) -> Size | None:
-    """What leaving twinkling out changes of mean probabilities.
+    """Change of mean probabilities by leaving twinkling out.
 
     With L half the logarithm of the factor I, E I = 1, and h the probability over the logarithm of
     the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2; in a product of
@@ -142,7 +257,7 @@ def size(points: Points) -> Size | None:
     """
     if points.word(_TURBULENCE) == "none" or (air := turbulence_of(points.parameters)) is None:
         return None
-    mean, square = _moments(points.word(_LAW), _legs(air, points.parameters, points.range))
+    mean, square = _moments(points.word(_LAW), both_ways(air, points.parameters, points.range))
     b = points.threshold
     slope, bend = _STEEPEST * (1 + b), _MOST_BENT * (1 + b * b)
     each = slope * mean + 0.5 * (bend + slope**2) * square
@@ -155,7 +270,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     air = turbulence_of(p)
     if air is None:
         return shots
-    legs = _legs(air, p, shots.range)
+    legs = both_ways(air, p, shots.range)
     power = factors(str(p[_LAW]), legs, realisation)
     beat = power if shots.architecture == "direct" else np.sqrt(power)
     sources = shots.noise_sources
@@ -170,7 +285,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     )
 
 
-EFFECT = Effect(
+SCINTILLATION = Effect(
     name="scintillation",
     about="an echo that twinkles in turbulent air",
     stage="draws",
@@ -186,11 +301,9 @@ EFFECT = Effect(
         Parameter(
             path=_CONSTANT,
             about="Structure constant of the refractive index of even turbulence",
-            si_unit="m^(-2/3)",
             default=1e-14,
             example="1e-14 m^(-2/3)",
-            at_least="0 m^(-2/3)",
-            at_most="100 m^(-2/3)",
+            limits=("0 m^(-2/3)", "100 m^(-2/3)"),
             category=True,
         ),
         Parameter(

@@ -1,4 +1,4 @@
-"""Speckle: what a rough surface does to the amplitude that each beamlet sends back.
+"""Speckle: random amplitudes that a rough surface sends back from each beamlet.
 
 A patch whose heights scatter by more than lambda/(4 pi) about their mean returns the sum of many
 waves of unrelated phase: a circular complex Gaussian amplitude [Goodman, Speckle Phenomena in
@@ -15,9 +15,11 @@ The three segments of a shot see the same heights, and frequencies that differ b
 that one g_b serves all three: amplitudes at frequencies df apart have the correlation
 exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and heights of 10 um (the roughness matters
 up to lambda or so, beyond which kappa is 0). Depth beyond roughness lies in the beamlets' ranges,
-and what it does between the segments in their lines' phases. What moves across the beam turns the
-beamlets against each other from one segment to the next, see :func:`turns`; coherent footprints
-with a share kappa left are taken not to, which makes their segments more alike than they are.
+and what it does between the segments in their lines' phases. With the instrument moving across the
+beam the Doppler shifts differ over the footprint, which turns the beamlets against each other from
+one segment to the next; all begin at the same range, and what all beamlets share is left out.
+Coherent footprints with a share kappa left are taken not to turn, which makes their segments more
+alike than they are.
 
 It acts on the lines' amplitudes alone, before their spectrum; the mean echo, and so its shot
 noise, stays.
@@ -32,7 +34,6 @@ from numpy.typing import ArrayLike
 from sweep.model import philox
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import Shots
 
 _ROUGHNESS = "target.roughness"
@@ -94,50 +95,8 @@ def factors(
     )
 
 
-def turns(*, carrier: ArrayLike, doppler: np.ndarray, interval: np.ndarray) -> np.ndarray:
-    """Phases [cycles] by which beamlets turn against the beam's centre within an interval.
-
-    With the instrument moving across the beam, the Doppler shifts differ over the footprint, and
-    the pattern that their speckles make has changed by the time that another segment begins. All
-    segments begin at the same range: what all beamlets share is left out.
-
-    Parameters
-    ----------
-    carrier : array_like
-        Optical frequency [Hz], (n,) or a scalar.
-    doppler : (n, beamlets) ndarray
-        beta_b - beta_0, beta = 2 v_r / c.
-    interval : (n,) ndarray
-        From the start of the first segment [s].
-    """
-    cycles = np.asarray(carrier, float) * np.asarray(interval, float)
-    return np.asarray(cycles[:, None] * doppler)
-
-
-def fixed_bin_detection(
-    *, steady: ArrayLike, diffuse_power: ArrayLike, bin_deviation: ArrayLike, threshold: ArrayLike
-) -> np.ndarray:
-    """Mean over speckle and noise of the chance that one given bin crosses the threshold, 0..1.
-
-    Steady signal m, diffuse signal of mean power P and noise of sigma a quadrature add up to a
-    Rice-distributed magnitude, so that it is Q_1(|m|/s, Th/s) with s^2 = sigma^2 + P/2; without
-    m it is Swerling's first case, exp(-Th^2 / (2 sigma^2 (1 + SNR))), SNR = P / (2 sigma^2).
-
-    Parameters
-    ----------
-    steady : array_like
-        |m|, magnitude of the coherent part.
-    diffuse_power : array_like
-        P, mean of |X|^2 of the diffuse part.
-    bin_deviation, threshold : array_like
-        sigma and Th.
-    """
-    s = np.sqrt(np.asarray(bin_deviation, float) ** 2 + np.asarray(diffuse_power, float) / 2)
-    return marcum_q1(np.asarray(steady, float) / s, np.asarray(threshold, float) / s).q
-
-
 def size(points: Points) -> Size | None:
-    """What leaving speckle out changes in all draws but few.
+    """Change by leaving speckle out in all draws but few.
 
     A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power
     (1 - kappa) |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within
@@ -196,7 +155,8 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     interval = np.where(turning, shots.duration, 0.0) + np.zeros(shots.size)
     phase = np.empty((3, *cycles.shape))
     for s, carrier in enumerate(shots.carriers):
-        np.add(cycles, turns(carrier=carrier, doppler=doppler, interval=s * interval), out=phase[s])
+        turned = np.asarray(carrier, float) * (s * interval)
+        np.add(cycles, turned[:, None] * doppler, out=phase[s])
     brighter = (amplitude**2).sum(axis=1) / np.maximum((steady**2).sum(axis=1), _SMALLEST)
     return replace(
         shots,
@@ -210,7 +170,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     )
 
 
-EFFECT = Effect(
+SPECKLE = Effect(
     name="speckle",
     about="amplitudes of a rough surface, at random",
     stage="draws",
@@ -221,11 +181,8 @@ EFFECT = Effect(
         Parameter(
             path=_ROUGHNESS,
             about="Standard deviation of the surface's height along the line of sight",
-            si_unit="m",
-            default=0.0,
             example="10 um",
-            at_least="0 m",
-            at_most="1 km",
+            limits=("0 m", "1 km"),
         ),
     ),
 )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.model.reflectance import LAWS
+from sweep.model.ground import LAWS
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Surface:
     reflectance : float
         What its law takes as such, 0..1.
     law : str
-        Reflectance law, one of :data:`sweep.model.reflectance.LAWS`.
+        Reflectance law, one of :data:`sweep.model.ground.LAWS`.
     roughness : float
         Standard deviation of the height within a beamlet's spot [m], >= 0: against the
         wavelength it decides on speckle.

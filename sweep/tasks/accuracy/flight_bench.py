@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
-from sweep.model.effects.flags import flags_of, names_of
+from sweep.model.effects.catalogue import flags_of, names_of
 from sweep.tasks.accuracy.bench import (
     NOT_IN_TRUTH,
     Seen,
@@ -375,10 +375,9 @@ def _look(
 
     And what their rays leave, (n,), if that is asked for.
     """
-    from sweep.model.chain import prepare_cast
     from sweep.model.eyepoints import seen_ground
     from sweep.model.ray_error import ray_error
-    from sweep.model.shot import statistics
+    from sweep.model.shot import prepare_cast, statistics
 
     given, ground = seen_ground(eyepoints, study.parameters_at(tiles.part), study.surfaces)
     shots = prepare_cast(given, ground, names, flags)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.effects.flags import flags_of, names_of
+from sweep.model.effects.catalogue import flags_of, names_of
 from sweep.tasks.accuracy.bench import NOT_IN_TRUTH, Seen, Trial, look_of, of_lines, seen_in
 from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
 from sweep.tasks.accuracy.sample import by_chance, neighbours, spread

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from sweep.model.chain import prepare
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.effects.planning import plan
 from sweep.model.effects.points import Points
-from sweep.model.shot import find
+from sweep.model.shot import find, prepare
 
 SIZES = (2**12, 2**13, 2**14, 2**15, 2**16, 2**17, 2**18)
 CLOSED = ("hamming", "hann", "rectangular", "flattop")
@@ -61,6 +60,11 @@ def planned(points, modes, tolerance, effects=EFFECTS, edges=None):
         return each if edges is None else np.maximum.reduceat(each, edges[:-1])
 
     return plan(points, tiles, modes, tolerance, effects)
+
+
+def kept_in(made, tile):
+    """Effects that are simulated in a tile."""
+    return tuple(n for n, each in zip(made.names, made.kept[:, tile], strict=True) if each)
 
 
 def shots_of(parameters, effects):

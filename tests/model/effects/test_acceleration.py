@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from sweep.model.effects import acceleration
+from sweep.model.effects import phase_errors
 
 LIGHT = mpmath.mpf(299792458)
 
@@ -28,7 +28,7 @@ def test_the_phase_is_what_acceleration_adds_to_the_delays_own(sign, a):
     }  # fmt: skip
     x = np.linspace(-1, 1, 9)
     start, duration = 4e-5, 4e-4
-    found = acceleration.phase(
+    found = phase_errors.acceleration_phase(
         x, **{k: np.array([v]) if k != "sign" else v for k, v in scene.items()},
         acceleration=np.array([a]), start=np.array([start]), duration=np.array([duration]),
     )[0]  # fmt: skip
@@ -44,7 +44,7 @@ def test_the_doppler_segment_drifts_by_two_a_over_lambda():
     wavelength, duration, a = 1550e-9, 2e-3, 250.0
     carrier = 299792458 / wavelength
     expected = 2 * a / wavelength * duration**2
-    phase = acceleration.phase(
+    phase = phase_errors.acceleration_phase(
         np.array([-1.0, 0.0, 1.0]), sign=0, carrier=carrier, chirp_rate=1e12, range=1e3,
         radial_velocity=50.0, acceleration=a, start=0.0, duration=duration,
     )[0]  # fmt: skip

@@ -12,7 +12,7 @@ from sweep.model.effects.atmosphere import (
     layer,
     optical_depth,
 )
-from sweep.model.effects.backscatter import power
+from sweep.model.effects.atmosphere import backscattered as power
 
 BEAM = {
     "laser_power": 1.0, "aperture": 25e-3, "optical_efficiency": 0.8, "beam_divergence": 50e-6,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from sweep.model.effects import chirp_nonlinearity
+from sweep.model.effects import phase_errors
 
 LIGHT = 299792458.0
 CHIRP, START, RECORD = 500e-6, 3e-5, 300e-6
@@ -37,7 +37,7 @@ def error_of(sign, *, quadratic=0.0, cubic=0.0, sinusoidal=0.0, periods=1.0, **s
 def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks, range_, velocity):
     scene = error_of(sign, **peaks, range=np.array([range_]), radial_velocity=np.array([velocity]))
     x = np.linspace(-1, 1, 7)
-    found = chirp_nonlinearity.phase(x, **scene)[0]
+    found = phase_errors.sweep_phase(x, **scene)[0]
     nodes, weights = np.polynomial.legendre.leggauss(20)
     shape = {k: scene[k] for k in ("quadratic", "cubic", "sinusoidal", "periods")}
     for value, t in zip(found, START + RECORD * (x + 1) / 2, strict=True):
@@ -63,9 +63,9 @@ def test_every_shape_peaks_at_its_peak_and_square_and_cube_have_no_slope_to_offe
 def test_no_delay_no_sweep_no_error():
     x = np.linspace(-1, 1, 5)
     some = {"quadratic": 1e6, "cubic": 1e6, "sinusoidal": 1e6}
-    none = chirp_nonlinearity.phase(x, **error_of(1, **some, range=np.array([0.0])))
+    none = phase_errors.sweep_phase(x, **error_of(1, **some, range=np.array([0.0])))
     assert not none.any()
-    assert not chirp_nonlinearity.phase(x, **error_of(0, **some)).any()
+    assert not phase_errors.sweep_phase(x, **error_of(0, **some)).any()
 
 
 def test_a_small_sine_raises_the_side_lines_of_bessels_functions():
@@ -75,7 +75,7 @@ def test_a_small_sine_raises_the_side_lines_of_bessels_functions():
     delay = 2 * 3000.0 / LIGHT
     index = 2 * np.pi * 4e4 * delay * np.sinc(periods * delay / CHIRP)
     n = np.arange(length)
-    error = np.exp(2j * np.pi * chirp_nonlinearity.phase(2 * n / length - 1, **scene)[0])
+    error = np.exp(2j * np.pi * phase_errors.sweep_phase(2 * n / length - 1, **scene)[0])
     spectrum = np.abs(np.fft.fft(np.exp(2j * np.pi * bins * n / length) * error)) / length
     for j in range(4):
         for side in (-1, 1):
@@ -89,7 +89,7 @@ def test_the_down_chirp_runs_through_the_error_backwards():
     whole = {"start": 0.0, "duration": CHIRP, "range": np.array([1e-3])}
     for name in ("quadratic", "cubic", "sinusoidal"):
         up, down = (
-            chirp_nonlinearity.phase(x, **error_of(sign, **{name: 1e5}, **whole))[0]
+            phase_errors.sweep_phase(x, **error_of(sign, **{name: 1e5}, **whole))[0]
             for sign in (1, -1)
         )
         np.testing.assert_allclose(down[::-1], up, atol=1e-6 * np.abs(up).max())

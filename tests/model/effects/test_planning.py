@@ -4,15 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from effect_points import planned, points_of, scene
+from effect_points import kept_in, planned, points_of, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import shot
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
-from sweep.model.effects.criteria import changes
 from sweep.model.effects.effect import Effect, Size
-from sweep.model.effects.planning import plan
+from sweep.model.effects.planning import changes, plan
 from sweep.model.marcum import log_at_least_one, marcum_q1
 
 TILES = 40
@@ -91,7 +90,7 @@ def test_where_the_signal_is_drowned_anything_may_go():
     phases = catalogue({"phases": Size(magnitude=0.5)})
     made = given_plan(Given(np.array([1e-4, 7.0, 1e3]), 6.55), {}, 1e-3, phases)
     assert made.kept.tolist() == [[False, True, True]] and made.error.max() < 1e-3
-    assert made.effects(1) == ("phases",) and made.effects(0) == ()
+    assert kept_in(made, 1) == ("phases",) and kept_in(made, 0) == ()
     # pd is 1 there all the same, which is what the noise's side of it tells
     cancel = catalogue({"phases": Size(added=1e-2)})
     made = given_plan(Given(np.array([1e-4, 1e3]), 6.55), {}, 1e-3, cancel)
@@ -117,7 +116,7 @@ def test_forced_effects_stay_and_go_and_the_error_is_told():
     sizes = {n: None if v is None else np.full(2, v) for n, v in sizes.items()}
     modes = {"a": "on", "b": "off", "far": "on"}
     made = given_plan(Given(np.ones(2), 1.0), modes, 1e-3, catalogue(sizes))
-    assert made.effects(0) == ("a", "c")  # of what is absent there is nothing to force on
+    assert kept_in(made, 0) == ("a", "c")  # of what is absent there is nothing to force on
     assert made.error == pytest.approx(0.3)
 
 
@@ -151,12 +150,12 @@ def test_an_effect_within_another_needs_it():
     within = {"phases": "footprint", "spread": "footprint", "turn": "phases"}
     points, effects = Given(np.ones(2), 1.0), catalogue(sizes, within)
     made = given_plan(points, {}, 1e-3, effects)
-    assert made.effects(0) == ("footprint", "phases") and made.effects(1) == ()
-    assert given_plan(points, {}, 0.6, effects).effects(0) == ()
+    assert kept_in(made, 0) == ("footprint", "phases") and kept_in(made, 1) == ()
+    assert kept_in(given_plan(points, {}, 0.6, effects), 0) == ()
     made = given_plan(points, {"footprint": "off"}, 1e-3, effects)
-    assert made.effects(0) == () and made.error[0] == pytest.approx(0.5001011)
+    assert kept_in(made, 0) == () and made.error[0] == pytest.approx(0.5001011)
     all_three = ("footprint", "phases", "turn")
-    assert given_plan(points, {"turn": "on"}, 1.0, effects).effects(1) == all_three
+    assert kept_in(given_plan(points, {"turn": "on"}, 1.0, effects), 1) == all_three
     with pytest.raises(ValueError, match="phases cannot be on"):
         given_plan(points, {"footprint": "off", "phases": "on"}, 1e-3, effects)
 
@@ -236,7 +235,7 @@ def smeared(table_4_1, phases, law, **changes):
     further = {path: value for path, value in changes.items() if "." in path}
     straight = {"beamlets": 1, "grazing_angle": np.pi / 2, "phases": phases}
     parameters = DEFAULTS | table_4_1(**straight, reflectance_law=law, **own) | further
-    names = planned(points_of(parameters), asked, 8e-4).effects(0)
+    names = kept_in(planned(points_of(parameters), asked, 8e-4), 0)
     return shot.evaluate(parameters, names), shot.evaluate(parameters, CERTAIN)
 
 

@@ -3,14 +3,12 @@ the tolerance."""
 
 import numpy as np
 import pytest
-from effect_points import found, planned, points_of, scene, shots_of
+from effect_points import found, kept_in, planned, points_of, scene, shots_of
 
 from sweep.model import shot
-from sweep.model.chain import prepare_cast
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
-from sweep.model.effects.spread import of_rays
-from sweep.model.ground import Cast, Footprints
-from sweep.model.shot import find
+from sweep.model.ground import Cast, Footprints, of_rays
+from sweep.model.shot import find, prepare_cast
 
 POINTS = 30
 CHOICE = [effect for effect in EFFECTS if effect.name in CORE]
@@ -246,7 +244,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
             assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
         truth = find(prepare_cast(parameters, ground))
         for i in range(len(edges) - 1):
-            of_kept = find(prepare_cast(parameters, ground, made.effects(i)))
+            of_kept = find(prepare_cast(parameters, ground, kept_in(made, i)))
             error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
         has_beside = made.change[CORE.index("several_returns")].any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from adc import truth_quantise
 
-from sweep.model.effects.quantisation import step, variance
+from sweep.model.effects.noise_sources import step, variance
 
 
 def test_levels_fill_the_full_scale_and_hold_at_its_ends():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sweep.model import truth
-from sweep.model.chain import prepare
-from sweep.model.effects import range_walk
+from sweep.model.effects import phase_errors
 from sweep.model.effects.catalogue import CORE
 from sweep.model.segments import spectrum
+from sweep.model.shot import prepare
 from sweep.model.waveform import SIGNS
 
 WINDOWS = (
@@ -50,7 +50,7 @@ def test_the_phase_is_what_the_truth_keeps_beyond_the_line(table_4_1, segment, v
         truth.analytic_record(shots, 0, segment, 0, range_walk=walk) for walk in (True, False)
     )
     x = 2 * np.arange(kept.size) / kept.size - 1
-    walk = range_walk.phase(x, **motion(shots, segment))[0]
+    walk = phase_errors.walk_phase(x, **motion(shots, segment))[0]
     # The truth rounds f tau: 1e10 cycles of 1e-16 at 10 km/s.
     assert np.abs(kept / dropped - np.exp(2j * np.pi * walk)).max() < 2e-5 * abs(velocity) / 1e4
 
@@ -95,7 +95,7 @@ def test_the_phase_of_the_beams_axis_serves_all_beamlets(table_4_1):
         )
     )  # fmt: skip
     x = 2 * np.arange(shots.window.length) / shots.window.length - 1
-    factor = np.exp(2j * np.pi * range_walk.phase(x, **motion(shots, 0))[0])
+    factor = np.exp(2j * np.pi * phase_errors.walk_phase(x, **motion(shots, 0))[0])
     for beamlet in (0, 50, 108):
         kept, dropped = (
             truth.analytic_record(shots, 0, 0, beamlet, range_walk=walk) for walk in (True, False)
@@ -108,6 +108,6 @@ def test_drift_counts_bins_and_has_the_chirps_sign():
     bins = 2 * 2e12 * 300 / 299792458 * (2**17 / 6e8) ** 2
     x = np.array([-1.0, -0.999, 0.999, 1.0])
     for sign in (1, -1):
-        cycles = range_walk.phase(x, sign=sign, start=0.0, **motion)[0]
+        cycles = phase_errors.walk_phase(x, sign=sign, start=0.0, **motion)[0]
         slope = (np.diff(cycles)[[0, 2]] / 0.001) * 2  # bins at the record's ends
         np.testing.assert_allclose(np.diff(slope), sign * bins, rtol=1e-3)

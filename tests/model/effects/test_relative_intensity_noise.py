@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sweep.model import window
-from sweep.model.effects.relative_intensity_noise import current_variance
-from sweep.model.noise import bin_deviation
+from sweep.model.effects.noise_sources import current_variance
+from sweep.model.link import bin_deviation
 
 ELECTRON = 1.602176634e-19
 LASER = {

@@ -3,43 +3,25 @@
 import numpy as np
 import pytest
 from adc import truth_quantise
-from scipy.integrate import quad
 from scipy.special import erf
 
-from sweep.model.effects.saturation import clipping, harmonic_amplitude
+from sweep.model.effects.saturation import clipping
 
 
 @pytest.mark.parametrize("ratio", [0.999, 0.9, 0.5, 0.1, 0.01])
-def test_a_clipped_sine_has_the_gain_and_power_of_the_textbook(ratio):
-    """Hard limiter on a sine, its describing function; the rest of its mean square is harmonics."""
+def test_a_clipped_sine_has_the_gain_of_the_textbook(ratio):
+    """Hard limiter on a sine, its describing function."""
     found = clipping(amplitude=2.0, deviation=2e-6 * ratio, full_scale=2.0 * ratio)
     angle = np.arcsin(ratio)
     gain = 2 / np.pi * (angle + ratio * np.sqrt(1 - ratio**2))
     assert found.signal_gain == pytest.approx(gain, rel=1e-6)
     assert found.noise_gain == pytest.approx(2 / np.pi * angle, rel=1e-4, abs=1e-6)
-    square, _ = quad(
-        lambda t: np.minimum(2 * np.sin(t), 2 * ratio) ** 2, 0, np.pi / 2, points=[angle]
-    )
-    distortion = square * 2 / np.pi - (2 * gain) ** 2 / 2
-    assert found.distortion == pytest.approx(distortion, rel=1e-5, abs=1e-10)
 
 
-def test_a_sine_clipped_to_a_square_wave_has_its_harmonics():
-    """4 V / pi (sin t + sin 3t / 3 + ...): distortion V^2 (1 - 8/pi^2)."""
+def test_a_sine_clipped_to_a_square_wave_has_its_fundamental():
     level = 1e-4
-    arguments = {"amplitude": 1.0, "deviation": 1e-9, "full_scale": level}
-    found = clipping(**arguments)
+    found = clipping(amplitude=1.0, deviation=1e-9, full_scale=level)
     assert found.signal_gain == pytest.approx(4 * level / np.pi, rel=1e-6)
-    assert found.distortion == pytest.approx(level**2 * (1 - 8 / np.pi**2), rel=1e-3)
-    for order in (1, 3, 5, 31):
-        amplitude = harmonic_amplitude(order, **arguments)
-        assert amplitude == pytest.approx(4 * level / np.pi / order, rel=1e-4)
-
-
-def test_harmonics_hold_the_distortion():
-    arguments = {"amplitude": 1.3, "deviation": 0.1, "full_scale": 1.0}
-    total = sum(harmonic_amplitude(k, **arguments) ** 2 / 2 for k in range(3, 32, 2))
-    assert clipping(**arguments).distortion == pytest.approx(total, rel=1e-9)
 
 
 @pytest.mark.parametrize("bits", [4, 6, 8, 12, 14])
@@ -71,9 +53,6 @@ def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude
     assert bins.mean() == pytest.approx(
         expected + lsb**2 / 24, abs=5 / np.sqrt(bins.size) * expected + lsb**2 / 24
     )
-    power = (found.signal_gain * amplitude) ** 2 / 2 + found.distortion + expected
-    error = 5 * np.std(records[0] ** 2) / np.sqrt(number) + 2 * amplitude * bend + lsb**2 / 24
-    assert np.mean(records[0] ** 2) == pytest.approx(power + lsb**2 / 24, abs=error)
 
 
 def test_the_gain_of_next_to_nothing_is_the_share_of_unclipped_noise():

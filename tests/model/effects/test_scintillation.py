@@ -8,13 +8,11 @@ from scipy.integrate import quad
 from sweep.model import philox
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.scintillation import (
-    factors,
-)
-from sweep.model.effects.turbulence import (
     HUFNAGEL_VALLEY,
     LogVariances,
     Turbulence,
     both_ways,
+    factors,
     log_variances,
     rytov_variance,
     structure_constant,
@@ -215,10 +213,16 @@ def test_still_air_is_exactly_one_and_faint_turbulence_the_same_by_either_law():
 
 
 def test_two_ways_take_the_footprint_out_and_the_aperture_back():
-    scene = {"wavelength": 1.55e-6, "range": 2000.0, "lidar_height": 1500.0, "target_height": 0.0}
-    out, back = both_ways(HUFNAGEL_VALLEY, aperture=25e-3, beam_divergence=50e-6, **scene)
-    wide_out, wide_back = both_ways(HUFNAGEL_VALLEY, aperture=25e-3, beam_divergence=5e-3, **scene)
+    def ways(aperture, divergence):
+        beam = {"laser.wavelength": 1.55e-6, "laser.beam_divergence": divergence,
+                "telescope.aperture": aperture}  # fmt: skip
+        place = {"atmosphere.target_height": 0.0, "atmosphere.path": "slant",
+                 "target.grazing_angle": np.arcsin(0.75)}  # fmt: skip
+        given = {f"instrument.{name}": value for name, value in beam.items()} | place
+        return both_ways(HUFNAGEL_VALLEY, given, np.array(2000.0))
+
+    (out, back), (wide_out, wide_back) = ways(25e-3, 50e-6), ways(25e-3, 5e-3)
     assert wide_out.large < out.large and wide_out.small < out.small
     assert wide_back == back
-    _, large_back = both_ways(HUFNAGEL_VALLEY, aperture=0.2, beam_divergence=50e-6, **scene)
+    _, large_back = ways(0.2, 50e-6)
     assert large_back.small < 0.2 * back.small

@@ -5,7 +5,7 @@ import pytest
 from effect_points import points_of
 
 from sweep.model import shot
-from sweep.model.effects.signal_shot_noise import size
+from sweep.model.effects.noise_sources import echo_size
 
 OTHERS = 1.53715e-13
 """Current variance of Table 4.1 [A^2]: 1.40992e-13 of it shot noise of 1 mW."""
@@ -18,7 +18,7 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     """
     distance = np.array([1.0, 2.0, 5.0, 20.0])
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
-    found = size(points_of(parameters))
+    found = echo_size(points_of(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
     np.testing.assert_allclose(found.noise, share, rtol=1e-4)
     assert not found.threshold_follows

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from effect_points import points_of
 
-from sweep.model.effects.solar_background import size
+from sweep.model.effects.noise_sources import sun_size
 
 OTHERS = 1.53715e-13
 """Current variance of Table 4.1 [A^2]."""
@@ -21,6 +21,6 @@ def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
     scene = table_4_1(
         solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024
     )
-    found = size(points_of(scene))
+    found = sun_size(points_of(scene))
     assert found.threshold_follows
     assert found.noise == pytest.approx(1.125e-19 / OTHERS, rel=1e-3)

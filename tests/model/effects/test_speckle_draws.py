@@ -6,14 +6,13 @@ from mean_over_draws import evaluate
 from speckle_pairs import joint_detection
 
 from sweep.model import philox, truth, window
-from sweep.model.chain import prepare
 from sweep.model.effects import speckle
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.effect import Realisation
 from sweep.model.marcum import marcum_q1
 from sweep.model.realisations import realise
 from sweep.model.shot import evaluate as evaluate_without
-from sweep.model.shot import find, statistics
+from sweep.model.shot import find, prepare, statistics
 
 AGREEMENT = 1e-9
 """Largest difference from the truth over the peak: the truth's own floor is 1e-11."""
@@ -138,13 +137,13 @@ def in_one_bin(parameters, steady=0.0, diffuse=1.0):
     shots, plain = prepared(parameters), evaluate_without(parameters)
     powers = evaluate_without(parameters | {"footprint.phases": "incoherent"})
     return {
-        s: speckle.fixed_bin_detection(
-            steady=np.sqrt(2 * steady * plain[f"snr_{s}"]), bin_deviation=1.0,
-            diffuse_power=2 * diffuse * powers[f"snr_{s}"],
-            threshold=shots.threshold / shots.bin_deviation,
-        )
+        s: marcum_q1(
+            np.sqrt(2 * steady * plain[f"snr_{s}"]) / deviation,
+            shots.threshold / shots.bin_deviation / deviation,
+        ).q
         for s in ("up", "doppler", "down")
-    }  # fmt: skip
+        for deviation in [np.sqrt(1 + diffuse * powers[f"snr_{s}"])]
+    }
 
 
 @pytest.mark.parametrize(

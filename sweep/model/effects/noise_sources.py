@@ -1,0 +1,303 @@
+"""Noise besides the receiver's own: of the echo, the sun, the local oscillator and the ADC.
+
+Each adds a variance at the ADC, and its size is that variance over the receiver's.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model import link
+from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
+from sweep.model.effects.points import Points
+from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE, Shots
+
+# The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
+# oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
+
+
+def echo_size(points: Points) -> Size:
+    """Shot noise of the echo, which the threshold does not follow."""
+    return Size(noise=points.echo_noise, threshold_follows=False)
+
+
+def add_echo(shots: Shots, scene: Scene) -> Shots:
+    """Shot noise of the whole echo."""
+    variance = shots.shot_noise_scale * shots.echo_power * scene.share("signal_shot_noise")
+    return noisier(shots, signal_shot=np.asarray(variance))
+
+
+SIGNAL_SHOT_NOISE = Effect(
+    name="signal_shot_noise",
+    about="shot noise of the echo itself",
+    stage="noise",
+    size=echo_size,
+    act=add_echo,
+    apart=False,
+)
+
+
+_IRRADIANCE, _DISTANCE = "target.solar_irradiance", "target.sun_distance"
+_ELEVATION, _FIELD = "target.sun_elevation", RECEIVER + "field_of_view"
+
+SUN_TEMPERATURE = 5772.0
+"""Effective temperature of the sun [K], IAU 2015 resolution B3."""
+SUN_RADIUS = 6.957e8
+"""Nominal radius of the sun [m], likewise."""
+
+
+def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike) -> np.ndarray:
+    """Spectral irradiance [W/m^3] of a level surface by a black sun; 0 for a distance of 0.
+
+    Planck's radiance pi B(wavelength, T) (R / d)^2 sin(elevation).
+
+    Parameters
+    ----------
+    wavelength, distance, elevation : array_like
+        [m]; from the sun [m]; of the sun above the surface [rad].
+    """
+    x, d = np.asarray(wavelength, float), np.asarray(distance, float)
+    exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
+    # 1 / (e^u - 1), written so that it fades to 0 where e^u exceeds what a float holds.
+    photons = np.exp(-exponent) / -np.expm1(-exponent)
+    exitance = 2 * np.pi * PLANCK * SPEED_OF_LIGHT**2 / x**5 * photons
+    dilution = np.where(d > 0, (SUN_RADIUS / np.where(d > 0, d, 1.0)) ** 2, 0.0)
+    return np.asarray(exitance * dilution * np.maximum(np.sin(elevation), 0.0))
+
+
+def solar_power(
+    *,
+    solar_irradiance: np.ndarray,
+    reflectance: np.ndarray,
+    aperture: np.ndarray,
+    beam_divergence: np.ndarray,
+    optical_passband: np.ndarray,
+    optical_efficiency: np.ndarray,
+) -> np.ndarray:
+    """Sunlight [W] scattered into the receiver by a diffuse surface that fills its field of view.
+
+    Radiance E rho / pi, seen through the aperture, over the solid angle of the beam's full
+    divergence and the optical passband. E is the spectral irradiance on the surface [W/m^3].
+    """
+    solid_angle = np.pi * (np.asarray(beam_divergence) / 2) ** 2
+    radiance = solar_irradiance * reflectance / np.pi
+    area = link.aperture_area(aperture)
+    return radiance * area * solid_angle * optical_passband * optical_efficiency
+
+
+def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Sunlight on the detector [W] without extinction, (n,) or scalar."""
+    lit = p[_IRRADIANCE] + sunlight(
+        wavelength=p[LASER + "wavelength"], distance=p[_DISTANCE], elevation=p[_ELEVATION]
+    )
+    field = np.asarray(p[_FIELD], float)
+    return solar_power(
+        solar_irradiance=lit,
+        reflectance=p["target.reflectance"],
+        aperture=p[TELESCOPE + "aperture"],
+        beam_divergence=np.where(field > 0, field, p[LASER + "beam_divergence"]),
+        optical_passband=p[RECEIVER + "optical_passband"],
+        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
+    )
+
+
+def sun_size(points: Points) -> Size | None:
+    """Shot noise of sunlight, without the air; the threshold is set on it."""
+    if not points.has(_IRRADIANCE, _DISTANCE):
+        return None
+    return Size(noise=received(points.numbers) * points.receiver.per_watt / points.noise_variance)
+
+
+def add_sun(shots: Shots, scene: Scene) -> Shots:
+    """Shot noise of sunlight; the air dims it on its way up."""
+    share = scene.share("solar_background")
+    light = received(scene.parameters) * shots.ground_transmission * share
+    return noisier(shots, solar_shot=np.asarray(shots.shot_noise_scale * light))
+
+
+SOLAR_BACKGROUND = Effect(
+    name="solar_background",
+    about="shot noise of sunlight on the target",
+    stage="noise",
+    size=sun_size,
+    act=add_sun,
+    apart=False,
+    parameters=(
+        Parameter(
+            path=_DISTANCE,
+            about="Distance of the target from the sun, which then lights it; 0 for none",
+            example="1.52 au",
+            limits=("0 m", "1e18 m"),
+        ),
+        Parameter(
+            path=_ELEVATION,
+            about="Elevation of that sun above the target's surface",
+            default=float(np.pi / 2),
+            example="30 deg",
+            limits=("0 deg", "90 deg"),
+            si_unit="rad",
+        ),
+        Parameter(
+            path=_FIELD,
+            about="Full angle of the receiver's field of view; 0 for that of the beam",
+            example="100 urad",
+            limits=("0 rad", "180 deg"),
+        ),
+    ),
+)
+
+
+_RIN, _REJECTION = LASER + "relative_intensity_noise", RECEIVER + "common_mode_rejection"
+
+
+def current_variance(
+    *,
+    relative_intensity_noise: ArrayLike,
+    common_mode_rejection: ArrayLike,
+    local_oscillator_power: ArrayLike,
+    apd_gain: ArrayLike,
+    responsivity: ArrayLike,
+    electrical_bandwidth: ArrayLike,
+) -> np.ndarray:
+    """Current variance [A^2] by intensity noise of the local oscillator.
+
+    One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
+    fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
+    of the ratio of their currents) divides the variance. Both are taken to be flat over the
+    electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
+
+    Parameters
+    ----------
+    relative_intensity_noise : array_like
+        One-sided density of dP/P [1/Hz], >= 0; -150 dB/Hz is 1e-15/Hz. (n,) or scalar, as all.
+    common_mode_rejection : array_like
+        Ratio of powers, >= 1; 1 for a single diode, 25 dB is 316.
+    local_oscillator_power : array_like
+        Power [W] on the detector; 0 for direct detection.
+    apd_gain, responsivity, electrical_bandwidth : array_like
+        As for :func:`sweep.model.link.shot_noise`.
+    """
+    current = (
+        np.asarray(apd_gain, float)
+        * np.asarray(responsivity, float)
+        * np.asarray(local_oscillator_power, float)
+    )
+    seen = np.asarray(relative_intensity_noise, float) / np.asarray(common_mode_rejection, float)
+    return current**2 * seen * np.asarray(electrical_bandwidth, float)
+
+
+def _current(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Current variance of points by their parameters [A^2]."""
+    own = ("local_oscillator_power", "apd_gain", "responsivity")
+    return current_variance(
+        relative_intensity_noise=p[_RIN],
+        common_mode_rejection=p[_REJECTION],
+        electrical_bandwidth=link.electrical_bandwidth(
+            detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
+            amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
+        ),
+        **{name: p[RECEIVER + name] for name in own},
+    )
+
+
+def intensity_size(points: Points) -> Size | None:
+    """Intensity noise, exactly; the threshold is set on it."""
+    if points.architecture == "direct" or not points.has(_RIN):
+        return None
+    current = _current(points.numbers)
+    return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
+
+
+def add_intensity(shots: Shots, scene: Scene) -> Shots:
+    """Intensity noise of the local oscillator; direct detection has none."""
+    if shots.architecture == "direct":
+        return shots
+    return noisier(shots, relative_intensity=_current(scene.parameters) * shots.noise_scale)
+
+
+RELATIVE_INTENSITY_NOISE = Effect(
+    name="relative_intensity_noise",
+    about="fluctuation of the local oscillator's power",
+    stage="noise",
+    size=intensity_size,
+    act=add_intensity,
+    parameters=(
+        Parameter(
+            path=_RIN,
+            about="One-sided spectral density of the laser's relative intensity",
+            example="-155 dB/Hz",
+            limits=("0 1/Hz", "100 1/Hz"),
+        ),
+        Parameter(
+            path=_REJECTION,
+            about="Common-mode rejection of a balanced receiver; 0 dB for a single diode",
+            default=1.0,
+            example="25 dB",
+            limits=("0 dB", "300 dB"),
+        ),
+    ),
+)
+
+
+_BITS, _FULL_SCALE = PROCESSING + "bits", PROCESSING + "full_scale"
+
+
+def step(*, full_scale: ArrayLike, bits: ArrayLike) -> np.ndarray:
+    """Step of an ADC, lsb = 2 V / 2^bits [V].
+
+    Parameters
+    ----------
+    full_scale : array_like
+        Largest voltage V [V] that does not clip, to either side; > 0.
+    bits : array_like
+        The effective number of bits, which need not be whole, makes the noise of a real ADC.
+    """
+    return 2 * np.asarray(full_scale, float) * 2.0 ** -np.asarray(bits, float)
+
+
+def variance(*, step: ArrayLike) -> np.ndarray:
+    """Variance lsb^2/12 [V^2] that rounding adds at the ADC.
+
+    Where the noise's deviation s spans a step or so the error is white and independent of the
+    signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
+    exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
+    gain nor its noise figure acts on it.
+    """
+    return np.asarray(step, float) ** 2 / 12
+
+
+def _rounding(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    bits = np.asarray(p[_BITS], float)
+    lsb = step(full_scale=p[_FULL_SCALE], bits=bits)
+    return np.where(bits > 0, variance(step=lsb), 0.0)
+
+
+def rounding_size(points: Points) -> Size | None:
+    """Rounding, without clipping; the threshold is set on it."""
+    if not points.has(_BITS):
+        return None
+    return Size(noise=_rounding(points.numbers) / points.noise_variance)
+
+
+def add_rounding(shots: Shots, scene: Scene) -> Shots:
+    """White noise of lsb^2/12, where the ADC has a number of bits."""
+    return noisier(shots, quantisation=_rounding(scene.parameters))
+
+
+QUANTISATION = Effect(
+    name="quantisation",
+    about="the ADC's steps",
+    stage="noise",
+    size=rounding_size,
+    act=add_rounding,
+    parameters=(
+        Parameter(
+            path=_BITS,
+            about="Effective number of bits of the ADC; 0 for one without steps",
+            example="12",
+            limits=("0", "64"),
+        ),
+    ),
+)
