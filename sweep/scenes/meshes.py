@@ -47,9 +47,8 @@ def read_mesh(
     unit: str | None = None,
     up: str | None = None,
     placement: Placement = IN_PLACE,
-    surface: int = 0,
 ) -> Facets:
-    """Facets of a mesh file; all its parts with one surface.
+    """Facets of a mesh file, all its parts.
 
     Nothing is mended here: degenerate and duplicate faces are dropped, and reported, when the
     scene is put together.
@@ -65,8 +64,6 @@ def read_mesh(
         z for all else.
     placement : Placement
         Where it stands.
-    surface : int
-        Surface index of its faces.
 
     Raises
     ------
@@ -79,7 +76,7 @@ def read_mesh(
     if upwards not in ("y", "z"):
         raise SceneError(path, f"has '{up}' for its vertical axis", "write 'y' or 'z'")
     scene = _loaded(path)
-    parts = [_part(mesh, matrix, surface) for mesh, matrix in _meshes(scene)]
+    parts = [_part(mesh, matrix) for mesh, matrix in _meshes(scene)]
     parts = [part for part in parts if len(part.faces)]
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
@@ -114,13 +111,13 @@ def _meshes(scene: Any) -> list[tuple[Any, np.ndarray]]:
     return [(geometry, matrix) for geometry, matrix in named if hasattr(geometry, "faces")]
 
 
-def _part(mesh: Any, matrix: np.ndarray, surface: int) -> Facets:
+def _part(mesh: Any, matrix: np.ndarray) -> Facets:
     """Facets of one mesh of a file, in the file's frame."""
     vertices = np.asarray(mesh.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored part is inside out
-    return Facets.of(vertices, faces, surface=surface)
+    return Facets.of(vertices, faces)
 
 
 def _checked(path: Path, placement: Placement) -> tuple[np.ndarray, float]:

@@ -307,9 +307,6 @@ class Shape:
             raise ValueError("boulders need a height ratio > 0, an elongation >= 1 and 0..4 levels")
 
 
-ROUND = Shape()
-
-
 def draw_boulders(
     generator: np.random.Generator,
     law: Law,
@@ -317,8 +314,7 @@ def draw_boulders(
     *,
     smallest: float,
     largest: float,
-    surface: int = 0,
-    shape: Shape = ROUND,
+    shape: Shape,
     bounds: tuple[float, float, float, float] | None = None,
 ) -> Facets:
     """Boulders on a terrain, from a size-frequency law.
@@ -334,8 +330,6 @@ def draw_boulders(
         Ground that they stand on.
     smallest, largest, bounds
         As of `scatter`; by default within the terrain's bounds.
-    surface : int
-        Surface index of the facets.
     shape : Shape
         Their form.
 
@@ -362,7 +356,7 @@ def draw_boulders(
     vertices += centre[:, None, :]
     shift = np.arange(len(centre)) * len(dome)
     faces = faces + shift[:, None, None]
-    return Facets.of(vertices, faces, surface=surface, origin=terrain.origin)
+    return Facets.of(vertices, faces, origin=terrain.origin)
 
 
 def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:

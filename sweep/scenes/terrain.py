@@ -79,7 +79,7 @@ class Terrain:
         row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
         return np.asarray(_on_triangles(self.heights, row, column) + self.origin[2])
 
-    def facets(self, *, surface: int = 0) -> Facets:
+    def facets(self) -> Facets:
         """Triangles of the ground, facing upwards, and the nodes that they use."""
         z, (dx, dy) = self.heights, self.spacing
         faces = _triangles(np.isfinite(z))
@@ -90,7 +90,7 @@ class Terrain:
         number = np.cumsum(used) - 1
         row, column = np.divmod(np.flatnonzero(used), z.shape[1])
         vertices = np.column_stack([column * dx, row * dy, z.ravel()[used]]) + 0.0  # never -0.0
-        return Facets.of(vertices, number[faces], surface=surface, origin=self.origin)
+        return Facets.of(vertices, number[faces], origin=self.origin)
 
 
 def _triangles(present: np.ndarray) -> np.ndarray:

@@ -67,7 +67,8 @@ class Tree:
         return round(self.leaf_area_index * crown / self.leaf_area)
 
 
-BROADLEAF = Tree()
+LEAVES, TRUNKS = 0, 1
+"""Surface indices."""
 
 
 def clump(
@@ -77,9 +78,7 @@ def clump(
     centre: tuple[float, float],
     radius: float,
     number: int,
-    tree: Tree = BROADLEAF,
-    trunk_surface: int = 0,
-    leaf_surface: int = 0,
+    tree: Tree,
 ) -> Facets:
     """A clump of trees on a terrain, their trunks at least half a crown apart.
 
@@ -91,8 +90,6 @@ def clump(
         World position (x, y) of the clump's middle, and how far from it trunks stand [m].
     number, tree
         Number of trees, at least 1, and their mean measures.
-    trunk_surface, leaf_surface : int
-        Surface indices.
 
     Raises
     ------
@@ -106,10 +103,7 @@ def clump(
             raise ValueError(f"a tree at ({x:.1f}, {y:.1f}) m would stand beside the ground")
         foot = np.array([x, y, z]) - terrain.origin
         size = 1 + tree.variation * generator.uniform(-1.0, 1.0)
-        for facets in (
-            trunk(tree, size, surface=trunk_surface),
-            crown(generator, tree, size, surface=leaf_surface),
-        ):
+        for facets in (trunk(tree, size), crown(generator, tree, size)):
             parts.append(
                 Facets(facets.vertices + foot, facets.faces, facets.surface, terrain.origin)
             )
@@ -139,8 +133,9 @@ def _places(
     return places
 
 
-def trunk(tree: Tree, size: float = 1.0, *, sides: int = 8, surface: int = 0) -> Facets:
+def trunk(tree: Tree, size: float = 1.0) -> Facets:
     """Tapered prism from half a metre below the foot to the middle of the crown."""
+    sides = 8
     top = (tree.crown_base + tree.height) / 2
     angle = 2 * math.pi * np.arange(sides) / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
@@ -150,12 +145,10 @@ def trunk(tree: Tree, size: float = 1.0, *, sides: int = 8, surface: int = 0) ->
     faces = np.concatenate(
         [np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])]
     )
-    return Facets.of(size * np.concatenate([lower, upper]), faces, surface=surface)
+    return Facets.of(size * np.concatenate([lower, upper]), faces, surface=TRUNKS)
 
 
-def crown(
-    generator: np.random.Generator, tree: Tree, size: float = 1.0, *, surface: int = 0
-) -> Facets:
+def crown(generator: np.random.Generator, tree: Tree, size: float = 1.0) -> Facets:
     """Leaves with their centres spread evenly over an ellipsoid, the tree's foot at the origin.
 
     A larger tree has more leaves, not larger ones: the leaf area index stays.
@@ -173,7 +166,7 @@ def crown(
     corners = [centres + along, centres + across, centres - along, centres - across]
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     faces = 4 * np.arange(number)[:, None, None] + halves
-    return Facets.of(np.stack(corners, axis=1), faces, surface=surface)
+    return Facets.of(np.stack(corners, axis=1), faces, surface=LEAVES)
 
 
 def _directions(generator: np.random.Generator, number: int) -> np.ndarray:

@@ -235,8 +235,6 @@ class Trees(Part):
             radius=self.radius,
             number=self.number,
             tree=Tree(**{name: getattr(self.tree, name) for name in TreeMeasures.model_fields}),
-            leaf_surface=0,
-            trunk_surface=1,
         )
 
 

@@ -244,8 +244,8 @@ def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray
 
     states = [None if body is None else body.state(time) for body in world.bodies]
     poses = [None if state is None else Pose(state.position, state.attitude) for state in states]
-    down = np.broadcast_to([0.0, 0.0, -1.0], position.shape)
-    return np.asarray(world.caster.cast(position, down, poses=poses).range)
+    down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
+    return np.asarray(world.caster.bundle(position, down, poses=poses).range)
 
 
 def scene_array(

@@ -49,8 +49,8 @@ class SceneMap(NamedTuple):
         x, y = _nodes(low - room, high + room)
         top = max(mesh_top(world), seen[:, 2].max()) + ABOVE
         grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), top)], axis=-1)
-        down = np.broadcast_to([0.0, 0.0, -1.0], (grid.size // 3, 3))
-        depth = world.caster.cast(grid.reshape(-1, 3), down, poses=_poses(spec, world)).range
+        down = np.broadcast_to([0.0, 0.0, -1.0], (grid.size // 3, 1, 3))
+        depth = world.caster.bundle(grid.reshape(-1, 3), down, poses=_poses(spec, world)).range
         height = np.where(np.isfinite(depth), top - depth, np.nan)
         return cls(x, y, height.reshape(len(y), len(x)), np.asarray(world.origin, float))
 
@@ -73,7 +73,7 @@ def _looked_at(spec: SceneSpec, world: World, scanner: str) -> np.ndarray:
     state = flight.state(flight.start + scan.time)
     direction = rotate(state.attitude, scan.direction)
     # Bodies that move are looked at where they are as the flight begins: it is only a map.
-    hits = world.caster.cast(state.position, direction, poses=_poses(spec, world))
+    hits = world.caster.bundle(state.position, direction[:, None], poses=_poses(spec, world))
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
     return np.concatenate([state.position, ground])

@@ -13,7 +13,10 @@ def flat(size=200.0, z=0.0, origin=(0.0, 0.0, 0.0)):
     return Terrain(np.full((2, 2), z), (size, size), np.array(origin))
 
 
-def field(law, ground, seed=1, shape=scattered.ROUND, smallest=0.2, largest=5.0):
+ROUND = scattered.Shape()
+
+
+def field(law, ground, seed=1, shape=ROUND, smallest=0.2, largest=5.0):
     facets = scattered.draw_boulders(
         np.random.default_rng(seed), law, ground, smallest=smallest, largest=largest, shape=shape
     )

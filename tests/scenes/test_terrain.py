@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,9 +119,9 @@ def test_far_off_ground_has_the_same_facets_to_the_last_bit():
 
 def test_joined_facets_keep_their_place_digits_and_surfaces():
     shift = np.array([3.0, -4.0, 5.0])
-    one = terrain(hilly(3, 3), origin=FAR).facets(surface=1)
-    other = terrain(hilly(4, 4), origin=FAR + shift).facets(surface=2)
-    both = join([one, other])
+    one = terrain(hilly(3, 3), origin=FAR).facets()
+    other = terrain(hilly(4, 4), origin=FAR + shift).facets()
+    both = join([one, replace(other, surface=other.surface + 1)])
     # Taking the first origin from the second rounds to the spacing of floats at 8e6 m.
     expected = np.concatenate([one.vertices, other.vertices + shift])
     np.testing.assert_allclose(both.vertices, expected, rtol=0, atol=2 * np.spacing(8.2e6))
@@ -137,8 +138,8 @@ def test_a_placed_object_is_scaled_turned_and_moved_in_that_order():
 
 
 def test_facets_become_a_mesh_at_the_same_place():
-    facets = terrain(hilly(5, 5), origin=FAR).facets(surface=3)
-    mesh, report = facets.mesh()
+    facets = terrain(hilly(5, 5), origin=FAR).facets()
+    mesh, report = replace(facets, surface=facets.surface + 3).mesh()
     np.testing.assert_allclose(
         np.sort(mesh.vertices + mesh.origin, axis=0),
         np.sort(facets.vertices + facets.origin, axis=0),

@@ -82,7 +82,7 @@ def test_leaf_centres_fill_the_crowns_ellipsoid_evenly():
 
 
 def test_the_trunk_tapers_faces_outwards_and_reaches_into_crown_and_ground():
-    trunk = trees.trunk(TREE, sides=12)
+    trunk = trees.trunk(TREE)
     z = trunk.vertices[:, 2]
     assert z.min() == -0.5 and TREE.crown_base < z.max() < TREE.height
     assert np.hypot(*trunk.vertices[:, :2].T).max() == pytest.approx(TREE.trunk_diameter / 2)
@@ -96,24 +96,32 @@ def test_a_clump_stands_on_its_hill_apart_and_within_its_radius():
     hill = ground(0.2, origin)
     centre = (origin[0] + 50.0, origin[1] + 50.0)
     clump = trees.clump(
-        np.random.default_rng(5), hill, centre=centre, radius=15.0, number=9, tree=TREE,
-        trunk_surface=1, leaf_surface=2,
+        np.random.default_rng(5), hill, centre=centre, radius=15.0, number=9, tree=TREE
     )  # fmt: skip
     np.testing.assert_array_equal(clump.origin, origin)
-    trunks = clump.vertices[np.unique(clump.faces[clump.surface == 1])].reshape(9, -1, 3)
+    trunks = clump.vertices[np.unique(clump.faces[clump.surface == trees.TRUNKS])].reshape(9, -1, 3)
     feet = trunks[:, :8].mean(axis=1)
     feet[:, 2] += 0.5  # the trunk begins below the ground
     apart = np.linalg.norm(feet[:, None, :2] - feet[None, :, :2], axis=2)[~np.eye(9, dtype=bool)]
     assert apart.min() >= TREE.crown_diameter / 2
     assert np.hypot(*(feet[:, :2] - 50.0).T).max() <= 15.0
     np.testing.assert_allclose(feet[:, 2], 0.2 * feet[:, 0], atol=1e-9)
-    assert (clump.surface == 2).sum() == 9 * 2 * TREE.leaves
+    assert (clump.surface == trees.LEAVES).sum() == 9 * 2 * TREE.leaves
+
+
+def _clump(seed, **places):
+    return trees.clump(np.random.default_rng(seed), ground(), tree=trees.Tree(), **places)
 
 
 def test_the_same_seed_plants_the_same_trees():
     grown = [
         trees.clump(
-            np.random.default_rng(seed), ground(), centre=(50.0, 50.0), radius=10.0, number=3
+            np.random.default_rng(seed),
+            ground(),
+            centre=(50.0, 50.0),
+            radius=10.0,
+            number=3,
+            tree=TREE,
         )
         for seed in (1, 1, 2)
     ]
@@ -123,8 +131,12 @@ def test_the_same_seed_plants_the_same_trees():
 
 def test_trees_without_room_or_ground_are_refused():
     with pytest.raises(ValueError, match="do not fit"):
-        trees.clump(np.random.default_rng(1), ground(), centre=(50, 50), radius=3.0, number=20)
+        trees.clump(
+            np.random.default_rng(1), ground(), centre=(50, 50), radius=3.0, number=20, tree=TREE
+        )
     with pytest.raises(ValueError, match="beside the ground"):
-        trees.clump(np.random.default_rng(1), ground(), centre=(500, 50), radius=3.0, number=1)
+        trees.clump(
+            np.random.default_rng(1), ground(), centre=(500, 50), radius=3.0, number=1, tree=TREE
+        )
     with pytest.raises(ValueError, match="crown"):
         trees.Tree(height=5.0, crown_base=6.0)

@@ -41,9 +41,9 @@ def straight_down(world, x, y, height=1000.0, time=0.0):
     places = np.column_stack(np.broadcast_arrays(np.asarray(x, float), y, height))
     down = np.broadcast_to([0.0, 0.0, -1.0], places.shape)
     poses = [None if b is None else b.state(np.array([time])) for b in world.bodies]
-    poses = [None if p is None else (p.position[0], p.attitude[0]) for p in poses]
-    hits = world.caster.cast(places, down, poses=[None if p is None else Pose(*p) for p in poses])
-    return height - hits.range, hits.surface
+    poses = [None if p is None else Pose(p.position[0], p.attitude[0]) for p in poses]
+    hits = world.caster.bundle(places, down[:, None], poses=poses)
+    return height - hits.range, hits.surface[:, 0]
 
 
 def test_a_plane_is_seen_at_its_distance_and_closing_speed():

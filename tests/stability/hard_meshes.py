@@ -34,7 +34,8 @@ def unit(v: np.ndarray) -> np.ndarray:
 def worst_of(scene: Scene) -> float:
     """Worst error of the ranges of a scene's rays [last places]."""
     vertices, faces, origins, directions = scene
-    hits = Caster(clean(vertices, faces, np.zeros(len(faces)))[0]).cast(origins, directions)
+    caster = Caster(clean(vertices, faces, np.zeros(len(faces)))[0])
+    hits = caster.bundle(origins, np.asarray(directions)[:, None])
     worst = 0.0
     for found, o, d in zip(hits.range, origins, directions, strict=True):
         exact = nearest(np.asarray(vertices, float), np.asarray(faces), o, d)

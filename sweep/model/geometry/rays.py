@@ -75,33 +75,6 @@ class Caster:
             raise ValueError("there is no body to cast rays at")
         self._trees = [build(mesh.vertices, mesh.faces) for mesh in self.meshes]
 
-    def cast(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        *,
-        poses: Sequence[Pose | None] | None = None,
-    ) -> Bundle:
-        """First hits of single rays: those of bundles, without the dimension of beamlets.
-
-        Parameters
-        ----------
-        origins, directions : (n, 3) array_like
-            Where rays start [m] and their unit vectors, in the world's frame. A facet on which a
-            ray starts, within rounding, may count as hit or not.
-        poses : sequence of Pose or None, optional
-            Of each body, None for one that rests in the world's frame; default all at rest.
-
-        Raises
-        ------
-        ValueError
-            Shapes do not fit, a number is not finite, or a direction is not of length 1.
-        """
-        directions = np.asarray(directions, dtype=np.float64)
-        found = self.bundle(origins, directions[..., None, :], poses=poses)
-        of_beamlets = "offset", "valid", "cos_incidence", "surface", "face", "body"
-        return found._replace(**{name: getattr(found, name)[:, 0] for name in of_beamlets})
-
     def bundle(
         self,
         origins: ArrayLike,
@@ -114,16 +87,18 @@ class Caster:
         Parameters
         ----------
         origins : (n, 3) array_like
-            Where bundles start [m].
+            Places where bundles start [m]. A facet on which a ray starts, within rounding, may
+            count as hit or not.
         directions : (n, b, 3) array_like
-            Unit vectors of each bundle's beamlets, b >= 1, the beam's centre first.
-        poses
-            As in `cast`, a pose for each bundle.
+            Unit vectors of each bundle's beamlets, b >= 1, the beam's centre first, in the world's
+            frame.
+        poses : sequence of Pose or None, optional
+            Of each body, None for one that rests in the world's frame; default all at rest.
 
         Raises
         ------
         ValueError
-            As in `cast`.
+            Shapes do not fit, a number is not finite, or a direction is not of length 1.
         """
         start, along = _rays(origins, directions)
         frames = self._frames(poses, len(start))

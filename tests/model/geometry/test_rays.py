@@ -92,6 +92,13 @@ def unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
+def cast(caster, origins, directions, **poses):
+    """First hits of single rays: those of bundles, without the dimension of beamlets."""
+    found = caster.bundle(origins, np.asarray(directions, float)[..., None, :], **poses)
+    of_beamlets = "offset", "valid", "cos_incidence", "surface", "face", "body"
+    return found._replace(**{name: getattr(found, name)[:, 0] for name in of_beamlets})
+
+
 def bumpy_sphere(subdivisions=3, seed=0, roughness=0.1):
     """A closed rough surface about zero of radius about 1: (vertices, faces)."""
     vertices, faces = icosphere(subdivisions)
@@ -168,7 +175,7 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale, offset):
     target += rng.uniform(-0.4, 0.4, (120, 3))
     origins = target + 2000.0 * unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(120) % 2]
     directions = unit(target - origins)
-    hits = Caster(clean(vertices, faces, 0)[0]).cast(origins, directions)
+    hits = cast(Caster(clean(vertices, faces, 0)[0]), origins, directions)
     around, worst = balls(vertices, faces), 0.0
     for i in range(120):
         truth = nearest_exactly(vertices, faces, around, origins[i], directions[i])
@@ -195,7 +202,7 @@ def test_of_100000_rays_at_vertices_and_at_edges_of_real_terrain_none_is_missed(
     targets = np.concatenate([vertices[rng.choice(inner, 50_000)], on_edges])
     origins = targets + 2000.0 * unit(rng.normal(size=(100_000, 3)) * [0.2, 0.2, 0.0] + [0, 0, 1])
     distance = np.linalg.norm(targets - origins, axis=1)
-    hits = caster.cast(origins, (targets - origins) / distance[:, None])
+    hits = cast(caster, origins, (targets - origins) / distance[:, None])
     assert (hits.face >= 0).all()
     assert (hits.range <= distance + 1e-9).all()
 
@@ -214,7 +221,7 @@ def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offs
     targets = np.concatenate([at_vertices, at_edges])
     origins = offset + rng.uniform(-0.4, 0.4, (100_000, 3))
     origins[:20_000] = offset
-    hits = caster.cast(origins, unit(targets - origins))
+    hits = cast(caster, origins, unit(targets - origins))
     assert (hits.face >= 0).all()
     assert (hits.range < 3.0).all()
 
@@ -237,7 +244,7 @@ def test_a_plane_is_met_where_its_closed_form_says_down_to_a_degree_of_grazing_a
         )
     )
     origins = np.stack([*rng.uniform(-100, 100, (2, grazing.size)), 2000 * np.sin(grazing)], axis=1)
-    hits = caster.cast(origins, directions)
+    hits = cast(caster, origins, directions)
     for r, o, d in zip(hits.range, origins, directions, strict=True):
         assert ulps(r, Fraction(o[2]) / -Fraction(d[2])) <= 1.0
     np.testing.assert_allclose(hits.cos_incidence, np.sin(grazing), atol=1e-15)
@@ -253,7 +260,7 @@ def test_a_tilted_plane_of_ten_kilometres_keeps_its_phase_at_a_degree_of_grazing
     targets = rng.dirichlet([3, 3, 3], 200) @ vertices
     directions = unit(np.c_[rng.normal(size=(200, 2)), np.full(200, -0.03)])
     origins = targets - 2000.0 * directions
-    hits = caster.cast(origins, directions)
+    hits = cast(caster, origins, directions)
     assert (hits.face == 0).sum() > 150
     for i in np.flatnonzero(hits.face == 0):
         t, inside = exact_range(
@@ -271,7 +278,7 @@ def test_a_sphere_of_facets_is_met_exactly_and_lies_as_near_the_sphere_as_its_fa
     directions = unit(0.7 * rng.uniform(-1, 1, (2000, 3)) - origins)
     along = -np.einsum("ij,ij->i", origins, directions)
     miss = np.einsum("ij,ij->i", origins, origins) - along**2
-    hits = caster.cast(origins, directions)
+    hits = cast(caster, origins, directions)
     outside = miss > 1.0
     assert (hits.face[outside] == -1).all()
     inner = np.linalg.norm(vertices[faces].mean(axis=1), axis=1).min()
@@ -292,7 +299,7 @@ def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
     outside = 10.0 * unit(rng.normal(size=(500, 3)))
     origins = np.concatenate([outside, rng.uniform(-0.9, 0.9, (500, 3))])
     directions = unit(np.concatenate([rng.uniform(-1.5, 1.5, (500, 3)) - outside, outside]))
-    hits = caster.cast(origins, directions)
+    hits = cast(caster, origins, directions)
     planes = np.sort((np.array([[[-1.0]], [[1.0]]]) - origins) / directions, axis=0)
     enter, leave = planes[0].max(axis=1), planes[1].min(axis=1)
     inside = np.arange(1000) >= 500
@@ -316,13 +323,13 @@ def test_rays_along_a_facet_see_what_stands_across_them():
     floor, _ = clean([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]], 0)
     wall, _ = clean([[5, -9, -9], [5, 9, -9], [5, 9, 9], [5, -9, 9]], [[0, 1, 2], [0, 2, 3]], 1)
     caster = Caster([floor, wall])
-    hits = caster.cast([[-3, 1, 0], [-3, 0, 0], [0, 0, 0.5]], [[1, 0, 0], [1, 0, 0], [0, 0, 1.0]])
+    hits = cast(caster, [[-3, 1, 0], [-3, 0, 0], [0, 0, 0.5]], [[1, 0, 0], [1, 0, 0], [0, 0, 1.0]])
     assert hits.body.tolist() == [1, 1, -1]
     assert hits.range.tolist() == [8.0, 8.0, np.inf]
 
 
 def test_a_miss_says_so_everywhere(closed):
-    hits = closed[2].cast([[0, 0, 5.0]], [[0, 0, 1.0]])
+    hits = cast(closed[2], [[0, 0, 5.0]], [[0, 0, 1.0]])
     assert (hits.face[0], hits.body[0], hits.surface[0]) == (-1, -1, -1)
     assert hits.range[0] == np.inf
     assert np.isnan(hits.cos_incidence[0])
@@ -335,7 +342,7 @@ def test_no_ray_within_a_silhouette_by_a_billionth_of_a_metre_passes_it():
     y = np.random.default_rng(16).uniform(-4.9, 8.0, 10_000)
     targets = np.stack([np.full_like(y, 1 + 1e-9), y, 10 + 0.3 * (y + 5) / 14], axis=1)
     origins = targets + 2000.0 * unit([0.3, 0.2, 1])
-    hits = Caster(merge([leaf, ground])).cast(origins, unit(targets - origins))
+    hits = cast(Caster(merge([leaf, ground])), origins, unit(targets - origins))
     assert (hits.surface == 7).all()
 
 
@@ -344,10 +351,10 @@ def test_the_order_and_the_grouping_of_rays_change_no_bit(closed):
     rng = np.random.default_rng(11)
     origins = rng.uniform(-2, 2, (5000, 3))
     directions = unit(rng.normal(size=(5000, 3)))
-    whole = caster.cast(origins, directions)
+    whole = cast(caster, origins, directions)
     order = rng.permutation(5000)
     for part in np.array_split(order, [1, 2, 50, 3000]):
-        piece = caster.cast(origins[part], directions[part])
+        piece = cast(caster, origins[part], directions[part])
         for a, b in zip(whole, piece, strict=True):
             np.testing.assert_array_equal(a[part], b)
 
@@ -369,7 +376,7 @@ def test_a_bundle_sees_what_its_rays_see_alone(closed, divergence):
     origins = 20.0 * unit(rng.normal(size=(300, 3)))
     directions = beam(unit(rng.uniform(-0.7, 0.7, (300, 3)) - origins), divergence)
     bundle = closed[2].bundle(origins, directions)
-    hits = closed[2].cast(np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
+    hits = cast(closed[2], np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
     shape = (300, 19)
     assert bundle.valid.mean() > 0.05
     np.testing.assert_array_equal(bundle.valid, (hits.face >= 0).reshape(shape))
@@ -458,7 +465,7 @@ def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
     origins = 30.0 * unit(rng.normal(size=(n, 3)))
     directions = beam(unit(rng.uniform(-4, 4, (n, 3)) - origins), 0.1)
     caster = Caster(meshes)
-    hits = caster.cast(origins, directions[:, 0], poses=poses)
+    hits = cast(caster, origins, directions[:, 0], poses=poses)
     bundle = caster.bundle(origins, directions, poses=poses)
     for i in range(n):
         moved = [placed(shapes[k][0], poses[k], i) for k in range(2)] + [shapes[2][0]]
@@ -499,7 +506,7 @@ def test_a_tumbling_body_at_two_kilometres_keeps_its_phase(offset):
     origins = pose.position + 2000.0 * unit(rng.normal(size=(n, 3)))
     directions = unit(pose.position + rng.uniform(-0.8, 0.8, (n, 3)) - origins)
     mesh, _ = clean(CORNERS, CUBE, 0)
-    hits = Caster(mesh).cast(origins, directions, poses=[pose])
+    hits = cast(Caster(mesh), origins, directions, poses=[pose])
     assert (hits.face >= 0).sum() > 25
     for i in np.flatnonzero(hits.face >= 0):
         rotation = exact_rotation(pose.attitude[i])
@@ -519,13 +526,13 @@ def test_of_bodies_one_behind_the_other_the_nearest_is_hit_in_whatever_order_the
     poses = [Pose(np.array([x, 0.0, 0.0]), straight) for x in (50.0, 10.0, 30.0)]
     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
         caster = Caster([mesh] * 3)
-        hits = caster.cast([[0, 0.2, 0.1]], [[1.0, 0, 0]], poses=[poses[k] for k in order])
+        hits = cast(caster, [[0, 0.2, 0.1]], [[1.0, 0, 0]], poses=[poses[k] for k in order])
         assert hits.range.tolist() == [9.0]
         assert hits.body.tolist() == [order.index(1)]
 
 
 def test_no_rays_give_no_hits(closed):
-    assert closed[2].cast(np.empty((0, 3)), np.empty((0, 3))).range.shape == (0,)
+    assert cast(closed[2], np.empty((0, 3)), np.empty((0, 3))).range.shape == (0,)
     assert closed[2].bundle(np.empty((0, 3)), np.empty((0, 5, 3))).offset.shape == (0, 5)
 
 
@@ -533,18 +540,18 @@ def test_mistakes_are_refused(closed):
     caster, o, d = closed[2], [[0.0, 0, 0]], [[0.0, 0, 1]]
     still = Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))
     for match, call in {
-        "length 1": lambda: caster.cast(o, [[0, 0, 1.001]]),
-        "of length 1": lambda: caster.cast(o, [[0, 0, np.nan]]),
-        "origin is finite": lambda: caster.cast([[0, 0, np.inf]], d),
-        "do not fit": lambda: caster.cast(o, d * 2),
+        "length 1": lambda: cast(caster, o, [[0, 0, 1.001]]),
+        "of length 1": lambda: cast(caster, o, [[0, 0, np.nan]]),
+        "origin is finite": lambda: cast(caster, [[0, 0, np.inf]], d),
+        "do not fit": lambda: cast(caster, o, d * 2),
         "fit each other": lambda: caster.bundle(o, d),
         "at least one beamlet": lambda: caster.bundle(o, np.empty((1, 0, 3))),
-        "as many poses": lambda: caster.cast(o, d, poses=[still, still]),
-        "one for each": lambda: caster.cast(o, d, poses=[Pose(np.zeros((2, 3)), still.attitude)]),
-        "position is finite": lambda: caster.cast(
-            o, d, poses=[Pose(np.full(3, np.nan), still.attitude)]
+        "as many poses": lambda: cast(caster, o, d, poses=[still, still]),
+        "one for each": lambda: cast(caster, o, d, poses=[Pose(np.zeros((2, 3)), still.attitude)]),
+        "position is finite": lambda: cast(
+            caster, o, d, poses=[Pose(np.full(3, np.nan), still.attitude)]
         ),
-        "quaternion": lambda: caster.cast(o, d, poses=[Pose(np.zeros(3), np.zeros(4))]),
+        "quaternion": lambda: cast(caster, o, d, poses=[Pose(np.zeros(3), np.zeros(4))]),
         "no body": lambda: Caster([]),
     }.items():
         with pytest.raises(ValueError, match=match):
