@@ -114,29 +114,15 @@ def _clump(seed, **places):
 
 
 def test_the_same_seed_plants_the_same_trees():
-    grown = [
-        trees.clump(
-            np.random.default_rng(seed),
-            ground(),
-            centre=(50.0, 50.0),
-            radius=10.0,
-            number=3,
-            tree=TREE,
-        )
-        for seed in (1, 1, 2)
-    ]
+    grown = [_clump(seed, centre=(50.0, 50.0), radius=10.0, number=3) for seed in (1, 1, 2)]
     np.testing.assert_array_equal(grown[0].vertices, grown[1].vertices)
     assert grown[0].vertices.shape != grown[2].vertices.shape
 
 
 def test_trees_without_room_or_ground_are_refused():
     with pytest.raises(ValueError, match="do not fit"):
-        trees.clump(
-            np.random.default_rng(1), ground(), centre=(50, 50), radius=3.0, number=20, tree=TREE
-        )
+        _clump(1, centre=(50, 50), radius=3.0, number=20)
     with pytest.raises(ValueError, match="beside the ground"):
-        trees.clump(
-            np.random.default_rng(1), ground(), centre=(500, 50), radius=3.0, number=1, tree=TREE
-        )
+        _clump(1, centre=(500, 50), radius=3.0, number=1)
     with pytest.raises(ValueError, match="crown"):
         trees.Tree(height=5.0, crown_base=6.0)
