@@ -180,7 +180,7 @@ def prepare_eyepoints(
 def seen_ground(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[Surface]
 ) -> tuple[Parameters, Cast]:
-    """Parameters of shots, and what their beams meet.
+    """Parameters of shots, and their footprints; a beamlet that misses sends nothing back.
 
     Parameters
     ----------
@@ -196,40 +196,6 @@ def seen_ground(
     ------
     ValueError
         Where a shot sees nothing, or a surface that is not given.
-    """
-    lit, relative, doppler, echo, beside = _footprints(eyepoints, surfaces)
-    upwards = eyepoints.direction[:, 2]
-    height = eyepoints.position[:, 2] + eyepoints.range * upwards
-    ground = Cast(Footprints(np.arange(len(echo)), relative, doppler, echo), beside)
-    shots = {
-        **parameters,
-        "target.range": eyepoints.range,
-        "target.radial_velocity": eyepoints.radial_velocity,
-        PATH_ELEVATION: -np.arcsin(upwards),
-        "target.reflectance": 1.0,
-        HEIGHT: parameters.get(HEIGHT, 0.0) + height,
-        # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
-        SUNLIGHT: np.asarray(parameters[SUNLIGHT]) * lit,
-    }
-    return shots, ground
-
-
-def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.ndarray, ...]:
-    """What footprints send back, and from where; 0 for a beamlet that misses.
-
-    Returns
-    -------
-    (n,) ndarray
-        Power fraction x reflectance.
-    (n, beamlets) ndarray, (n, beamlets) ndarray, (n, beamlets) ndarray
-        Offset, Doppler and echo as of :class:`sweep.model.ground.Footprints`.
-    (n, beamlets) bool ndarray
-        Whether a beamlet meets another surface than the reference beamlet.
-
-    Raises
-    ------
-    ValueError
-        As of :func:`seen_ground`.
     """
     if not eyepoints.seen.all():
         raise ValueError("a shot that sees nothing has no radiometry: leave it out")
@@ -248,4 +214,17 @@ def _footprints(eyepoints: Eyepoints, surfaces: Sequence[Surface]) -> tuple[np.n
         np.copyto(back, scattered, where=hit & by_law)
     echo = sent * back / ((1 + relative) * (1 + relative))
     axis = surface[np.arange(len(surface)), eyepoints.reference]
-    return sent.sum(axis=1), relative, doppler, echo, hit & (surface != axis[:, None])
+    upwards = eyepoints.direction[:, 2]
+    height = eyepoints.position[:, 2] + eyepoints.range * upwards
+    footprints = Footprints(np.arange(len(echo)), relative, doppler, echo)
+    shots = {
+        **parameters,
+        "target.range": eyepoints.range,
+        "target.radial_velocity": eyepoints.radial_velocity,
+        PATH_ELEVATION: -np.arcsin(upwards),
+        "target.reflectance": 1.0,
+        HEIGHT: parameters.get(HEIGHT, 0.0) + height,
+        # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
+        SUNLIGHT: np.asarray(parameters[SUNLIGHT]) * sent.sum(axis=1),
+    }
+    return shots, Cast(footprints, hit & (surface != axis[:, None]))

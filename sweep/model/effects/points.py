@@ -115,10 +115,21 @@ class Points:
             (number, ground.pattern(self._words)) if number else resolution.finest(self._words)
         )
         direct = self.architecture == "direct"
+        self.sample_rate = self[PROCESSING + "sample_rate"]
+        self.start = self[PROCESSING + "acquisition_delay"]
+        """Acquisition delay t_0 [s]."""
+        self.bin_width = self.sample_rate / self.fft_size
+        """[Hz]."""
+        self.chirp_rate = self[CHIRP + "bandwidth"] / self[CHIRP + "duration"]
+        self.range, self.radial_velocity = self["target.range"], self["target.radial_velocity"]
+        """On the beam's axis [m, m/s], positive when closing."""
+        self.delay = 2 / SPEED_OF_LIGHT * self.range
+        self.beta = 2 * self.radial_velocity / SPEED_OF_LIGHT
+        """Doppler ratio."""
         self.signs = self.columns(*(waveform.SIGNS[::2] if direct else waveform.SIGNS))
-        self.coherent = self.word("footprint.phases") == "coherent"
-        self.adds_amplitudes = self.coherent or direct
-        self.by_roots = self.coherent and not direct
+        coherent = self.word("footprint.phases") == "coherent"
+        self.adds_amplitudes = coherent or direct
+        self.by_roots = coherent and not direct
         """Whether roots of echoes add."""
 
     def __getitem__(self, path: str) -> np.ndarray:
@@ -190,30 +201,10 @@ class Points:
         """Bins of the FFT to one of fs/L."""
         return self.lobe.margin
 
-    @property
-    def sample_rate(self) -> np.ndarray:
-        """Sample rate [Hz]."""
-        return self[PROCESSING + "sample_rate"]
-
-    @property
-    def start(self) -> np.ndarray:
-        """Acquisition delay t_0 [s]."""
-        return self[PROCESSING + "acquisition_delay"]
-
     @cached_property
     def record_duration(self) -> np.ndarray:
         """Length of the record L/fs [s]."""
         return self.window.length / self.sample_rate
-
-    @cached_property
-    def bin_width(self) -> np.ndarray:
-        """Width of a bin fs/N [Hz]."""
-        return self.sample_rate / self.fft_size
-
-    @cached_property
-    def chirp_rate(self) -> np.ndarray:
-        """Chirp rate S = B/T [Hz/s]."""
-        return self[CHIRP + "bandwidth"] / self[CHIRP + "duration"]
 
     @cached_property
     def carriers(self) -> np.ndarray:
@@ -252,26 +243,6 @@ class Points:
 
     # The target
 
-    @property
-    def range(self) -> np.ndarray:
-        """Range on the beam's axis [m]."""
-        return self["target.range"]
-
-    @property
-    def delay(self) -> np.ndarray:
-        """Delay of the echo [s]."""
-        return 2 / SPEED_OF_LIGHT * self.range
-
-    @cached_property
-    def radial_velocity(self) -> np.ndarray:
-        """Radial velocity on the beam's axis [m/s], positive when closing."""
-        return self["target.radial_velocity"]
-
-    @cached_property
-    def beta(self) -> np.ndarray:
-        """Doppler ratio 2 v_r / c."""
-        return 2 * self.radial_velocity / SPEED_OF_LIGHT
-
     @cached_property
     def footprint(self) -> Extent:
         """What the beams meet, as they all have it or on a plane."""
@@ -280,8 +251,7 @@ class Points:
         angle = self["target.grazing_angle"]
         echo = backscatter(self.word("target.reflectance_law"), np.sin(angle))
         if self.number == 1:
-            none = NO_SPREAD
-            return Extent(echo, 1.0, none, none, none)
+            return Extent(echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
         shape: dict[str, Any] = {
             "grazing_angle": angle, "beam_divergence": self[LASER + "beam_divergence"],
             "number": self.number, "pattern": self.pattern,

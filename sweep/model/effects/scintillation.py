@@ -166,8 +166,8 @@ def factors(
     """
     uniforms = philox.uniforms(realisation.keys, realisation.draw, philox.STREAM_SCINTILLATION, 4)
     total = np.ones(realisation.draw.size)
-    for i, variance in enumerate(_parts(legs, total.size)):
-        total *= _inverse(distribution, uniforms[:, i], variance)
+    for i, variance in enumerate(v for leg in legs for v in leg):
+        total *= _inverse(distribution, uniforms[:, i], np.asarray(variance, float))
     return total
 
 
@@ -188,20 +188,14 @@ def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarra
     return np.asarray(mean / 2), np.asarray((mean**2 + spread) / 4)
 
 
-def _parts(legs: Sequence[LogVariances], size: int) -> list[np.ndarray]:
-    return [np.broadcast_to(np.asarray(v, float), size) for leg in legs for v in leg]
-
-
-def _inverse(
-    distribution: str, chance: np.ndarray, variance: np.ndarray, *, upper: bool = False
-) -> np.ndarray:
-    """Value that a factor of unit mean and this log variance falls below (exceeds) by chance.
+def _inverse(distribution: str, chance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Value that a factor of unit mean and this log variance falls below by chance.
 
     A gamma law of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5, which
     the library's inverse can get wrong, go by Wilson and Hilferty's cube of a normal number,
     there within 1e-3 standard deviations.
     """
-    z = special.ndtri(chance) * (-1.0 if upper else 1.0)
+    z = special.ndtri(chance)
     if distribution == "log_normal":
         return np.asarray(np.exp(np.sqrt(variance) * z - variance / 2))
     if distribution != "gamma_gamma":
@@ -210,9 +204,8 @@ def _inverse(
         )
     spread = np.expm1(variance)
     shape = 1 / np.maximum(spread, _LEAST_SPREAD)
-    inverse = special.gammainccinv if upper else special.gammaincinv
     cube = (1 - spread / 9 + np.sqrt(spread) / 3 * z) ** 3
-    return np.where(spread > _LEAST_SPREAD, inverse(shape, chance) / shape, cube)
+    return np.where(spread > _LEAST_SPREAD, special.gammaincinv(shape, chance) / shape, cube)
 
 
 _TURBULENCE, _CONSTANT = "atmosphere.turbulence", "atmosphere.structure_constant"
