@@ -18,7 +18,6 @@ magnitudes: |X| counts by its change over itself, or over sigma where it is belo
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -83,20 +82,22 @@ def plan(
         For a mode that is none of these, a name that is no effect's, or an effect that is on
         within one that is off.
     """
-    rules = rules_of(tuple(effects), tuple((modes or {}).items()))
-    points.at_rest = rules.decided.get("doppler") == "off"
+    names = tuple(effect.name for effect in effects)
+    decided = _decided(effects, modes or {})
+    points.at_rest = decided.get("doppler") == "off"
     with np.errstate(all="ignore"):  # of what exceeds all numbers nothing is known: it is kept
         sizes = sizes_of(points, effects)
         leaking = None
-        if rules.decided.get("leakage") == "on" and "leakage" in sizes:
+        if decided.get("leakage") == "on" and "leakage" in sizes:
             leaking = {effect.name: effect.stage in _MOVING for effect in effects}
         found = {name: tiles(change) for name, change in changes(sizes, points, leaking).items()}
-    there = np.array([name in found for name in rules.names])
+    there = np.array([name in found for name in names])
     number = max((value.size for value in found.values()), default=1)
-    change = np.array([found.get(name, np.zeros(number)) for name in rules.names])
-    kept = chosen(change, there, rules, tolerance)
+    change = np.array([found.get(name, np.zeros(number)) for name in names])
+    kept = _kept(change, there, effects, decided, tolerance)
     error = np.where(kept, 0.0, change).sum(axis=0)
-    return Plan(rules.names, kept, change, error, kept[there & rules.open].all(axis=0))
+    choice = there & np.array([name not in decided for name in names])
+    return Plan(names, kept, change, error, kept[choice].all(axis=0))
 
 
 def sizes_of(points: Points, effects: Sequence[Effect] = EFFECTS) -> dict[str, Size]:
@@ -107,91 +108,68 @@ def sizes_of(points: Points, effects: Sequence[Effect] = EFFECTS) -> dict[str, S
     return {name: size for name, size in sizes if size is not None}
 
 
-class Rules(NamedTuple):
-    """What modes say of effects, whatever their sizes."""
-
-    names: tuple[str, ...]
-    decided: Mapping[str, str]
-    """Effects that are on or off, and what these take with them."""
-    open: np.ndarray
-    """Whether it is neither on nor off, (effects,) bool."""
-    free: np.ndarray
-    """Whether it costs nothing, as a number added to the noise does, (effects,) bool."""
-    parents: tuple[tuple[int, int], ...]
-    """Effects and what they are within, the last first."""
-    needs: tuple[tuple[int, int], ...]
-    """Effects, and what each is simulated with."""
-
-
-@lru_cache(maxsize=16)
-def rules_of(effects: tuple[Effect, ...], modes: tuple[tuple[str, str], ...]) -> Rules:
-    """What modes say, the same for all blocks of a study."""
-    names = tuple(effect.name for effect in effects)
-    within = {effect.name: effect.within for effect in effects if effect.within in names}
-    decided = _decided(names, dict(modes), within)
-    needs = [
-        (row, names.index(need))
-        for row, effect in enumerate(effects)
-        for need in effect.needs
-        if need in names and decided.get(need) != "off"
-    ]
-    parents = [(names.index(child), names.index(parent)) for child, parent in within.items()]
-    return Rules(
-        names=names,
-        decided=decided,
-        open=np.array([name not in decided for name in names], np.bool_),
-        free=np.array([effect.stage == "noise" for effect in effects], np.bool_),
-        parents=tuple(sorted(parents, reverse=True)),
-        needs=tuple(needs),
-    )
-
-
-def _decided(
-    names: Sequence[str], modes: Mapping[str, str], within: Mapping[str, str]
-) -> dict[str, str]:
+def _decided(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
     """Effects that are on or off whatever their sizes, and what these take with them."""
+    names = [effect.name for effect in effects]
     if unknown := sorted(set(modes) - set(names)):
         raise ValueError(f"no effect {', '.join(unknown)}: choose from {', '.join(names)}")
     for name, mode in modes.items():
         if mode not in MODES:
             raise ValueError(f"{name}: no mode {mode!r}: choose from {', '.join(MODES)}")
     decided = {name: mode for name, mode in modes.items() if mode != "auto"}
-    for name in names:  # an effect follows in the list what it is within
-        if decided.get(within.get(name, "")) == "off":
+    for name, parent in _within(effects):
+        if decided.get(parent) == "off":
             if decided.get(name) == "on":
-                raise ValueError(f"{name} cannot be on within {within[name]}, which is off")
+                raise ValueError(f"{name} cannot be on within {parent}, which is off")
             decided[name] = "off"
-    for name in reversed(names):
-        if decided.get(name) == "on" and name in within:
-            decided[within[name]] = "on"
+    for name, parent in reversed(_within(effects)):
+        if decided.get(name) == "on":
+            decided[parent] = "on"
     return decided
 
 
-def chosen(change: np.ndarray, there: np.ndarray, rules: Rules, tolerance: float) -> np.ndarray:
+def _within(effects: Sequence[Effect]) -> list[tuple[str, str]]:
+    """Effects that are part of others, and these, which stand before them in the list."""
+    names = {effect.name for effect in effects}
+    return [(effect.name, effect.within) for effect in effects if effect.within in names]
+
+
+def _kept(
+    change: np.ndarray,
+    there: np.ndarray,
+    effects: Sequence[Effect],
+    decided: Mapping[str, str],
+    tolerance: float,
+) -> np.ndarray:
     """Effects to keep, (effects, tiles) bool.
 
     The smallest are left out first, as long as their sum is within what the tolerance leaves; an
     effect never before those within it, last ones first where they are alike. Those that cost
-    nothing are never left out. ``there`` says of which effects the scene has anything.
+    nothing, as a number added to the noise does, are never left out. ``there`` says of which
+    effects the scene has anything.
     """
-    off = [row for row, name in enumerate(rules.names) if rules.decided.get(name) == "off"]
-    room = np.maximum(tolerance - change[off].sum(axis=0), 0.0)
-    rows = np.flatnonzero(there & rules.open)
+    place = {effect.name: row for row, effect in enumerate(effects)}
+    mode = np.array([decided.get(name, "") for name in place])
+    free = np.array([effect.stage == "noise" for effect in effects])
+    room = np.maximum(tolerance - change[mode == "off"].sum(axis=0), 0.0)
+    choice = there & (mode == "")
     key = change.copy()
-    for child, parent in rules.parents:
-        if there[child] and rules.open[child]:
+    for name, within in reversed(_within(effects)):
+        child, parent = place[name], place[within]
+        if choice[child]:
             key[parent] = np.maximum(key[parent], key[child])
-    backwards = rows[::-1]
+    backwards = np.flatnonzero(choice)[::-1]
     order = backwards[np.argsort(key[backwards], axis=0, kind="stable")]
-    cost = np.where(rules.free[:, None], 0.0, change)
+    cost = np.where(free[:, None], 0.0, change)
     total = np.cumsum(np.take_along_axis(cost, order, axis=0), axis=0)
     kept = np.zeros(change.shape, np.bool_)
     np.put_along_axis(kept, order, ~(total <= room), axis=0)
-    kept[rows[rules.free[rows]]] = True
-    on = [row for row, name in enumerate(rules.names) if rules.decided.get(name) == "on"]
-    kept[on] = there[on, None]
-    for row, need in rules.needs:
-        kept[need] |= kept[row] & there[need]
+    kept[choice & free] = True
+    kept[mode == "on"] = there[mode == "on", None]
+    for row, effect in enumerate(effects):
+        for need in effect.needs:
+            if need in place and decided.get(need) != "off":
+                kept[place[need]] |= kept[row] & there[place[need]]
     return kept
 
 
