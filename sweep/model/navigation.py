@@ -36,8 +36,8 @@ from scipy.special import chdtri
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import UNCONFIRMED
 
-STRETCH = 1 << 16
-"""Beams solved for at once."""
+STRETCH = 1 << 14
+"""Beams solved for at once: so many that what is made of them stays at hand."""
 
 LEAST_SINE = 0.05
 """A beam that grazes the ground at less than about 3 deg is weighted as if at that angle."""
@@ -184,11 +184,14 @@ def altitude(
     if offset is not None:
         moved = np.broadcast_to(np.asarray(offset, float), (*shape, *u.shape[1:]))
         points += moved.reshape(u.shape)
+    # Beams first, cycles last: NumPy is fast along the last.
+    points, u, error = (np.ascontiguousarray(each.T) for each in (points, u, error))
 
     def fit(index: np.ndarray, used: np.ndarray) -> Fit:
-        some = points[index], u[index], error[index], used
+        mask = np.ascontiguousarray(used.T)
+        some = np.where(mask, points[..., index], 0.0), u[..., index], error[:, index], mask
         with np.errstate(divide="ignore", invalid="ignore"):
-            gradient = _plane(*some, np.zeros((index.size, 2)), slope, relief)[3]
+            gradient = _plane(*some, np.zeros((2, index.size)), slope, relief)[3]
             height, variance, chi, _ = _plane(*some, gradient, slope, relief)
         count = used.sum(axis=1)
         return height, variance, np.where(count > 0, chi, np.nan), np.maximum(count - 1, 0)
@@ -207,28 +210,29 @@ def _plane(
     the error times ``gradient . (u_x, u_y) - u_z``, so the weights need a gradient beforehand.
 
     About the weighted centre of the points, height and slopes do not correlate. Slopes known
-    beforehand are two more observations of 0.
+    beforehand are two more observations of 0. Points and beams are (3, b, n), gradients (2, n).
     """
-    n, b = used.shape
-    sine = (gradient[:, None] * beams[..., :2]).sum(axis=2) - beams[..., 2]
+    b, n = used.shape
+    sine = gradient[0] * beams[0] + gradient[1] * beams[1] - beams[2]
     moved = errors * np.maximum(sine, LEAST_SINE)
     weight = np.where(used, 1.0 / np.hypot(moved, relief), 0.0)
-    total = sum(weight.T**2)
-    share = (weight**2 / total[:, None])[..., None]
-    centre = np.where(used[..., None], points * share, 0.0).sum(axis=1)
-    apart = np.where(used[..., None], weight[..., None] * (points - centre[:, None]), 0.0)
+    total = sum(weight**2)  # one beam after the other: NumPy's order would go by n
+    centre = sum((points * (weight**2 / total)).swapaxes(0, 1))
+    apart = weight * (points - centre[:, None])
     residual = np.zeros((n, b + 2))
-    residual[:, :b] = apart[..., 2]
-    height, variance, gradient = -centre[:, 2], 1.0 / total, np.zeros((n, 2))
+    residual[:, :b] = apart[2].T
+    height, variance, gradient = -centre[2], 1.0 / total, np.zeros((2, n))
     if slope > 0:
-        known = np.broadcast_to(np.eye(2) / slope, (n, 2, 2))
-        columns = np.concatenate([apart[..., :2], known], axis=1)
+        columns = np.zeros((n, b + 2, 2))
+        columns[:, :b] = apart[:2].T
+        columns[:, b, 0] = columns[:, b + 1, 1] = 1.0 / slope
         turn, square, coordinate = _least_squares(columns, residual)
-        along = centre[:, :1] * turn[:, 0] + centre[:, 1:2] * turn[:, 1]
+        turn, square, coordinate = turn.T, square.T, coordinate.T  # cycles last
         for k in range(2):
-            height = height + along[:, k] * coordinate[:, k]
-            variance = variance + along[:, k] ** 2 / square[:, k]
-        gradient = (turn * coordinate[:, None]).sum(axis=2)
+            along = centre[0] * turn[k, 0] + centre[1] * turn[k, 1]
+            height = height + along * coordinate[k]
+            variance = variance + along**2 / square[k]
+            gradient = gradient + turn[k] * coordinate[k]
     return height, variance, sum(residual.T**2), gradient
 
 
