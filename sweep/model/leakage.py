@@ -36,12 +36,13 @@ from sweep.model.spectrum import (
     POINT,
     S_A_RE,
     S_PLACE,
+    SOURCE_DIGITS,
     TAN,
     TURN_IM,
     TURN_RE,
     WEIGHT,
-    WINDOW,
     add_far,
+    envelope_from,
     magnitudes,
     run_of,
     seen,
@@ -85,22 +86,22 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         As of :func:`sweep.model.spectrum.detect`.
     leakage : float
     """
-    n, lowest, highest, total = lines
-    half, beside = sizes[0] // 2, sizes[2] - WINDOW - 2
+    n, lowest, highest, total, faint = lines
+    half, beside = sizes[0] // 2, sizes[6]
     place = seen(origin, lowest, highest, sizes)
-    mirror = max(min(place[0], half - place[1]), 0.0) if sizes[6] == IMAGED else math.inf
+    mirror = max(min(place[0], half - place[1]), 0.0) if sizes[7] == IMAGED else math.inf
     crossing = stays_below(noise[1], total, place, form, sizes)
     afar, sources = total, 0
     least = max(crossing, float(beside))
     left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
     if left < 0.0 or crossing > beside:
-        sources = take_sources(n, lowest, highest, sizes, room)
+        sources = take_sources(n, lowest, highest, float(beside), SOURCE_DIGITS, sizes, room)
         afar = weight_afar(total, sources, sizes, room)
         if crossing > beside:
             crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
         least = min(max(crossing, float(beside)), float(beside + half))
         left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
-    known = n, lowest, highest, sources
+    known = n, lowest, highest, sources, faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
         count = high - low + 1
@@ -169,9 +170,7 @@ def _all_beyond(weight, first, mirror, noise, form):
 @njit(cache=True, error_model="numpy")
 def _envelope_beyond(first, form):
     """Envelope ``first`` bins away; half the sum of its squares in all bins from there on."""
-    place = 0
-    while place + 1 < form.shape[1] and form[0, place + 1] <= first - 1.5:
-        place += 1
+    place = envelope_from(first - 1.5, form)
     return form[1, place], form[1, place] * form[1, place] + form[2, place]
 
 
@@ -220,7 +219,7 @@ def _chances(count, noise, room, exempt, series):
 def _least_reach(weight, spread, noise, crossing, form, sizes):
     """Bins beyond the near ones that the run has to take in: see the module."""
     sigma, level, _ = noise
-    clearance = sizes[2] - WINDOW - 2
+    clearance = sizes[6]
     beside = form[1, clearance] * weight / sigma
     gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
     least = max(crossing, max(gentle, 0.75 * spread)) - clearance
@@ -275,7 +274,7 @@ def _leakage(run, place, noise, form, sizes, tangent, room, exempt, series):
 def _far_values(points, centre, origin, sources, form, sizes, tangent, room):
     """|X|^2 at points whose tangents from ``centre`` are in row POINT, into row HALF_SQUARE."""
     power, way = sizes[4] != 0, -1 if origin < 0 else 1
-    for turn in range(2 if sizes[6] == IMAGED else 1):
+    for turn in range(2 if sizes[7] == IMAGED else 1):
         towards = way if turn == 0 else -way
         shift = tangent_of(centre - towards * origin, sizes[0], tangent)
         for i in range(points):
@@ -326,7 +325,7 @@ def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
     far_bin = 0 if side < 0 else half_size
     half = side > 0 and 2 * half_size != fft_size
     last_bin = abs(far_bin - centre)
-    goes_on = sizes[6] != IMAGED and last_bin < half_size
+    goes_on = sizes[7] != IMAGED and last_bin < half_size
     half = half or goes_on
     far = max(_cotangent(last_bin, half, fft_size, tangent), 1e-9)
     near = _cotangent(last, True, fft_size, tangent)

@@ -7,8 +7,10 @@ share one shape. With x = -1 .. 1 over the record of L samples, r = L/N, and y b
 
 whose phase counts from the middle of the record. G is kept in three forms:
 
-- **A table** of G, or of |G|^2 where lines add as powers, at every 1/16 (1/32) bin out to some
-  bins on either side. Ten values beside each other make any other, to 1e-12 of the peak.
+- **A table** of G, or of |G|^2 where lines add as powers, at cells of 1/2 (1/4) bin out to some
+  bins on either side. Lines are shared out among the fourteen cells beside them, by a kernel that
+  all but vanishes beyond; the table has divided out what that does. It is a Kaiser-Bessel kernel,
+  as of non-uniform FFTs [Fessler and Sutton 2003], and right to 1e-12 of the peak.
 - **Beyond the table** by the record's two ends alone. With c = cot(pi y / N),
 
       G(y) = e^{i pi r y} A(c) - e^{-i pi r y} B(c)
@@ -30,15 +32,35 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.special import i0
 
 from sweep.model.elementary import sincos_cycles
 from sweep.model.window import COSINE_SUMS, Window, samples
 
-CELLS = (16, 32)
+CELLS = (2, 4)
 """Cells of the table in a bin of fs/N, for amplitudes and for powers."""
 
-TIERS = ((24, 24), (48, 56), (128, 200))
-"""Modes at the most, and bins of fs/L on either side that the table then holds."""
+POINTS = 14
+"""Cells among which a line is shared out: -6 .. 7 beside its place between 0 and 1."""
+
+WIDEN = 32.32432
+"""Parameter of the kernel I_0(b sqrt(1 - (2 z / POINTS)^2)) / I_0(b) over z cells."""
+
+TAPS = np.array([
+    27.059814524108916, -24.069297462538476, 18.21886188994693, -12.301303141361002,
+    7.584228285544723, -4.313600790782408, 2.270108868623467, -1.1041027145184494,
+    0.49429836881691397, -0.2024309201966936, 0.07519960545439297, -0.025063737807734597,
+    0.007388544649665242, -0.0018900276225103194, 0.0004085782830266439, -7.179287548481712e-05,
+    9.634021822884657e-06, -8.798393952475983e-07, 4.1136322681806606e-08,
+])  # fmt: skip
+"""Even filter over cells whose transform is 1 over the kernel's, to 1e-13 below pi / 2."""
+
+TIERS = ((24, 20, 64), (48, 56, 96), (128, 200, 256))
+"""Modes at the most; bins of fs/L beyond which the record's ends then tell a shape; bins that its
+table holds on either side, where few points share it."""
+
+SHARED = 256
+"""Bins that it holds where many do: wide footprints are then served by it."""
 
 DERIVATIVES = 12
 """Derivatives at the record's ends."""
@@ -52,33 +74,39 @@ _SHORTEST, _MOST_PADDED = 4096, 8
 _FAR = 48
 """Distances at which the envelope is known beyond the table."""
 
-_MARGIN = 1.1
-"""On the envelope, which is looked at every quarter of a bin."""
+_MARGIN = 1.05
+"""On the envelope, for what happens between cells."""
+
+_BEYOND = TAPS.size - 1
+"""Cells on either side of a table that its filter looks at."""
 
 
 class Shapes(NamedTuple):
     """Line shapes of one window and FFT, as the compiled code takes them; see `segments`."""
 
     sizes: np.ndarray
-    """(6,) int64: FFT size N, window length L, bins T of the table on either side, cells a bin,
-    whether the table is of powers, whether it holds all bins."""
+    """(7,) int64: FFT size N, window length L, bins T of the table on either side, cells a bin,
+    whether the table is of powers, whether it holds all bins; bins beyond which ends tell."""
     modes: np.ndarray
-    """(modes, cells * columns): of each mode the real (even modes) or imaginary part (odd ones)
+    """(modes, places): of each mode the real (even modes) or imaginary part (odd ones), by cell,
     that does not come from the record's first sample."""
     edges: np.ndarray
-    """(2, cells * columns): half of the window's first sample times cos and sin of pi r y."""
+    """(2, places): half of the window's first sample times cos and sin of pi r y."""
     ends: np.ndarray
     """(modes, 4, DERIVATIVES + 2): real and imaginary parts of A and of B, lowest power first."""
     reach: np.ndarray
     """(m,): distances [bins of fs/N] at which the envelope is known."""
     whole: np.ndarray
     """(segments, 2, cells * columns): tables that hold all bins; else empty."""
+    outlines: np.ndarray
+    """(segments, 2, m): their envelopes, as of :func:`build`; else empty."""
 
 
 @lru_cache(maxsize=24)
-def shapes(window: Window, fft_size: int, power: bool, tier: int) -> Shapes:
+def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: bool = True) -> Shapes:
     """What shapes of up to some modes (:data:`TIERS`) are made of."""
-    number, beside = TIERS[tier]
+    number, clear, beside = TIERS[tier]
+    beside = SHARED if shared else beside
     ratio, length = window.length / fft_size, window.length
     bins = math.ceil(beside / ratio)
     y = _places(bins, power)
@@ -94,11 +122,12 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int) -> Shapes:
     modes += _corrections(taylor, ratio * y, length)
     edge = float(taylor[0, 0])
     return Shapes(
-        np.array([fft_size, length, bins, CELLS[power], power, False]),
+        np.array([fft_size, length, bins, CELLS[power], power, False, math.ceil(clear / ratio)]),
         modes,
         0.5 * edge * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)]),
         _ends(taylor, length),
         _distances(bins, fft_size),
+        np.empty((0, 2, 0)),
         np.empty((0, 2, 0)),
     )
 
@@ -114,23 +143,66 @@ def has_modes(window: Window, fft_size: int) -> bool:
 
 def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) -> Shapes:
     """Shapes that have tables of all bins, of phase errors [cycles] by segment, (segments, L)."""
-    cells, columns = CELLS[power], fft_size
-    place = (np.arange(columns) - columns // 2) * cells - np.arange(cells)[:, None]
-    turn = np.exp(1j * np.pi * (window.length / fft_size) * (place / cells))
-    whole = np.empty((len(phase), 2, cells * columns))
-    w = samples(window.name, window.length)
-    for table, psi in zip(whole, phase, strict=True):
+    cells, half, length = CELLS[power], fft_size // 2, window.length
+    number = cells * fft_size
+    place = (np.arange(fft_size) - half) * cells - np.arange(cells)[:, None]
+    turn = np.exp(1j * np.pi * (length / fft_size / cells) * place)
+    whole = np.empty((len(phase), 2, number))
+    reach = _distances(half, fft_size)
+    outlines = np.zeros((len(phase), 2, reach.size))
+    w, x = samples(window.name, length), 2 * np.arange(length) / length - 1
+    for table, outline, psi in zip(whole, outlines, phase, strict=True):
         record = w * np.exp(2j * np.pi * (psi - np.rint(psi)))
-        found = (np.fft.fft(record, cells * fft_size)[place % (cells * fft_size)] * turn).ravel()
-        table[0], table[1] = (np.abs(found) ** 2, 0) if power else (found.real, found.imag)
+        square = np.abs(np.fft.fft(record, number)) ** 2
+        _outline_of_all(square, cells, outline)
+        if power:
+            found = TAPS[0] * square
+            for k in range(1, TAPS.size):
+                found += TAPS[k] * (np.roll(square, k) + np.roll(square, -k))
+            table[0], table[1] = found[place % number].ravel(), 0.0
+        else:
+            record /= kernel_transform(np.pi * (length / fft_size / cells) * x)
+            found = (np.fft.fft(record, number)[place % number] * turn).ravel()
+            table[0], table[1] = found.real, found.imag
     return Shapes(
-        np.array([fft_size, window.length, columns // 2, cells, power, True]),
+        np.array([fft_size, length, half, cells, power, True, half]),
         np.empty((0, 0)),
         np.empty((2, 0)),
         np.empty((0, 4, 1)),
-        _distances(columns // 2, fft_size),
+        reach,
         whole,
+        outlines,
     )
+
+
+def _outline_of_all(square: np.ndarray, cells: int, outline: np.ndarray) -> None:
+    """Envelope of |G|^2 at all cells of the circle."""
+    both = square + np.maximum(np.roll(square, cells // 2), np.roll(square, -(cells // 2)))
+    half = square.size // 2
+    folded = np.maximum(both[: half + 1], both[-np.arange(half + 1)])
+    beyond = np.maximum.accumulate(folded[::-1])[::-1]
+    beyond = beyond[np.maximum(np.arange(0, half + 1, cells) - 1, 0)]  # from the cell before on
+    beyond *= _MARGIN**2
+    outline[0, : beyond.size] = np.sqrt(beyond)
+    steps = 0.5 * (beyond + np.append(beyond[1:], 0.0))
+    outline[1, : beyond.size] = np.cumsum(steps[::-1])[::-1]
+
+
+def kernel(z: np.ndarray) -> np.ndarray:
+    """The kernel by which lines are shared out, at z cells, |z| <= POINTS / 2."""
+    root = np.sqrt(np.maximum(1 - (2 * z / POINTS) ** 2, 0.0))
+    return np.asarray(i0(WIDEN * root) / i0(WIDEN))
+
+
+def kernel_transform(theta: np.ndarray) -> np.ndarray:
+    """Its transform at theta radians a cell, |theta| <= pi."""
+    root = np.sqrt(WIDEN**2 - (POINTS * theta / 2) ** 2)
+    return np.asarray(POINTS * np.sinh(root) / root / i0(WIDEN))
+
+
+def places_of(sizes: np.ndarray) -> int:
+    """Numbers in a row of a table of these sizes."""
+    return int(sizes[3] * (sizes[0] if sizes[5] else 2 * sizes[2] + 1))
 
 
 def record_places(nodes: int) -> np.ndarray:
@@ -147,9 +219,9 @@ def to_modes(nodes: int) -> np.ndarray:
 
 
 def _places(bins: int, power: bool) -> np.ndarray:
-    """Distances y of a table's cells from their line, flat."""
-    cell = np.arange(CELLS[power]) / CELLS[power]
-    return np.ravel(np.arange(-bins, bins + 1)[None, :] - cell[:, None])
+    """Distances y of a table's cells from their line, and of those that its filter looks at."""
+    cells = CELLS[power]
+    return np.arange(-bins * cells - cells + 1 - _BEYOND, bins * cells + _BEYOND + 1) / cells
 
 
 def _distances(bins: int, fft_size: int) -> np.ndarray:
@@ -286,8 +358,8 @@ def build(re, im, number, shapes, table, ends, envelope):
     """
     sizes, modes, edges, mode_ends, reach = shapes[0], shapes[1], shapes[2], shapes[3], shapes[4]
     at_first_re, at_first_im, at_last_re, at_last_im = 0.0, 0.0, 0.0, 0.0
-    size = table.shape[1]
-    table[:] = 0.0
+    size = modes.shape[1]
+    raw = np.zeros((2, size))
     ends[:] = 0.0
     for j in range(number):
         a, b = re[j], im[j]
@@ -299,8 +371,8 @@ def build(re, im, number, shapes, table, ends, envelope):
         if j & 1:
             a, b = -b, a
         for i in range(size):
-            table[0, i] += a * modes[j, i]
-            table[1, i] += b * modes[j, i]
+            raw[0, i] += a * modes[j, i]
+            raw[1, i] += b * modes[j, i]
         for d in range(ends.shape[1]):
             for k in range(0, 4, 2):
                 one, other = mode_ends[j, k, d], mode_ends[j, k + 1, d]
@@ -311,31 +383,56 @@ def build(re, im, number, shapes, table, ends, envelope):
     c, d = at_first_re + at_last_re, at_first_im + at_last_im
     for i in range(size):
         cosine, sine = edges[0, i], edges[1, i]
-        table[0, i] += a * cosine - d * sine
-        table[1, i] += b * cosine + c * sine
+        raw[0, i] += a * cosine - d * sine
+        raw[1, i] += b * cosine + c * sine
     if sizes[4]:
         for i in range(size):
-            table[0, i] = table[0, i] * table[0, i] + table[1, i] * table[1, i]
-    put_envelope(table, ends, sizes, reach, envelope)
+            raw[0, i] = raw[0, i] * raw[0, i] + raw[1, i] * raw[1, i]
+    _put_table(raw, sizes, table)
+    _put_envelope(raw, ends, sizes, reach, envelope)
 
 
 @njit(cache=True, error_model="numpy")
-def put_envelope(table, ends, sizes, reach, envelope):
-    """Envelope of a table, and of what is beyond it; as of :func:`build`."""
+def _put_table(raw, sizes, table):
+    """What the kernel does to lines divided out of values at cells, in rows by cell of a bin."""
+    cells, columns = sizes[3], 2 * sizes[2] + 1
+    number = np.uint64(cells * columns)
+    filtered = np.empty(cells * columns)
+    for row in range(1 if sizes[4] else 2):
+        for i in range(number):
+            filtered[i] = TAPS[0] * raw[row, i + np.uint64(_BEYOND)]
+        for k in range(1, TAPS.size):
+            low, high = np.uint64(_BEYOND - k), np.uint64(_BEYOND + k)
+            for i in range(number):
+                filtered[i] += TAPS[k] * (raw[row, i + low] + raw[row, i + high])
+        for m in range(cells):
+            for q in range(columns):
+                table[row, m * columns + q] = filtered[q * cells + cells - 1 - m]
+
+
+@njit(cache=True, error_model="numpy")
+def _put_envelope(raw, ends, sizes, reach, envelope):
+    """Envelope of values at cells, and of what is beyond them; as of :func:`build`.
+
+    |G|^2 goes as a sine of y with a period of a bin, so that it is nowhere more than two values
+    half a bin apart have together.
+    """
     bins, cells, power = sizes[2], sizes[3], sizes[4]
-    columns = table.shape[1] // cells
+    middle = bins * cells + cells - 1 + _BEYOND
     most, area, before = 0.0, 0.0, 0.0
     for i in range(reach.size - 1, -1, -1):
         if i <= bins:
-            for row in range(0, cells, cells // 4):
-                for side in range(2):
-                    column = bins - i if side == 0 else min(bins + i, columns - 1)
-                    at = row * columns + column
-                    square = table[0, at]
-                    if not power:
-                        square = square * square + table[1, at] * table[1, at]
-                    most = max(most, _MARGIN * math.sqrt(square))
-        elif not sizes[5]:
+            for k in range(-1, cells):  # from the cell before on
+                for side in range(-1, 2, 2):
+                    total = 0.0
+                    for further in range(0, cells, cells // 2):
+                        at = middle + side * (i * cells + k + further)
+                        if power:
+                            total += raw[0, at]
+                        else:
+                            total += raw[0, at] * raw[0, at] + raw[1, at] * raw[1, at]
+                    most = max(most, _MARGIN * math.sqrt(total))
+        else:
             c = 1.0 / math.tan(math.pi * reach[i] / sizes[0])
             a_re, a_im, b_re, b_im = 0.0, 0.0, 0.0, 0.0
             for d in range(ends.shape[1] - 1, -1, -1):
@@ -344,7 +441,7 @@ def put_envelope(table, ends, sizes, reach, envelope):
                 b_re = b_re * c + ends[2, d]
                 b_im = b_im * c + ends[3, d]
             most = max(most, math.hypot(a_re, a_im) + math.hypot(b_re, b_im))
-        further = reach[i + 1] - reach[i] if i + 1 < reach.size else 0.0
-        area += further * 0.5 * (most * most + before)  # an upper sum, where it falls ever slower
+        width = reach[i + 1] - reach[i] if i + 1 < reach.size else 0.0
+        area += width * 0.5 * (most * most + before)  # an upper sum, where it falls ever slower
         before = most * most
         envelope[0, i], envelope[1, i] = most, area

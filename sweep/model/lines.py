@@ -45,7 +45,7 @@ BLOCK_SIZE = 128
 
 _X, _EVEN, _ODD, _RE, _IM, _LANES = (BLOCK_SIZE * k for k in range(6))
 
-LEAST_WIDTH = 10 * BLOCK_SIZE
+LEAST_WIDTH = 14 * BLOCK_SIZE
 """Of scratch."""
 
 COMMON = 16

@@ -93,7 +93,7 @@ UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
 
 LINE_STEPS = 2
-"""Steps that take few lines for many, at the most: each may err by as much of the whole."""
+"""Steps of a sum of lines that leave something out, at the most: each may err by as much."""
 
 
 class PhaseError(NamedTuple):

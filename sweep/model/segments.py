@@ -205,16 +205,19 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
         np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16)),
         np.empty((count, place.size)),
     )
-    table, form = np.empty((2, 0)), np.zeros((7, shapes.reach.size))
+    table = np.empty((2, line_shape.places_of(shapes.sizes)))
+    form = np.zeros((7, shapes.reach.size))
     if shapes.sizes[5]:
         table = shapes.whole[0]
     else:
-        table, one = np.empty((2, shapes.modes.shape[1])), np.ones(1)
+        one = np.ones(1)
         line_shape.build(one, 0 * one, 1, shapes, table, form[3:, :14], form[1:3])
     room[RE, 0], room[IM, 0] = 1.0, 0.0
     for i, at in enumerate(place):
         room[PLACE, 0] = at
-        field(first, count, (1, at, at, 0), table, form, shapes.sizes, tangents(fft_size), room)
+        field(
+            first, count, (1, at, at, 0, 0.0), table, form, shapes.sizes, tangents(fft_size), room
+        )
         found[:, i] = np.hypot(room[F_RE, :count], room[F_IM, :count])
     return found
 
@@ -277,7 +280,7 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
             if these.any():
                 yield _sorted(
                     some[these], place[which[these]],
-                    line_shape.shapes(window, fft_size, power, tier),
+                    line_shape.shapes(window, fft_size, power, tier, shared=shots.alike),
                     centre[:, told], modes[:, told], number[:, told],
                 )  # fmt: skip
             left = left[~told]
@@ -349,9 +352,7 @@ def _some(
     values = np.full((4, segments, m), np.nan)
     magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
     shapes = together.shapes
-    columns, known = shapes.modes.shape[1], shapes.reach.size
-    if shapes.sizes[5]:
-        columns = shapes.whole.shape[2]
+    places, known = line_shape.places_of(shapes.sizes), shapes.reach.size
     done = _inspect_points(
         np.ascontiguousarray(table[:, part]),
         np.stack([shots.row[part], together.which[first:]]),
@@ -361,7 +362,7 @@ def _some(
         (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
          shots.window.sum),
-        (np.empty((segments, 2, columns)), np.zeros((segments, 7, known))),
+        (np.empty((segments, 2, places)), np.zeros((segments, 7, known))),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
     )  # fmt: skip
@@ -452,7 +453,7 @@ def _make_shapes(which, segments, modes, shapes, table, form):
         ends, envelope = form[s, 3:7, :14], form[s, 1:3]
         if shapes[0][5]:
             table[s] = shapes[5][s]
-            line_shape.put_envelope(table[s], ends, shapes[0], shapes[4], envelope)
+            envelope[:] = shapes[6][s]
         else:
             line_shape.build(
                 mode[s, which, 0], mode[s, which, 1], number[s, which], shapes, table[s], ends,
@@ -518,7 +519,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )
-            lines, noise, leakage = (n, lowest, highest, total), (sigma, level, p[14]), 0.0
+            lines = n, lowest, highest, total, p[15] * sigma / LINE_STEPS
+            noise, leakage = (sigma, level, p[14]), 0.0
             if leaks[s] == INTEGRAL:
                 low, count, peak, exempted, leakage = inspect(
                     origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series

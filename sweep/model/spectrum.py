@@ -17,10 +17,11 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.polynomial.chebyshev import cheb2poly, chebfit
 
 from sweep.model.detection import mark
 from sweep.model.elementary import sincos_cycles
-from sweep.model.line_shape import CELLS
+from sweep.model.line_shape import CELLS, POINTS, kernel
 from sweep.model.lines import BLOCK, BLOCK_SIZE, IM, PLACE, RE, X, put_on_nodes
 
 CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = range(7, 13)
@@ -48,38 +49,40 @@ FOLDED, IMAGED, COMPLEX = range(3)
 """Views of a spectrum: bins 0 .. N/2 of a real record, without images and with them; all N bins
 of a complex record, numbered on past 0 and N."""
 
-_SOURCE_DIGITS = 28.0
-"""ln of the accuracy of sources, and a little for the poles of a window on either side."""
-
-POINTS = 10
-"""Cells among which a line is shared out: -4 .. 5 beside its place between 0 and 1."""
+SOURCE_DIGITS = 28.0
+"""-ln of the error of sources, and a little for the poles of a window on either side."""
 
 WINDOW = 8
 """Bins within which lines are shared out together; these share the bins that tables hold."""
 
+EDGE = POINTS // 2 // CELLS[0] + 1
+"""Bins beside a window in which its lines have cells."""
+
 MOST_CELLS = WINDOW * CELLS[1] + POINTS
+
+BESIDE = WINDOW + EDGE + 1
+"""Bins by which tables may hold less about a line than on either side of a cell."""
 
 _PART, _CELL, _RE, _IM = (BLOCK_SIZE * k for k in range(4))
 """Of a block of lines: places beyond their cell, cells, and weights."""
 
-_n = np.arange(-4, 6)
-BASIS = np.array(
-    [
-        np.polynomial.polynomial.polyfromroots(np.delete(_n, j)) / np.prod(j - 4 - np.delete(_n, j))
-        for j in range(POINTS)
-    ]
-).T.copy()
-"""Lagrange's polynomials of degree 9 through ten cells: by power and cell."""
+DEGREE = 13
+
+_s = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+BASIS = np.array([
+    cheb2poly(chebfit(_s, kernel((_s + 1) / 2 - j), DEGREE))
+    for j in range(1 - POINTS // 2, POINTS // 2 + 1)
+]).T.copy()  # fmt: skip
+"""Polynomials of the kernel, by power of s = -1 .. 1 across a cell and by cell."""
 
 
 @njit(cache=True, error_model="numpy")
 def add_near(first, count, lines, table, sizes, room):
     """Adds n lines to F in bins ``first`` .. where their shape's table holds these.
 
-    Each line is shared out among ten cells, by Lagrange's polynomials; each cell has a row of the
-    table.
+    Each line is shared out among cells; each of these has a row of the table.
     """
-    n, lowest, highest, _ = lines
+    n, lowest, highest, _, _ = lines
     cells, last = sizes[3], math.floor(highest)
     for start in range(math.floor(lowest), last + 1, WINDOW):
         number = min(WINDOW, last + 1 - start) * cells + POINTS
@@ -89,7 +92,7 @@ def add_near(first, count, lines, table, sizes, room):
         for b in range(n):
             if start <= room[PLACE, b] < start + WINDOW:
                 place = (room[PLACE, b] - start) * cells
-                room[BLOCK, _PART + taken] = place - math.floor(place)
+                room[BLOCK, _PART + taken] = 2.0 * (place - math.floor(place)) - 1.0
                 room[BLOCK, _CELL + taken] = math.floor(place)
                 room[BLOCK, _RE + taken], room[BLOCK, _IM + taken] = room[RE, b], room[IM, b]
                 taken += 1
@@ -104,11 +107,11 @@ def add_near(first, count, lines, table, sizes, room):
 
 @njit(cache=True, error_model="numpy")
 def _share_out(number, room):
-    """Adds a block of lines to cells, ten of them each."""
+    """Adds a block of lines to cells, POINTS of them each."""
     for j in range(POINTS):
         for i in range(number):
-            weight, part = BASIS[POINTS - 1, j], room[BLOCK, _PART + i]
-            for d in range(POINTS - 2, -1, -1):
+            weight, part = BASIS[DEGREE, j], room[BLOCK, _PART + i]
+            for d in range(DEGREE - 1, -1, -1):
                 weight = weight * part + BASIS[d, j]
             room[SHARES, j * BLOCK_SIZE + i] = weight
     for i in range(number):
@@ -124,12 +127,12 @@ def _share_out(number, room):
 def held_of(start, lap, sizes):
     """First bin, and one past the last, that tables hold of all lines of a window."""
     beside, start = sizes[2], start + lap * sizes[0]
-    return start + WINDOW - beside, start + beside
+    return start + WINDOW + EDGE - beside, start - EDGE + beside
 
 
 @njit(cache=True, error_model="numpy")
 def _add_cells(first, count, window, table, sizes, room):
-    """Adds a window's cells, which begin four before it, to F; as of :func:`add_near`."""
+    """Adds a window's cells, which begin six before it, to F; as of :func:`add_near`."""
     start, number, lap = window
     cells, power = sizes[3], sizes[4]
     columns = table.shape[1] // cells
@@ -141,7 +144,8 @@ def _add_cells(first, count, window, table, sizes, room):
         return
     for c in range(number):
         re, im = turned * room[CELL_RE, c], turned * room[CELL_IM, c]
-        bin_, row = begin + (c - 4) // cells, (c - 4) % cells
+        at = c + 1 - POINTS // 2
+        bin_, row = begin + at // cells, at % cells
         if sizes[5]:
             low, high = max(first, bin_), min(first + count, bin_ + columns)
         if low >= high or (re == 0.0 and im == 0.0):
@@ -159,10 +163,10 @@ def _add_cells(first, count, window, table, sizes, room):
 
 
 @njit(cache=True, error_model="numpy")
-def take_sources(n, lowest, highest, sizes, room):
+def take_sources(n, lowest, highest, distance, digits, sizes, room):
     """Strengths of n lines as the record's ends see them, and sources that stand for them.
 
-    Sources serve bins that tables do not hold. Returns their number.
+    Sources serve bins from some ``distance`` on, to e^-digits. Returns their number.
     """
     power, half_ratio = sizes[4] != 0, 0.5 * sizes[1] / sizes[0]
     for b in range(n):
@@ -175,8 +179,8 @@ def take_sources(n, lowest, highest, sizes, room):
     middle, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
     number = n
     if half > 0.0:
-        z = 1.0 + (sizes[2] - WINDOW) / half
-        number = 2 + int(_SOURCE_DIGITS / math.log(z + math.sqrt(z * z - 1.0)))
+        z = 1.0 + distance / half
+        number = 2 + int(digits / math.log(z + math.sqrt(z * z - 1.0)))
     elif n > 1:
         number = 1
     put_on_nodes(room, A_RE, A_IM, n, number, (middle, half), S_A_RE, S_A_IM)
@@ -207,14 +211,18 @@ def tangent_of(k, fft_size, tangent):
 @njit(cache=True, error_model="numpy")
 def prepare_far(first, count, sizes, tangent, room):
     """Tangents and turns of bins ``first`` .., count <= STRIP, into rows TAN and TURN."""
-    fft_size, whole = sizes[0], sizes[0] == sizes[1]
+    fft_size = sizes[0]
+    k = first % fft_size
     for i in range(count):
-        room[TAN, i] = tangent_of(first + i, fft_size, tangent)
-        if whole:
+        room[TAN, i] = tangent[k] if 2 * k <= fft_size else -tangent[fft_size - k]
+        k = k + 1 if k + 1 < fft_size else 0
+    if fft_size == sizes[1]:
+        for i in range(count):
             room[TURN_RE, i], room[TURN_IM, i] = -1.0 if (first + i) & 1 else 1.0, 0.0
-        else:
-            turn = sincos_cycles(0.5 * (first + i) * sizes[1] / fft_size)
-            room[TURN_RE, i], room[TURN_IM, i] = turn[1], turn[0]
+        return
+    for i in range(count):
+        turn = sincos_cycles(0.5 * (first + i) * sizes[1] / fft_size)
+        room[TURN_RE, i], room[TURN_IM, i] = turn[1], turn[0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -273,20 +281,25 @@ def add_far(start, end, at, place, strength, b, form, sizes, room):
 def field(first, count, lines, table, form, sizes, tangent, room):
     """F in bins ``first`` .., counted from the lines' origin, into rows F_RE and F_IM.
 
-    ``lines``: their number, lowest and highest place, and how many sources stand for them, 0 if
-    there are none yet. Returns how many there are then.
+    ``lines``: their number, lowest and highest place, how many sources stand for them, 0 if there
+    are none, and what may be left out of the shape.
     """
-    n, lowest, highest, sources = lines
+    n, lowest, highest, sources, faint = lines
     whole = sizes[5] != 0
     count = (count + 7) // 8 * 8  # whole vectors: a rest takes as long
     for i in range(count):
         room[F_RE, i], room[F_IM, i] = 0.0, 0.0
     add_near(first, count, lines, table, sizes, room)
-    reach = sizes[2] - WINDOW - 1  # of tables from any line
+    reach = sizes[2] - BESIDE  # of tables from any line
     if whole or (highest - first < reach and first + count - lowest < reach):
-        return sources
+        return
     if sources == 0:
-        sources = take_sources(n, lowest, highest, sizes, room)
+        distance = max(gap_of(first, count, lowest, highest, sizes[0]), float(reach))
+        digits = SOURCE_DIGITS
+        if faint > 0.0:
+            part = math.log(max(form[1, envelope_from(distance, form)] / faint, 1.0))
+            digits = min(digits, 4.0 + (2.0 * part if sizes[4] else part))
+        sources = take_sources(n, lowest, highest, distance, digits, sizes, room)
     # Bins of which tables hold some lines, if not all; but for these, sources do.
     begun = math.floor(lowest)
     last = begun + (math.floor(highest) - begun) // WINDOW * WINDOW
@@ -317,7 +330,20 @@ def field(first, count, lines, table, form, sizes, tangent, room):
                         )  # fmt: skip
                     start = max(start, past)
         at = stop
-    return sources
+
+
+@njit(cache=True, error_model="numpy")
+def gap_of(first, count, lowest, highest, fft_size):
+    """Least distance of some bins from lines, around the circle of all bins; 0 amid them."""
+    apart = first + 0.5 * (count - 1) - 0.5 * (lowest + highest)
+    apart = abs(apart - fft_size * np.rint(apart / fft_size))
+    return max(apart - 0.5 * (count - 1) - 0.5 * (highest - lowest), 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def envelope_from(distance, form):
+    """Index of what is known of envelopes from a distance on."""
+    return max(np.searchsorted(form[0], distance, "right") - 1, 0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -326,8 +352,8 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
 
     ``shifts`` (2, m): places [bins] and weights over which |X|^2 is averaged; m may be 0.
     """
-    power, view = sizes[4] != 0, sizes[6]
-    n, lowest, highest, sources = lines
+    power, view = sizes[4] != 0, sizes[7]
+    n, lowest, highest, sources, faint = lines
     sign = -1 if origin < 0 and view != COMPLEX else 1
     many = shifts.shape[1] > 0
     if many:
@@ -341,8 +367,12 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
         for turn in range(2 if view == IMAGED else 1):  # the lines, then their images
             way = sign if turn == 0 else -sign
             first = low - origin if way > 0 else 1 - low - count - origin
-            moved = n, lowest + apart, highest + apart, sources
-            sources = field(first, count, moved, table, form, sizes, tangent, room)
+            if turn == 1:
+                gap = gap_of(first, count, lowest + apart, highest + apart, sizes[0])
+                if form[1, envelope_from(gap, form)] <= faint:
+                    continue
+            moved = n, lowest + apart, highest + apart, sources, faint
+            field(first, count, moved, table, form, sizes, tangent, room)
             for i in range(count):
                 j = i if way > 0 else count - 1 - i
                 re, im = room[F_RE, j], way * room[F_IM, j]
@@ -359,7 +389,6 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
     row = SUM if many else OUT
     for i in range(count):
         room[OUT, i] = math.sqrt(max(room[row, i], 0.0))
-    return sources
 
 
 @njit(cache=True, error_model="numpy")
@@ -382,7 +411,7 @@ def reach_of(level, weight, form):
 @njit(cache=True, error_model="numpy")
 def seen(origin, lowest, highest, sizes):
     """Lowest and highest place at which lines are seen, in bins; 0 .. N/2 where they fold."""
-    if origin < 0 and sizes[6] != COMPLEX:
+    if origin < 0 and sizes[7] != COMPLEX:
         return -origin - highest, -origin - lowest
     return origin + lowest, origin + highest
 
@@ -393,7 +422,7 @@ def run_of(beyond, place, sizes):
     half = sizes[0] // 2
     beyond = min(beyond, 2.0 * sizes[0])
     low, high = math.floor(place[0] - beyond), math.ceil(place[1] + beyond)
-    if sizes[6] == COMPLEX:
+    if sizes[7] == COMPLEX:
         if high - low >= sizes[0]:
             low = (low + high + 1 - sizes[0]) // 2
         return low, min(high, low + sizes[0] - 1)
@@ -407,7 +436,7 @@ def run_of(beyond, place, sizes):
 @njit(cache=True, error_model="numpy")
 def stays_below(level, weight, place, form, sizes):
     """Bins beyond which lines and images of a summed weight stay below a level."""
-    if sizes[6] == IMAGED:
+    if sizes[7] == IMAGED:
         edge = min(place[0], 0.5 * sizes[0] - place[1])  # no bin is nearer to an image
         share = 0.5 if edge < reach_of(0.1 * level, weight, form) else 0.9
         return reach_of(share * level, weight, form) + 1.0
@@ -421,7 +450,8 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
     Parameters
     ----------
     origin, lines
-        Bin from which lines count, and as of :func:`field` with their summed weight at the end.
+        Bin from which lines count; number of lines, lowest and highest place, their summed weight,
+        and the most that an image may come to that is left out.
     levels : (float, float)
         Threshold; level below which bins may be left out. If none is above it, bins that the
         largest is known to exceed are.
@@ -434,8 +464,8 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
         First bin of the run, number of bins, index of the largest, number of exempt ones; |X| in
         row OUT.
     """
-    n, lowest, highest, total = lines
-    room_for = sizes[0] if sizes[6] == COMPLEX else sizes[0] // 2 + 1
+    n, lowest, highest, total, least = lines
+    room_for = sizes[0] if sizes[7] == COMPLEX else sizes[0] // 2 + 1
     before, after = 0.0, 0.0
     for m in range(shifts.shape[1]):
         before, after = min(before, shifts[0, m]), max(after, shifts[0, m])
@@ -444,17 +474,15 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
     beyond = stays_below(level, weight, place, form, sizes)
     if not level > 0.0:
         beyond = np.inf
-    elif not sizes[5] and beyond > 2 * sizes[2] and n > 1 and shifts.shape[1] == 0:
-        sources = take_sources(n, lowest, highest, sizes, room)
+    elif not sizes[5] and beyond > 2 * sizes[6] and n > 1 and shifts.shape[1] == 0:
+        sources = take_sources(n, lowest, highest, float(sizes[6]), SOURCE_DIGITS, sizes, room)
         weight = weight_afar(total, sources, sizes, room)
-        beyond = max(stays_below(level, weight, place, form, sizes), 2.0 * sizes[2])
+        beyond = max(stays_below(level, weight, place, form, sizes), 2.0 * sizes[6])
+    known = n, lowest, highest, sources, least / max(total, 1e-300)
     while True:
         low, high = run_of(beyond, place, sizes)
         count = high - low + 1
-        sources = magnitudes(
-            low, count, origin, (n, lowest, highest, sources), shifts, table, form, sizes, tangent,
-            room,
-        )  # fmt: skip
+        magnitudes(low, count, origin, known, shifts, table, form, sizes, tangent, room)
         peak, exempted = mark(room[OUT], count, levels[0], exempt)
         most = room[OUT, peak]
         if most >= level or count >= room_for:
