@@ -1,6 +1,9 @@
 """Link budget and receiver: the echo's beat in the photocurrent, and the noise beside it."""
 
 import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,48 +72,67 @@ def shot_noise(
     return 2 * ELEMENTARY_CHARGE * gain * responsivity * power * electrical_bandwidth
 
 
-def receiver_currents(
-    architecture: str,
-    *,
-    local_oscillator_power: np.ndarray,
-    apd_gain: np.ndarray,
-    excess_noise_factor: np.ndarray,
-    responsivity: np.ndarray,
-    noise_equivalent_power: np.ndarray,
-    amplifier_noise_current: np.ndarray,
-    electrical_bandwidth: np.ndarray,
-    load_resistance: np.ndarray,
-    temperature: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Current variance of each source in the receiver [A^2] inside the electrical bandwidth.
+class ReceiverNoise(NamedTuple):
+    """Variances at the ADC [V^2]."""
+
+    per_ampere: np.ndarray
+    """Of 1 A^2 of current."""
+    per_watt: np.ndarray
+    """Of the shot noise of 1 W of light."""
+    sources: dict[str, np.ndarray]
+    """Of the receiver's own, by source."""
+
+
+NOISY = (
+    "local_oscillator_power", "apd_gain", "excess_noise_factor", "responsivity",
+    "noise_equivalent_power", "amplifier_noise_current", "load_resistance", "temperature",
+    "detector_bandwidth", "amplifier_bandwidth", "noise_figure", "transimpedance",
+)  # fmt: skip
+"""Parameters of the receiver that its noise follows from."""
+
+
+def receiver_noise(architecture: str, values: Mapping[str, np.ndarray]) -> ReceiverNoise:
+    """Noise of receivers of an architecture, from :data:`NOISY`, (n,) or scalars.
 
     The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
     current squared. Direct detection has no local oscillator and adds its load's thermal noise
     4 k T B_e / R_L [T 2.22]. What light from outside adds are effects.
+
+    A heterodyne receiver mixes an IF down: noise from both sides of the IF lands in the record,
+    which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's; its RF noise
+    figure multiplies all of it.
     """
-    detector = (apd_gain * responsivity * noise_equivalent_power) ** 2 * electrical_bandwidth
-    own = {"detector": detector, "amplifier": np.asarray(amplifier_noise_current) ** 2}
-    if architecture == "direct":
-        thermal = 4 * BOLTZMANN * temperature * electrical_bandwidth / load_resistance
-        return own | {"thermal": thermal}
-    oscillator = shot_noise(
-        power=local_oscillator_power,
-        apd_gain=apd_gain,
-        excess_noise_factor=excess_noise_factor,
-        responsivity=responsivity,
-        electrical_bandwidth=electrical_bandwidth,
+    if any(value.ndim for value in values.values()):
+        return _noise(architecture, values)
+    known = _of_one(architecture, *(values[name].item() for name in NOISY))
+    return known._replace(sources=dict(known.sources))
+
+
+@lru_cache(maxsize=64, typed=True)
+def _of_one(architecture: str, *values: float) -> ReceiverNoise:
+    given = {name: np.asarray(value) for name, value in zip(NOISY, values, strict=True)}
+    return _noise(architecture, given)
+
+
+def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
+    bandwidth = electrical_bandwidth(
+        detector_bandwidth=v["detector_bandwidth"], amplifier_bandwidth=v["amplifier_bandwidth"]
     )
-    return {"local_oscillator_shot": oscillator} | own
-
-
-def current_scale(architecture: str, *, noise_figure: np.ndarray) -> np.ndarray:
-    """Factor on all current variances: 2 F_RF for a heterodyne receiver, else 1.
-
-    It mixes an IF down: noise from both sides of the IF lands in the record, which makes the
-    shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's; its RF noise figure
-    multiplies all of it.
-    """
-    return np.asarray(2.0 * noise_figure if architecture == "heterodyne" else 1.0)
+    light = {name: v[name] for name in ("apd_gain", "excess_noise_factor", "responsivity")}
+    detector = (v["apd_gain"] * v["responsivity"] * v["noise_equivalent_power"]) ** 2 * bandwidth
+    own = {"detector": detector, "amplifier": np.asarray(v["amplifier_noise_current"]) ** 2}
+    if architecture == "direct":
+        thermal = 4 * BOLTZMANN * v["temperature"] * bandwidth / v["load_resistance"]
+        own = own | {"thermal": thermal}
+    else:
+        power = v["local_oscillator_power"]
+        oscillator = shot_noise(power=power, electrical_bandwidth=bandwidth, **light)
+        own = {"local_oscillator_shot": oscillator} | own
+    both_sides = 2.0 * v["noise_figure"] if architecture == "heterodyne" else 1.0
+    scale = np.asarray(both_sides * v["transimpedance"] ** 2)
+    per_watt = shot_noise(power=1.0, electrical_bandwidth=bandwidth, **light)
+    sources = {source: np.asarray(value * scale) for source, value in own.items()}
+    return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
 
 
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:

@@ -27,12 +27,9 @@ from sweep.model.ground import Extent, backscatter
 from sweep.model.preparation import (
     CHIRP,
     LASER,
-    NOISY,
     PROCESSING,
     RECEIVER,
-    ReceiverNoise,
     link_scales,
-    receiver_noise,
     relative_amplitude,
 )
 from sweep.model.window import Window, canonical_name, window
@@ -218,10 +215,10 @@ class Points:
         return self.columns(*(found if len(self.signs) == 3 else found[::2]))
 
     @cached_property
-    def receiver(self) -> ReceiverNoise:
+    def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
-        values = {name: self[RECEIVER + name] for name in NOISY}
-        return receiver_noise(self.architecture, values)
+        values = {name: self[RECEIVER + name] for name in link.NOISY}
+        return link.receiver_noise(self.architecture, values)
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
