@@ -142,10 +142,14 @@ def plane_footprint(
     beam_divergence: np.ndarray,
     number: int,
     pattern: str = "hexagonal",
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    radial: ArrayLike = 0.0,
+    transverse: ArrayLike = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Beamlets of a beam on a flat plane, per unit of range along the beam's axis.
 
-    A plane's footprint scales with range, so one row serves every range.
+    A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
+    towards the plane's near side, and x across, sees the velocity (v_r + v_t y) / |d| with
+    |d|^2 = 1 + x^2 + y^2.
 
     Parameters
     ----------
@@ -155,6 +159,8 @@ def plane_footprint(
         Full 1/e^2 angle [rad].
     number, pattern
         Of :func:`beamlets`.
+    radial, transverse : (n,) array_like
+        Velocity along the axis, positive closing, and across it towards the near side [m/s].
 
     Returns
     -------
@@ -164,6 +170,8 @@ def plane_footprint(
         Cosine of each beamlet's incidence angle.
     weights : (n, number) ndarray
         Power fractions; 0, with offset 0, for a beamlet that passes over the horizon.
+    closing : (n, number) ndarray
+        Closing speed of each beamlet less that of the beam's axis [m/s].
     """
     (across, along), share = beamlets(number, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4
@@ -177,36 +185,9 @@ def plane_footprint(
     safe = np.where(hits, height, 1.0)
     offset = np.where(hits, (stretch * sine - y * cosine) / safe, 0.0)
     cos_incidence = np.where(hits, height / (1 + stretch), 0.0)
-    return offset, cos_incidence, np.where(hits, share, 0.0)
-
-
-def velocity_offsets(
-    *,
-    radial: np.ndarray,
-    transverse: np.ndarray,
-    beam_divergence: np.ndarray,
-    number: int,
-    pattern: str = "hexagonal",
-) -> np.ndarray:
-    """Closing speed of each beamlet less that of the beam's axis [m/s], (n, number).
-
-    A beamlet y off the axis towards the plane's near side, and x across, sees
-    (v_r + v_t y) / |d| with |d|^2 = 1 + x^2 + y^2.
-
-    Parameters
-    ----------
-    radial, transverse : (n,) ndarray
-        Velocity along the axis, positive closing, and across it towards the near side [m/s].
-    beam_divergence, number, pattern
-        As of :func:`plane_footprint`.
-    """
-    (across, along), _ = beamlets(number, pattern)
-    sigma = np.asarray(beam_divergence, float)[:, None] / 4
-    x, y = across * sigma, along * sigma
-    square = x * x + y * y
-    stretch = square / (1 + np.sqrt(1 + square))  # |d| - 1
-    closing = np.asarray(transverse)[:, None] * y - np.asarray(radial)[:, None] * stretch
-    return np.asarray(closing / (1 + stretch))
+    along_beam, across_beam = (np.asarray(v, float)[..., None] for v in (radial, transverse))
+    closing = (across_beam * y - along_beam * stretch) / (1 + stretch)
+    return offset, cos_incidence, np.where(hits, share, 0.0), closing
 
 
 class Moments(NamedTuple):

@@ -109,17 +109,15 @@ class Plane:
     def beamlets(self) -> Footprints:
         """The whole footprint: a row for each distinct geometry."""
         shapes, row = np.unique(np.stack(self._columns), axis=1, return_inverse=True)
-        offset, cos_incidence, weights = footprint.plane_footprint(
+        offset, cos_incidence, weights, closing = footprint.plane_footprint(
             grazing_angle=shapes[0],
             beam_divergence=shapes[1],
             number=self._number,
             pattern=self._pattern,
+            radial=shapes[2],
+            transverse=shapes[3],
         )
         echo = weights * backscatter(self._law, cos_incidence) / (1 + offset) ** 2
-        closing = footprint.velocity_offsets(
-            radial=shapes[2], transverse=shapes[3], beam_divergence=shapes[1],
-            number=self._number, pattern=self._pattern,
-        )  # fmt: skip
         doppler = np.where(weights > 0, 2 * closing / SPEED_OF_LIGHT, 0.0)
         return Footprints(_rows(row, self._size), offset, doppler, echo)
 

@@ -79,7 +79,7 @@ def test_many_beamlets_have_the_beams_gaussian_profile(pattern):
 
 
 def footprint(grazing_angle, divergence, number):
-    offset, cos_incidence, weights = plane_footprint(
+    offset, cos_incidence, weights, _ = plane_footprint(
         grazing_angle=np.atleast_1d(grazing_angle), beam_divergence=np.atleast_1d(divergence),
         number=number,
     )  # fmt: skip
@@ -167,4 +167,4 @@ def test_rows_of_many_footprints_are_each_by_itself():
     together = plane_footprint(grazing_angle=angles, beam_divergence=divergences, number=37)
     for row in range(3):
         alone = footprint(angles[row], divergences[row], 37)
-        assert all(np.array_equal(a[row], b) for a, b in zip(together, alone, strict=True))
+        assert all(np.array_equal(a[row], b) for a, b in zip(together[:3], alone, strict=True))

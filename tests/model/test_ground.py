@@ -8,7 +8,7 @@ from sweep.model import segments, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.noise_sources import sunlight
-from sweep.model.footprint import beamlets, velocity_offsets
+from sweep.model.footprint import beamlets, plane_footprint
 
 STORM = {"atmosphere.profile": "mars_storm"}
 
@@ -17,10 +17,10 @@ def test_velocities_of_beamlets_by_vectors():
     """The instrument moves with v_r along the axis and v_t across it, towards the near side."""
     (across, along), _ = beamlets(37)
     divergence, radial, transverse = 0.2, 40.0, -70.0
-    found = velocity_offsets(
-        radial=np.array([radial]), transverse=np.array([transverse]),
+    *_, (found,) = plane_footprint(
+        radial=[radial], transverse=[transverse], grazing_angle=np.ones(1),
         beam_divergence=np.array([divergence]), number=37,
-    )[0]  # fmt: skip
+    )  # fmt: skip
     rays = np.stack([across * divergence / 4, along * divergence / 4, np.ones(37)])
     rays /= np.linalg.norm(rays, axis=0)
     velocity = np.array([0.0, transverse, radial])

@@ -34,7 +34,7 @@ def turned_by_rounding(metres: float) -> float:
 def footprint_error(grazing: float, divergence: float) -> float:
     """Worst error of offset and cosine of 109 beamlets, over what their cancellations allow."""
     (across, along), _ = footprint.beamlets(109)
-    offset, cosine, weight = footprint.plane_footprint(
+    offset, cosine, weight, _ = footprint.plane_footprint(
         grazing_angle=np.array([grazing]), beam_divergence=np.array([divergence]), number=109
     )
     angle, sigma, worst = mp.mpf(grazing), mp.mpf(divergence) / 4, mp.mpf(0)
@@ -75,7 +75,7 @@ def footprints() -> float:
 )
 def normal_incidence() -> float:
     (across, along), _ = footprint.beamlets(109)
-    offset, _, _ = footprint.plane_footprint(
+    offset, _, _, _ = footprint.plane_footprint(
         grazing_angle=np.array([math.pi / 2]), beam_divergence=np.array([50e-6]), number=109
     )
     with mp.workdps(40):
