@@ -11,7 +11,7 @@ from small_flights import SCENE, small_scene
 from test_extend import Interrupting
 
 from sweep.cli import main
-from sweep.model import clouds, cycles
+from sweep.model import clouds, navigation
 from sweep.storage.atomic_replace import beside
 from sweep.tasks import flight_study
 from sweep.tasks.driver import extend, resume
@@ -71,7 +71,7 @@ class Computed:
 @pytest.fixture
 def computed(monkeypatch):
     """What is computed from here on, but for what compiles the model."""
-    count, cloud, solve = Computed(), clouds.cloud, cycles.solve
+    count, cloud, solve = Computed(), clouds.cloud, navigation.solve
 
     def drawn(eyepoints, *, draws, **rest):
         count.shots += len(eyepoints.time) * draws
@@ -83,7 +83,7 @@ def computed(monkeypatch):
         return found
 
     monkeypatch.setattr(clouds, "cloud", drawn)
-    monkeypatch.setattr(cycles, "solve", solved)
+    monkeypatch.setattr(navigation, "solve", solved)
     monkeypatch.setattr(FlightStudy, "compile", lambda self: None)
     return count
 
