@@ -187,9 +187,9 @@ def test_the_grounds_slope_and_relief_are_passed_on():
 @PATTERNS
 def test_any_split_of_cycles_gives_the_same_bytes(beams, monkeypatch):
     each = len(beams)
-    seen = _seen(beams)
+    seen = _seen(beams, number=40, rate=4.0)
     generator = np.random.default_rng(1)
-    points = _points(seen, draws=5)
+    points = _points(seen)
     points["flags"][generator.random(points["flags"].shape) < 0.2] = 0
     for name in ("range", "radial_velocity"):
         points[f"{name}_interpolated"] += generator.normal(0, 1e-3, points["flags"].shape)
