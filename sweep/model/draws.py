@@ -65,26 +65,15 @@ def count_by_chance(
 ) -> None:
     """Add the draws of some rows, held against their outputs, to the counts.
 
-    Parameters
-    ----------
-    rows : Rows
-        Draws within the batches.
-    ends : (batches + 1,) ndarray
-        Numbers of draws between batches.
-    outputs : mapping
-        Of each row.
-    counts : (names, points, batches) int64 ndarray
-        In the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
+    ``ends`` (batches + 1,) are the numbers of draws between batches; the counts, int64, are (names,
+    points, batches) in the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
     size, chances = rows.point.size, np.array(_chances(outputs))
     _count(rows, ends, np.zeros((2, size)), chances, False, Seen.nothing(size), counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
-    """Add the draws of some rows, in the noise of their shots, to the counts.
-
-    Parameters are those of :func:`count_by_chance`.
-    """
+    """Add the draws of some rows, in the noise of their shots, as :func:`count_by_chance` does."""
     levels = noise_levels(shots)
     one = np.exp(-0.5 * levels[0] ** 2)
     for part, seen in seen_spectra(shots):
@@ -170,7 +159,7 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count(rows, ends, levels, chances, noisy, seen, counts):
-    """Draws of each row into counts (names, points, batches), in the order of DRAW_OUTPUTS.
+    """Add the draws of each row to the counts.
 
     ``levels`` (2, m) are threshold and noise under the lines, over the noise of any other bin;
     ``chances`` (2, 3, m) those of a detection, of no meaning in noise, and of a false alarm in

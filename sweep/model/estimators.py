@@ -263,15 +263,10 @@ class Deviation(NamedTuple):
 
 
 def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
-    """Power of a tone over that of the noise before the FFT.
+    """Power of a tone over that of the noise before the FFT, from that of a tone's bin after it.
 
-    Parameters
-    ----------
-    snr : array_like
-        |X|^2 of the tone on a bin over the mean noise power of a bin; a tone between bins has its
-        scalloping loss more than its strongest bin shows.
-    window : Window
-        |X| = A sum(w) / 2 on a bin, noise power sum(w^2) s^2.
+    A tone between bins has its scalloping loss more than its strongest bin shows. On a bin
+    |X| = A sum(w) / 2; the noise has the power sum(w^2) s^2.
     """
     return np.asarray(snr, float) * 2 * window.energy / window.sum**2
 
@@ -304,12 +299,6 @@ def windowed_deviation(*, cnr: ArrayLike, window: Window, sample_rate: ArrayLike
     which is the bound for the rectangular window and more for every other: the expansion of the
     periodogram about its maximum [Rife and Vincent, Bell Syst. Tech. J. 49, 197, 1970].
 
-    Parameters
-    ----------
-    cnr, sample_rate : array_like
-        As of :func:`beat_deviation`.
-    window : Window
-        The window.
     """
     w = taper(window)
     place = np.arange(window.length) - (w * np.arange(window.length)).sum() / w.sum()

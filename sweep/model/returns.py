@@ -202,7 +202,6 @@ def draw_returns(
     first_draw: int = 0,
     draws: int = 1,
     method: str = "probabilities",
-    tolerance: float = TOLERANCE,
 ) -> Returns:
     """Returns of every shot, draw by draw.
 
@@ -218,8 +217,6 @@ def draw_returns(
         Number of the first draw, number of draws; any stretch of draws can be had alone.
     method : str
         ``probabilities`` or ``noise``.
-    tolerance : float
-        Of :func:`sweep.model.pairing.pair_peaks` [bins].
 
     Raises
     ------
@@ -237,7 +234,6 @@ def draw_returns(
     one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
     how = How(
         int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
-        float(tolerance),
     )  # fmt: skip
     tables = interpolator(shots.window, shots.fft_size)
     counted = np.nan_to_num(shots.counted_bins(found.exempted))
@@ -264,7 +260,6 @@ class How(NamedTuple):
     """There is a Doppler segment."""
     half: int
     """N/2."""
-    tolerance: float
 
 
 class Known(NamedTuple):
@@ -406,7 +401,7 @@ def _draw(keys, how, known, seen, tables, out):
                     )
             confirmed, count = pair_peaks(
                 peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
-                peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.tolerance,
+                peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, TOLERANCE,
                 pairs,
             )  # fmt: skip
             for r in range(min(count, most)):
