@@ -215,16 +215,23 @@ def reach_of(number: int, pattern: str) -> float:
     return float(np.sqrt((points**2).sum(axis=0)).max())
 
 
-def plane_range_moments(
-    *, grazing_angle: ArrayLike, beam_divergence: ArrayLike, number: int, pattern: str
-) -> Moments:
-    """Bounds on (R_b - R_0)/R_0 of a beam on a plane, weighted by echo power.
+def plane_moments(
+    *,
+    across: ArrayLike,
+    along: ArrayLike,
+    grazing_angle: ArrayLike,
+    beam_divergence: ArrayLike,
+    number: int,
+    pattern: str,
+) -> tuple[Moments, Moments]:
+    """Bounds for a beam on a plane: (R_b - R_0)/R_0, and radial velocities off the axis's [m/s].
 
-    u has the rms q; the rest bounds Taylor's remainders.
+    Both weighted by echo power. u has the rms q; the rest bounds Taylor's remainders. At a velocity
+    off the beam a beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1),
+    |d|^2 = 1 + x^2.
     """
-    if number == 1:
-        return NO_SPREAD
     radius, sigma = reach_of(number, pattern), np.asarray(beam_divergence, float) / 4
+    across, along = np.abs(across), np.abs(along)
     rms = sigma / np.tan(grazing_angle)
     widest, bulge = radius * rms, (radius * sigma) * (radius * sigma) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -234,36 +241,16 @@ def plane_range_moments(
         mean = lean + (rms * rms + sigma * sigma) * heavier / inside
         far = (rms + sigma * np.sqrt(bulge)) * np.sqrt(heavier) / inside
         extreme = (widest + bulge) / inside
-    return Moments(*(np.where(widest < 1, value, np.inf) for value in (mean, far, extreme)))
-
-
-def plane_velocity_moments(
-    *,
-    across: ArrayLike,
-    along: ArrayLike,
-    grazing_angle: ArrayLike,
-    beam_divergence: ArrayLike,
-    number: int,
-    pattern: str,
-) -> Moments:
-    """Bounds on the beamlets' radial velocities less the axis's [m/s], at a velocity off the beam.
-
-    A beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1), |d|^2 = 1 + x^2; its
-    weight is that of :func:`plane_range_moments`.
-    """
-    if number == 1:
-        return NO_SPREAD
-    radius, sigma = reach_of(number, pattern), np.asarray(beam_divergence, float) / 4
-    across, along = np.abs(across), np.abs(along)
-    slope = sigma / np.tan(grazing_angle)
-    side, bulge = 1 + np.minimum(radius * slope, 1.0), (radius * sigma) * (radius * sigma) / 2
+    ranges = Moments(*(np.where(widest < 1, value, np.inf) for value in (mean, far, extreme)))
+    side = 1 + np.minimum(widest, 1.0)  # velocities have bounds beyond the horizon too
     heavier = side * side * side * np.exp(6 * bulge)
-    lean = sigma * (3 * slope * heavier + 8 * radius * bulge)
-    return Moments(
+    lean = sigma * (3 * rms * heavier + 8 * radius * bulge)
+    velocities = Moments(
         across * lean + along * (sigma * sigma) * heavier,
         (across * sigma + along * sigma * np.sqrt(bulge)) * np.sqrt(heavier),
         across * radius * sigma + along * bulge,
     )
+    return ranges, velocities
 
 
 def plane_echo_ratio(

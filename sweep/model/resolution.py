@@ -52,8 +52,7 @@ from sweep.model.footprint import (
     HERMITE,
     RULE_REACH,
     gaussian_rule,
-    plane_range_moments,
-    plane_velocity_moments,
+    plane_moments,
     velocity_to_bins,
 )
 from sweep.model.preparation import (
@@ -243,13 +242,12 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     sigma, slope = divergence / 4, divergence / 4 / np.tan(angle)
     bins = p[PROCESSING + "sample_rate"] / p["record"]
     rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
-    shape: dict[str, Any] = {
-        "grazing_angle": angle, "beam_divergence": divergence, "number": most, "pattern": "line",
-    }  # fmt: skip
-    # Beyond the horizon the moments have no bound: there the plain one has to do.
-    rms = plane_range_moments(**shape).rms
-    rms = np.where(np.isfinite(rms), rms, slope)
-    velocity = plane_velocity_moments(across=across, along=along, **shape).rms
+    ranges, velocities = plane_moments(
+        across=across, along=along, grazing_angle=angle, beam_divergence=divergence, number=most,
+        pattern="line",
+    )  # fmt: skip
+    # Beyond the horizon the ranges' have no bound: there the plain one has to do.
+    rms = np.where(np.isfinite(ranges.rms), ranges.rms, slope)
     slopes = 2 / SPEED_OF_LIGHT * np.asarray(rate, float) * (1 + np.abs(doppler_ratio(along)))
     per_range = slopes * p["target.range"] / bins
     per_speed = velocity_to_bins(
@@ -260,7 +258,7 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     )
     signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
     return Spread(
-        deviation=per_range * rms + per_speed * velocity + nothing,
+        deviation=per_range * rms + per_speed * velocities.rms + nothing,
         slope=abs(per_speed * across * sigma + signs * per_range * slope) + nothing,
         curve=abs(per_speed * along + signs * per_range) * (sigma**2 / 2) + nothing,
     )

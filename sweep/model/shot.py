@@ -146,21 +146,18 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
+    by_segment = {"pd": pd, "miss": miss, "snr": snr}
     results = {
-        "pd_up": pd[0],
-        "pd_down": pd[2],
-        "pd_doppler": pd[1],
+        **{
+            f"{name}_{segment}": values[s]
+            for name, values in by_segment.items()
+            for s, segment in enumerate(waveform.SEGMENTS)
+        },
         "pd_shot": pd[0] * pd[2],
-        "miss_up": miss[0],
-        "miss_down": miss[2],
-        "miss_doppler": miss[1],
         "miss_shot": miss[0] + pd[0] * miss[2],
         **alarms,
         "p_leakage_up": leakage[0],
         "p_leakage_down": leakage[2],
-        "snr_up": snr[0],
-        "snr_down": snr[2],
-        "snr_doppler": snr[1],
         "beamlets": np.full(shots.size, float(shots.offset.shape[1])),
         "beamlets_error": shots.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,

@@ -19,8 +19,7 @@ from sweep.model.footprint import (
     Moments,
     beamlets,
     plane_echo_ratio,
-    plane_range_moments,
-    plane_velocity_moments,
+    plane_moments,
     velocity_to_bins,
 )
 from sweep.model.ground import Extent, backscatter
@@ -253,8 +252,7 @@ class Points:
             "grazing_angle": angle, "beam_divergence": self[LASER + "beam_divergence"],
             "number": self.number, "pattern": self.pattern,
         }  # fmt: skip
-        ranges = plane_range_moments(**shape)
-        velocities = plane_velocity_moments(
+        ranges, velocities = plane_moments(
             across=self["target.transverse_velocity"], along=self.radial_velocity, **shape
         )
         ratio = plane_echo_ratio(self.word("target.reflectance_law"), **shape)
