@@ -82,7 +82,7 @@ def at_dc() -> float:
     return max(departure(one) for one in on_frequency([0.0] * 4))
 
 
-@FAMILY.case("beats 1e-18 to 1e-6 bins off DC", **of_the_peak(1e8, 2e-12))
+@FAMILY.case("beats 1e-18 to 1e-6 bins off DC", **of_the_peak(1e8, 1e-12))
 def beside_dc() -> float:
     return max(
         departure(
@@ -115,7 +115,7 @@ def ten_kilometres_a_second() -> float:
     )
 
 
-@FAMILY.case("Doppler and range beat equal, closing and receding", **of_the_peak(8e7, 2e-12, 178))
+@FAMILY.case("Doppler and range beat equal, closing and receding", **of_the_peak(8e7, 1e-12, 178))
 def equal_beats() -> float:
     range_beat = 2e12 * 2 * 2000.0 / SPEED_OF_LIGHT
     return max(
@@ -127,7 +127,7 @@ def equal_beats() -> float:
     )
 
 
-@FAMILY.case("zero velocity: the Doppler line on DC and on its image", **of_the_peak(3e7, 2e-12))
+@FAMILY.case("zero velocity: the Doppler line on DC and on its image", **of_the_peak(3e7, 1e-12))
 def at_rest() -> float:
     return max(
         departure(shots(radial_velocity=0.0, window=window, fft_size=SIZE, **scene))
@@ -136,7 +136,7 @@ def at_rest() -> float:
     )
 
 
-@FAMILY.case("receding faster than the range beat", **of_the_peak(3e8, 2e-12))
+@FAMILY.case("receding faster than the range beat", **of_the_peak(3e8, 1e-12))
 def receding() -> float:
     return max(
         departure(shots(radial_velocity=v, window="hann", fft_size=SIZE, range=r))
@@ -152,12 +152,12 @@ def tones(bins: float, **changes: Any) -> Iterator[Shots]:
         yield shots(radial_velocity=v, window=window, fft_size=SIZE, **changes)
 
 
-@FAMILY.case("tones exactly on bins: nulls beside them", **of_the_peak(1.5e8, 2e-12))
+@FAMILY.case("tones exactly on bins: nulls beside them", **of_the_peak(1.5e8, 1e-12))
 def on_bins() -> float:
     return max(departure(one) for bins in (1.0, 777.0) for one in tones(bins))
 
 
-@FAMILY.case("tones half-way between bins", **of_the_peak(3e8, 2e-12))
+@FAMILY.case("tones half-way between bins", **of_the_peak(3e8, 1e-12))
 def between_bins() -> float:
     return max(departure(one) for bins in (0.5, 2047.5) for one in tones(bins))
 

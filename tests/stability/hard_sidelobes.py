@@ -97,7 +97,7 @@ def last_bins() -> float:
     "main lobes and nulls of all closed forms, lines 1e-9 of a bin off their bin",
     reference="sum of the terms, 100 digits",
     measure="abs(W), of the peak",
-    allowed=2e-12,
+    allowed=1e-12,
     limit=4 * EPS,
     because="lines are shared out by a kernel that is right to 1e-13",
 )
@@ -155,7 +155,7 @@ def tapered_long() -> float:
 
 @FAMILY.case(
     "tabulated windows with a step at their ends",
-    allowed=2e-12, limit=EPS, because="one rounding; a kernel that is right to 1e-13", **PEAK,
+    allowed=2e-13, limit=EPS, because="one rounding; a kernel that is right to 1e-13", **PEAK,
 )  # fmt: skip
 def stepped() -> float:
     return tabulated_error(

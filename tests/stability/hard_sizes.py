@@ -47,7 +47,7 @@ def long_fft(size: int, **changes: Any) -> float:
     return max(few_bins(one, segment, 1e-3) for segment in range(3))
 
 
-@FAMILY.case("FFTs of 2 to 9 points", allowed=3e-11, limit=place(2e8, 9),
+@FAMILY.case("FFTs of 2 to 9 points", allowed=1e-12, limit=place(2e8, 9),
              because="beats of 2e8 Hz, rounded; windows below 64 samples come from the table",
              **EXACT)  # fmt: skip
 def shortest() -> float:
@@ -59,7 +59,7 @@ def shortest() -> float:
     )
 
 
-@FAMILY.case("FFTs of 63, 64, 1009, 2187 and 4095 points", allowed=5e-12, limit=place(2e8, 4095),
+@FAMILY.case("FFTs of 63, 64, 1009, 2187 and 4095 points", allowed=1e-12, limit=place(2e8, 4095),
              because="beats of 2e8 Hz, rounded; 63 samples come from the table",
              **EXACT)  # fmt: skip
 def odd_sizes() -> float:
