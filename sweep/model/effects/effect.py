@@ -109,6 +109,8 @@ class Size(NamedTuple):
     """Bins by which what is measured moves; they count as a change of a probability does."""
     alarms: Sized = 0.0
     """Change of log10 of a shot's probability of a false alarm, by bins that cross the level."""
+    beside: Sized = 0.0
+    """Sigmas by which bins that leak move, besides what the largest moves by."""
     chance: Sized = 0.0
     """Change of a probability itself, summed over the segments where there is one of each."""
 

@@ -215,7 +215,7 @@ def changes(
                 total = total + 0.5 * louder * b * b * near / np.sqrt(1 + 2 * at * b)
                 most = np.maximum(most, b * b * louder / _LN_10)
         if leaking and leaking[name]:
-            moved = (np.minimum(size.magnitude, _HUGE) + size.added) * high
+            moved = (np.minimum(size.magnitude, _HUGE) + size.added) * high + size.beside
             most = np.maximum(most, np.minimum(moved, sizes["leakage"].chance))
         change = np.maximum(_sum(total, points), _most(most, points))
         found[name] = np.fmin(np.maximum(change, size.chance), 1.0)

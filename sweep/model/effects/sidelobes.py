@@ -43,6 +43,7 @@ from sweep.model.preparation import PROCESSING, Shots
 from sweep.model.window import window
 
 _LN_10 = math.log(10)
+_HUGE = 1e12
 _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
 
@@ -62,7 +63,9 @@ def image_size(points: Points) -> Size:
     inside, beside = form.tail(1.5 * apart), form.tail(0.5 * apart)
     far = beside * beside + outside * outside
     power = np.maximum(inside * inside, np.maximum(far - least, 0.0)) / least
-    return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms)
+    strongest = np.minimum(points.level * points.footprint.gain * outside, _HUGE)
+    leaking = strongest * np.minimum(strongest / points.threshold, 1.0)  # a bin at the threshold
+    return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms, beside=leaking)
 
 
 def _alarm_change(points: Points) -> np.ndarray | float:
