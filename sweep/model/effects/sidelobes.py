@@ -54,18 +54,29 @@ def image_size(points: Points) -> Size:
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
-    alarms = _alarm_change(points)
+    alarms, form, apart = _alarm_change(points), points.lobe, points.apart
+    beside = _beside(points)
     if points.adds_amplitudes:
-        return Size(added=points.image, alarms=alarms)
-    form, apart = points.lobe, points.apart
+        return Size(added=points.image, alarms=alarms, beside=beside)
     least = points.powers[0] / (1 + 2 * points.smeared / points.margin)
     outside = form.tail(apart)
-    inside, beside = form.tail(1.5 * apart), form.tail(0.5 * apart)
-    far = beside * beside + outside * outside
+    inside, further = form.tail(1.5 * apart), form.tail(0.5 * apart)
+    far = further * further + outside * outside
     power = np.maximum(inside * inside, np.maximum(far - least, 0.0)) / least
-    strongest = np.minimum(points.level * points.footprint.gain * outside, _HUGE)
-    leaking = strongest * np.minimum(strongest / points.threshold, 1.0)  # a bin at the threshold
-    return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms, beside=leaking)
+    return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms, beside=beside)
+
+
+def _beside(points: Points) -> np.ndarray:
+    """What images that add as powers change of leakage: of a bin at the threshold, or of all bins.
+
+    These cross with chances of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no slower
+    than 1 / k from ``apart`` on, so that all bins have ``apart`` times the a^2 of the nearest.
+    """
+    image = points.level * points.footprint.gain * points.lobe.tail(points.apart)
+    square, b = np.minimum(image, _HUGE) ** 2, points.threshold
+    y = 0.5 * b * b
+    alone = np.minimum(square / b, np.sqrt(square))
+    return np.maximum(alone, 0.5 * square * points.apart * np.minimum(y / np.expm1(y), 1.0))
 
 
 def _alarm_change(points: Points) -> np.ndarray | float:
