@@ -14,7 +14,7 @@ from sweep.scenes.grids import read_image
 from sweep.scenes.raster import read_raster
 from sweep.scenes.terrain import Terrain, refine, smooth
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
+DATA = Path(__file__).parents[3] / "shared" / "data"
 GALE = DATA / "gale_crater_hirise_1m.tif"
 APOLLO = DATA / "apollo15_nac_2m.png"
 
