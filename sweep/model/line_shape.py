@@ -394,7 +394,7 @@ def build(re, im, number, shapes, table, ends, envelope):
 
 @njit(cache=True, error_model="numpy")
 def _put_table(raw, sizes, table):
-    """What the kernel does to lines divided out of values at cells, in rows by cell of a bin."""
+    """Values at cells with the kernel divided out of them, in rows by cell of a bin."""
     cells, columns = sizes[3], 2 * sizes[2] + 1
     number = np.uint64(cells * columns)
     filtered = np.empty(cells * columns)

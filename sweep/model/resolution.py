@@ -415,7 +415,7 @@ def _smoothed_errors() -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _curved_departure(number: int) -> np.ndarray:
-    """How far a rule's mean of exp(i turn x^2) may be from 1 / sqrt(1 - 2 i turn), up to turns."""
+    """Largest error of a rule's mean of exp(i turn x^2), 1 / sqrt(1 - 2 i turn), up to turns."""
     x, w = gaussian_rule(number)
     mean = np.array([(w * np.exp(1j * turn * x**2)).sum() for turn in _CURVED_TURNS.tolist()])
     return np.maximum.accumulate(np.abs(mean - 1 / np.sqrt(1 - 2j * _CURVED_TURNS)))
@@ -446,7 +446,7 @@ def _peak(window_name: str) -> float:
 
 
 def _departure(number: int, turn: np.ndarray) -> np.ndarray:
-    """How far a rule's mean of cos(turn x) may be from exp(-turn^2 / 2)."""
+    """Largest error of a rule's mean of cos(turn x), which is exp(-turn^2 / 2)."""
     if number <= HERMITE:
         x, w = gaussian_rule(number)
         mean = (w * np.cos(turn[:, None] * x)).sum(axis=1)

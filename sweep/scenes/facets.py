@@ -97,7 +97,7 @@ def join(parts: Sequence[Facets]) -> Facets:
 
 @dataclass(frozen=True)
 class Report:
-    """What `clean` was given, found and did, in counts that `_WORDS` tells the meaning of."""
+    """Counts of facets that `clean` was given, found and mended; `_WORDS` has their meaning."""
 
     vertices: int
     faces: int

@@ -67,7 +67,7 @@ def image_size(points: Points) -> Size:
 
 
 def _beside(points: Points) -> np.ndarray:
-    """What images that add as powers change of leakage: of a bin at the threshold, or of all bins.
+    """Change of leakage by images that add as powers: of a bin at the threshold, or of all bins.
 
     These cross with chances of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no slower
     than 1 / k from ``apart`` on, so that all bins have ``apart`` times the a^2 of the nearest.
@@ -125,7 +125,7 @@ _LEVELS = 1.04
 _NEAR, _FAR = 48, 24
 """Bins that are looked at one by one, and stretches beyond."""
 _IMAGES = 1.1
-"""What images may make of sidelobes far from the edge; near it twice as much."""
+"""Factor that images may put to sidelobes far from the edge; near it twice as much."""
 
 
 def leakage_size(points: Points) -> Size:
