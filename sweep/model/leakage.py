@@ -30,13 +30,13 @@ from sweep.model.spectrum import (
     CHANCE,
     F_IM,
     F_RE,
+    FINER,
     HALF_SQUARE,
     IMAGED,
     OUT,
     POINT,
-    S_A_RE,
-    S_PLACE,
     SOURCE_DIGITS,
+    SOURCES,
     TAN,
     TURN_IM,
     TURN_RE,
@@ -101,7 +101,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
             crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
         least = min(max(crossing, float(beside)), float(beside + half))
         left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
-    known = n, lowest, highest, sources, faint / max(total, 1e-300)
+    known = n, lowest, highest, 0, faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
         count = high - low + 1
@@ -118,10 +118,10 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         count = high - low + 1
         magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
         peak, exempted = mark(room[OUT], count, noise[1], exempt)
-        run = low, count, peak, origin, sources
+        run = low, count, peak, origin
         leakage, settled = _leakage(
-            run, place, noise, form, sizes, tangent, room, exempt, series
-        )  # fmt: skip
+            run, (n, lowest, highest), place, noise, form, sizes, tangent, room, exempt, series
+        )
         if settled:
             return low, count, peak, exempted, leakage
         reach *= 2
@@ -227,9 +227,9 @@ def _least_reach(weight, spread, noise, crossing, form, sizes):
 
 
 @njit(cache=True, error_model="numpy")
-def _leakage(run, place, noise, form, sizes, tangent, room, exempt, series):
+def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, series):
     """Leakage of the run and of all beyond it; False where the run is too short to tell."""
-    low, count, peak, origin, sources = run
+    low, count, peak, origin = run
     sigma, level, _ = noise
     fft_size, half = sizes[0], sizes[0] // 2
     beta, scale = level / sigma, 0.5 / (sigma * sigma)
@@ -258,7 +258,8 @@ def _leakage(run, place, noise, form, sizes, tangent, room, exempt, series):
     for i in range(points):
         room[WEIGHT, i] *= bins / (1.0 + room[POINT, i] * room[POINT, i])
         room[POINT, i] = 1.0 / room[POINT, i]
-    _far_values(points, centre, origin, sources, form, sizes, tangent, room)
+    digits = min(max(math.log(200.0 * beta * beta / max(noise[2], 1e-300)), 4.0), SOURCE_DIGITS)
+    _far_values(points, centre, origin, lines, digits, form, sizes, tangent, room)
     for i in range(points):
         room[HALF_SQUARE, i] *= scale
     largest_beyond = largest(room[HALF_SQUARE, :points])
@@ -271,9 +272,13 @@ def _leakage(run, place, noise, form, sizes, tangent, room, exempt, series):
 
 
 @njit(cache=True, error_model="numpy")
-def _far_values(points, centre, origin, sources, form, sizes, tangent, room):
-    """|X|^2 at points whose tangents from ``centre`` are in row POINT, into row HALF_SQUARE."""
+def _far_values(points, centre, origin, lines, digits, form, sizes, tangent, room):
+    """|X|^2 at points whose tangents from ``centre`` are in row POINT, into row HALF_SQUARE.
+
+    To e^-digits, but for lines so few that each stands for itself.
+    """
     power, way = sizes[4] != 0, -1 if origin < 0 else 1
+    n, lowest, highest = lines
     for turn in range(2 if sizes[7] == IMAGED else 1):
         towards = way if turn == 0 else -way
         shift = tangent_of(centre - towards * origin, sizes[0], tangent)
@@ -282,8 +287,13 @@ def _far_values(points, centre, origin, sources, form, sizes, tangent, room):
             room[TAN, i] = towards * (t + shift) / (1.0 - t * shift)
             room[TURN_RE, i], room[TURN_IM, i] = 1.0, 0.0
             room[F_RE, i], room[F_IM, i] = 0.0, 0.0
+        nearest = float(sizes[6])
+        if turn == 1:  # images are as far from DC and Nyquist as the lines
+            edge = min(centre, sizes[0] // 2 - centre) - 0.5 * (highest - lowest)
+            nearest = max(nearest, edge - 2.0)
+        sources = take_sources(n, lowest, highest, nearest, digits, sizes, room)
         for b in range(sources):
-            add_far(0, points, 0, S_PLACE, S_A_RE, b, form, sizes, room)
+            add_far(0, points, 0, SOURCES, b, digits + FINER, form, sizes, room)
         for i in range(points):
             re, im = room[F_RE, i], towards * room[F_IM, i]
             room[HALF_SQUARE, i] = re if turn == 0 else room[HALF_SQUARE, i] + re

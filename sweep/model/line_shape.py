@@ -419,28 +419,31 @@ def _put_envelope(raw, ends, sizes, reach, envelope):
     """
     bins, cells, power = sizes[2], sizes[3], sizes[4]
     middle = bins * cells + cells - 1 + _BEYOND
+    pairs, half = np.empty(raw.shape[1]), np.uint64(cells // 2)
+    for i in range(np.uint64(raw.shape[1])):
+        re, im = raw[0, i], 0.0 if power else raw[1, i]
+        pairs[i] = re if power else re * re + im * im
+    number = reach.size - bins - 1
+    c, parts = np.empty(number), np.zeros((4, number))
+    for i in range(number):
+        c[i] = 1.0 / math.tan(math.pi * reach[bins + 1 + i] / sizes[0])
+    for d in range(ends.shape[1] - 1, -1, -1):
+        for k in range(4):
+            for i in range(number):
+                parts[k, i] = parts[k, i] * c[i] + ends[k, d]
     most, area, before = 0.0, 0.0, 0.0
     for i in range(reach.size - 1, -1, -1):
         if i <= bins:
+            above, below = np.uint64(middle + i * cells), np.uint64(middle - i * cells)
+            total = 0.0
             for k in range(-1, cells):  # from the cell before on
-                for side in range(-1, 2, 2):
-                    total = 0.0
-                    for further in range(0, cells, cells // 2):
-                        at = middle + side * (i * cells + k + further)
-                        if power:
-                            total += raw[0, at]
-                        else:
-                            total += raw[0, at] * raw[0, at] + raw[1, at] * raw[1, at]
-                    most = max(most, _MARGIN * math.sqrt(total))
+                up, down = above + np.uint64(k), below - np.uint64(k)
+                total = max(total, pairs[up] + pairs[up + half], pairs[down] + pairs[down - half])
+            most = max(most, _MARGIN * math.sqrt(total))
         else:
-            c = 1.0 / math.tan(math.pi * reach[i] / sizes[0])
-            a_re, a_im, b_re, b_im = 0.0, 0.0, 0.0, 0.0
-            for d in range(ends.shape[1] - 1, -1, -1):
-                a_re = a_re * c + ends[0, d]
-                a_im = a_im * c + ends[1, d]
-                b_re = b_re * c + ends[2, d]
-                b_im = b_im * c + ends[3, d]
-            most = max(most, math.hypot(a_re, a_im) + math.hypot(b_re, b_im))
+            j = i - bins - 1
+            first, last = math.hypot(parts[0, j], parts[1, j]), math.hypot(parts[2, j], parts[3, j])
+            most = max(most, first + last)
         width = reach[i + 1] - reach[i] if i + 1 < reach.size else 0.0
         area += width * 0.5 * (most * most + before)  # an upper sum, where it falls ever slower
         before = most * most

@@ -444,12 +444,16 @@ def _used(shift):
 
 
 @njit(cache=True, error_model="numpy")
-def _make_shapes(which, segments, modes, shapes, table, form):
-    """Tables and outlines of a shape in all segments."""
+def _make_shapes(which, before, segments, modes, shapes, table, form):
+    """Tables and outlines of a shape in all segments, unless they are those of ``before``."""
     _, mode, number, _ = modes
     for s in range(segments.size):
         if not segments[s]:
             continue
+        if before >= 0 and number[s, before] == 1 and number[s, which] == 1:
+            same = mode[s, before, 0, 0] == mode[s, which, 0, 0]
+            if same and mode[s, before, 1, 0] == mode[s, which, 1, 0]:
+                continue
         ends, envelope = form[s, 3:7, :14], form[s, 1:3]
         if shapes[0][5]:
             table[s] = shapes[5][s]
@@ -507,8 +511,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         p[:] = points[:, i]
         row, which, shift = where[0, i], where[1, i], _used(shifts[i])
         if which != made_of:
+            _make_shapes(which, made_of, segments, modes, shapes, table, form)
             made_of = which
-            _make_shapes(which, segments, modes, shapes, table, form)
         sigma, level = p[10], p[11]
         if leaks.any() and level / sigma != before:
             before = level / sigma

@@ -30,6 +30,9 @@ CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = range(7, 13)
 S_PLACE, S_A_RE, S_A_IM, S_B_RE, S_B_IM = range(13, 18)
 """The same of sources, and their places."""
 
+LINES, SOURCES = (PLACE, A_RE), (S_PLACE, S_A_RE)
+"""Rows of places and first rows of strengths."""
+
 F_RE, F_IM, OUT, OUT_IM = range(18, 22)
 """F in a run of bins that rise; |X| of the run."""
 
@@ -51,6 +54,9 @@ of a complex record, numbered on past 0 and N."""
 
 SOURCE_DIGITS = 28.0
 """-ln of the error of sources, and a little for the poles of a window on either side."""
+
+FINER = 11.0
+"""By how much more the polynomials of the record's ends are told."""
 
 WINDOW = 8
 """Bins within which lines are shared out together; these share the bins that tables hold."""
@@ -226,15 +232,16 @@ def prepare_far(first, count, sizes, tangent, room):
 
 
 @njit(cache=True, error_model="numpy")
-def add_far(start, end, at, place, strength, b, form, sizes, room):
-    """Adds line or source b to F, from ``at`` on, in prepared bins start .. end - 1.
+def add_far(start, end, at, rows, b, digits, form, sizes, room):
+    """Adds line or source b to F, from ``at`` on, in prepared bins start .. end - 1, to e^-digits.
 
-    ``place`` and ``strength`` are rows: PLACE and A_RE, or S_PLACE and S_A_RE.
+    ``rows`` are those of places and strengths: LINES or SOURCES.
     """
     power = sizes[4] != 0
+    strength, cut = rows[1], math.exp(-digits)
     a_re, a_im = room[strength, b], room[strength + 1, b]
     b_re, b_im = room[strength + 2, b], room[strength + 3, b]
-    t, nearest = math.tan(math.pi * room[place, b] / sizes[0]), 0.0
+    t, nearest = math.tan(math.pi * room[rows[0], b] / sizes[0]), 0.0
     begin, stop, to = np.uint64(start), np.uint64(end), np.uint64(at - start)
     for i in range(begin, stop):
         room[COT, i] = (1.0 + room[TAN, i] * t) / (room[TAN, i] - t)
@@ -244,7 +251,7 @@ def add_far(start, end, at, place, strength, b, form, sizes, room):
     for d in range(14):
         size = factor * (abs(form[3, d]) + abs(form[4, d]) + abs(form[5, d]) + abs(form[6, d]))
         most = max(most, size)
-        degree = d if size > 1e-17 * most else degree
+        degree = d if size > cut * most else degree
         factor *= nearest
     for i in range(begin, stop):
         room[P_RE, i], room[P_IM, i] = form[3, degree], form[4, degree]
@@ -293,9 +300,9 @@ def field(first, count, lines, table, form, sizes, tangent, room):
     reach = sizes[2] - BESIDE  # of tables from any line
     if whole or (highest - first < reach and first + count - lowest < reach):
         return
+    digits = SOURCE_DIGITS
     if sources == 0:
         distance = max(gap_of(first, count, lowest, highest, sizes[0]), float(reach))
-        digits = SOURCE_DIGITS
         if faint > 0.0:
             part = math.log(max(form[1, envelope_from(distance, form)] / faint, 1.0))
             digits = min(digits, 4.0 + (2.0 * part if sizes[4] else part))
@@ -314,7 +321,7 @@ def field(first, count, lines, table, form, sizes, tangent, room):
         if not amid:
             prepare_far(at, stop - at, sizes, tangent, room)
             for b in range(sources):
-                add_far(0, stop - at, at - first, S_PLACE, S_A_RE, b, form, sizes, room)
+                add_far(0, stop - at, at - first, SOURCES, b, digits + FINER, form, sizes, room)
         elif last > begun:
             prepare_far(at, stop - at, sizes, tangent, room)
             for b in range(n):  # what the table does not hold of each line
@@ -325,8 +332,8 @@ def field(first, count, lines, table, form, sizes, tangent, room):
                     until = min(held, stop) if lap < 2 else stop
                     if start < until:
                         add_far(
-                            start - at, until - at, start - first, PLACE, A_RE, b, form, sizes,
-                            room,
+                            start - at, until - at, start - first, LINES, b, digits + FINER, form,
+                            sizes, room,
                         )  # fmt: skip
                     start = max(start, past)
         at = stop
