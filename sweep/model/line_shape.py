@@ -102,6 +102,9 @@ class Shapes(NamedTuple):
     """(segments, 2, m): their envelopes, as of :func:`build`; else empty."""
 
 
+_gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
+
+
 @lru_cache(maxsize=24)
 def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: bool = True) -> Shapes:
     """What shapes of up to some modes (:data:`TIERS`) are made of."""
@@ -111,7 +114,7 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
     bins = math.ceil(beside / ratio)
     y = _places(bins, power)
     order = 4 * ((math.ceil(math.pi * beside) + number) // 4) + 64
-    x, weight = np.polynomial.legendre.leggauss(order)
+    x, weight = _gauss_legendre(order)
     cosines = np.array([float(c) for c in COSINE_SUMS[window.name]])
     w = np.cos(np.pi * np.outer(x, np.arange(cosines.size))) @ np.diag(cosines)
     strength = np.cos(np.outer(np.arange(number), np.arccos(x))) * (

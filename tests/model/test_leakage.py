@@ -70,7 +70,7 @@ def test_what_a_tone_leaks_far_from_it_is_bounded_and_not_by_much_more(name, nea
     envelope = form[1, np.searchsorted(form[0], first, "right") - 1]
     weight = nearest / envelope
     alarm, leaked = np.exp(-(level**2) / 2), []
-    for offset in (0.25, 0.5, 0.75):
+    for offset in (0.25, 0.5):
         tone = np.exp(2j * np.pi * offset * n / size)
         magnitude = np.abs(np.fft.fft(samples(name, size) * tone))
         away = np.minimum(np.abs(n - offset), np.abs(n - offset - size))
@@ -94,14 +94,14 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
     generator, shape = np.random.default_rng(5), window(name, 4096)
     _, form, sizes, _, _ = shape_of(shape, 4096)
     room, gained = np.zeros((ROOM, LEAST_WIDTH)), []
-    for degree in (0, 0, 1, 2, 3, 4, 6):
+    for degree in (0, 1, 2, 4, 6):
         places = np.append(generator.uniform(-half, half, 10), [-half, half])
         s = strengths_without_moments(places / half, degree, generator)
         n, total = places.size, abs(s).sum()
         room[PLACE, :n], room[RE, :n], room[IM, :n] = places, s.real, s.imag
         sources = take_sources(n, -half, half, float(sizes[6]), SOURCE_DIGITS, sizes, room)
         bound = weight_afar(total, sources, sizes, room)
-        away = np.arange(sizes[6] + 1, 2000, 7) + generator.uniform(0, 1)
+        away = np.geomspace(sizes[6] + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + away[:, None] - places
         kernel = transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
         envelope = form[1, np.searchsorted(form[0], away - 1.5, "right") - 1]

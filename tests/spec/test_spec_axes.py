@@ -179,7 +179,6 @@ def test_arrays_of_an_axis_are_read_only():
     "values",
     [
         {"step": ["1 mm", "10 km", "1 mm"]},
-        {"linear": ["1 m", "10 km"], "number": 10**7},
         {"log": ["1 m", "10 km"], "number": 10**7},
     ],
 )

@@ -1,17 +1,54 @@
-"""Intensity noise of the local oscillator, against a fluctuating laser on two diodes."""
+"""Sunlight, the echo's own shot noise and a fluctuating laser: by hand, and on two diodes."""
 
 import numpy as np
 import pytest
+from effect_points import points_of
 
-from sweep.model import window
-from sweep.model.effects.noise_sources import current_variance
+from sweep.model import shot, window
+from sweep.model.effects.noise_sources import current_variance, echo_size, sun_size
 from sweep.model.link import bin_deviation
+
+OTHERS = 1.53715e-13
+"""Current variance of Table 4.1 [A^2]: 1.40992e-13 of it shot noise of 1 mW."""
 
 ELECTRON = 1.602176634e-19
 LASER = {
     "relative_intensity_noise": 1e-15, "common_mode_rejection": 1.0, "local_oscillator_power": 1e-3,
     "apd_gain": 1.0, "responsivity": 1.1, "electrical_bandwidth": 400e6,
 }  # fmt: skip
+
+
+def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
+    """0.26 W/m^2/nm at 1.55 um on white ground, 1 km away, through 25 nm, 1 mrad and 25 mm.
+
+    The patch is 0.785 m^2 and receives 5.105 W; Lambert's law sends P/pi per steradian, and the
+    aperture is 4.909e-10 sr: 7.977e-10 W, 1.125e-19 A^2 of shot noise, 7.3e-7 of the whole.
+    """
+    light = 0.26 * 25 * (np.pi * 0.5**2) / np.pi * (np.pi * 0.0125**2 / 1000.0**2)
+    assert light == pytest.approx(7.977e-10, rel=1e-3)
+    scene = table_4_1(
+        solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024
+    )
+    found = sun_size(points_of(scene))
+    assert found.threshold_follows
+    assert found.noise == pytest.approx(1.125e-19 / OTHERS, rel=1e-3)
+
+
+def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
+    """Threshold without the echo, noise with it: Pfa = exp(-Th^2/2s^2 / (1 + share)), [T 4.2].
+
+    At 2 km the echo is 1.953125e-12 W beside 1 mW: 17 % more false alarms at 1 m, 0.6 % at 5 m.
+    """
+    distance = np.array([1.0, 2.0, 5.0, 20.0])
+    parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
+    found = echo_size(points_of(parameters))
+    share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
+    np.testing.assert_allclose(found.noise, share, rtol=1e-4)
+    assert not found.threshold_follows
+    predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + found.noise))
+    np.testing.assert_allclose(shot.evaluate(parameters)["pfa_bin"], predicted, rtol=1e-5)
+    rise = predicted / np.exp(-(4 - np.pi) / 4 * 100) - 1
+    assert rise == pytest.approx([0.166, 0.0392, 0.00617, 3.8e-4], rel=0.02)
 
 
 def test_two_diodes_that_do_not_match_see_what_is_left_of_a_fluctuating_laser():
