@@ -26,6 +26,7 @@ TABLE_4_1 = {
     "instrument.chirp.duration": 500e-6,
     "instrument.telescope.aperture": 25e-3,
     "instrument.telescope.optical_efficiency": 1.0,
+    "instrument.telescope.coupling": "aperture",
     "instrument.receiver.architecture": "homodyne",
     "instrument.receiver.local_oscillator_power": 1e-3,
     "instrument.receiver.mixing_efficiency": 1.0,

@@ -33,6 +33,7 @@ from sweep.cli.telling import (
     tell_effects,
     warn_before,
     warn_of_alarms,
+    warn_of_beam,
 )
 from sweep.storage.locations import Location
 
@@ -210,6 +211,7 @@ def plan(spec: Path, workers: int | None) -> None:
     for name, text in lines:
         click.echo(f"{name:>12}  {text}")
     tell_effects(effects)
+    warn_of_beam(study)
     warn_of_alarms(study)
 
 

@@ -359,8 +359,17 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
         )
 
 
+def warn_of_beam(study: Spec | SceneSpec) -> None:
+    """Say where a beam is narrower than its aperture makes it."""
+    from sweep.spec.beam_check import too_narrow
+
+    if told := too_narrow(study):
+        click.echo(f"warning: {told}", err=True)
+
+
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
     """Before a run: false alarms in many shots, and effects that are forced off and matter."""
+    warn_of_beam(study)
     warn_of_alarms(study)
     if "off" in study.modes().values():
         warn(effects_of(study, store, costs=False))

@@ -5,11 +5,13 @@ depend on laser power, receiver or processing. It is worked out once and serves 
 radiometric studies [T 3.2].
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from sweep.model import beam
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.atmosphere import PATH_ELEVATION
 from sweep.model.effects.catalogue import CORE
@@ -87,6 +89,7 @@ def observe(
     bodies: Sequence[Flight | None] | None = None,
     jitter: PointingJitter | None = None,
     rotation: bool = True,
+    angles: Callable[[np.ndarray], beam.Angles] | None = None,
 ) -> Eyepoints:
     """Eyepoints of shots by number.
 
@@ -109,6 +112,9 @@ def observe(
         and `direction` stay those commanded. None draws nothing.
     rotation : bool
         Whether the surfaces of turning bodies move as they turn.
+    angles : callable, optional
+        Footprint by the range (n,) of the beam's axis, infinite where that hits nothing
+        (:func:`sweep.model.beam.angles`); by default `beam_divergence` everywhere.
     """
     index = np.asarray(index)
     shots = scanner.shots(index)
@@ -116,11 +122,19 @@ def observe(
     state = flight.state(time)
     (across, along), weight = beamlets(number, pattern)
     attitude = state.attitude if jitter is None else jitter.turned(state.attitude, index)
-    rays = beamlet_rays(attitude, shots.direction, across, along, beam_divergence / 4)
     moving = [None if body is None else body.state(time) for body in bodies or ()]
     poses = [None if body is None else Pose(body.position, body.attitude) for body in moving]
+    fan = partial(beamlet_rays, attitude, shots.direction)
+    if angles is None:
+        seen = rays = fan(across, along, beam_divergence / 4)
+    else:  # a ray along the axis tells how wide the footprint is
+        nothing = np.zeros(1)
+        axis = caster.bundle(state.position, fan(nothing, nothing, 1.0), poses=poses or None)
+        rays, seen = (
+            fan(across, along, np.reshape(full, (-1, 1)) / 4) for full in angles(axis.range)
+        )
     bundle = caster.bundle(state.position, rays, poses=poses or None)
-    velocity = _radial_velocity(state, rays, bundle, moving, rotation)
+    velocity = _radial_velocity(state, (rays, seen), bundle, moving, rotation)
     rows = np.arange(len(time))
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
     return Eyepoints(
@@ -132,19 +146,21 @@ def observe(
 
 def _radial_velocity(
     state: State,
-    rays: np.ndarray,
+    rays: tuple[np.ndarray, np.ndarray],
     bundle: Bundle,
     moving: Sequence[State | None],
     rotation: bool,
 ) -> np.ndarray:
     """Closing speed of instrument and surface along every beamlet [m/s], (n, b); nan for a miss.
 
+    Of the rays, the first find the places, the second have the directions of the light there.
     A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
     turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
     """
-    closing = rays[..., 0] * state.velocity[:, :1]
+    places, seen = rays
+    closing = seen[..., 0] * state.velocity[:, :1]
     for k in (2, 1):  # the order that results have had, bit for bit
-        closing += rays[..., k] * state.velocity[:, k, None]
+        closing += seen[..., k] * state.velocity[:, k, None]
     closing[~bundle.valid] = np.nan
     for body, motion in enumerate(moving):
         if motion is None:
@@ -152,9 +168,9 @@ def _radial_velocity(
         surface = motion.velocity[:, None]
         if rotation and motion.rate.any():
             hit = np.where(bundle.body == body, bundle.range[:, None] + bundle.offset, 0.0)
-            arm = state.position[:, None] + rays * hit[..., None] - motion.position[:, None]
+            arm = state.position[:, None] + places * hit[..., None] - motion.position[:, None]
             surface = surface + np.cross(motion.rate[:, None], arm)
-        receding = (rays * surface).sum(axis=-1)
+        receding = (seen * surface).sum(axis=-1)
         closing = np.where(bundle.body == body, closing - receding, closing)
     return closing
 
@@ -212,7 +228,11 @@ def seen_ground(
         by_law = np.array([each.law == law for each in surfaces])[surface]
         scattered = backscatter(law, eyepoints.cos_incidence)
         np.copyto(back, scattered, where=hit & by_law)
-    echo = sent * back / ((1 + relative) * (1 + relative))
+    loss = (1 + relative) * (1 + relative)
+    if beam.is_single_mode(parameters):
+        first, second = beam.dimming(parameters, eyepoints.range[:, None])
+        loss = 1 + relative * (first + relative * second)
+    echo = sent * back / loss
     axis = surface[np.arange(len(surface)), eyepoints.reference]
     upwards = eyepoints.direction[:, 2]
     height = eyepoints.position[:, 2] + eyepoints.range * upwards

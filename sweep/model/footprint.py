@@ -144,6 +144,7 @@ def plane_footprint(
     pattern: str = "hexagonal",
     radial: ArrayLike = 0.0,
     transverse: ArrayLike = 0.0,
+    directions: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Beamlets of a beam on a flat plane, per unit of range along the beam's axis.
 
@@ -161,6 +162,9 @@ def plane_footprint(
         Of :func:`beamlets`.
     radial, transverse : (n,) array_like
         Velocity along the axis, positive closing, and across it towards the near side [m/s].
+    directions : (n,) ndarray, optional
+        Full 1/e^2 angle of the directions that velocities are seen along [rad]; as of the places
+        by default (:class:`sweep.model.beam.Angles`).
 
     Returns
     -------
@@ -185,6 +189,9 @@ def plane_footprint(
     safe = np.where(hits, height, 1.0)
     offset = np.where(hits, (stretch * sine - y * cosine) / safe, 0.0)
     cos_incidence = np.where(hits, height / (1 + stretch), 0.0)
+    if directions is not None:
+        x, y = (v * (np.asarray(directions, float)[:, None] / 4) for v in (across, along))
+        stretch = (square := x * x + y * y) / (1 + np.sqrt(1 + square))
     along_beam, across_beam = (np.asarray(v, float)[..., None] for v in (radial, transverse))
     closing = (across_beam * y - along_beam * stretch) / (1 + stretch)
     return offset, cos_incidence, np.where(hits, share, 0.0), closing
@@ -223,12 +230,13 @@ def plane_moments(
     beam_divergence: ArrayLike,
     number: int,
     pattern: str,
+    directions: ArrayLike | None = None,
 ) -> tuple[Moments, Moments]:
     """Bounds for a beam on a plane: (R_b - R_0)/R_0, and radial velocities off the axis's [m/s].
 
     Both weighted by echo power. u has the rms q; the rest bounds Taylor's remainders. At a velocity
     off the beam a beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1),
-    |d|^2 = 1 + x^2.
+    |d|^2 = 1 + x^2, with x by `directions` where that is another angle than the places'.
     """
     radius, sigma = reach_of(number, pattern), np.asarray(beam_divergence, float) / 4
     across, along = np.abs(across), np.abs(along)
@@ -244,6 +252,9 @@ def plane_moments(
     ranges = Moments(*(np.where(widest < 1, value, np.inf) for value in (mean, far, extreme)))
     side = 1 + np.minimum(widest, 1.0)  # velocities have bounds beyond the horizon too
     heavier = side * side * side * np.exp(6 * bulge)
+    if directions is not None:
+        sigma = np.asarray(directions, float) / 4
+        bulge = (radius * sigma) * (radius * sigma) / 2
     lean = sigma * (3 * rms * heavier + 8 * radius * bulge)
     velocities = Moments(
         across * lean + along * (sigma * sigma) * heavier,

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import footprint
+from sweep.model import beam, footprint
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import Moments
 
@@ -90,11 +90,13 @@ class Plane:
         self._law = str(p["target.reflectance_law"])
         self._number = int(p["footprint.beamlets"])
         self._pattern = pattern(p)
+        places, directions = beam.angles(p)
         columns = np.broadcast_arrays(
             p["target.grazing_angle"],
-            p["instrument.laser.beam_divergence"],
+            places,
             p["target.radial_velocity"] if moving else 0.0,
             p["target.transverse_velocity"] if moving else 0.0,
+            *(() if beam.is_thesis(p) else (directions, *beam.dimming(p))),
         )
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
@@ -116,8 +118,13 @@ class Plane:
             pattern=self._pattern,
             radial=shapes[2],
             transverse=shapes[3],
+            directions=shapes[4] if len(shapes) > 4 else None,
         )
-        echo = weights * backscatter(self._law, cos_incidence) / (1 + offset) ** 2
+        loss = (1 + offset) ** 2
+        if len(shapes) > 4:
+            first, second = shapes[5:, :, None]
+            loss = 1 + offset * (first + offset * second)
+        echo = weights * backscatter(self._law, cos_incidence) / loss
         doppler = np.where(weights > 0, 2 * closing / SPEED_OF_LIGHT, 0.0)
         return Footprints(_rows(row, self._size), offset, doppler, echo)
 

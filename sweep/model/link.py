@@ -20,17 +20,18 @@ def aperture_area(aperture: np.ndarray) -> np.ndarray:
 def echo_power_scale(
     *,
     power: np.ndarray,
-    aperture: np.ndarray,
+    area: np.ndarray,
     optical_efficiency: np.ndarray,
     reflectance: np.ndarray,
     range: np.ndarray,
 ) -> np.ndarray:
     """Echo power [W] for a backscatter of 1/sr with the whole beam at one range.
 
-    [T 4.4] without its 1/(2 pi): that belongs to the reflectance law. A beamlet's echo is this
-    times its power fraction, its backscatter [1/sr] and (R_0/R_b)^2.
+    [T 4.4] without its 1/(2 pi): that belongs to the reflectance law; `area` [m^2] is that of
+    :func:`sweep.model.beam.collecting_area`. A beamlet's echo is this times its power fraction, its
+    backscatter [1/sr] and what :func:`sweep.model.beam.dimming` says of its range.
     """
-    return power * aperture_area(aperture) * optical_efficiency * reflectance / range**2
+    return power * area * optical_efficiency * reflectance / range**2
 
 
 def beat_scale(

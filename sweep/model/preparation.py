@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, link, waveform
+from sweep.model import beam, detection, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.ground import Ground
@@ -366,7 +366,7 @@ def link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndar
     """Echo power [W] per backscatter of 1/sr, and the beat photocurrent [A] of that."""
     power_scale = link.echo_power_scale(
         power=p[LASER + "power"],
-        aperture=p[TELESCOPE + "aperture"],
+        area=beam.collecting_area(p),
         optical_efficiency=p[TELESCOPE + "optical_efficiency"],
         reflectance=p["target.reflectance"],
         range=p["target.range"],

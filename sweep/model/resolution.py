@@ -44,7 +44,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import detection, ground
+from sweep.model import beam, detection, ground
 from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.lobes import Lobe, lobe
@@ -237,14 +237,14 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
 def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     """Spread of the lines of up, Doppler and down segment [bins of fs/L]."""
     angle, along = p["target.grazing_angle"], np.asarray(p["target.radial_velocity"], float)
-    divergence = np.asarray(p[LASER + "beam_divergence"], float)
+    places, directions = beam.angles(p)
     across = np.asarray(p["target.transverse_velocity"], float)
-    sigma, slope = divergence / 4, divergence / 4 / np.tan(angle)
+    sigma, slope, turn = places / 4, places / 4 / np.tan(angle), directions / 4
     bins = p[PROCESSING + "sample_rate"] / p["record"]
     rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
     ranges, velocities = plane_moments(
-        across=across, along=along, grazing_angle=angle, beam_divergence=divergence, number=most,
-        pattern="line",
+        across=across, along=along, grazing_angle=angle, beam_divergence=places, number=most,
+        pattern="line", directions=directions,
     )  # fmt: skip
     # Beyond the horizon the ranges' have no bound: there the plain one has to do.
     rms = np.where(np.isfinite(ranges.rms), ranges.rms, slope)
@@ -259,8 +259,9 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
     return Spread(
         deviation=per_range * rms + per_speed * velocities.rms + nothing,
-        slope=abs(per_speed * across * sigma + signs * per_range * slope) + nothing,
-        curve=abs(per_speed * along + signs * per_range) * (sigma**2 / 2) + nothing,
+        slope=abs(per_speed * across * turn + signs * per_range * slope) + nothing,
+        curve=abs(per_speed * along * (turn / sigma) ** 2 + signs * per_range) * (sigma**2 / 2)
+        + nothing,
     )
 
 

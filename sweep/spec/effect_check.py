@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model import beam
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
@@ -43,6 +44,22 @@ def _above_zero(path: str, asks: Condition, other: str) -> Need:
 
 
 NEEDS = (
+    *(
+        Need(
+            path,
+            lambda value: value != 0,
+            other,
+            lacks,
+            "counts by the mode that a coherent receiver sees, and here all light in the aperture "
+            "does",
+            "take a coherent receiver of coupling: single_mode",
+        )
+        for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
+        for other, lacks in (
+            (beam.COUPLING, lambda coupling: coupling == beam.APERTURE),
+            (beam.ARCHITECTURE, lambda architecture: architecture == "direct"),
+        )
+    ),
     _above_zero(
         "instrument.processing.bits", lambda bits: bits > 0, "instrument.processing.full_scale"
     ),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
 
+from sweep.model.beam import COUPLINGS, SINGLE_MODE
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.spec.effect_fields import with_parameters
@@ -50,13 +51,46 @@ class Laser(Part):
     beam_divergence: Annotated[
         float,
         Numeric(
-            about="Full angle of the beam, for a Gaussian beam between its 1/e^2 points",
+            about="Full angle of the beam, for a Gaussian beam between its 1/e^2 points; or give "
+            "beam_waist",
             si_unit="rad",
             example="50 urad",
             at_least="1e-12 rad",
             at_most="90 deg",
+            words=(("none", 0),),
         ),
-    ]
+    ] = 0.0
+    beam_waist: Annotated[
+        float,
+        Numeric(
+            about="1/e^2 radius of the beam as it leaves the telescope; or give beam_divergence",
+            si_unit="m",
+            example="5 mm",
+            at_least="100 nm",
+            at_most="1 km",
+            words=(("none", 0),),
+        ),
+    ] = 0.0
+    beam_quality: Annotated[
+        float,
+        Numeric(
+            about="M^2 of the sent beam; 1 for a beam at the limit of diffraction",
+            example="1.2",
+            at_least="1",
+            at_most="1e6",
+        ),
+    ] = 1.0
+    focus: Annotated[
+        float,
+        Numeric(
+            about="Distance at which the telescope is focused; none: at infinity",
+            si_unit="m",
+            example="20 m",
+            at_least="1 mm",
+            at_most="1e15 m",
+            words=(("none", 0),),
+        ),
+    ] = 0.0
 
 
 @with_parameters("instrument.chirp")
@@ -118,6 +152,14 @@ class Telescope(Part):
             at_most="1",
         ),
     ] = 1.0
+    coupling: Annotated[
+        str,
+        Choice(
+            about="Light that mixes with the local oscillator: that of a single mode, or all in "
+            "the aperture, as the thesis has it; direct detection always has all",
+            options=COUPLINGS,
+        ),
+    ] = SINGLE_MODE
 
 
 @with_parameters("instrument.receiver")
@@ -207,6 +249,18 @@ class Receiver(Part):
             at_most="1e9 W",
         ),
     ] = 1e-3
+    local_oscillator_waist: Annotated[
+        float,
+        Numeric(
+            about="1/e^2 radius at the telescope of the beam that the local oscillator would make; "
+            "none: the sent beam's. single_mode only",
+            si_unit="m",
+            example="5 mm",
+            at_least="100 nm",
+            at_most="1 km",
+            words=(("none", 0),),
+        ),
+    ] = 0.0
     mixing_efficiency: Annotated[
         float,
         Numeric(

@@ -163,12 +163,12 @@ class Numeric(Rule):
 
     def written(self, value: Any) -> str | int | float:
         """Text that reads back as exactly `value`: ``0.001 W``; of decibels, to 15 digits."""
+        for word, stands_for in self.words:
+            if value == stands_for:
+                return word
         if self.si_unit:
             number = 10.0 * math.log10(value) if self.si_unit == DECIBEL else float(value)
             return f"{repr(number).removesuffix('.0')} {self.si_unit}"
-        for word, number in self.words:
-            if value == number:
-                return word
         return int(value) if self.whole else float(value)
 
     def schema(self) -> dict[str, Any]:
@@ -180,7 +180,9 @@ class Numeric(Rule):
         description = f"{self.about}; {', '.join(bounds)}" if bounds else self.about
         common: dict[str, Any] = {"description": description, "examples": [self.example]}
         if self.si_unit:
-            return common | {"type": "string", "pattern": r"^\s*[-+−.0-9].*[^\s0-9.]\S*\s*$"}
+            words = (rf"^{word}$" for word, _ in self.words)
+            pattern = "|".join([r"^\s*[-+−.0-9].*[^\s0-9.]\S*\s*$", *words])
+            return common | {"type": "string", "pattern": pattern}
         kinds: list[dict[str, Any]] = [
             {"type": "integer" if self.whole else "number"} | self._numeric_bounds(),
             {"type": "string", "pattern": r"^\s*[-+.0-9][-+.0-9eE^*_ ]*%?\s*$"},

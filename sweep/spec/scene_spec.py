@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 from pydantic import Field, PrivateAttr
 
-from sweep.model import VERSION
+from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
 from sweep.spec.axes import Axis
@@ -25,9 +27,8 @@ from sweep.spec.motion import Platform
 from sweep.spec.reading import Document, plain
 from sweep.spec.scanners import AnyScanner, shots_a_cycle
 from sweep.spec.scene_axes import (
-    ARCHITECTURE,
+    Arrangement,
     axis_findings,
-    beamlet_pattern,
     parameter_findings,
     why_not,
 )
@@ -118,7 +119,7 @@ class SceneSpec(Study):
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
         """What is wrong with a parameter taking a value without the geometry changing."""
-        return parameter_findings(*self._arrangement, path, [value], location)
+        return parameter_findings(self._arrangement, path, [value], location)
 
     @property
     def base(self) -> Path:
@@ -194,14 +195,19 @@ class SceneSpec(Study):
     @property
     def pattern(self) -> str:
         """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
-        footprint, architecture = self._arrangement
-        return beamlet_pattern(*footprint, architecture)
+        return self._arrangement.beamlets
 
     @property
-    def _arrangement(self) -> tuple[tuple[str, str], str]:
-        """What arranges the beamlets: pattern and phases of the footprint, architecture."""
-        words = {path: str(value) for path, value in self.parameters().items()}
-        return (words[PATTERN], words["footprint.phases"]), words[ARCHITECTURE]
+    def _arrangement(self) -> Arrangement:
+        p = self.parameters()
+        paths = PATTERN, "footprint.phases", beam.ARCHITECTURE
+        pattern, phases, architecture = (str(p[path]) for path in paths)
+        return Arrangement(pattern, phases, architecture, beam.is_thesis(p))
+
+    def footprint_angles(self) -> Callable[[np.ndarray], beam.Angles] | None:
+        """Angles of the beam's footprint by range; None where its divergence says all."""
+        p = self.parameters()
+        return None if beam.is_thesis(p) else partial(beam.angles, p)
 
     def pointing_jitter(self) -> PointingJitter | None:
         """Random turns of the beams; None where there are none."""
@@ -221,12 +227,13 @@ class SceneSpec(Study):
 
         Names are no part of it, nor are reflectances, nor where files are: they count by content.
         """
+        p = self.parameters()
         seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
         return seen | {
             "model": VERSION,
-            "beamlets": self.parameters()[BEAMLETS],
+            "beamlets": p[BEAMLETS],
             "pattern": self.pattern,
-            "beam_divergence": self.instrument.laser.beam_divergence,
+            "beam": {beam.DIVERGENCE: p[beam.DIVERGENCE]} if beam.is_thesis(p) else beam.shape(p),
             "seed": self.seed if self.platform.jitter else 0,
             "rotation": self.modes()["rotation"] != "off",
         }

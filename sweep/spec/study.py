@@ -15,6 +15,7 @@ from pydantic import ConfigDict, PrivateAttr, ValidationError
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.axis_reading import paths_on_axes, read_axes
+from sweep.spec.beam_check import beam_findings
 from sweep.spec.effect_check import effect_findings, written_modes
 from sweep.spec.fields import (
     UNSTORED,
@@ -124,6 +125,7 @@ class Study(Part, ABC):
             findings += findings_of(error, cls)
         values = readable(written, axes)
         findings += grid_findings(values, axes)
+        findings += beam_findings(values, axes)
         findings += effect_findings(values, axes, written_modes(written))
         findings += _size_finding(axes)
         findings += cls.further_findings(written, axes, base, axes_are_whole)
@@ -204,6 +206,7 @@ class Study(Part, ABC):
             findings += self.unvaried(path, parameters[path], (name,))
         if not findings:
             findings = grid_findings(parameters, ())
+            findings += beam_findings(parameters, ())
             findings += effect_findings(parameters, (), self.modes())
         if findings:
             raise SpecError(Document({}).mistake(finding) for finding in findings)

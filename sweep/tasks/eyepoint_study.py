@@ -228,6 +228,7 @@ class EyepointStudy:
             "number": self.beamlets,
             "pattern": self.spec.pattern,
             "jitter": self.spec.pointing_jitter(),
+            "angles": self.spec.footprint_angles(),
             "rotation": self.spec.modes()["rotation"] != "off",
         }
 

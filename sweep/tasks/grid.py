@@ -28,7 +28,10 @@ GEOMETRIC = (
     "target.transverse_velocity",
     "target.pointing_jitter",
 )
-GEOMETRIC_PREFIXES = ("instrument.laser.beam_divergence", "footprint.")
+GEOMETRIC_PREFIXES = (
+    "instrument.laser.beam_", "instrument.laser.focus", "instrument.telescope.coupling",
+    "instrument.receiver.local_oscillator_waist", "footprint.",
+)  # fmt: skip
 
 #: Seconds that a block takes at the most, as :func:`seconds_a_point` has it: what is lost where a
 #: worker dies. It also bounds the counts of draws, one a point and batch, to some 100 MB.

@@ -6,7 +6,7 @@ from typing import Any
 INSTRUMENT = {
     "laser": {"wavelength": "1550 nm", "power": "50 mW", "beam_divergence": "2 mrad"},
     "chirp": {"bandwidth": "1 GHz", "start_frequency": "5.5 GHz", "duration": "500 us"},
-    "telescope": {"aperture": "25 mm"},
+    "telescope": {"aperture": "25 mm", "coupling": "aperture"},
     "receiver": {
         "responsivity": "1.1 A/W", "detector_bandwidth": "400 MHz", "optical_passband": "25 nm",
         "noise_equivalent_power": "5 pW/rtHz", "transimpedance": "7 kohm",

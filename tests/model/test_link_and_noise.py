@@ -49,8 +49,8 @@ def test_the_echo_is_that_of_equation_4_4():
     """1 W, 25 mm, tau rho = 0.1, 2 km: 1 * (pi 0.0125^2) * 0.1 / (2 pi 2000^2) = 1.953125e-12 W."""
     for efficiency, reflectance in ((0.1, 1.0), (0.5, 0.2)):
         scale = echo_power_scale(
-            power=1.0, aperture=25e-3, optical_efficiency=efficiency, reflectance=reflectance,
-            range=2000.0,
+            power=1.0, area=aperture_area(25e-3), optical_efficiency=efficiency,
+            reflectance=reflectance, range=2000.0,
         )  # fmt: skip
         echo = scale * backscatter("thesis", np.ones(1))
         assert echo == pytest.approx(1.953125e-12, rel=1e-14)
@@ -61,7 +61,11 @@ def test_a_whole_hemisphere_of_aperture_collects_the_whole_echo():
     diameter = 2 * np.sqrt(2) * 100.0
     assert aperture_area(diameter) == pytest.approx(2 * np.pi * 100.0**2, rel=1e-15)
     scale = echo_power_scale(
-        power=3.0, aperture=diameter, optical_efficiency=0.5, reflectance=0.4, range=100.0
+        power=3.0,
+        area=aperture_area(diameter),
+        optical_efficiency=0.5,
+        reflectance=0.4,
+        range=100.0,
     )
     assert scale * backscatter("thesis", np.ones(1)) == pytest.approx(3.0 * 0.5 * 0.4, rel=1e-14)
 

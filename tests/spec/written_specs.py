@@ -8,7 +8,7 @@ BASE: dict[str, Any] = {
     "instrument": {
         "laser": {"wavelength": "1550 nm", "power": "1 W", "beam_divergence": "50 urad"},
         "chirp": {"bandwidth": "1 GHz", "start_frequency": "5.5 GHz", "duration": "500 us"},
-        "telescope": {"aperture": "25 mm"},
+        "telescope": {"aperture": "25 mm", "coupling": "aperture"},
         "receiver": {
             "responsivity": "1.1 A/W",
             "detector_bandwidth": "400 MHz",

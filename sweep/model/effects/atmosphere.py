@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model import beam
 from sweep.model.effects import noise_sources
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
@@ -333,13 +334,14 @@ def scatter_back(shots: Shots, scene: Scene) -> Shots:
     air = profile_of(p)
     if air is None:
         return shots
+    diameter, angle = beam.receiving_field(p)
     light = backscattered(
         air,
         **_path(p, shots.range),
         laser_power=p[LASER + "power"],
-        aperture=p[TELESCOPE + "aperture"],
+        aperture=diameter,
         optical_efficiency=p[TELESCOPE + "optical_efficiency"],
-        beam_divergence=p[LASER + "beam_divergence"],
+        beam_divergence=angle,
         lidar_ratio=p["atmosphere.lidar_ratio"],
     )
     return noisier(shots, backscatter_shot=np.asarray(shots.shot_noise_scale * light))
@@ -354,9 +356,10 @@ def backscatter_size(points: Points) -> Size | None:
     air = profile_of(points.parameters)
     if air is None:
         return None
-    path, aperture = _path(points.parameters, points.range), points[TELESCOPE + "aperture"]
+    path = _path(points.parameters, points.range)
+    aperture, angle = beam.receiving_field(points.parameters)
     lowest = np.minimum(path["start_height"], path["end_height"])
-    near = aperture / points[LASER + "beam_divergence"]
+    near = aperture / angle
     local = optical_depth(air, start_height=lowest, end_height=lowest, range=1.0)
     even = local * np.arctan(points.range / near) / near
     returned = np.minimum(even, -np.expm1(-2 * optical_depth(air, **path)) / 2 / near**2)

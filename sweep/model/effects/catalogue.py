@@ -4,10 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from sweep.model import beam
 from sweep.model.effects import (
     atmosphere,
     doppler,
     footprint,
+    lag,
     line_width,
     noise_sources,
     phase_errors,
@@ -26,6 +28,7 @@ EFFECTS: tuple[Effect, ...] = (
     doppler.DOPPLER,
     doppler.DOPPLER_SPREAD,
     doppler.ROTATION,
+    lag.LAG,
     atmosphere.EXTINCTION,
     noise_sources.SIGNAL_SHOT_NOISE,
     noise_sources.SOLAR_BACKGROUND,
@@ -51,7 +54,8 @@ PARAMETERS: tuple[Parameter, ...] = tuple(
 )
 """Fields that effects bring into a spec."""
 
-DEFAULTS = {parameter.path: parameter.default for parameter in PARAMETERS}
+DEFAULTS = beam.DEFAULTS | {parameter.path: parameter.default for parameter in PARAMETERS}
+"""Of the beams' parameters and of the effects'."""
 
 CORE = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import link
+from sweep.model import beam, link
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
@@ -93,11 +93,12 @@ def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
         wavelength=p[LASER + "wavelength"], distance=p[_DISTANCE], elevation=p[_ELEVATION]
     )
     field = np.asarray(p[_FIELD], float)
+    diameter, angle = beam.receiving_field(p)
     return solar_power(
         solar_irradiance=lit,
         reflectance=p["target.reflectance"],
-        aperture=p[TELESCOPE + "aperture"],
-        beam_divergence=np.where(field > 0, field, p[LASER + "beam_divergence"]),
+        aperture=np.where(field > 0, p[TELESCOPE + "aperture"], diameter),
+        beam_divergence=np.where(field > 0, field, angle),
         optical_passband=p[RECEIVER + "optical_passband"],
         optical_efficiency=p[TELESCOPE + "optical_efficiency"],
     )
@@ -107,7 +108,9 @@ def sun_size(points: Points) -> Size | None:
     """Shot noise of sunlight, without the air; the threshold is set on it."""
     if not points.has(_IRRADIANCE, _DISTANCE):
         return None
-    return Size(noise=received(points.numbers) * points.receiver.per_watt / points.noise_variance)
+    return Size(
+        noise=received(points.parameters) * points.receiver.per_watt / points.noise_variance
+    )
 
 
 def add_sun(shots: Shots, scene: Scene) -> Shots:

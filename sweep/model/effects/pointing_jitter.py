@@ -95,8 +95,7 @@ def _furthest(points: Points) -> tuple[np.ndarray, np.ndarray]:
     off = points[_JITTER] * math.sqrt(2 * math.log(1 / RARE))
     rim: np.ndarray | float = 0.0
     if points.number > 1:
-        divergence = points["instrument.laser.beam_divergence"]
-        rim = reach_of(points.number, points.pattern) * divergence / 4
+        rim = reach_of(points.number, points.pattern) * points.angles.places / 4
     lowest = points["target.grazing_angle"] - rim
     sure = lowest > off
     lowest = np.where(sure, lowest, 1.0)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import detection, ground, link, resolution, waveform
+from sweep.model import beam, detection, ground, link, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.lobes import Lobe, lobe
 from sweep.model.footprint import (
@@ -240,6 +240,11 @@ class Points:
     # The target
 
     @cached_property
+    def angles(self) -> beam.Angles:
+        """Full angles of the footprint [rad]."""
+        return beam.angles(self.parameters)
+
+    @cached_property
     def footprint(self) -> Extent:
         """What the beams meet, as they all have it or on a plane."""
         if (found := self._footprint) is not None:
@@ -249,12 +254,13 @@ class Points:
         if self.number == 1:
             return Extent(echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
         shape: dict[str, Any] = {
-            "grazing_angle": angle, "beam_divergence": self[LASER + "beam_divergence"],
+            "grazing_angle": angle, "beam_divergence": self.angles.places,
             "number": self.number, "pattern": self.pattern,
         }  # fmt: skip
         ranges, velocities = plane_moments(
-            across=self["target.transverse_velocity"], along=self.radial_velocity, **shape
-        )
+            across=self["target.transverse_velocity"], along=self.radial_velocity,
+            directions=self.angles.directions, **shape,
+        )  # fmt: skip
         ratio = plane_echo_ratio(self.word("target.reflectance_law"), **shape)
         gain = 1.0
         if self.by_roots:
@@ -264,7 +270,7 @@ class Points:
     @cached_property
     def scales(self) -> tuple[np.ndarray, np.ndarray]:
         """Echo power [W] for a relative echo of 1/sr; amplitude of the beat [V] for that of 1."""
-        power, current = link_scales(self.architecture, self._numbers)
+        power, current = link_scales(self.architecture, self.parameters)
         return power, current * self[RECEIVER + "transimpedance"]
 
     @cached_property

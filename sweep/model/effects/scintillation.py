@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from sweep.model import philox
+from sweep.model import beam, philox
 from sweep.model.effects.atmosphere import path_heights
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
@@ -226,15 +226,15 @@ def both_ways(
     """Log variances of the way out, averaged over the footprint, and back, over the aperture."""
     lidar, target = path_heights(p, range)
     aperture = np.asarray(p[TELESCOPE + "aperture"], float)
-    footprint = aperture + np.asarray(p[LASER + "beam_divergence"], float) * range
+    footprint = aperture + beam.divergence(p) * range
     ways = (("plane", lidar, target, footprint), ("spherical", target, lidar, aperture))
-    beam = {"wavelength": p[LASER + "wavelength"], "range": range}
+    light = {"wavelength": p[LASER + "wavelength"], "range": range}
     out, back = (
         log_variances(
             wave,
-            rytov_variance=rytov_variance(wave, air, start_height=start, end_height=end, **beam),
+            rytov_variance=rytov_variance(wave, air, start_height=start, end_height=end, **light),
             aperture=width,
-            **beam,
+            **light,
         )
         for wave, start, end, width in ways
     )

@@ -280,7 +280,11 @@ Scanner = BeamCycle | LineScan
 
 
 def beamlet_rays(
-    attitude: np.ndarray, axis: np.ndarray, across: np.ndarray, along: np.ndarray, sigma: float
+    attitude: np.ndarray,
+    axis: np.ndarray,
+    across: np.ndarray,
+    along: np.ndarray,
+    sigma: float | np.ndarray,
 ) -> np.ndarray:
     """Unit vectors of every beamlet in the world frame, (n, b, 3).
 
@@ -293,7 +297,7 @@ def beamlet_rays(
     across, along : (b,) ndarray
         Tangents of the angles off the axis towards the two vectors of :func:`transverse_of`, in
         units of `sigma`.
-    sigma : float
+    sigma : float or (n, 1) ndarray
         Standard deviation of the beam on each axis [rad].
     """
     vectors = rotate(attitude[:, None], np.stack([*transverse_of(axis), axis], axis=1))
