@@ -363,7 +363,7 @@ def warn_of_beam(study: Spec | SceneSpec) -> None:
     """Say where a beam is narrower than its aperture makes it."""
     from sweep.spec.beam_check import too_narrow
 
-    if told := too_narrow(study):
+    if told := too_narrow(study.parameters_off_axes(), study.axes):
         click.echo(f"warning: {told}", err=True)
 
 

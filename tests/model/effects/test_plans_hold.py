@@ -23,6 +23,7 @@ KINDS = (
     {"architecture": "heterodyne", "phases": "coherent"},
     {"range": np.geomspace(0.3, 8.0, POINTS), "grazing_angle": 1.2},
     {"beamlets": 0},
+    {"coupling": "single_mode", "range": np.geomspace(3.0, 3000.0, POINTS)},
 )
 ROUNDING = 1e-8
 STILL = {"doppler": "off"}
@@ -110,6 +111,10 @@ FURTHER = {
     "extinction": lambda rng: {
         "atmosphere.profile": "exponential",
         "atmosphere.extinction": float(10 ** rng.uniform(-8, -3)),
+    },
+    "lag": lambda rng: {
+        "instrument.telescope.coupling": "single_mode",
+        "instrument.telescope.misalignment": sizes_of_many(rng, -7, -4),
     },
     "saturation": lambda rng: {
         "instrument.processing.full_scale": 10 ** rng.uniform(-3, 0, POINTS)

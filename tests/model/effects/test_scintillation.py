@@ -6,6 +6,7 @@ from scipy import special, stats
 from scipy.integrate import quad
 
 from sweep.model import philox
+from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.scintillation import (
     HUFNAGEL_VALLEY,
@@ -218,7 +219,8 @@ def test_two_ways_take_the_footprint_out_and_the_aperture_back():
                 "telescope.aperture": aperture}  # fmt: skip
         place = {"atmosphere.target_height": 0.0, "atmosphere.path": "slant",
                  "target.grazing_angle": np.arcsin(0.75)}  # fmt: skip
-        given = {f"instrument.{name}": value for name, value in beam.items()} | place
+        given = {f"instrument.{name}": value for name, value in beam.items()}
+        given = DEFAULTS | given | place
         return both_ways(HUFNAGEL_VALLEY, given, np.array(2000.0))
 
     (out, back), (wide_out, wide_back) = ways(25e-3, 50e-6), ways(25e-3, 5e-3)
