@@ -30,14 +30,16 @@ directions, which spread at every range as they do far away.
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import RectBivariateSpline
 from scipy.special import j0
 
 from sweep.model.constants import SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RectBivariateSpline
 
 SINGLE_MODE, APERTURE = COUPLINGS = "single_mode", "aperture"
 
@@ -297,12 +299,14 @@ def truncation(fill: ArrayLike, defocus: ArrayLike = 0.0) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _truncations() -> RectBivariateSpline:
+def _truncations() -> "RectBivariateSpline":
     """:func:`truncation` over fill and 1 / (1 + defocus / 4), to some 1e-4.
 
     Far away a field exp(-c r^2), c = (a/w)^2 - i defocus, of the unit circle becomes its Hankel
     transform; uncut, the integral of its fourth power over the plane is 1 / (32 |c|^2 Re c).
     """
+    from scipy.interpolate import RectBivariateSpline  # slow to import, and few need it
+
     r, weight = np.polynomial.legendre.leggauss(96)
     r, weight = (r + 1) / 2, weight / 2
     node, share = np.polynomial.legendre.leggauss(12)
