@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from random_parts import SPREADS, Parts
 from written_values import STYLES, Style, cheaper, inside, numbers, spelled, unit_of, values
 
+from sweep.model import beam
 from sweep.spec import Spec, SpecError
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.limits import DELAY, DURATION, RANGE, SAMPLE_RATE
@@ -74,6 +75,11 @@ QUANTA = ("instrument.receiver.responsivity", "instrument.laser.wavelength")
 FFT_SIZE = "instrument.processing.fft_size"
 """Too small for whole spectra only, which then are not drawn: the usual size would cost much."""
 
+BEAM = (beam.DIVERGENCE, beam.WAIST, beam.RECEIVED_WAIST, beam.COUPLING)
+"""Parameters of which some alone make a beam, such as an aperture can make."""
+
+GOOD = {beam.DIVERGENCE: "50 urad", beam.COUPLING: beam.APERTURE}
+
 TIMING = (DURATION, DELAY, RANGE, SAMPLE_RATE)
 """Parameters that a record's length follows from."""
 
@@ -94,22 +100,28 @@ def mended(written: dict[str, Any]) -> dict[str, Any]:
 def _mend(written: dict[str, Any], path: str) -> None:
     """Take out a field or an axis that is to blame; of a record's length, all that counts."""
     axes = written.get("axes", {})
-    blamed = {DURATION: TIMING, QUANTA[0]: QUANTA, FFT_SIZE: ("draws",)}.get(path, (path,))
+    groups = {
+        DURATION: TIMING,
+        QUANTA[0]: QUANTA,
+        FFT_SIZE: ("draws",),
+        **dict.fromkeys(BEAM, BEAM),
+    }
+    blamed = groups.get(path, (path,))
     if path.startswith("axes."):
         axis = path.removeprefix("axes.").split(".zip")[0]
         axes.pop(axis, None)
-        blamed = (axis,) if axis in parameter_rules() else TIMING
+        blamed = groups.get(axis, (axis,)) if axis in parameter_rules() else (*TIMING, *BEAM)
     for name in [name for name in axes if set(plain_paths({name: axes[name]})) & set(blamed)]:
         axes.pop(name)
     for each in blamed:
         drop(written, each)
         rule = parameter_rules().get(each)
-        if rule is not None and default_of(each) is None:
+        if rule is not None and (default_of(each) is None or each in GOOD):
             *parents, name = each.split(".")
             part = written
             for parent in parents:
                 part = part.setdefault(parent, {})
-            part[name] = rule.example  # type: ignore[attr-defined]
+            part[name] = GOOD.get(each) or rule.example  # type: ignore[attr-defined]
 
 
 def plain_paths(axes: dict[str, Any]) -> list[str]:

@@ -9,7 +9,8 @@ from sweep.spec import SceneSpec
 SCENE = {
     "title": "Small scene",
     "question": "Does it fly?",
-    "instrument": STUDY["instrument"] | {"telescope": {"aperture": "50 mm"}},
+    "instrument": STUDY["instrument"]
+    | {"telescope": {"aperture": "50 mm", "coupling": "aperture"}},
     "scene": {
         "origin": "ground",
         "objects": {

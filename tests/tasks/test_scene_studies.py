@@ -144,7 +144,8 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
     other = small_scene(
         scene=SCENE["scene"] | {"objects": objects},
         draws={"number": 2},
-        instrument=SCENE["instrument"] | {"telescope": {"aperture": "20 mm"}},
+        instrument=SCENE["instrument"]
+        | {"telescope": {"aperture": "20 mm", "coupling": "aperture"}},
         title="Darker",
     )
     looks = []
