@@ -230,8 +230,10 @@ def collecting_area(p: Parameters) -> np.ndarray:
     both = sent.angle(far) ** 2 + received.angle(far) ** 2
     area = 8 * np.asarray(p[WAVELENGTH]) ** 2 / (math.pi * both)
     defocus = math.pi * (diameter / 2) ** 2 / p[WAVELENGTH] * (1 / far - sent.curvature)
-    cut = [truncation(2 * beam.waist / diameter, defocus) for beam in (sent, received)]
-    return np.asarray(area * np.sqrt(cut[0] * cut[1]))
+    left = truncation(2 * sent.waist / diameter, defocus)
+    if np.any(p[RECEIVED_WAIST]):
+        left = np.sqrt(left * truncation(2 * received.waist / diameter, defocus))
+    return np.asarray(area * left)
 
 
 def receiving_field(p: Parameters) -> tuple[np.ndarray, np.ndarray]:
