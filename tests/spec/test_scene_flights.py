@@ -241,6 +241,7 @@ def test_parameters_are_set_anew_where_the_rays_stay_the_same():
     for at, words in (
         ({"beam_divergence": "1 mrad"}, "moves the beamlets"),
         ({"architecture": "direct"}, "moves the beamlets"),
+        ({"focus": "30 m"}, "moves the beamlets"),
         ({"target.range": "1 m"}, "is no parameter"),
         ({"power": "3 s"}, "needs a unit like W"),
     ):

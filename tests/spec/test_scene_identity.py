@@ -63,6 +63,7 @@ OTHER_GEOMETRY = {
     "footprint.beamlets": 19,
     "footprint.phases": "coherent",
     "instrument.laser.beam_divergence": "60 urad",
+    "instrument.laser.focus": "30 m",
     "seed": 2,
 }
 SAME_GEOMETRY = {

@@ -209,6 +209,9 @@ def test_a_flight_too_short_for_a_cycle_is_told():
 AXES = [
     ({"instrument.laser.beam_divergence": ["50 urad"]}, "instrument.laser.beam_divergence",
      "moves the beamlets, and a study casts its rays once; make another study of it"),
+    ({"instrument.laser.focus": ["30 m"]}, "instrument.laser.focus", "moves the beamlets"),
+    ({"instrument.telescope.coupling": ["aperture"]}, "instrument.telescope.coupling",
+     "moves the beamlets"),
     ({"footprint.beamlets": [1, 7]}, "footprint.beamlets", "moves the beamlets"),
     ({"footprint.phases": ["coherent"]}, "footprint.phases", "moves the beamlets"),
     ({"accuracy.leakage_floor": [0.1]}, "accuracy.leakage_floor", "make another study"),
@@ -412,3 +415,11 @@ def test_the_mapping_given_is_left_as_it_was():
     before = yaml.safe_dump(EVERYTHING)
     SceneSpec.from_mapping(EVERYTHING)
     assert yaml.safe_dump(EVERYTHING) == before
+
+
+def test_no_axis_over_wavelength_moves_the_rays_of_a_single_mode():
+    mode = {"instrument.telescope.coupling": "single_mode"}
+    mode |= {"instrument.laser.beam_divergence": "100 urad"}
+    axes = {"instrument.laser.wavelength": ["1550 nm", "1551 nm"]}
+    (mistake,) = mistakes_of(written(mode, axes=axes))
+    assert "the beam's radius follows from it" in str(mistake)
