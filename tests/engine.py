@@ -56,7 +56,8 @@ def shape_of(window, fft_size, *, power=False, phase=None, view=IMAGED):
             shapes = line_shape.shapes(window, fft_size, power, tier)
             table = np.empty((2, line_shape.places_of(shapes.sizes)))
             form = np.zeros((7, shapes.reach.size))
-            line_shape.build(*modes[0, 0], number, shapes, table, form[3:, :14], form[1:3])
+            parts = centre, modes, count, np.empty((1, 2, 0))
+            line_shape.build(0, (0, -1), parts, shapes, table, form)
             break
     if table is None:
         x = 2 * np.arange(window.length) / window.length - 1

@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_345, "modules": 284, "lines of the model": 15_760, "modules of the model": 63,
+    "lines": 52_361, "modules": 284, "lines of the model": 15_780, "modules of the model": 63,
     "compiled functions": 113, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

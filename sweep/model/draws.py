@@ -143,18 +143,17 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
         after = np.cumsum(leaking).reshape(-1, 3)
         there = runs.bins.T > 0
         others = shots.counted_bins(np.where(there, runs.exempted.T, 0.0)) - leaking
-        yield (
-            runs.part,
-            Seen(
-                low=np.where(there, runs.low.T, 0),
-                peak=np.where(there, runs.peak.T, 0),
-                ratio=np.where(there, runs.magnitude.T / sigma[runs.part, None], np.nan),
-                others=np.maximum(others, 0.0),
-                stretch=np.stack([after - leaking, after], axis=2),
-                aside=number[leaks],
-                leaked=ratio[leaks],
-            ),
+        seen = Seen(
+            low=np.where(there, runs.low.T, 0),
+            peak=np.where(there, runs.peak.T, 0),
+            ratio=np.where(there, runs.magnitude.T / sigma[runs.part, None], np.nan),
+            others=np.maximum(others, 0.0),
+            stretch=np.stack([after - leaking, after], axis=2),
+            aside=number[leaks],
+            leaked=ratio[leaks],
         )
+        # In C order as those of `nothing`: numba compiles anew for each order.
+        yield runs.part, Seen(*map(np.ascontiguousarray, seen))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -201,7 +200,7 @@ def _count(rows, ends, levels, chances, noisy, seen, counts):
 @njit(cache=True, error_model="numpy")
 def _happen(address, stream, chance, words, found):
     """Mark the draws (key, first, number) in which something of that chance happens."""
-    philox.fill_words(address[:3], stream, 0, (1, 0), address[3], words)
+    philox.fill_words(address[:3], stream, philox.FIRST_BLOCK, philox.BY_DRAW, address[3], words)
     for d in range(address[3]):
         found[d] |= philox.to_uniform(words[0, d]) < chance
 
@@ -212,7 +211,7 @@ def _cross(address, stream, index, ratio, deviation, threshold, words, found):
 
     The threshold is a power; the noise, of that deviation, is pair `index` of the stream.
     """
-    philox.fill_words(address[:3], stream, index >> 1, (1, 0), address[3], words)
+    philox.fill_words(address[:3], stream, index >> 1, philox.BY_DRAW, address[3], words)
     lane = 2 * (index & 1)
     for d in range(address[3]):
         re, im = philox.to_normals(words[lane, d], words[lane + 1, d])

@@ -41,6 +41,7 @@ from sweep.model.spectrum import (
     TURN_IM,
     TURN_RE,
     WEIGHT,
+    ZERO,
     add_far,
     envelope_from,
     magnitudes,
@@ -134,7 +135,7 @@ def of_bins(count, noise, floor, room, exempt, series):
         if room[OUT, i] < floor * noise[0]:
             exempt[i] = True
     _chances(count, noise, room, exempt, series)
-    return any_crossing(room[CHANCE], 0, count)
+    return any_crossing(room[CHANCE], ZERO, count)
 
 
 @njit(cache=True, error_model="numpy")
@@ -202,7 +203,7 @@ def _of_run(count, left, noise, room, exempt, series):
     if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
         return 0.0
     _chances(count, noise, room, exempt, series)
-    return any_crossing(room[CHANCE], 0, count)
+    return any_crossing(room[CHANCE], ZERO, count)
 
 
 @njit(cache=True, error_model="numpy")
@@ -235,12 +236,12 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     beta, scale = level / sigma, 0.5 / (sigma * sigma)
     _chances(count, noise, room, exempt, series)
     below, above = low > 0, low + count - 1 < half
-    some = any_crossing(room[CHANCE], APRON if below else 0, count - APRON if above else count)
+    some = any_crossing(room[CHANCE], APRON if below else ZERO, count - APRON if above else count)
     if not below and not above:
         return some, True
     centre = abs(math.floor(0.5 * (place[0] + place[1]) + 0.5))
     centre = fft_size - centre if centre > half else centre
-    tail, rest, points = 0.0, 0.0, 0
+    tail, rest, points = 0.0, 0.0, ZERO
     for side in (-1, 1):
         if not (below if side < 0 else above):
             continue
@@ -293,7 +294,7 @@ def _far_values(points, centre, origin, lines, digits, form, sizes, tangent, roo
             nearest = max(nearest, edge - 2.0)
         sources = take_sources(n, lowest, highest, nearest, digits, sizes, room)
         for b in range(sources):
-            add_far(0, points, 0, SOURCES, b, digits + FINER, form, sizes, room)
+            add_far(ZERO, points, ZERO, SOURCES, b, digits + FINER, form, sizes, room)
         for i in range(points):
             re, im = room[F_RE, i], towards * room[F_IM, i]
             room[HALF_SQUARE, i] = re if turn == 0 else room[HALF_SQUARE, i] + re

@@ -342,24 +342,40 @@ def find_modes(phase, matrix, centre, found, number):
 
 
 @njit(cache=True, error_model="numpy")
-def build(re, im, number, shapes, table, ends, envelope):
-    """A shape of its modes.
+def build(segment, numbers, parts, shapes, table, form):
+    """A shape of its modes, or from where it is whole.
 
     Parameters
     ----------
-    re, im : (>= number,) float64
-        Modes.
-    number : int
+    segment : int
+    numbers : (int, int)
+        The shape's number, and that of the one that stands in the results, or -1.
+    parts : tuple
+        Modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
     shapes : Shapes
         What they are made of, as a tuple.
     table : (2, cells * columns) float64
         Result: G, or |G|^2 in the first row.
-    ends : (4, DERIVATIVES + 2) float64
-        Result: A and B.
-    envelope : (2, m) float64
-        Result: most that |G| comes to from each of the distances on; integral of its square.
+    form : (7, >= m) float64
+        Result: in rows 1 and 2 the most that |G| comes to from each of m distances on, and the
+        integral of its square; in the others A and B of DERIVATIVES + 2 terms.
     """
     sizes, modes, edges, mode_ends, reach = shapes[0], shapes[1], shapes[2], shapes[3], shapes[4]
+    which, before = numbers
+    re, im = parts[1][segment, which, 0], parts[1][segment, which, 1]
+    number = parts[2][segment, which]
+    if before >= 0 and number == 1 and parts[2][segment, before] == 1:
+        one = parts[1][segment, before]
+        if one[0, 0] == re[0] and one[1, 0] == im[0]:
+            return
+    envelope, ends = form[1:3], form[3:7, : DERIVATIVES + 2]
+    if sizes[5]:
+        for i in range(2):
+            for k in range(table.shape[1]):
+                table[i, k] = shapes[5][segment, i, k]
+            for k in range(envelope.shape[1]):
+                envelope[i, k] = shapes[6][segment, i, k]
+        return
     at_first_re, at_first_im, at_last_re, at_last_im = 0.0, 0.0, 0.0, 0.0
     size = modes.shape[1]
     raw = np.zeros((2, size))

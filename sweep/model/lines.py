@@ -36,9 +36,10 @@ POWER_TOLERANCES = (
 MOST_NODES = 128
 """Equivalent lines at the most; wider bundles are left as they are."""
 
-PLACE, RE, IM, X, BLOCK, MOMENT_RE, MOMENT_IM = range(7)
+PLACE, RE, IM, X, BLOCK, MOMENT_RE, MOMENT_IM = np.arange(7)
 """Rows of scratch: places [bins from the origin] and C_b (powers: |C_b|^2 and 0); places of nodes;
-blocks of lines; moments."""
+blocks of lines; moments. They are NumPy's integers, as numba compiles a function anew for each of
+Python's that is written in a call."""
 
 BLOCK_SIZE = 128
 """Lines that are done together; constant, so that compiled loops need no tests of what overlaps."""

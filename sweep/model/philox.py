@@ -35,6 +35,10 @@ _HIGH0, _HIGH1 = (np.uint64(m >> 32) for m in _MULTIPLIERS)
 _WEYL_0 = np.uint64(0x9E3779B97F4A7C15)
 _WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
 _HALF_WORD = np.uint64(0xFFFFFFFF)
+
+FIRST_BLOCK, BY_DRAW, BY_BLOCK = np.int64(0), (1, 0), (0, 1)
+"""Arguments of :func:`fill_words`, which numba compiles anew for each number written in a call."""
+
 _32, _12 = np.uint64(32), np.uint64(12)
 
 
@@ -129,7 +133,8 @@ def _fill(keys, draws, stream, out):
     """Blocks of four uniforms, from the first on, in a draw of each key."""
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):
-        fill_words((keys[i, 0], keys[i, 1], draws[i]), stream, 0, (0, 1), words.shape[1], words)
+        address = keys[i, 0], keys[i, 1], draws[i]
+        fill_words(address, stream, FIRST_BLOCK, BY_BLOCK, words.shape[1], words)
         for block in range(words.shape[1]):
             for lane in range(4):
                 out[i, 4 * block + lane] = to_uniform(words[lane, block])

@@ -126,7 +126,8 @@ def _find_groups(part, runs, magnitudes, levels, half, bins, neighbours, pd):
                 pd[i, s, g] = marcum_q1_pair(magnitude[k] / deviation, level / deviation)[0]
                 for side in range(3):
                     neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
-                bins[:, i, s, g] += low[s, j]
+                for field in range(3):
+                    bins[field, i, s, g] += low[s, j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -143,7 +144,7 @@ def _list_groups(magnitude, peak, level, bins):
     if magnitude[peak] < level:
         bins[:, 0] = peak
         return 1
-    spans, found, k = np.empty((3, magnitude.size // 2 + 1), np.int64), 0, 0
+    most, found, k = bins.shape[1], 0, 0
     while k < magnitude.size:
         if magnitude[k] < level:
             k += 1
@@ -152,11 +153,16 @@ def _list_groups(magnitude, peak, level, bins):
         while k < magnitude.size and magnitude[k] >= level:
             best = k if magnitude[k] > magnitude[best] else best
             k += 1
-        spans[BIN, found], spans[FIRST, found], spans[LAST, found] = best, first, k - 1
-        found += 1
-    order = np.argsort(-magnitude[spans[BIN, :found]], kind="mergesort")[: bins.shape[1]]
-    bins[:, : order.size] = spans[:, order]
-    return order.size
+        g = found
+        while g > 0 and magnitude[bins[BIN, g - 1]] < magnitude[best]:
+            g -= 1
+        found = min(found + 1, most)
+        for h in range(found - 1, g, -1):
+            for field in range(3):
+                bins[field, h] = bins[field, h - 1]
+        if g < most:
+            bins[BIN, g], bins[FIRST, g], bins[LAST, g] = best, first, k - 1
+    return found
 
 
 class Returns(NamedTuple):
@@ -411,7 +417,9 @@ def _draw(keys, how, known, seen, tables, out):
                 centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
                 if k >= 0:
                     group[1], centres[1] = which[1, k], peaks[1, k, FINE]
-                out.peaks[i, d, r, 0], out.peaks[i, d, r, 1] = peaks[0, u], peaks[2, v]
+                both = out.peaks[i, d, r]
+                for f in range(4):  # slices would compile an error message of shapes
+                    both[0, f], both[1, f] = peaks[0, u, f], peaks[2, v, f]
                 flag, out.beamlet[i, d, r] = judge(
                     group, centres, known.bins[i], known.lines[i], known.amplitude[i]
                 )
@@ -465,7 +473,7 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
         if ratio >= largest:
             place, largest = seen.low[i, s] + seen.aside[n], ratio
     stream = philox.STREAM_NOISE_MAXIMUM[s] if how.noisy else philox.STREAM_FALSE_ALARM[s]
-    words = philox.words4(a, b, draw, stream, 0)
+    words = philox.words4(a, b, draw, stream, philox.FIRST_BLOCK)
     chance = philox.to_uniform(words[0])
     if chance < known.alarm[i, s]:
         ratio = max(largest_of(seen.others[i, s], chance), beta)
@@ -485,11 +493,8 @@ def look(address, at, g, how, known, seen, tables, peak):
     """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
-    centre, m, stream = (
-        known.bins[i, s, BIN, g],
-        known.magnitude[i, s, g] / sigma,
-        philox.STREAM_NOISE[s],
-    )
+    centre, m = known.bins[i, s, BIN, g], known.magnitude[i, s, g] / sigma
+    stream = philox.STREAM_NOISE[s]
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
     re, im = re * under_lines, im * under_lines
@@ -541,9 +546,15 @@ def free_bin(chance, bins, half):
     while number < bins.shape[1] and bins[BIN, number] >= 0:
         number += 1
     spans, free, end = np.empty((number, 2), np.int64), half, 1
-    for g, group in enumerate(np.argsort(bins[FIRST, :number])):  # disjoint and rising
-        spans[g, 0] = max(bins[FIRST, group] - 1, end)
-        end = max(min(bins[LAST, group] + 2, half + 1), spans[g, 0])
+    for g in range(number):  # disjoint; in rising order
+        k = g
+        while k > 0 and spans[k - 1, 0] > bins[FIRST, g]:
+            spans[k, 0], spans[k, 1] = spans[k - 1, 0], spans[k - 1, 1]
+            k -= 1
+        spans[k, 0], spans[k, 1] = bins[FIRST, g], bins[LAST, g]
+    for g in range(number):
+        spans[g, 0] = max(spans[g, 0] - 1, end)
+        end = max(min(spans[g, 1] + 2, half + 1), spans[g, 0])
         spans[g, 1], free = end, free - (end - spans[g, 0])
     place = 1 + int(chance * free)
     for g in range(number):

@@ -207,11 +207,10 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
     )
     table = np.empty((2, line_shape.places_of(shapes.sizes)))
     form = np.zeros((7, shapes.reach.size))
-    if shapes.sizes[5]:
-        table = shapes.whole[0]
-    else:
-        one = np.ones(1)
-        line_shape.build(one, 0 * one, 1, shapes, table, form[3:, :14], form[1:3])
+    modes = np.zeros((1, 1, 2, 1))
+    modes[..., 0, :] = 1.0
+    parts = np.zeros((1, 1)), modes, np.ones((1, 1), np.int64), np.empty((1, 2, 0))
+    line_shape.build(0, (0, -1), parts, shapes, table, form)
     room[RE, 0], room[IM, 0] = 1.0, 0.0
     for i, at in enumerate(place):
         room[PLACE, 0] = at
@@ -352,9 +351,10 @@ def _some(
     values = np.full((4, segments, m), np.nan)
     magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
     shapes = together.shapes
-    places, known = line_shape.places_of(shapes.sizes), shapes.reach.size
+    places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.size))
+    form[:, 0] = shapes.reach
     done = _inspect_points(
-        np.ascontiguousarray(table[:, part]),
+        np.ascontiguousarray(table[:, part].T),
         np.stack([shots.row[part], together.which[first:]]),
         shots.footprint,
         (together.centre, together.modes, together.number, shifts),
@@ -362,7 +362,7 @@ def _some(
         (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
          shots.window.sum),
-        (np.empty((segments, 2, places)), np.zeros((segments, 7, known))),
+        (np.empty((segments, 2, places)), form),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
     )  # fmt: skip
@@ -444,28 +444,6 @@ def _used(shift):
 
 
 @njit(cache=True, error_model="numpy")
-def _make_shapes(which, before, segments, modes, shapes, table, form):
-    """Tables and outlines of a shape in all segments, unless they are those of ``before``."""
-    _, mode, number, _ = modes
-    for s in range(segments.size):
-        if not segments[s]:
-            continue
-        if before >= 0 and number[s, before] == 1 and number[s, which] == 1:
-            same = mode[s, before, 0, 0] == mode[s, which, 0, 0]
-            if same and mode[s, before, 1, 0] == mode[s, which, 1, 0]:
-                continue
-        ends, envelope = form[s, 3:7, :14], form[s, 1:3]
-        if shapes[0][5]:
-            table[s] = shapes[5][s]
-            envelope[:] = shapes[6][s]
-        else:
-            line_shape.build(
-                mode[s, which, 0], mode[s, which, 1], number[s, which], shapes, table[s], ends,
-                envelope,
-            )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
 def _keep(at, count, room, exempt, magnitudes, exempts):
     """Hands a run on, from ``at`` on; where the next one begins."""
     for k in range(count):
@@ -479,7 +457,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
 
     Parameters
     ----------
-    points : (COMMON + 2 segments, m) float64
+    points : (m, COMMON + 2 segments) float64
         :meth:`sweep.model.preparation.Shots.point_table`.
     where : (2, m) int64
         Rows in the footprints; shapes.
@@ -503,15 +481,14 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     table, form = made
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
-    keep, at = magnitudes.size > 0, 0
-    p = np.empty(points.shape[0])
+    keep, at = magnitudes.size > 0, np.int64(0)
     before, made_of = -1.0, -1
-    form[:, 0, : shapes[4].size] = shapes[4]
-    for i in range(points.shape[1]):
-        p[:] = points[:, i]
-        row, which, shift = where[0, i], where[1, i], _used(shifts[i])
+    for i in range(points.shape[0]):
+        p, row, which, shift = points[i], where[0, i], where[1, i], _used(shifts[i])
         if which != made_of:
-            _make_shapes(which, made_of, segments, modes, shapes, table, form)
+            for s in range(segments.size):
+                if segments[s]:
+                    line_shape.build(s, (which, made_of), modes, shapes, table[s], form[s])
             made_of = which
         sigma, level = p[10], p[11]
         if leaks.any() and level / sigma != before:
@@ -546,4 +523,4 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             numbers[2, s, i], numbers[3, s, i] = peak, exempted
             values[0, s, i], values[1, s, i] = found, missed
             values[2, s, i], values[3, s, i] = room[OUT, peak], leakage
-    return points.shape[1]
+    return points.shape[0]

@@ -24,26 +24,29 @@ from sweep.model.elementary import sincos_cycles
 from sweep.model.line_shape import CELLS, POINTS, kernel
 from sweep.model.lines import BLOCK, BLOCK_SIZE, IM, PLACE, RE, X, put_on_nodes
 
-CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = range(7, 13)
+CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = np.arange(7, 13)
 """Rows of scratch: cells; strengths of lines as the record's two ends see them."""
 
-S_PLACE, S_A_RE, S_A_IM, S_B_RE, S_B_IM = range(13, 18)
+S_PLACE, S_A_RE, S_A_IM, S_B_RE, S_B_IM = np.arange(13, 18)
 """The same of sources, and their places."""
 
 LINES, SOURCES = (PLACE, A_RE), (S_PLACE, S_A_RE)
 """Rows of places and first rows of strengths."""
 
-F_RE, F_IM, OUT, OUT_IM = range(18, 22)
+F_RE, F_IM, OUT, OUT_IM = np.arange(18, 22)
 """F in a run of bins that rise; |X| of the run."""
 
-TAN, TURN_RE, TURN_IM, COT, P_RE, P_IM, Q_RE, Q_IM = range(22, 30)
+TAN, TURN_RE, TURN_IM, COT, P_RE, P_IM, Q_RE, Q_IM = np.arange(22, 30)
 """Of bins far away: tan(pi k / N), exp(i pi r k), and scratch."""
 
-SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT, SHARES = range(30, 36)
+SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT, SHARES = np.arange(30, 36)
 """Of averages; of leakage; of lines among cells."""
 
 ROOM = 36
 """Rows in all."""
+
+ZERO = np.int64(0)
+"""0 as an argument, of NumPy for the same reason as the rows."""
 
 STRIP = 128
 """Bins far away that are done together."""
@@ -321,7 +324,7 @@ def field(first, count, lines, table, form, sizes, tangent, room):
         if not amid:
             prepare_far(at, stop - at, sizes, tangent, room)
             for b in range(sources):
-                add_far(0, stop - at, at - first, SOURCES, b, digits + FINER, form, sizes, room)
+                add_far(ZERO, stop - at, at - first, SOURCES, b, digits + FINER, form, sizes, room)
         elif last > begun:
             prepare_far(at, stop - at, sizes, tangent, room)
             for b in range(n):  # what the table does not hold of each line
@@ -350,7 +353,14 @@ def gap_of(first, count, lowest, highest, fft_size):
 @njit(cache=True, error_model="numpy")
 def envelope_from(distance, form):
     """Index of what is known of envelopes from a distance on."""
-    return max(np.searchsorted(form[0], distance, "right") - 1, 0)
+    low, high = 0, form.shape[1]
+    while low < high:
+        middle = (low + high) // 2
+        if form[0, middle] <= distance:
+            low = middle + 1
+        else:
+            high = middle
+    return max(low - 1, 0)
 
 
 @njit(cache=True, error_model="numpy")

@@ -43,7 +43,7 @@ _ENTRY_SLACK = 1.0 + 1e-14
 _TIE_SLACK = 1.0 + 1e-12
 """Above the rounding of a hit's distance: a box is left out only if it cannot hold a tie."""
 
-_LARGEST_FRONT = 128
+_LARGEST_FRONT, _ENDLESS = np.array([128, 1 << 62])
 """Triangles tested against a whole bundle before its rays are better walked one by one."""
 
 
@@ -203,7 +203,7 @@ def nearest(tree, origins, directions, distance, face):
         if not _walk(tree, o, d, distance[i], face[i], room, stack, _LARGEST_FRONT):
             for b in range(d.shape[0]):
                 one = slice(b, b + 1)
-                _walk(tree, o, d[one], distance[i, one], face[i, one], room, stack, 1 << 62)
+                _walk(tree, o, d[one], distance[i, one], face[i, one], room, stack, _ENDLESS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -213,6 +213,8 @@ class _Frame(NamedTuple):
             parts = [slice(k, k + _AT_ONCE) for k in range(0, n * b, _AT_ONCE)]
             turned = [self.directions(d[part], rows[part])[0].T for part in parts]
             directions = np.concatenate([*turned, np.empty((0, 3))]).reshape(directions.shape)
+        directions = directions.view()
+        directions.flags.writeable = False  # always, as numba compiles anew for either
         return np.ascontiguousarray(o), directions
 
     def out(self, v, rows):
