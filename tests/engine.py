@@ -66,4 +66,4 @@ def shape_of(window, fft_size, *, power=False, phase=None, view=IMAGED):
         form[1:3] = shapes.outlines[0]
     form[0] = shapes.reach
     shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
-    return table, form, np.append(shapes.sizes, view), shift, number
+    return table, form, np.append(shapes.sizes, (view, 0)), shift, number

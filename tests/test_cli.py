@@ -32,7 +32,8 @@ instrument:
     transimpedance: 7 kohm
     amplifier_bandwidth: 400 MHz
     amplifier_noise_current: 25 nA
-  processing: {sample_rate: 600 MHz, fft_size: 2^14, tnr: 8}
+  processing:
+    {sample_rate: 600 MHz, fft_size: 2^14, noise_bins: independent, detection: peak_bin, tnr: 8}
 target: {range: 2 km, grazing_angle: 60 deg, radial_velocity: 20 m/s, reflectance: 0.01}
 footprint: {beamlets: 9}
 axes:

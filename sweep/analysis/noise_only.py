@@ -14,8 +14,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
+from sweep.model.alarms import first_circular, independent_bins, neighbour_correlation
 from sweep.model.detectors import DETECTORS, FIXED
+from sweep.model.preparation import as_arrays
+from sweep.model.window import canonical_name, window
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -36,16 +40,29 @@ def bin_probability(tnr: float) -> float:
     return math.exp(-bin_exponent(tnr))
 
 
-def bins_counted(parameters: Mapping[str, Any]) -> int:
-    """Bins of a segment that can raise a false alarm, from SI values by dotted path."""
-    size = int(parameters["instrument.processing.fft_size"])
-    return size if parameters["instrument.processing.bins_counted"] == "all" else size // 2
+def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
+    """Independent bins that raise as many false alarms as a segment's, by a bin's chance of one.
+
+    From SI values by dotted path; as :meth:`sweep.model.preparation.Shots.counted_bins`.
+    """
+    arrays, name = as_arrays(parameters), "instrument.processing."
+    size = int(arrays[name + "fft_size"])
+    is_all = parameters[name + "bins_counted"] == "all"
+    if parameters[name + "noise_bins"] == "independent":
+        return np.full(np.shape(bin_probability), float(size if is_all else size // 2))
+    taper = window(canonical_name(str(parameters[name + "window"])), int(arrays["record"]))
+    level = np.sqrt(-2 * np.log(np.maximum(bin_probability, 1e-300)))
+    return independent_bins(
+        size if is_all else size // 2 + 1 - 2 * first_circular(taper, size),
+        level=level,
+        correlation=neighbour_correlation(taper, size),
+    )
 
 
-def segment_probability(bin_probability: np.ndarray, bins: float) -> np.ndarray:
+def segment_probability(bin_probability: np.ndarray, bins: ArrayLike) -> np.ndarray:
     """Probability of a false alarm in a segment of so many bins, 1 - (1 - p)^N, 0..1."""
     with np.errstate(divide="ignore"):
-        return np.asarray(-np.expm1(bins * np.log1p(-np.asarray(bin_probability))))
+        return np.asarray(-np.expm1(np.asarray(bins) * np.log1p(-np.asarray(bin_probability))))
 
 
 def shot_probability(tnr: float, bins: float) -> float:
@@ -77,7 +94,7 @@ def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
             in_a_bin = float(parameters["instrument.processing.detector.pfa"])
         else:
             continue
-        bins = bins_counted(parameters)
+        bins = float(bins_counted(parameters, in_a_bin))
         once, twice = (float(segment_probability(np.asarray(in_a_bin), n * bins)) for n in (1, 2))
         found.append((twice, once**2))
     return found

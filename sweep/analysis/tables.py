@@ -166,7 +166,7 @@ class Reference:
     """Noise alone at one setting of the instrument."""
 
     tnr: float
-    bins: int
+    bins: float
     closed_form: float
     model: float
     model_bin: float
@@ -206,7 +206,7 @@ def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
     parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
     tnr = float(parameters["instrument.processing.tnr"])
-    bins = noise_only.bins_counted(parameters)
+    bins = float(noise_only.bins_counted(parameters, noise_only.bin_probability(tnr)))
     found = evaluate(parameters)
     return Reference(
         tnr=tnr,

@@ -19,11 +19,12 @@ from sweep.model.effects.catalogue import CORE
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
+from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
 from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.ray_error import ray_error
-from sweep.model.returns import Groups, Returns, draw_returns, groups
+from sweep.model.returns import Returns, draw_returns
 from sweep.model.shot import prepare_cast
 
 STRETCH = 1 << 20
@@ -139,7 +140,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     """Probabilities before any draw, (n,) each."""
     up, doppler, down = found.pd[:, :, 0].T
     one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]
-    noise = at_least_one(one, shots.counted_bins(found.exempted[:, [0, 2]]))
+    noise = at_least_one(one, shots.counted_bins(found.exempted.T[[0, 2]]).T)
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)
     above = found.magnitude[:, 0] >= shots.threshold[:, None]

@@ -50,9 +50,10 @@ def taper(window: Window) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def main_lobe(window: Window) -> float:
-    """Distance [bins of fs/L] of the first minimum of |W|, to 1/8 bin."""
+    """Distance [bins of fs/L] of the first minimum of |W| below its half, to 1/8 bin."""
     magnitude = np.abs(np.fft.rfft(taper(window), 8 * window.length))
-    return float(np.argmax(np.diff(magnitude) > 0)) / 8
+    low = magnitude[:-1] < 0.5 * magnitude[0]  # a flattop's top has minima of its own
+    return float(np.argmax(low & (np.diff(magnitude) > 0))) / 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,15 +2,16 @@
 
 Two ways that agree in the mean. ``probabilities`` is [T 3.3.2]'s: uniform numbers against pd and
 the probability of a false alarm (noise and leakage together). ``noise`` adds complex Gaussian
-noise to the bins that hold signal and looks; over the other bins, which hold noise alone, the
-largest magnitude is drawn exactly from its order statistic. Both take the bins' noise as
-independent, as the closed forms do. Where effects are random, each draw has a spectrum and
+noise to the bins of the echo, alike as window and padding make it, and looks; over the other bins,
+which hold noise alone, the largest magnitude is drawn from the order statistic of as many
+independent ones as alarm as often. Where effects are random, each draw has a spectrum and
 probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling`, which also says
 when to stop.
 
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model import philox
+from sweep.model.alarms import TAPS, noise_filter
 from sweep.model.marcum import at_least_one
 from sweep.model.philox import (
     STREAM_DETECTION,
@@ -69,7 +71,8 @@ def count_by_chance(
     points, batches) in the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
     size, chances = rows.point.size, np.array(_chances(outputs))
-    _count(rows, ends, np.zeros((2, size)), chances, False, Seen.nothing(size), counts)
+    none = False, np.empty((0, TAPS)), np.empty(0, np.int64), 0
+    _count(rows, ends, np.zeros((2, size)), chances, none, Seen.nothing(size), counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
@@ -80,7 +83,22 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         others = at_least_one(one[part], seen.others.T)
         chances = np.array([np.zeros_like(others), others])  # in C order
         some = Rows(*(column[part] for column in rows))
-        _count(some, ends, levels[:, part].copy(), chances, True, seen, counts)
+        rule = echo_filter(shots, seen)
+        _count(some, ends, levels[:, part].copy(), chances, (True, *rule), seen, counts)
+
+
+def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int]:
+    """Filter of the noise of an echo's bins, none where the largest alone detects; N or 0.
+
+    The last is N where noise at DC and Nyquist is real.
+    """
+    most = int(seen.bins.max(initial=1)) if shots.echo_rule[1] else 0
+    bins = 1 << (most - 1).bit_length() if most else 0
+    if shots.noise_bins == "independent":
+        weights = np.zeros((bins, TAPS))
+        weights[:, TAPS // 2] = 1.0
+        return weights, np.arange(bins) - TAPS // 2, 0
+    return *noise_filter(shots.window, shots.fft_size, bins), shots.real_ends
 
 
 def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -101,6 +119,10 @@ def noise_levels(shots: Shots) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(levels, (2, shots.size)))
 
 
+ECHO = 1 << 24
+"""Numbers of the noise of an echo's bins, from which they count apart from those of single bins."""
+
+
 class Seen(NamedTuple):
     """What spectra without noise hold, by point and segment (m, 3), for noise to be added to."""
 
@@ -110,6 +132,16 @@ class Seen(NamedTuple):
     """int64: number of the largest."""
     ratio: np.ndarray
     """Its |X| / sigma; nan for a segment that does not exist."""
+    real: np.ndarray
+    """bool: whether noise is real there."""
+    start: np.ndarray
+    """int64: where the segment's bins begin in the two that follow, from ``low`` on."""
+    bins: np.ndarray
+    """int64: number of these."""
+    ratios: np.ndarray
+    """|X| / sigma of all bins."""
+    echo: np.ndarray
+    """bool: whether they are of the echo."""
     others: np.ndarray
     """Bins that count for false alarms and hold noise alone."""
     stretch: np.ndarray
@@ -124,12 +156,14 @@ class Seen(NamedTuple):
         """No spectra, for what is drawn against probabilities."""
         low, stretch = np.zeros((points, 3), np.int64), np.zeros((points, 3, 2), np.int64)
         none, others = np.full((points, 3), np.nan), np.zeros((points, 3))
-        return cls(low, low, none, others, stretch, np.empty(0, np.int64), np.empty(0))
+        real, leaked = np.zeros((points, 3), np.bool_), (np.empty(0, np.int64), np.empty(0))
+        bins = low, low, np.empty(0), np.empty(0, np.bool_)
+        return cls(low, low, none, real, *bins, others, stretch, *leaked)
 
 
 def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
     """Points of some shots, and their spectra; as many at once as memory holds."""
-    sigma = shots.bin_deviation
+    sigma, is_real = shots.bin_deviation, shots.real_ends > 0
     # Without leakage none but the peak is looked at.
     floor = shots.floor + np.zeros(shots.size) if shots.leakage else np.full(shots.size, np.inf)
     for runs in runs_of(shots, least=np.minimum(shots.threshold, floor * sigma), leakage=False):
@@ -142,11 +176,17 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
         leaking = np.bincount(run[leaks], minlength=count.size).reshape(-1, 3)
         after = np.cumsum(leaking).reshape(-1, 3)
         there = runs.bins.T > 0
-        others = shots.counted_bins(np.where(there, runs.exempted.T, 0.0)) - leaking
+        exempted = np.where(there, runs.exempted.T, 0.0)
+        others = shots.counted_bins(exempted.T, runs.part).T - leaking
         seen = Seen(
             low=np.where(there, runs.low.T, 0),
             peak=np.where(there, runs.peak.T, 0),
+            real=np.isin((runs.low + runs.peak).T, (0, shots.real_ends / 2)) & there & is_real,
             ratio=np.where(there, runs.magnitude.T / sigma[runs.part, None], np.nan),
+            start=(np.cumsum(count) - count).reshape(-1, 3),
+            bins=runs.bins.T,
+            ratios=ratio,
+            echo=runs.exempt[at],
             others=np.maximum(others, 0.0),
             stretch=np.stack([after - leaking, after], axis=2),
             aside=number[leaks],
@@ -157,13 +197,16 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(rows, ends, levels, chances, noisy, seen, counts):
+def _count(rows, ends, levels, chances, how, seen, counts):
     """Add the draws of each row to the counts.
 
+    ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`.
     ``levels`` (2, m) are threshold and noise under the lines, over the noise of any other bin;
     ``chances`` (2, 3, m) those of a detection, of no meaning in noise, and of a false alarm in
     bins that are not looked at one by one.
     """
+    noisy, weights, start, real_ends = how
+    noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
     hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
@@ -175,8 +218,16 @@ def _count(rows, ends, levels, chances, noisy, seen, counts):
             hits[:], alarms[:] = False, False
             for s in range(3):
                 stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
-                if noisy:
-                    _cross(address, stream, peak, ratio, under_lines, threshold, words, hits[s])
+                if noisy and weights.size > 0:
+                    _cross_any(
+                        address, (j, s), seen, (weights, start, real_ends), levels[:, j],
+                        noise_of_bins, hits[s],
+                    )  # fmt: skip
+                elif noisy:
+                    noise = under_lines, under_lines
+                    if seen.real[j, s]:
+                        noise = math.sqrt(2.0) * under_lines, 0.0
+                    _cross(address, stream, peak, ratio, noise, threshold, words, hits[s])
                 else:
                     _happen(address, STREAM_DETECTION[s], chances[0, s, j], words, hits[s])
                 if chances[1, s, j] > 0.0:
@@ -184,7 +235,10 @@ def _count(rows, ends, levels, chances, noisy, seen, counts):
                     _happen(address, largest, chances[1, s, j], words, alarms[s])
                 for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
                     leaked = seen.leaked[k]
-                    _cross(address, stream, seen.aside[k], leaked, 1.0, threshold, words, alarms[s])
+                    _cross(
+                        address, stream, seen.aside[k], leaked, (1.0, 1.0), threshold, words,
+                        alarms[s],
+                    )  # fmt: skip
             for d in range(number):
                 while first + d >= ends[batch + 1]:
                     batch += 1
@@ -206,14 +260,75 @@ def _happen(address, stream, chance, words, found):
 
 
 @njit(cache=True, error_model="numpy")
+def _cross_any(address, at, seen, rule, levels, room, found):
+    """Mark the draws in which any bin of an echo, with its noise, reaches the threshold."""
+    begin, count = seen.start[at], seen.bins[at]
+    ratios, echo = seen.ratios[begin : begin + count], seen.echo[begin : begin + count]
+    if not echo.any():
+        return
+    first, last = 0, count - 1
+    while not echo[first]:
+        first += 1
+    while not echo[last]:
+        last -= 1
+    threshold, under_lines = levels
+    for d in range(address[3]):
+        draw = address[0], address[1], address[2] + d, STREAM_NOISE[at[1]]
+        draw_noise(draw, ECHO, seen.low[at] + first, last - first + 1, rule, room)
+        for i in range(first, last + 1):
+            re, im = under_lines * room[0, i - first], under_lines * room[1, i - first]
+            re += ratios[i]
+            found[d] |= echo[i] and re * re + im * im >= threshold * threshold
+
+
+@njit(cache=True, error_model="numpy")
+def draw_noise(draw, number, low, count, rule, room):
+    """Noise of adjacent bins over sigma, in phase with the signal and across, to rows 0 and 1.
+
+    Parameters
+    ----------
+    draw : (uint64, uint64, int, int)
+        Key of the point, number of the draw, stream.
+    number : int
+        From which on the independent numbers count.
+    low, count : int
+        First bin; number of bins.
+    rule : tuple
+        :func:`echo_filter`.
+    room : (4, >= count + TAPS) float64
+        Result, and the independent numbers.
+    """
+    weights, start, ends = rule
+    taps = weights.shape[1]
+    turned = ends > 0 and 2 * (low + count - 1) == ends  # counted from Nyquist
+    is_even = turned or (ends > 0 and low == 0)
+    first = 0 if is_even else start[0]
+    for j in range(start[count - 1] + taps - first):
+        re, im = philox.normal_pair(draw[0], draw[1], draw[2], draw[3], number + j)
+        if is_even and j == 0:
+            re, im = math.sqrt(2.0) * re, 0.0
+        room[2, j], room[3, j] = re, im
+    for k in range(count):
+        re, im = 0.0, 0.0
+        for m in range(taps):
+            j = start[k] + m - first
+            sign = -1.0 if is_even and j < 0 else 1.0  # a real record's are conjugate
+            re += weights[k, m] * room[2, abs(j)]
+            im += weights[k, m] * sign * room[3, abs(j)]
+        i = count - 1 - k if turned else k
+        room[0, i], room[1, i] = re, im
+
+
+@njit(cache=True, error_model="numpy")
 def _cross(address, stream, index, ratio, deviation, threshold, words, found):
     """Mark the draws in which a bin of that |X| / sigma, with its noise, reaches the threshold.
 
-    The threshold is a power; the noise, of that deviation, is pair `index` of the stream.
+    The threshold is a power; the noise, of these deviations in the signal's phase and across, is
+    pair `index` of the stream.
     """
     philox.fill_words(address[:3], stream, index >> 1, philox.BY_DRAW, address[3], words)
     lane = 2 * (index & 1)
     for d in range(address[3]):
         re, im = philox.to_normals(words[lane, d], words[lane + 1, d])
-        re, im = ratio + re * deviation, im * deviation
+        re, im = ratio + re * deviation[0], im * deviation[1]
         found[d] |= re**2 + im**2 >= threshold

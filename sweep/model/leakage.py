@@ -107,7 +107,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         low, high = run_of(least, place, sizes)
         count = high - low + 1
         magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
-        peak, exempted = mark(room[OUT], count, noise[1], exempt)
+        peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
         chance = _of_run(count, left, noise, room, exempt, series)
         return low, count, peak, exempted, chance
     near_low, near_high = run_of(float(beside), place, sizes)
@@ -118,7 +118,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         high = half if half - high <= reach + APRON else high
         count = high - low + 1
         magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
-        peak, exempted = mark(room[OUT], count, noise[1], exempt)
+        peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
         run = low, count, peak, origin
         leakage, settled = _leakage(
             run, (n, lowest, highest), place, noise, form, sizes, tangent, room, exempt, series

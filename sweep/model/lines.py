@@ -50,8 +50,10 @@ LEAST_WIDTH = 14 * BLOCK_SIZE
 """Of scratch."""
 
 COMMON = 16
-"""Numbers of a point that its segments share; of each segment two follow: signed chirp rate
-[Hz/s] and carrier [Hz]."""
+"""Numbers of a point that its segments share; of each segment OWN follow."""
+
+OWN = 3
+"""Signed chirp rate [Hz/s]; carrier [Hz]; gain of the whitened spectrum."""
 
 CHEBYSHEV = np.zeros((MOST_NODES + 1, MOST_NODES))
 for _n in range(1, MOST_NODES + 1):
@@ -102,11 +104,12 @@ def _left_out(log_z: np.ndarray, order: int, weights: np.ndarray) -> np.ndarray:
 def place_lines(p, segment, footprint, row, sizes, room):
     """Lines of a segment: places and complex weights C_b, into rows PLACE, RE and IM.
 
-    C_b is half the amplitude, with the receiver's gain and the phase in the record's middle.
+    C_b is half the amplitude, with the receiver's gain and the phase in the record's middle, in a
+    spectrum whose noise is white.
 
     Parameters
     ----------
-    p : (COMMON + 2 segments,) float64
+    p : (COMMON + OWN segments,) float64
         The point (:meth:`sweep.model.preparation.Shots.point_table`).
     segment : int
     footprint : (3 or 3 + segments, rows, beamlets) float64
@@ -123,8 +126,9 @@ def place_lines(p, segment, footprint, row, sizes, room):
     """
     power = sizes[4] != 0
     fft_size, length = sizes[0], sizes[1]
-    range_0, beta, scale, start = p[0], p[1], p[3], p[7]
-    rate, carrier = p[COMMON + 2 * segment], p[COMMON + 1 + 2 * segment]
+    own = COMMON + OWN * segment
+    range_0, beta, scale, start = p[0], p[1], p[3] * p[own + 2], p[7]
+    rate, carrier = p[own], p[own + 1]
     bins = fft_size / p[6]
     per_metre = rate * (2.0 / SPEED_OF_LIGHT)
     centre_frequency = carrier * beta - per_metre * (1.0 + beta) * range_0

@@ -165,3 +165,43 @@ def electrical_bandwidth(
     [T] states one figure for both and uses it as the noise bandwidth; so does this.
     """
     return np.minimum(detector_bandwidth, amplifier_bandwidth)
+
+
+def noise_density(
+    frequency: np.ndarray,
+    *,
+    detector_bandwidth: np.ndarray,
+    amplifier_bandwidth: np.ndarray,
+    sample_rate: np.ndarray,
+) -> np.ndarray:
+    """Density of the noise in a record, over that of white noise of the same sources.
+
+    The sources' noise passes |H|^2 and folds: f_s / (2 B_e) sum_m |H(f + m f_s)|^2 at a frequency f
+    [Hz] of any sign, folded or not. With a = 2 pi B / f_s a single pole's sum is
+
+        sum_m 1 / (1 + (f + m f_s)^2 / B^2) = (a / 2) sinh a / (cosh a - cos(2 pi f / f_s))
+
+    and that of two poles follows by partial fractions, or by the derivative where they are equal.
+    """
+    one, other = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
+    cosine = np.cos(2 * np.pi * (np.asarray(frequency) / sample_rate))
+    alike = np.abs(one - other) <= 1e-4 * np.minimum(one, other)
+    first, slope = _pole(2 * np.pi * np.where(alike, (one + other) / 2, one) / sample_rate, cosine)
+    second, _ = _pole(2 * np.pi * other / sample_rate, cosine)
+    ratio = np.where(alike, 0.5, np.square(other / one))
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.where(np.isinf(ratio), first, (ratio * first - second) / (ratio - 1))
+    total = np.where(alike, first - slope, apart)
+    folded = np.arccos(np.clip(cosine, -1, 1)) * sample_rate / (2 * np.pi)
+    direct = 1 / ((1 + (folded / one) ** 2) * (1 + (folded / other) ** 2))  # where all else rounds
+    both = electrical_bandwidth(detector_bandwidth=one, amplifier_bandwidth=other)
+    return np.asarray(np.maximum(total, direct) * sample_rate / (2 * both))
+
+
+def _pole(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum s over the aliases of a single pole, a > 0, and (a / 2) ds/da."""
+    q, rest = np.exp(-a), -np.expm1(-a)
+    below = rest * rest + 2 * q * (1 - cosine)
+    tangent = rest * (2 - rest) / below
+    change = 2 * q * (2 * q - cosine * (1 + q * q)) / below**2
+    return a / 2 * tangent, a / 4 * (tangent + a * change)

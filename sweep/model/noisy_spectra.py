@@ -11,10 +11,11 @@ is what the spectrum is; in wider ones estimators see a smoother peak than speck
 A phase common to all bins makes no difference to circular noise and is left out.
 
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
-|X|^2. A segment is detected where it flags the strongest bin of the signal or one of the two beside
-it; adjacent flagged bins form a group, and a group outside the bins that the signal occupies is a
-false alarm. The estimator is given the spectrum and the largest bin of the detected group. Where
-all segments are detected, their frequencies are resolved into range and radial velocity.
+|X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the
+strongest or one of the two beside it); adjacent flagged bins form a group, and a group outside the
+bins that the signal occupies is a false alarm. The estimator is given the spectrum and the largest
+bin of the detected group. Where all segments are detected, their frequencies are resolved into
+range and radial velocity.
 """
 
 import math
@@ -66,7 +67,7 @@ class Signal(NamedTuple):
     spectrum: np.ndarray
     """(N/2 + 1,) complex [V]."""
     strongest: int
-    """Largest bin, 1..N/2 - 1."""
+    """Largest bin; 1..N/2 - 1 where noise is taken to be circular in all."""
     first: int
     """First of the bins that the signal occupies: those from the first to the last of half its
     largest magnitude, and a main lobe's half-width to either side. What is detected elsewhere is
@@ -83,20 +84,29 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
     """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down."""
     _, magnitude = segment_spectrum(shots, i, segment)
     half, window = shots.fft_size // 2, shots.window
-    k = int(np.clip(np.argmax(magnitude), 1, half - 1))
+    least = 0 if shots.real_ends else 1  # at DC and Nyquist, else taken for circular
+    k = int(np.clip(np.argmax(magnitude), least, half - least))
     if not magnitude[k] > 0:
         return Signal(magnitude.astype(complex), k, 1, 0, float(k), 0.0)
     tables = interpolator(window, shots.fft_size)
-    place = k + sub_bin(magnitude[k - 1], magnitude[k], magnitude[k + 1], tables)
+    below, above = magnitude[abs(k - 1)], magnitude[min(k + 1, 2 * half - k - 1)]
+    place = k + sub_bin(below, magnitude[k], above, tables)
     high = np.flatnonzero(magnitude >= 0.5 * magnitude[k])
     beside = math.ceil(main_lobe(window) * shots.fft_size / window.length)
     total = 2 * (magnitude**2).sum() - magnitude[0] ** 2 - magnitude[half] ** 2
     power = total / (shots.fft_size * window.energy)
+    first, last = max(int(high[0]) - beside, least), min(int(high[-1]) + beside, half - least)
+    phases = _tone_phases(place, shots)
+    if high[-1] - high[0] > beside:  # wider than a tone: in step, as in one's main lobe
+        apart = np.arange(first, last + 1) - k
+        phases[first : last + 1] = phases[k] * np.exp(
+            -1j * np.pi * apart * (window.length / shots.fft_size)
+        )
     return Signal(
-        spectrum=magnitude * _tone_phases(place, shots),
+        spectrum=magnitude * phases,
         strongest=k,
-        first=max(int(high[0]) - beside, 1),
-        last=min(int(high[-1]) + beside, half - 1),
+        first=first,
+        last=last,
         frequency=place,
         cnr=float(power / shots.noise_variance[i]),
     )
@@ -184,14 +194,20 @@ def look(spectra: np.ndarray, signal: Signal, view: View) -> Found:
     """What is found in spectra (m, N/2 + 1) of a segment."""
     power = spectra.real**2 + spectra.imag**2
     flags = np.array(view.detect(power, view.setting), bool)
-    flags[:, [0, -1]] = False  # DC and Nyquist
-    low, high = max(signal.strongest - 1, 1), min(signal.strongest + 2, power.shape[1] - 1)
+    shots, bins, half = view.shots, np.arange(power.shape[1]), power.shape[1] - 1
+    low, high = max(signal.strongest - 1, 0), min(signal.strongest + 2, half + 1)
+    if shots.detection == "any_bin" and signal.last >= signal.first:
+        low, high = signal.first, signal.last + 1
+    if not shots.real_ends:
+        low, high = max(low, 1), min(high, half)
     near = np.where(flags[:, low:high], power[:, low:high], -1.0)
     hit, detected = low + near.argmax(axis=1), near.max(axis=1) >= 0
+    flags[:, [0, -1]] = False  # DC and Nyquist
     edges = np.diff(flags.astype(np.int8), axis=1)
     row, start = np.nonzero(edges > 0)  # of each group of flagged bins
     start, end = start + 1, np.nonzero(edges < 0)[1] + 1
     false = (start > signal.last) | (end <= signal.first)
+    false &= (start <= half - shots.searched_from) & (end > shots.searched_from)
     alarms, flagged = (
         np.bincount(row[false], weights, len(spectra)).astype(np.int64)
         for weights in (None, (end - start)[false])
@@ -199,7 +215,6 @@ def look(spectra: np.ndarray, signal: Signal, view: View) -> Found:
     own = detected[row] & (start <= hit[row]) & (hit[row] < end)
     first, last = np.ones((len(spectra), 1)), np.full((len(spectra), 1), power.shape[1] - 1)
     first[row[own], 0], last[row[own], 0] = start[own], end[own]
-    bins = np.arange(power.shape[1])
     peak = np.where((first <= bins) & (bins < last), power, -1.0).argmax(axis=1)
     return Found(detected, alarms, flagged, view.estimate(spectra, peak, view.setting))
 
@@ -222,7 +237,8 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             noise = noise_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
             spectra = signal.spectrum + noise
             found[s] = look(spectra, signal, view)
-            searched += view.setting.fft_size // 2 - 1 - max(signal.last - signal.first + 1, 0)
+            inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
+            searched += inside - max(signal.last - signal.first + 1, 0)
     up, doppler, down = found
     both, alarm = up.detected & down.detected, (up.alarms > 0, down.alarms > 0)
     counts = np.array([

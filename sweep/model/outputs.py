@@ -81,7 +81,9 @@ OUTPUTS: dict[str, Output] = {
         "largest change of a probability of detection by more beamlets",
         "summed over the segments; 0 where their number is given, and so part of what is asked",
     ),
-    "noise_variance": Output("V^2", "noise variance at the ADC, sigma_x^2"),
+    "noise_variance": Output(
+        "V^2", "noise variance at the ADC, sigma_x^2", "of noise that is white within the bandwidth"
+    ),
     "range_error": Output(
         "m",
         "reported less true range, without noise",
@@ -169,7 +171,7 @@ SPECTRA_OUTPUTS: dict[str, Output] = {
     **{name: OUTPUTS[name] for name in KEPT},
     **_by_segment(
         "pd_{}", "probability of detection", shot="Up- and down-chirp both detected",
-        comment="share of draws with a detection at the strongest bin or beside it.",
+        comment="share of draws with a detection in a bin of the echo.",
     ),
     "pfa_bin": Output("1", "share of bins with a false alarm", f"those in groups of {_AT_FAULT}"),
     "pfa_bin_error": Output("1", "standard error of pfa_bin over draws"),

@@ -8,6 +8,7 @@ footprint's geometry is worked out once and serves every point that has it, what
 radiometry.
 """
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, detection, link, waveform
+from sweep.model import alarms, beam, detection, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
 from sweep.model.window import Window, canonical_name, window
 
@@ -31,6 +33,9 @@ BEAMLETS_ERROR = "footprint.beamlets_error"
 
 CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 """Numbers that points must share to be prepared together; words they must share all."""
+
+ADC_NOISE = "quantisation"
+"""Noise source that does not pass the receiver."""
 
 UNSEEN = frozenset({"signal_shot"})
 """Noise sources that come with an echo: the threshold is not set on them."""
@@ -72,6 +77,12 @@ class Shots:
     window: Window
     fft_size: int
     bins_counted: str
+    noise_bins: str
+    """``correlated``: noise of bins as the record makes it; ``independent``: as [T] has it."""
+    detection: str
+    """``any_bin``: of the echo; ``peak_bin``: the largest alone, as in [T]."""
+    noise_shape: str
+    """``receiver``: noise passes the receiver as signals do; ``white``: none of it, as in [T]."""
     tnr: np.ndarray
     range: np.ndarray
     """(n,): of the target on the beam's axis."""
@@ -170,6 +181,25 @@ class Shots:
         return np.asarray(sum(seen)) + np.zeros(self.size)
 
     @cached_property
+    def whitening(self) -> np.ndarray:
+        """Gain of each segment's lines in a spectrum whose noise is white, (segments, n).
+
+        Spectra are divided by the root of the noise's density over that of white noise. It changes
+        little over an echo and is taken on the beam's axis. What the ADC adds is white before.
+        """
+        if self.noise_shape == "white":
+            return np.ones((len(self.waveform), self.size))
+        delay = (2 / SPEED_OF_LIGHT) * self.range * (1 + self.beta)
+        shape = {
+            "detector_bandwidth": self.detector_bandwidth,
+            "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
+        }  # fmt: skip
+        white = self.noise_sources.get(ADC_NOISE, 0.0) / self.quiet_variance
+        beats = (s.carrier * self.beta - s.chirp_rate * delay for s in self.waveform)
+        densities = (link.noise_density(beat, **shape) for beat in beats)
+        return in_rows([(g + (1 - g) * white) ** -0.5 for g in densities], (self.size,))
+
+    @cached_property
     def noise_variance(self) -> np.ndarray:
         """Noise variance sigma_x^2 at the ADC [V^2], (n,)."""
         unseen = (v for name, v in self.noise_sources.items() if name in UNSEEN)
@@ -229,9 +259,9 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Numbers of each point as compiled code takes them, (16 + 2 segments, n).
+        """Numbers of each point as compiled code takes them, (16 + 3 segments, n).
 
-        What all segments share, and of each segment the signed chirp rate [Hz/s] and the carrier.
+        What all segments share; of each the signed chirp rate [Hz/s], the carrier, the whitening.
         """
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
@@ -239,14 +269,64 @@ class Shots:
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance,
         )  # fmt: skip
-        further = (x for each in self.waveform for x in (each.chirp_rate, each.carrier))
+        further = (
+            x
+            for each, gain in zip(self.waveform, self.whitening, strict=True)
+            for x in (each.chirp_rate, each.carrier, gain)
+        )
         return in_rows((*columns, *further), (self.size,))
 
-    def counted_bins(self, exempted: np.ndarray) -> np.ndarray:
-        """Bins that can raise a false alarm, given those that the detection occupies."""
+    @property
+    def real_ends(self) -> int:
+        """FFT size where noise in bins 0 and N/2 is real, as that of a real record is; else 0."""
+        is_real = self.noise_bins == "correlated" and not self.complex_record
+        return self.fft_size if is_real else 0
+
+    @property
+    def searched_from(self) -> int:
+        """First bin searched for alarms, counted from DC and from Nyquist."""
+        return alarms.first_circular(self.window, self.fft_size) if self.real_ends else 1
+
+    @property
+    def correlation(self) -> float:
+        """Of the noise of adjacent bins, 0..1."""
+        if self.noise_bins == "independent":
+            return 0.0
+        return alarms.neighbour_correlation(self.window, self.fft_size)
+
+    @property
+    def echo_rule(self) -> tuple[int, int, np.ndarray]:
+        """Of detection: :attr:`real_ends`; half of a main lobe [bins]; rule for pairs of bins.
+
+        0 and nothing where the largest bin alone detects.
+        """
+        if self.detection == "peak_bin":
+            return self.real_ends, 0, np.empty((3, 0))
+        lobe = main_lobe(self.window) * self.fft_size / self.window.length
+        return self.real_ends, math.ceil(lobe), alarms.pair_nodes(self.correlation)
+
+    def counted_bins(
+        self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
+    ) -> np.ndarray:
+        """Independent bins that would raise a false alarm as often as those that can.
+
+        Parameters
+        ----------
+        exempted : (..., m) ndarray
+            Bins that the detection of some points occupies.
+        points
+            Which points these are.
+        """
+        searched = self.fft_size // 2
+        if self.real_ends:
+            searched += 1 - 2 * self.searched_from
+        bins = np.maximum(searched - exempted, 0.0)
         if self.bins_counted == "all":
-            return np.full(np.shape(exempted), float(self.fft_size))
-        return np.maximum(self.fft_size // 2 - exempted, 0.0)
+            bins = np.full(np.shape(exempted), float(self.fft_size))
+        if self.noise_bins == "independent":
+            return bins
+        level = np.broadcast_to(self.threshold / self.bin_deviation, self.size)[points]
+        return alarms.independent_bins(bins, level=level, correlation=self.correlation)
 
 
 def categories(
@@ -320,6 +400,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
         fft_size=int(p[PROCESSING + "fft_size"]),
         bins_counted=str(p[PROCESSING + "bins_counted"]),
+        noise_bins=str(p[PROCESSING + "noise_bins"]),
+        detection=str(p[PROCESSING + "detection"]),
+        noise_shape=str(p[RECEIVER + "noise_shape"]),
         tnr=p[PROCESSING + "tnr"],
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,

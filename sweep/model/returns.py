@@ -1,9 +1,8 @@
 """Returns of footprints with several surfaces, draw by draw.
 
-:func:`groups` finds in the noiseless spectra of a shot's segments the groups of adjacent bins at
-or above the threshold, each a target (PHYSICS section 6). :func:`draw_returns` draws which of
-them are detected, adds false peaks, pairs the peaks (:mod:`sweep.model.pairing`) and reports
-range and radial velocity, by whole bins and interpolated between them.
+:func:`draw_returns` draws which groups of bins (:mod:`sweep.model.groups`) are detected, adds false
+peaks, pairs the peaks (:mod:`sweep.model.pairing`) and reports range and radial velocity, by whole
+bins and interpolated between them.
 
 The two ways to draw are those of :mod:`sweep.model.draws`, with the same random numbers: the
 strongest group is detected, and a false alarm raised, in the very draws that are counted there.
@@ -11,10 +10,9 @@ strongest group is detected, and a false alarm raised, in the very draws that ar
 - ``probabilities``: a uniform number against the pd of each group, one against the probability of
   a false alarm (noise and leakage). Peaks stay in their noiseless bins; the interpolated position
   has a normal error of the standard error that is reported.
-- ``noise``: complex Gaussian noise in the strongest bin of each group and its two neighbours, so
-  that the largest of the three may change, and in the bins of leaked signal; the largest of all
-  other bins by its order statistic. Within the three bins noise is correlated as the window does;
-  otherwise bins are independent, as in the closed forms.
+- ``noise``: complex Gaussian noise in all bins of each group's echo (of ``peak_bin`` in the
+  strongest and its two neighbours), alike as the window makes it, so that another may be the
+  largest, and in the bins of leaked signal; the largest of all other bins by its order statistic.
 
 The interpolated range is put right for what range walk moves it by, v_r (T_w + 2 t_0), by the
 velocity that is measured with it.
@@ -35,9 +33,19 @@ from numba import njit
 
 from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.draws import Seen, is_noisy, noise_levels, seen_spectra
+from sweep.model.detection import echo_of, is_end
+from sweep.model.draws import (
+    ECHO,
+    Seen,
+    draw_noise,
+    echo_filter,
+    is_noisy,
+    noise_levels,
+    seen_spectra,
+)
+from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
-from sweep.model.marcum import at_least_one, marcum_q1_pair
+from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
     FALSE_ALARM,
     MISPAIRED,
@@ -49,120 +57,12 @@ from sweep.model.pairing import (
     pair_peaks,
 )
 from sweep.model.preparation import Shots
-from sweep.model.segments import runs_of
-
-BIN, FIRST, LAST = range(3)
-"""Bins of a group: the strongest, the first and the last."""
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
 
 FALSE, ABSENT = -1, -2
 """In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
-
-
-class Groups(NamedTuple):
-    """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
-
-    Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
-    none. Where no bin crosses the threshold the strongest is listed, as noise may lift it.
-    """
-
-    bin: np.ndarray
-    """(n, 3, most) int64: strongest bin, 0..N/2."""
-    first: np.ndarray
-    """(n, 3, most) int64: first bin of the group."""
-    last: np.ndarray
-    """(n, 3, most) int64: last bin of the group."""
-    neighbours: np.ndarray
-    """(n, 3, most, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
-    pd: np.ndarray
-    """(n, 3, most): probability that noise leaves the strongest bin above the threshold."""
-    exempted: np.ndarray
-    """(n, 3): bins that cannot raise a false alarm."""
-    leakage: np.ndarray
-    """(n, 3): probability that leaked signal raises a further group, over noise alone."""
-
-    @property
-    def magnitude(self) -> np.ndarray:
-        """|X| of the strongest bin, (n, 3, most)."""
-        return self.neighbours[..., 1]
-
-
-def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
-    """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
-
-    ``every_bin`` as of :func:`sweep.model.shot.find`.
-    """
-    n = shots.size
-    bins = np.full((3, n, 3, most), -1, np.int64)
-    neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
-    exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    levels = np.stack([shots.threshold, shots.line_deviation])
-    for runs in runs_of(shots, every_bin=every_bin):
-        _find_groups(
-            runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
-            shots.fft_size // 2, bins, neighbours, pd,
-        )  # fmt: skip
-        some = np.where(runs.bins > 0, runs.exempted, np.nan)
-        exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
-    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _find_groups(part, runs, magnitudes, levels, half, bins, neighbours, pd):
-    """Groups of every run, into arrays of the shapes of :class:`Groups`."""
-    low, count, peak, start = runs
-    for j in range(part.size):
-        i = part[j]
-        level, deviation = levels[0, i], levels[1, i]
-        for s in range(3):
-            if count[s, j] == 0:
-                continue
-            magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
-            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
-            for g in range(found):
-                k = bins[BIN, i, s, g]
-                pd[i, s, g] = marcum_q1_pair(magnitude[k] / deviation, level / deviation)[0]
-                for side in range(3):
-                    neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
-                for field in range(3):
-                    bins[field, i, s, g] += low[s, j]
-
-
-@njit(cache=True, error_model="numpy")
-def _beside(magnitude, low, k, half):
-    """Magnitude k of a run that starts at bin ``low``; mirrored at DC and Nyquist, 0 past it."""
-    bin_ = abs(low + k)
-    k = (2 * half - bin_ if bin_ > half else bin_) - low
-    return magnitude[k] if 0 <= k < magnitude.size else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _list_groups(magnitude, peak, level, bins):
-    """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
-    if magnitude[peak] < level:
-        bins[:, 0] = peak
-        return 1
-    most, found, k = bins.shape[1], 0, 0
-    while k < magnitude.size:
-        if magnitude[k] < level:
-            k += 1
-            continue
-        best = first = k
-        while k < magnitude.size and magnitude[k] >= level:
-            best = k if magnitude[k] > magnitude[best] else best
-            k += 1
-        g = found
-        while g > 0 and magnitude[bins[BIN, g - 1]] < magnitude[best]:
-            g -= 1
-        found = min(found + 1, most)
-        for h in range(found - 1, g, -1):
-            for field in range(3):
-                bins[field, h] = bins[field, h - 1]
-        if g < most:
-            bins[BIN, g], bins[FIRST, g], bins[LAST, g] = best, first, k - 1
-    return found
 
 
 class Returns(NamedTuple):
@@ -240,16 +140,18 @@ def draw_returns(
     one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
     how = How(
         int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
+        shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
     )  # fmt: skip
     tables = interpolator(shots.window, shots.fft_size)
-    counted = np.nan_to_num(shots.counted_bins(found.exempted))
+    counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
     nothing = np.arange(n), Seen.nothing(n)._replace(others=counted)
     for part, seen in seen_spectra(shots) if noisy else [nothing]:
         some = Known(*(column[part] for column in known))
         quiet = 1 - at_least_one(one[part], seen.others)
         alarm = 1 - quiet if noisy else 1 - quiet * (1 - some.alarm)
         own = Drawn(*(column[part] for column in drawn))
-        _draw(keys[part], how, some._replace(alarm=alarm), seen, tables, own)
+        of_part = how._replace(rule=echo_filter(shots, seen))
+        _draw(keys[part], of_part, some._replace(alarm=alarm), seen, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
     return _measured(shots, found, drawn)
@@ -266,6 +168,12 @@ class How(NamedTuple):
     """There is a Doppler segment."""
     half: int
     """N/2."""
+    ends: int
+    """N where noise at DC and Nyquist is real, else 0."""
+    beside: int
+    """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
+    rule: tuple[np.ndarray, np.ndarray, int]
+    """:func:`sweep.model.draws.echo_filter`"""
 
 
 class Known(NamedTuple):
@@ -452,7 +360,9 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
     for g in range(bins.shape[1]):
         if bins[BIN, g] < 0:
             break
-        if how.noisy:
+        if how.noisy and how.beside > 0:
+            there = look_at_all(address, at, g, how, known, seen, tables, peaks[count])
+        elif how.noisy:
             there = look(address, at, g, how, known, seen, tables, peaks[count])
         else:
             there = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g) < known.pd[i, s, g]
@@ -497,6 +407,8 @@ def look(address, at, g, how, known, seen, tables, peak):
     stream = philox.STREAM_NOISE[s]
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
+    if is_end(centre, how.ends):
+        re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * under_lines, im * under_lines
     if (m[1] + re) ** 2 + im**2 < beta * beta:
         return False
@@ -518,6 +430,37 @@ def look(address, at, g, how, known, seen, tables, peak):
         shift = 1 if above > below else -1
     error, ratio = sub_bin_error(delta, middle / under_lines, tables), max(below, middle, above)
     put(peak, centre + shift, centre + delta, error, ratio, known.spread[i, s, g], how, tables)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def look_at_all(address, at, g, how, known, seen, tables, peak):
+    """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
+
+    The peak is the largest of them.
+    """
+    (a, b, draw), (i, s) = address, at
+    _, beta, under_lines = known.levels[i]
+    low, start = seen.low[i, s], seen.start[i, s]
+    run = seen.ratios[start : start + seen.bins[i, s]]
+    first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
+    first, last = echo_of(run, first, last, beta, how.beside)
+    count, best = last - first + 1, 0
+    room = np.empty((4, count + how.rule[0].shape[1]))
+    numbers = ECHO * (1 + g)
+    draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
+    for k in range(count):
+        re, im = run[first + k] + under_lines * room[0, k], under_lines * room[1, k]
+        room[0, k] = math.hypot(re, im)
+        best = k if room[0, k] > room[0, best] else best
+    middle, spread = room[0, best], known.spread[i, s, g]
+    if middle < beta:
+        return False
+    below = room[0, best - 1] if best > 0 else 0.0
+    above = room[0, best + 1] if best + 1 < count else 0.0
+    delta, centre = sub_bin(below, middle, above, tables), low + first + best
+    error = sub_bin_error(delta, middle / under_lines, tables)
+    put(peak, centre, centre + delta, error, middle, spread, how, tables)
     return True
 
 

@@ -14,6 +14,7 @@ from numba import njit
 
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
+from sweep.model.detection import found_pair
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.leakage import MOST_POINTS, inspect, of_bins
 from sweep.model.line_shape import Shapes
@@ -31,7 +32,6 @@ from sweep.model.lines import (
     relative_error,
     survey,
 )
-from sweep.model.marcum import marcum_q1_pair
 from sweep.model.preparation import LINE_STEPS, Shots
 from sweep.model.spectrum import (
     A_IM,
@@ -353,15 +353,16 @@ def _some(
     shapes = together.shapes
     places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.size))
     form[:, 0] = shapes.reach
+    rule = shots.echo_rule
     done = _inspect_points(
         np.ascontiguousarray(table[:, part].T),
         np.stack([shots.row[part], together.which[first:]]),
         shots.footprint,
         (together.centre, together.modes, together.number, shifts),
-        shapes._replace(sizes=np.append(shapes.sizes, view(shots))),
+        shapes._replace(sizes=np.append(shapes.sizes, (view(shots), rule[1]))),
         (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
-         shots.window.sum),
+         shots.window.sum, rule),
         (np.empty((segments, 2, places)), form),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
@@ -457,18 +458,19 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
 
     Parameters
     ----------
-    points : (m, COMMON + 2 segments) float64
+    points : (m, COMMON + OWN segments) float64
         :meth:`sweep.model.preparation.Shots.point_table`.
     where : (2, m) int64
         Rows in the footprints; shapes.
     footprint : (3 or 3 + segments, rows, beamlets) float64
     modes, shapes
-        Of :class:`Together`, with shifts (m, 2, k); sizes with the view at their end.
+        Of :class:`Together`, with shifts (m, 2, k); sizes with the view and half of the echo's
+        main lobe at their end.
     tables : tuple
         Limits of nodes; tangents.
     how : tuple
         Segments that there are; levels below which bins may be left out; each segment's way to look
-        at leakage; the window's sum.
+        at leakage; the window's sum; rule of detection.
     made, work : tuple
         Room for shapes; for spectra.
     out : tuple
@@ -477,7 +479,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
-    segments, levels, leaks, window_sum = how
+    segments, levels, leaks, window_sum, rule = how
     table, form = made
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
@@ -516,9 +518,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     return i
                 numbers[4, s, i] = at
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
+            found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
-            found, missed = marcum_q1_pair(room[OUT, peak] / p[13], level / p[13])
             numbers[0, s, i], numbers[1, s, i] = low, count
             numbers[2, s, i], numbers[3, s, i] = peak, exempted
             values[0, s, i], values[1, s, i] = found, missed

@@ -496,11 +496,12 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
         weight = weight_afar(total, sources, sizes, room)
         beyond = max(stays_below(level, weight, place, form, sizes), 2.0 * sizes[6])
     known = n, lowest, highest, sources, least / max(total, 1e-300)
+    beyond = max(beyond, 2.0 * sizes[8])  # main lobes beside bins of half the largest
     while True:
         low, high = run_of(beyond, place, sizes)
         count = high - low + 1
         magnitudes(low, count, origin, known, shifts, table, form, sizes, tangent, room)
-        peak, exempted = mark(room[OUT], count, levels[0], exempt)
+        peak, exempted = mark(room[OUT], count, levels[0], exempt, sizes[8])
         most = room[OUT, peak]
         if most >= level or count >= room_for:
             return low, count, peak, exempted

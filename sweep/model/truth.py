@@ -58,8 +58,9 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
         for segment in map(int, np.flatnonzero(shots.segments)):
             magnitude, out = spectrum(shots, i, segment, range_walk=range_walk), np.empty((6, 1))
             detect_rows(
-                magnitude[None], np.zeros(1, np.int64), bins, table[13, [i]], table[11, [i]], out
-            )
+                magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, table[13, [i]],
+                table[11, [i]], out,
+            )  # fmt: skip
             found[segment, :, i] = out[:, 0]
     return found
 
@@ -91,6 +92,7 @@ def analytic_record(
         transimpedance=np.array(1.0),
     )
     amplitude = _at(shots.beat_scale, i) * shots.amplitude[shots.row[i], beamlet]
+    amplitude = amplitude * shots.whitening[segment][i]
     return amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start))
 
 

@@ -191,15 +191,18 @@ def _roc_traces(track: Track, name: str, number: int, point: xr.Dataset) -> list
     """Line and dot of one point, for each kind of false alarm."""
     curve = point.sweep.roc(IN_A_BIN, draws=DRAWS)
     spec = point.sweep.spec
-    bins = noise_only.bins_counted(spec.parameters() | {
+    parameters = spec.parameters() | {
         str(c.attrs["path"]): parameter(point, str(c.attrs["path"]), spec).values.item()
-        for c in point.coords.values() if "path" in c.attrs
-    })  # fmt: skip
+        for c in point.coords.values()
+        if "path" in c.attrs
+    }
+    pfa = 10.0 ** point["log10_pfa_bin"].values
+    bins, own_bins = (noise_only.bins_counted(parameters, p) for p in (IN_A_BIN, pfa))
     traces = []
     for alarm, of in _ALARM_OF.items():
         meta = when(number, part=track.words, alarm=alarm)
         line = {"dash": looks.DASHES[number % len(looks.DASHES)], "width": 2}
-        own = of(10.0 ** point["log10_pfa_bin"].values, bins)
+        own = of(pfa, own_bins)
         traces += [
             go.Scatter(
                 x=of(IN_A_BIN, bins).astype(np.float32), y=curve["pd"].values.astype(np.float32),

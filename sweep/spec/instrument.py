@@ -236,6 +236,14 @@ class Receiver(Part):
             at_most="1 kA",
         ),
     ]
+    noise_shape: Annotated[
+        str,
+        Choice(
+            about="Density of the receiver's noise: shaped by its bandwidths as signals are, or "
+            "white over the record",
+            options=("receiver", "white"),
+        ),
+    ] = "receiver"
     architecture: Annotated[
         str, Choice(about="How the echo is detected", options=ARCHITECTURES)
     ] = "homodyne"
@@ -429,6 +437,21 @@ class Processing(Part):
             options=("half", "all"),
         ),
     ] = "half"
+    detection: Annotated[
+        str,
+        Choice(
+            about="Bins by which an echo is detected: any that it occupies, or the largest alone",
+            options=("any_bin", "peak_bin"),
+        ),
+    ] = "any_bin"
+    noise_bins: Annotated[
+        str,
+        Choice(
+            about="Noise of bins: correlated as window and padding make it, and real at DC and "
+            "Nyquist; or independent and circular, as the thesis takes it",
+            options=("correlated", "independent"),
+        ),
+    ] = "correlated"
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
 

@@ -15,12 +15,15 @@ INSTRUMENT = {
         "transimpedance": "7 kohm",
         "amplifier_bandwidth": "400 MHz",
         "amplifier_noise_current": "25 nA",
+        "noise_shape": "white",
     },
     "processing": {
         "sample_rate": "600 MHz",
         "fft_size": "2^17",
         "tnr": 10,
         "bins_counted": "all",
+        "noise_bins": "independent",
+        "detection": "peak_bin",
     },
 }
 TARGET = {

@@ -11,9 +11,9 @@ from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES, flags_of, names_
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone
+from sweep.model.groups import groups
 from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
-from sweep.model.returns import groups
 from sweep.model.shot import evaluate
 
 DRAWS = 20_000

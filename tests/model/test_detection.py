@@ -103,7 +103,7 @@ def assess(magnitude, sigma, level, floor):
     room, exempt = np.empty((ROOM, count + 16)), np.empty(count, np.bool_)
     room[OUT, :count], series = magnitude, np.empty(MOST_TERMS)
     crossing_series(level / sigma, series)
-    peak, exempted = mark(room[OUT], count, level, exempt)
+    peak, exempted = mark(room[OUT], count, level, exempt, 0)
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
     return peak, marked, of_bins(count, (sigma, level, 0.0), floor, room, exempt, series)

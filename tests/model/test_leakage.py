@@ -17,9 +17,9 @@ from sweep.model.crossings import (
     silence,
 )
 from sweep.model.ground import Cast, Footprints
+from sweep.model.groups import groups
 from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.returns import groups
 from sweep.model.segments import spectrum
 from sweep.model.shot import find, prepare, prepare_cast
 from sweep.model.spectrum import OUT, ROOM, SOURCE_DIGITS, take_sources, weight_afar

@@ -12,8 +12,8 @@ from test_leakage import drawn_bundles as bundles
 from sweep.model import philox, returns, segments, truth
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
+from sweep.model.groups import groups
 from sweep.model.preparation import PhaseError
-from sweep.model.returns import groups
 from sweep.model.sampling import simulate
 from sweep.model.segments import POINTS
 from sweep.model.shot import evaluate, find, prepare

@@ -10,9 +10,9 @@ from sweep.model.clouds import cloud
 from sweep.model.eyepoints import prepare_eyepoints, seen_ground
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
+from sweep.model.groups import groups
 from sweep.model.ray_error import folded, ray_error
 from sweep.model.resolution import more_rays, rays_needed
-from sweep.model.returns import groups
 from sweep.scenes.facets import clean
 
 RAYS = Accuracy.rays

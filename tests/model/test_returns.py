@@ -9,6 +9,7 @@ from scipy import ndimage, stats
 from sweep.model import philox, truth, waveform
 from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
+from sweep.model.groups import groups
 from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
 from sweep.model.returns import (
@@ -20,7 +21,6 @@ from sweep.model.returns import (
     draw_peaks,
     draw_returns,
     free_bin,
-    groups,
     judge,
     largest_of,
 )
@@ -218,13 +218,14 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method):
+@pytest.mark.parametrize("law", [{}, {"detection": "any_bin", "noise_bins": "correlated"}])
+def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, law):
     """Peaks pair one to one, so there are min(up, down) returns, of 0..2 peaks in each list.
 
     With chances p of the true and a of the false peak, both in up and down and independent:
     returns 2 in p a p a, and so on; confirmed by the true Doppler peak where that is there.
     """
-    parameters = _weak(table_4_1)
+    parameters = _weak(table_4_1, **law)
     shots = _prepared(parameters)
     out = evaluate(parameters)
     got = _drawn(shots, draws=DRAWS, method=method)
@@ -281,7 +282,8 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
 
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
-    how = How(0, True, True, True, half)
+    rule = np.empty((0, 17)), np.empty(0, np.int64), 0
+    how = How(0, True, True, True, half, 0, 0, rule)
     known = Known(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),

@@ -8,8 +8,8 @@ over the noise per quadrature,
 
 Whether this is so at a point is seen from the point itself: no random effect was simulated there,
 and the closed form gives back what is stored at the study's own threshold. (It does not where bins
-that hold lines have more noise than others.) All other points are simulated anew at every
-threshold, with the same draws at each.
+that hold lines have more noise than others, nor where any bin of an echo detects.) All other points
+are simulated anew at every threshold, with the same draws at each.
 
 Either way the effects are those that were simulated in the study: such as its own threshold called
 for. Far from it, what was left out may change pd by more than the study's tolerance.

@@ -322,7 +322,13 @@ class Points:
     @cached_property
     def level(self) -> np.ndarray:
         """Magnitude of the bare line on a bin over sigma, by segment."""
-        return self.beat * (0.5 * self.window.sum) / self.deviation * self.transfer
+        level = self.beat * (0.5 * self.window.sum) / self.deviation * self.transfer
+        if self.word(RECEIVER + "noise_shape") == "white":
+            return level
+        names = "detector_bandwidth", "amplifier_bandwidth"
+        poles = {name: self[RECEIVER + name] for name in names}
+        shape = link.noise_density(self.frequency, sample_rate=self.sample_rate, **poles)
+        return level / np.sqrt(shape)
 
     @cached_property
     def amplitude(self) -> np.ndarray:

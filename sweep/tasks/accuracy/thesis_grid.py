@@ -75,7 +75,8 @@ def find(
                 )
                 out = np.empty((6, index.size))
                 bins = shots.fft_size // 2, 1.0 / shots.fft_size
-                detect_rows(magnitude, low, bins, table[13, index], table[11, index], out)
+                levels = table[13, index], table[11, index]
+                detect_rows(magnitude, low, bins, shots.echo_rule, *levels, out)
                 out[3] *= table[6, index]
                 found[segment][:, index] = out
     return found

@@ -1,0 +1,130 @@
+"""Groups of adjacent bins at or above the threshold in noiseless spectra: targets and sidelobes.
+
+Each is a target, or a strong one's sidelobe (PHYSICS section 6).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sweep.model.detection import echo_of, found_pair
+from sweep.model.preparation import Shots
+from sweep.model.segments import runs_of
+
+BIN, FIRST, LAST = range(3)
+"""Bins of a group: the strongest, the first and the last."""
+
+
+class Groups(NamedTuple):
+    """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
+
+    Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
+    none. Where no bin crosses the threshold the strongest is listed, as noise may lift it.
+    """
+
+    bin: np.ndarray
+    """(n, 3, most) int64: strongest bin, 0..N/2."""
+    first: np.ndarray
+    """(n, 3, most) int64: first bin of the group."""
+    last: np.ndarray
+    """(n, 3, most) int64: last bin of the group."""
+    neighbours: np.ndarray
+    """(n, 3, most, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
+    pd: np.ndarray
+    """(n, 3, most): probability of detection."""
+    exempted: np.ndarray
+    """(n, 3): bins that cannot raise a false alarm."""
+    leakage: np.ndarray
+    """(n, 3): probability that leaked signal raises a further group, over noise alone."""
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """|X| of the strongest bin, (n, 3, most)."""
+        return self.neighbours[..., 1]
+
+
+def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
+    """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
+
+    ``every_bin`` as of :func:`sweep.model.shot.find`.
+    """
+    n = shots.size
+    bins = np.full((3, n, 3, most), -1, np.int64)
+    neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
+    exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    levels = np.stack([shots.threshold, shots.line_deviation])
+    for runs in runs_of(shots, every_bin=every_bin):
+        _find_groups(
+            runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
+            (shots.fft_size // 2, shots.echo_rule), bins, neighbours, pd,
+        )  # fmt: skip
+        some = np.where(runs.bins > 0, runs.exempted, np.nan)
+        exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
+    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
+    """Groups of every run, into arrays of the shapes of :class:`Groups`.
+
+    ``how``: N/2, and :attr:`sweep.model.preparation.Shots.echo_rule`.
+    """
+    (low, count, peak, start), (half, rule) = runs, how
+    for j in range(part.size):
+        i = part[j]
+        level, deviation = levels[0, i], levels[1, i]
+        for s in range(3):
+            if count[s, j] == 0:
+                continue
+            magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
+            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
+            for g in range(found):
+                k = bins[BIN, i, s, g]
+                first, last = echo_of(
+                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule[1]
+                )
+                echo = np.ones(last - first + 1, np.bool_)
+                pd[i, s, g] = found_pair(
+                    magnitude[first : last + 1], echo, k - first, low[s, j] + first, rule,
+                    (deviation, level),
+                )[0]  # fmt: skip
+                for side in range(3):
+                    neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
+                for field in range(3):
+                    bins[field, i, s, g] += low[s, j]
+
+
+@njit(cache=True, error_model="numpy")
+def _beside(magnitude, low, k, half):
+    """Magnitude k of a run that starts at bin ``low``; mirrored at DC and Nyquist, 0 past it."""
+    bin_ = abs(low + k)
+    k = (2 * half - bin_ if bin_ > half else bin_) - low
+    return magnitude[k] if 0 <= k < magnitude.size else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _list_groups(magnitude, peak, level, bins):
+    """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
+    if magnitude[peak] < level:
+        bins[:, 0] = peak
+        return 1
+    most, found, k = bins.shape[1], 0, 0
+    while k < magnitude.size:
+        if magnitude[k] < level:
+            k += 1
+            continue
+        best = first = k
+        while k < magnitude.size and magnitude[k] >= level:
+            best = k if magnitude[k] > magnitude[best] else best
+            k += 1
+        g = found
+        while g > 0 and magnitude[bins[BIN, g - 1]] < magnitude[best]:
+            g -= 1
+        found = min(found + 1, most)
+        for h in range(found - 1, g, -1):
+            for field in range(3):
+                bins[field, h] = bins[field, h - 1]
+        if g < most:
+            bins[BIN, g], bins[FIRST, g], bins[LAST, g] = best, first, k - 1
+    return found

@@ -1,0 +1,147 @@
+"""Detection by any bin of an echo, and false alarms: closed forms against drawn records.
+
+`Instrument.drawn` makes records sample by sample (white noise at eight times the rate through the
+receiver's poles, the exact delay's beat), and shares nothing with the closed forms but the link
+budget. Further effects join where it makes its records.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from sweep.model import link, philox, shot, truth
+from sweep.model.alarms import first_circular
+from sweep.model.detectors import main_lobe
+from sweep.model.sampling import simulate
+from sweep.model.window import samples
+
+OVER, DRAWS = 8, 8_000
+NATURE = {"noise_bins": "correlated", "detection": "any_bin", "noise_shape": "receiver"}
+
+
+class Instrument(NamedTuple):
+    """A prepared shot and its parameters."""
+
+    parameters: dict
+    shots: shot.Shots
+
+    @classmethod
+    def of(cls, parameters):
+        ((_, shots),) = shot.prepare(parameters)
+        return cls(parameters, shots)
+
+    @property
+    def size(self):
+        return self.shots.fft_size
+
+    def noise(self, draws, rng):
+        """Noise (draws, L) in the record: white within the bandwidth, through H, sampled."""
+        shots, length = self.shots, self.shots.window.length
+        rate = float(shots.sample_rate[0])
+        poles = {
+            "detector_bandwidth": shots.detector_bandwidth,
+            "amplifier_bandwidth": shots.amplifier_bandwidth,
+        }
+        # enough samples that what a transform's circle brings back is far from the record
+        whole = OVER * (length + 64)
+        high = np.fft.rfftfreq(whole, 1 / (OVER * rate))
+        gain = link.transfer(high, transimpedance=1.0, **poles)
+        within = link.electrical_bandwidth(**poles) / (OVER * rate / 2)
+        white = rng.normal(size=(draws, whole)) * np.sqrt(shots.noise_variance[0] / within)
+        return np.fft.irfft(gain * np.fft.rfft(white, axis=1), axis=1)[:, : OVER * length : OVER]
+
+    def spectra(self, records):
+        """|X| of records, in every bin over the noise's density there."""
+        shots = self.shots
+        taper = samples(shots.window.name, shots.window.length)
+        density = link.noise_density(
+            np.fft.rfftfreq(self.size, 1 / shots.sample_rate[0]),
+            detector_bandwidth=shots.detector_bandwidth,
+            amplifier_bandwidth=shots.amplifier_bandwidth,
+            sample_rate=shots.sample_rate[0],
+        )
+        return np.abs(np.fft.rfft(taper * records, self.size, axis=-1)) / np.sqrt(density)
+
+    def drawn(self, segment, seed):
+        """Shares of draws in which the echo is detected, and in which another bin alarms."""
+        shots, rng, found = self.shots, np.random.default_rng(seed), []
+        beats = (
+            truth.analytic_record(shots, 0, segment, b, range_walk=False).real
+            for b in range(shots.offset.shape[1])
+        )
+        record = sum(beats) / shots.whitening[segment, 0]
+        signal, level = self.spectra(record), float(shots.threshold[0])
+        lobe = int(np.ceil(main_lobe(shots.window) * self.size / shots.window.length))
+        echo = np.zeros(signal.size, bool)
+        for k in np.flatnonzero((signal >= signal.max() / 2) & (signal > 0)):
+            echo[max(k - lobe, 0) : k + lobe + 1] = True
+        for k in np.flatnonzero(signal >= level):
+            echo[max(k - 1, 0) : k + 2] = True
+        edge = first_circular(shots.window, self.size)
+        searched = ~echo
+        searched[:edge] = searched[signal.size - edge :] = False
+        for _ in range(DRAWS // 2000):
+            above = self.spectra(record + self.noise(2000, rng)) >= level
+            found.append((above[:, echo].any(axis=1), above[:, searched].any(axis=1)))
+        return np.concatenate(found, axis=1).mean(axis=1)
+
+
+def spread(p):
+    return 5 * np.sqrt(max(p * (1 - p), 1e-3) / DRAWS)
+
+
+def random_scene(table_4_1, seed):
+    """An instrument and a target whose echo is neither sure nor lost, off DC by a main lobe."""
+    rng = np.random.default_rng((71, seed))
+    window = ("hamming", "hann", "blackman", "rectangular", "flattop")[seed % 5]
+    length, size = (256, 256) if seed % 2 else (128, 256)
+    scene = table_4_1(
+        **NATURE, window=window, fft_size=size, beamlets=1, tnr=rng.uniform(5, 8),
+        range=rng.uniform(1000, 4000), radial_velocity=rng.uniform(1, 5), leakage_floor=0.0,
+        acquisition_delay=500e-6 - length / 600e6,
+        detector_bandwidth=rng.uniform(150e6, 600e6), amplifier_bandwidth=rng.uniform(150e6, 600e6),
+    )  # fmt: skip
+    snr = shot.evaluate(scene)["snr_up"][0]
+    wanted = (scene["instrument.processing.tnr"] * 0.655 + rng.uniform(-1, 1)) ** 2 / 2
+    return scene | {"instrument.laser.power": wanted / snr}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, seed):
+    """Of lone lines; the rule for neighbours' joint chances is good to 0.005 there."""
+    scene = random_scene(table_4_1, seed)
+    instrument, outputs = Instrument.of(scene), shot.evaluate(scene)
+    pd, alarm = instrument.drawn(0, seed)
+    assert 0.02 < pd < 0.98
+    assert outputs["pd_up"][0] == pytest.approx(pd, abs=0.005 + spread(pd))
+    expected = 1 - (1 - outputs["pfa_segment"][0]) * (1 - outputs["p_leakage_up"][0])
+    assert expected == pytest.approx(alarm, abs=0.04 * alarm + spread(alarm))
+
+
+def test_an_echo_without_light_is_found_as_often_as_its_bins_alarm(table_4_1):
+    """Five bins beside each other of a Hamming window: pd goes over into pfa."""
+    scene = table_4_1(**NATURE, reflectance=1e-12, beamlets=1, fft_size=4096, tnr=6.0)
+    shots, outputs = Instrument.of(scene).shots, shot.evaluate(scene)
+    occupied = shot.find(shots)[0, 4, 0]
+    per_bin = -np.log1p(-outputs["pfa_segment"][0]) / (2045 - occupied)
+    assert outputs["pd_up"][0] == pytest.approx(occupied * per_bin, rel=0.1)
+    assert 5 <= occupied <= 7
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+@pytest.mark.parametrize("independent", [False, True])
+def test_an_echo_over_many_bins_is_detected_by_any_of_them(table_4_1, method, independent):
+    changes = {"noise_bins": "independent"} if independent else {}
+    scene = table_4_1(
+        **(NATURE | changes), range=9000.0 + 0.17 * np.arange(2), grazing_angle=np.radians(10),
+        phases="incoherent",
+    )  # fmt: skip
+    outputs = shot.evaluate(scene)
+    peak = shot.evaluate(scene | {"instrument.processing.detection": "peak_bin"})
+    assert (outputs["pd_up"] > peak["pd_up"] + 0.1).all()
+    keys = philox.point_keys(np.arange(2.0)[:, None], domain="tests", seed=3)
+    counts = simulate(scene, shot.CORE, keys=keys, batch_sizes=[DRAWS], method=method)
+    for name in ("up", "down", "shot"):
+        drawn = counts[f"n_detected_{name}"][:, 0] / DRAWS
+        assert drawn == pytest.approx(outputs[f"pd_{name}"], abs=0.01 + spread(0.5)), name
