@@ -35,7 +35,7 @@ instrument:
   processing:
     {sample_rate: 600 MHz, fft_size: 2^14, noise_bins: independent, detection: peak_bin, tnr: 8}
 target: {range: 2 km, grazing_angle: 60 deg, radial_velocity: 20 m/s, reflectance: 0.01}
-footprint: {beamlets: 9}
+footprint: {beamlets: 9, speckle: none}
 axes:
   target.range: {linear: [10 m, 5 km], number: 40}
   instrument.laser.power: [1 W, 3 W]

@@ -20,7 +20,7 @@ platform:
          initial_speed: 100 m/s, final_speed: 30 m/s}
 scanners:
   three: {kind: cone, beams: 3, half_angle: 22.5 deg, rate: 4 Hz}
-footprint: {beamlets: 7}
+footprint: {beamlets: 7, speckle: none}
 draws: {number: 2}
 """
 )

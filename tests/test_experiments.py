@@ -129,4 +129,5 @@ def test_the_published_study_is_there():
     assert {path.stem for path in SCENES} >= {
         "forest_scan", "morpheus_three_beam", "square_high_descent", "square_low_descent",
         "oblique_descent", "expanded_pattern", "gale_crater_descent", "scan_pattern_comparison",
+        "speckled_descent",
     }  # fmt: skip

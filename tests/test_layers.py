@@ -30,8 +30,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 53_035, "modules": 286, "lines of the model": 16_410, "modules of the model": 65,
-    "compiled functions": 121, "arguments of a compiled function": 10,
+    "lines": 52_652, "modules": 284, "lines of the model": 16_057, "modules of the model": 63,
+    "compiled functions": 114, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600

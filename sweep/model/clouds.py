@@ -139,6 +139,7 @@ def _groups(
 def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     """Probabilities before any draw, (n,) each."""
     up, doppler, down = found.pd[:, :, 0].T
+    both = shots.both(up, down)
     one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]
     noise = at_least_one(one, shots.counted_bins(found.exempted.T[[0, 2]]).T)
     leakage = found.leakage[:, [0, 2]]
@@ -148,7 +149,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
         "pd_up": up,
         "pd_down": down,
         "pd_doppler": doppler,
-        "pd_shot": up * down,
+        "pd_shot": both,
         "pfa_up": alarm[:, 0],
         "pfa_down": alarm[:, 1],
         "snr_up": (found.magnitude[:, 0, 0] / shots.bin_deviation) ** 2 / 2,

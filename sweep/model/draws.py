@@ -6,7 +6,7 @@ noise to the bins of the echo, alike as window and padding make it, and looks; o
 which hold noise alone, the largest magnitude is drawn from the order statistic of as many
 independent ones as alarm as often. Where effects are random, each draw has a spectrum and
 probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling`, which also says
-when to stop.
+when to stop. Echoes in developed speckle fade by factors that the segments have partly in common.
 
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
@@ -70,21 +70,24 @@ def count_by_chance(
     ``ends`` (batches + 1,) are the numbers of draws between batches; the counts, int64, are (names,
     points, batches) in the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
-    size, chances = rows.point.size, np.array(_chances(outputs))
+    size, chances = rows.point.size, _chances(outputs)
     none = False, np.empty((0, TAPS)), np.empty(0, np.int64), 0
-    _count(rows, ends, np.zeros((2, size)), chances, none, Seen.nothing(size), counts)
+    nothing = Seen.nothing(size), np.empty((0, size))
+    _count(rows, ends, np.zeros((2, size)), chances, none, *nothing, counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
     """Add the draws of some rows, in the noise of their shots, as :func:`count_by_chance` does."""
     levels = noise_levels(shots)
+    mixing = np.empty((0, shots.size)) if shots.fading is None else shots.fading.mixing()
     one = np.exp(-0.5 * levels[0] ** 2)
     for part, seen in seen_spectra(shots):
         others = at_least_one(one[part], seen.others.T)
-        chances = np.array([np.zeros_like(others), others])  # in C order
+        chances = np.array([others, *np.zeros((2, *others.shape))])  # in C order
         some = Rows(*(column[part] for column in rows))
         rule = echo_filter(shots, seen)
-        _count(some, ends, levels[:, part].copy(), chances, (True, *rule), seen, counts)
+        own = levels[:, part].copy(), chances, (True, *rule), seen, mixing[:, part].copy()
+        _count(some, ends, *own, counts)
 
 
 def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int]:
@@ -101,16 +104,24 @@ def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int
     return *noise_filter(shots.window, shots.fft_size, bins), shots.real_ends
 
 
-def _chances(outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities of detection and of a false alarm by segment (up, Doppler, down), (3, n)."""
-    found = np.stack([outputs["pd_up"], outputs["pd_doppler"], outputs["pd_down"]])
+def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Probabilities of a false alarm, and of a detection without and with one in the up segment.
+
+    By segment (up, Doppler, down), (3, 3, n).
+    """
+    up, down, both = (np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beside = np.where(up > 0, np.minimum(both / up, 1.0), down)
+        alone = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
+    doppler = np.nan_to_num(outputs["pd_doppler"])
     noise_up = outputs["pfa_segment"]
     both, one = outputs["log10_pfa_shot"], outputs["log10_pfa_segment"]
     some = np.isfinite(one)  # else the detection occupies every bin
     noise_down = np.where(some, 10 ** (both - np.where(some, one, 0.0)), 0.0)
-    up = 1 - (1 - noise_up) * (1 - outputs["p_leakage_up"])
-    down = 1 - (1 - noise_down) * (1 - outputs["p_leakage_down"])
-    return np.nan_to_num(found), np.stack([up, np.zeros_like(up), down])
+    alarm_up = 1 - (1 - noise_up) * (1 - outputs["p_leakage_up"])
+    alarm_down = 1 - (1 - noise_down) * (1 - outputs["p_leakage_down"])
+    alarms = alarm_up, np.zeros_like(alarm_up), alarm_down
+    return np.array([alarms, (up, doppler, alone), (up, doppler, beside)])
 
 
 def noise_levels(shots: Shots) -> np.ndarray:
@@ -197,17 +208,19 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(rows, ends, levels, chances, how, seen, counts):
+def _count(rows, ends, levels, chances, how, seen, mixing, counts):
     """Add the draws of each row to the counts.
 
     ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`.
     ``levels`` (2, m) are threshold and noise under the lines, over the noise of any other bin;
-    ``chances`` (2, 3, m) those of a detection, of no meaning in noise, and of a false alarm in
-    bins that are not looked at one by one.
+    ``chances`` (3, 3, m) those of a false alarm in bins that are not looked at one by one, and, of
+    no meaning in noise, of a detection without and with one in the up segment; ``mixing`` (6, m)
+    that of :meth:`sweep.model.detection.Fading.mixing`, or nothing.
     """
     noisy, weights, start, real_ends = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
+    factors = np.ones((3, _AT_ONCE))
     hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
         threshold, under_lines = levels[0, j] * levels[0, j], levels[1, j]
@@ -216,29 +229,31 @@ def _count(rows, ends, levels, chances, how, seen, counts):
             number = min(_AT_ONCE, rows.last[j] - first)
             address = rows.keys[j, 0], rows.keys[j, 1], first, number
             hits[:], alarms[:] = False, False
+            for d in range(number if mixing.shape[0] > 0 else 0):
+                factors[:, d] = fading_factors(address[:2], first + d, 0, mixing[:, j])
             for s in range(3):
                 stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
                 if noisy and weights.size > 0:
                     _cross_any(
                         address, (j, s), seen, (weights, start, real_ends), levels[:, j],
-                        noise_of_bins, hits[s],
+                        factors[s], noise_of_bins, hits[s],
                     )  # fmt: skip
                 elif noisy:
                     noise = under_lines, under_lines
                     if seen.real[j, s]:
                         noise = math.sqrt(2.0) * under_lines, 0.0
-                    _cross(address, stream, peak, ratio, noise, threshold, words, hits[s])
+                    line = ratio, noise, threshold, factors[s]
+                    _cross(address, stream, peak, line, words, hits[s])
                 else:
-                    _happen(address, STREAM_DETECTION[s], chances[0, s, j], words, hits[s])
-                if chances[1, s, j] > 0.0:
+                    either = chances[1, s, j], chances[2, s, j]
+                    _happen(address, STREAM_DETECTION[s], either, hits[0], words, hits[s])
+                if chances[0, s, j] > 0.0:
                     largest = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
-                    _happen(address, largest, chances[1, s, j], words, alarms[s])
+                    chance = chances[0, s, j], chances[0, s, j]
+                    _happen(address, largest, chance, hits[0], words, alarms[s])
                 for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
-                    leaked = seen.leaked[k]
-                    _cross(
-                        address, stream, seen.aside[k], leaked, (1.0, 1.0), threshold, words,
-                        alarms[s],
-                    )  # fmt: skip
+                    line = seen.leaked[k], (1.0, 1.0), threshold, factors[s]
+                    _cross(address, stream, seen.aside[k], line, words, alarms[s])
             for d in range(number):
                 while first + d >= ends[batch + 1]:
                     batch += 1
@@ -252,15 +267,43 @@ def _count(rows, ends, levels, chances, how, seen, counts):
 
 
 @njit(cache=True, error_model="numpy")
-def _happen(address, stream, chance, words, found):
-    """Mark the draws (key, first, number) in which something of that chance happens."""
+def fading_of_draws(key, draws, mixing, out):
+    """Factors of the strongest group, as of :func:`fading_factors`, (3, m) of m draws."""
+    for d in range(draws.size):
+        out[:, d] = fading_factors((key[0], key[1]), draws[d], 0, mixing)
+
+
+@njit(cache=True, error_model="numpy")
+def fading_factors(key, draw, group, mixing):
+    """Factors of a draw on the magnitudes of a group in the three segments; their mean square is 1.
+
+    Three standard normal amplitudes of the stream, those of the group's number, mixed.
+    """
+    stream, half = philox.STREAM_SPECKLE, math.sqrt(0.5)
+    a, b = philox.normal_pair(key[0], key[1], draw, stream, 3 * group)
+    c, d = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 1)
+    e, f = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 2)
+    near, own, far, re, im, rest = mixing
+    second = math.hypot(near * a + own * c, near * b + own * d)
+    last_re = far * a + (re * c - im * d) + rest * e
+    last_im = far * b + (re * d + im * c) + rest * f
+    return half * math.hypot(a, b), half * second, half * math.hypot(last_re, last_im)
+
+
+@njit(cache=True, error_model="numpy")
+def _happen(address, stream, chances, given, words, found):
+    """Mark the draws (key, first, number) in which something happens, by two chances.
+
+    The second is that of draws that are ``given``. These may be the ones that are marked.
+    """
     philox.fill_words(address[:3], stream, philox.FIRST_BLOCK, philox.BY_DRAW, address[3], words)
     for d in range(address[3]):
+        chance = chances[1] if given[d] else chances[0]
         found[d] |= philox.to_uniform(words[0, d]) < chance
 
 
 @njit(cache=True, error_model="numpy")
-def _cross_any(address, at, seen, rule, levels, room, found):
+def _cross_any(address, at, seen, rule, levels, factors, room, found):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold."""
     begin, count = seen.start[at], seen.bins[at]
     ratios, echo = seen.ratios[begin : begin + count], seen.echo[begin : begin + count]
@@ -277,7 +320,7 @@ def _cross_any(address, at, seen, rule, levels, room, found):
         draw_noise(draw, ECHO, seen.low[at] + first, last - first + 1, rule, room)
         for i in range(first, last + 1):
             re, im = under_lines * room[0, i - first], under_lines * room[1, i - first]
-            re += ratios[i]
+            re += ratios[i] * factors[d]
             found[d] |= echo[i] and re * re + im * im >= threshold * threshold
 
 
@@ -319,16 +362,21 @@ def draw_noise(draw, number, low, count, rule, room):
         room[0, i], room[1, i] = re, im
 
 
-@njit(cache=True, error_model="numpy")
-def _cross(address, stream, index, ratio, deviation, threshold, words, found):
-    """Mark the draws in which a bin of that |X| / sigma, with its noise, reaches the threshold.
+def _cross(address, stream, index, line, words, found):
+    """Mark the draws in which a bin, with its noise, reaches the threshold.
 
-    The threshold is a power; the noise, of these deviations in the signal's phase and across, is
-    pair `index` of the stream.
+    Parameters
+    ----------
+    line : tuple
+        |X| / sigma; the noise's deviations in its phase and across; the threshold, a power;
+        factors on |X|, draw by draw.
+    index : int
+        Pair of the stream that the noise is.
     """
+    ratio, deviation, threshold, factors = line
     philox.fill_words(address[:3], stream, index >> 1, philox.BY_DRAW, address[3], words)
     lane = 2 * (index & 1)
     for d in range(address[3]):
         re, im = philox.to_normals(words[lane, d], words[lane + 1, d])
-        re, im = ratio + re * deviation[0], im * deviation[1]
+        re, im = ratio * factors[d] + re * deviation[0], im * deviation[1]
         found[d] |= re**2 + im**2 >= threshold

@@ -7,7 +7,8 @@ they are. Every sample is addressed by point, draw, segment and place (:mod:`swe
 The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, with all
 effects. Where beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
-is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make.
+is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make. In
+developed speckle all bins of a draw fade together.
 A phase common to all bins makes no difference to circular noise and is left out.
 
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
@@ -27,6 +28,7 @@ from scipy import fft
 
 from sweep.model import waveform
 from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
+from sweep.model.draws import fading_of_draws
 from sweep.model.estimators import (
     ESTIMATORS,
     PEAK_BIN,
@@ -140,6 +142,14 @@ def noise_of(
     return noise
 
 
+def fading_of(shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Factors on point i's signal by which it fades, (3, m) by segment; 1 where it does not."""
+    factors = np.ones((3, draws.size))
+    if shots.fading is not None:
+        fading_of_draws(key, draws, np.ascontiguousarray(shots.fading.mixing()[:, i]), factors)
+    return factors
+
+
 class View(NamedTuple):
     """A shot, and how it is looked at."""
 
@@ -232,10 +242,11 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nothing = np.zeros(draws.size, np.int64)
     found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3
     searched = 0
+    factors = fading_of(view.shots, view.i, key=view.key, draws=draws)
     for s, signal in enumerate(view.signals):
         if signal is not None:
             noise = noise_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
-            spectra = signal.spectrum + noise
+            spectra = signal.spectrum * factors[s][:, None] + noise
             found[s] = look(spectra, signal, view)
             inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
             searched += inside - max(signal.last - signal.first + 1, 0)

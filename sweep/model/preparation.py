@@ -19,6 +19,7 @@ import numpy as np
 from sweep.model import alarms, beam, detection, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import Fading
 from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
 from sweep.model.window import Window, canonical_name, window
@@ -143,6 +144,8 @@ class Shots:
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
     """Whether the record is I and Q, and its spectrum has signed bins and no images."""
+    fading: Fading | None = None
+    """Of echoes in developed speckle."""
     image: bool = False
     """Whether the lines' images at negative frequencies are summed."""
     leakage: bool = False
@@ -231,6 +234,13 @@ class Shots:
         floor = detection.quiet_below(chance=self.leakage_tolerance, level=level, bins=bins)
         return np.where(given == AUTOMATIC, floor, given)
 
+    def both(self, up: np.ndarray, down: np.ndarray) -> np.ndarray:
+        """Chance that up and down segment are detected, both, by their own chances; (..., n)."""
+        if self.fading is None:
+            return up * down
+        level = self.threshold / self.line_deviation
+        return detection.fading_together(up, down, level, np.abs(self.fading.over))
+
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
         energy = np.asarray(self.window.energy)
         return link.bin_deviation(noise_variance=variance, window_energy=energy)
@@ -295,15 +305,18 @@ class Shots:
         return alarms.neighbour_correlation(self.window, self.fft_size)
 
     @property
-    def echo_rule(self) -> tuple[int, int, np.ndarray]:
+    def echo_rule(self) -> tuple[int, int, np.ndarray, float]:
         """Of detection: :attr:`real_ends`; half of a main lobe [bins]; rule for pairs of bins.
 
-        0 and nothing where the largest bin alone detects.
+        0 and nothing where the largest bin alone detects. At the end the correlation of neighbours'
+        noise where echoes fade, else -1.
         """
+        fades = -1.0 if self.fading is None else self.correlation
         if self.detection == "peak_bin":
-            return self.real_ends, 0, np.empty((3, 0))
+            return self.real_ends, 0, np.empty((3, 0)), fades
         lobe = main_lobe(self.window) * self.fft_size / self.window.length
-        return self.real_ends, math.ceil(lobe), alarms.pair_nodes(self.correlation)
+        pairs = alarms.pair_nodes(self.correlation)
+        return self.real_ends, math.ceil(lobe), pairs, fades
 
     def counted_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)

@@ -17,6 +17,10 @@ strongest group is detected, and a false alarm raised, in the very draws that ar
 The interpolated range is put right for what range walk moves it by, v_r (T_w + 2 t_0), by the
 velocity that is measured with it.
 
+Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
+segments, which share what their speckles do; against probabilities the down segment's chance
+follows from the up segment's draw, and a detected peak's power is drawn for each segment alone.
+
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
 spread, of which the instrument is taken to know the size (:func:`interpolation.spread_error`).
 
@@ -39,6 +43,7 @@ from sweep.model.draws import (
     Seen,
     draw_noise,
     echo_filter,
+    fading_factors,
     is_noisy,
     noise_levels,
     seen_spectra,
@@ -197,6 +202,11 @@ class Known(NamedTuple):
     """(n, 3): chance of a false alarm in bins that are not drawn one by one."""
     at_start: np.ndarray
     """(n,): as of :func:`sweep.model.pairing.confirm`."""
+    beside: np.ndarray
+    """(n, 2, most): chance of a group in the down segment, where the up segment's of the same
+    number is missed, or detected."""
+    mixing: np.ndarray
+    """(n, 6), as of :meth:`sweep.model.detection.Fading.mixing`; or (n, 0)."""
 
 
 class Drawn(NamedTuple):
@@ -229,8 +239,19 @@ def _known(shots: Shots, found: Groups) -> Known:
     return Known(
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
-        np.broadcast_to(carrier / (carrier + shots.bandwidth / 2), n).copy(),
+        np.broadcast_to(carrier / (carrier + shots.bandwidth / 2), n).copy(), _beside(shots, found),
+        np.empty((n, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
+
+
+def _beside(shots: Shots, found: Groups) -> np.ndarray:
+    """Chances of groups in the down segment, as of :class:`Known`."""
+    up, down = found.pd[:, 0], found.pd[:, 2]
+    both = shots.both(up.T, down.T).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        detected = np.where(up > 0, np.minimum(both / up, 1.0), down)
+        missed = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
+    return np.stack([missed, detected], axis=1)
 
 
 def beamlet_lines(shots: Shots) -> np.ndarray:
@@ -284,7 +305,7 @@ def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     right = abs(off) <= reach * metre
     right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
     signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
-    pd = found.pd[point, 0, group[..., 0]] * found.pd[point, 2, group[..., 2]]
+    pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
     # What the ground came nearer by within the record, which the measured velocity tells.
     distance[..., FINE] += velocity[..., FINE] * walk[..., 0]
@@ -303,6 +324,7 @@ def _draw(keys, how, known, seen, tables, out):
     n, draws, most = out.flags.shape
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     number, pairs = np.empty(3, np.int64), np.empty((most + 1, 4), np.int64)
+    up = np.zeros(most, np.bool_)
     for i in range(n):
         for d in range(draws):
             address = keys[i, 0], keys[i, 1], how.first_draw + d
@@ -311,7 +333,7 @@ def _draw(keys, how, known, seen, tables, out):
                     number[s], which[s, 0] = 1, ABSENT
                 else:
                     number[s] = draw_peaks(
-                        address, (i, s), how, known, seen, tables, peaks[s], which[s]
+                        address, (i, s), how, known, seen, tables, peaks[s], which[s], up
                     )
             confirmed, count = pair_peaks(
                 peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
@@ -335,7 +357,7 @@ def _draw(keys, how, known, seen, tables, out):
 
 
 @njit(cache=True, error_model="numpy")
-def draw_peaks(address, at, how, known, seen, tables, peaks, which):
+def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
     """Peaks of one segment in one draw: which groups are detected, where, and one false peak.
 
     Parameters
@@ -348,6 +370,8 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
         :class:`How`, :class:`Known`, :class:`sweep.model.draws.Seen`, and the interpolator.
     peaks, which : (most + 1, 4) float64, (most + 1,) int64
         Result: peaks by their fields, and their groups.
+    up : (most,) bool
+        Groups that are detected in the up segment, which comes first.
 
     Returns
     -------
@@ -365,14 +389,23 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which):
         elif how.noisy:
             there = look(address, at, g, how, known, seen, tables, peaks[count])
         else:
-            there = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g) < known.pd[i, s, g]
+            chance = known.pd[i, s, g]
+            if s == 2:
+                chance = known.beside[i, 1 if up[g] else 0, g]
+            uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
+            there = uniform < chance
             if there:
                 m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
                 delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
+                if known.mixing.shape[1]:  # powers above the threshold are exponential
+                    power = 2.0 * under_lines * under_lines + ratio * ratio
+                    ratio = math.sqrt(beta * beta - power * math.log(uniform / chance))
                 error = sub_bin_error(delta, ratio / under_lines, tables)
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
+        if s == 0:
+            up[g] = there
         if there:
             which[count] = g
             count += 1
@@ -403,8 +436,10 @@ def look(address, at, g, how, known, seen, tables, peak):
     """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
-    centre, m = known.bins[i, s, BIN, g], known.magnitude[i, s, g] / sigma
-    stream = philox.STREAM_NOISE[s]
+    centre, stream = known.bins[i, s, BIN, g], philox.STREAM_NOISE[s]
+    m = known.magnitude[i, s, g] / sigma
+    if known.mixing.shape[1]:
+        m = m * fading_factors((a, b), draw, g, known.mixing[i])[s]
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
     if is_end(centre, how.ends):
@@ -446,11 +481,14 @@ def look_at_all(address, at, g, how, known, seen, tables, peak):
     first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
     first, last = echo_of(run, first, last, beta, how.beside)
     count, best = last - first + 1, 0
-    room = np.empty((4, count + how.rule[0].shape[1]))
+    factor, room = 1.0, np.empty((4, count + how.rule[0].shape[1]))
+    if known.mixing.shape[1]:
+        factor = fading_factors((a, b), draw, g, known.mixing[i])[s]
     numbers = ECHO * (1 + g)
     draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
     for k in range(count):
-        re, im = run[first + k] + under_lines * room[0, k], under_lines * room[1, k]
+        re = run[first + k] * factor + under_lines * room[0, k]
+        im = under_lines * room[1, k]
         room[0, k] = math.hypot(re, im)
         best = k if room[0, k] > room[0, best] else best
     middle, spread = room[0, best], known.spread[i, s, g]

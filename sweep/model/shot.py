@@ -146,6 +146,9 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
+    pd_shot, miss_shot = shots.both(pd[0], pd[2]), miss[0] + pd[0] * miss[2]
+    if shots.fading is not None:
+        miss_shot = miss[0] + (pd[0] - pd_shot)
     by_segment = {"pd": pd, "miss": miss, "snr": snr}
     results = {
         **{
@@ -153,8 +156,8 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
             for name, values in by_segment.items()
             for s, segment in enumerate(waveform.SEGMENTS)
         },
-        "pd_shot": pd[0] * pd[2],
-        "miss_shot": miss[0] + pd[0] * miss[2],
+        "pd_shot": pd_shot,
+        "miss_shot": miss_shot,
         **alarms,
         "p_leakage_up": leakage[0],
         "p_leakage_down": leakage[2],

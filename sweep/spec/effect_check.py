@@ -78,6 +78,14 @@ NEEDS = (
         if_on=True,
     ),
     Need(
+        "target.roughness",
+        lambda roughness: roughness > 0,
+        "footprint.speckle",
+        lambda law: law == "developed",
+        "says how rough the target is, which developed speckle takes to be without limit",
+        "set footprint.speckle: none",
+    ),
+    Need(
         "target.sun_distance",
         lambda distance: (distance > 0) & (distance < SUN_RADIUS),
         "instrument.laser.wavelength",

@@ -14,6 +14,8 @@ from sweep.spec.mistakes import ABSENT, Finding, Location
 
 OF_PLANES = ("line", "square")
 """Patterns of beamlets that stand for a plane's slope."""
+SPECKLE = "footprint.speckle"
+"""Of the footprint what moves no beamlet."""
 STORED = frozenset(
     name
     for table in (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
@@ -37,6 +39,8 @@ _REASONS = {
 
 def why_not(path: str) -> tuple[str, str]:
     """Why an axis can't set a parameter, and a remedy; empty where it can."""
+    if path == SPECKLE:
+        return "", ""
     return next((why for start, why in _REASONS.items() if path.startswith(start)), ("", ""))
 
 

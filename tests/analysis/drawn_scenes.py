@@ -59,7 +59,7 @@ MAPPING = {
             "along": ["2 deg", "-2 deg"],
         },
     },
-    "footprint": {"beamlets": 19},
+    "footprint": {"beamlets": 19, "speckle": "none"},
     "draws": {"number": 3, "returns": 3},
     "navigation": {"ground_slope": 0.1, "test_level": 0},
     "storage": {"block_shots": 64, "block_draws": 2},

@@ -57,7 +57,7 @@ def study(axes, **sections) -> Spec:
         "title": "Small",
         "instrument": INSTRUMENT,
         "target": TARGET,
-        "footprint": {"beamlets": 9},
+        "footprint": {"beamlets": 9, "speckle": "none"},
         "axes": axes,
     }
     return Spec.from_mapping(mapping | sections)

@@ -27,7 +27,7 @@ def speckled(tmp_path_factory):
         stored(
             tmp_path_factory.mktemp("speckled"),
             {"target.range": ["500 m", "3 km", "6 km"]},
-            footprint={"beamlets": 1},
+            footprint={"beamlets": 1, "speckle": "none"},
             target=study({}).to_yaml_mapping()["target"] | {"roughness": "10 um"},
             draws={"number": 400, "batch": 400},
             seed=5,
@@ -132,7 +132,9 @@ def test_the_roc_of_a_speckled_target_is_swerlings(speckled):
     point = speckled.sweep.sel(range="3 km")
     pfa = np.logspace(-14, -2, 5)
     curve = point.sweep.roc(pfa, segment="up", draws=4000)
-    smooth = study({}, footprint={"beamlets": 1}).parameters() | {"target.range": 3000.0}
+    smooth = study({}, footprint={"beamlets": 1, "speckle": "none"}).parameters() | {
+        "target.range": 3000.0
+    }
     snr = evaluate(smooth)["snr_up"].item()
     expected = pfa ** (1 / (1 + snr))
     assert curve.simulated
@@ -278,7 +280,9 @@ def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
     windows = {"instrument.processing.window": ["hann", "hamming"]}
     axes = {"target.range": ["1003 m", "4001 m"], **windows}
     target = study({}).to_yaml_mapping()["target"] | {"grazing_angle": "90 deg"}
-    dataset = sweep.open(stored(tmp_path, axes, footprint={"beamlets": 1}, target=target))
+    dataset = sweep.open(
+        stored(tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, target=target)
+    )
     place, speed = dataset.sweep.range_error(), dataset.sweep.velocity_error()
     assert place.bound.chunks is not None
     for i, distance in enumerate((1003.0, 4001.0)):

@@ -139,7 +139,7 @@ SMOOTH = {**INSTRUMENT, "processing": INSTRUMENT["processing"] | {"window": "fla
 @pytest.mark.parametrize("step,error", [(1000, 40.0), (250, 2.5)])
 def test_the_maximum_range_is_the_root_of_the_model_itself(step, error, tmp_path):
     axes = {"target.range": {"step": ["1 km", "9 km", f"{step} m"]}}
-    sections = {"instrument": SMOOTH, "footprint": {"beamlets": 1}}
+    sections = {"instrument": SMOOTH, "footprint": {"beamlets": 1, "speckle": "none"}}
     found = sweep.open(stored(tmp_path, axes, **sections)).sweep.maximum_range().compute()
     parameters = study({}, **sections).parameters()
 
@@ -162,7 +162,9 @@ def test_a_zipped_axis_is_walked_after_a_selection(tmp_path):
             ]
         }
     }
-    dataset = sweep.open(stored(tmp_path, axes, footprint={"beamlets": 1}, instrument=SMOOTH))
+    dataset = sweep.open(
+        stored(tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, instrument=SMOOTH)
+    )
     with pytest.raises(ValueError, match="select by the other coordinates along 'cut'"):
         dataset.sweep.maximum_range()
     part = dataset.sweep.sel(grazing_angle="15 deg")

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 #: another job in the place of a killed one.
 SLOW = {
     **STUDY,
-    "footprint": {"beamlets": 109},
+    "footprint": {"beamlets": 109, "speckle": "none"},
     "draws": {"number": 500_000, "method": "noise", "batch": 1000},
     "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 20}},
     "storage": {"block_points": 1},

@@ -432,7 +432,7 @@ def leg(arena: Arena, scheduler: str | None, command: str = "run") -> Callable[[
 
 def other():
     """The study that takes the place of the small one by --overwrite."""
-    return small(footprint={"beamlets": 7})
+    return small(footprint={"beamlets": 7, "speckle": "none"})
 
 
 def set_up(arena: Arena, command: str, undisturbed: Path, dice: random.Random) -> None:

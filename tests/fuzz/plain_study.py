@@ -19,7 +19,7 @@ INSTRUMENT = {
 def plain(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str, Any]:
     """A study of one point with changes by dotted path, and sections added."""
     target = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.1}
-    footprint = {"beamlets": 7}
+    footprint = {"beamlets": 7, "speckle": "none"}
     written = {"title": "Plain", "instrument": INSTRUMENT, "target": target, "footprint": footprint}
     mapping = copy.deepcopy(written | sections)
     for path, value in (changes or {}).items():

@@ -186,7 +186,7 @@ def flight_in(instrument, turn, shift):
             "attitude": {"kind": "nadir", "heading": heading},
         },
         "scanners": {"cone": {"kind": "cone", "beams": 5, "half_angle": "9 deg", "rate": "5 Hz"}},
-        "footprint": {"beamlets": 7},
+        "footprint": {"beamlets": 7, "speckle": "none"},
         "accuracy": {"tolerance": 0},
     }  # fmt: skip
 

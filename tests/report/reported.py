@@ -9,7 +9,7 @@ GRID = {
     "question": "How far does more power reach?",
     "instrument": "instruments/table_4_1.yaml",
     "target": {"radial_velocity": "150 m/s", "reflectance": 0.1},
-    "footprint": {"beamlets": 9},
+    "footprint": {"beamlets": 9, "speckle": "none"},
     "axes": {
         "instrument.laser.power": ["1 W", "3 W"],
         "target.range": {"linear": ["20 m", "12 km"], "number": 1201},
@@ -38,7 +38,7 @@ SCENE = {
                  "initial_speed": "60 m/s", "final_speed": "20 m/s"},
     },
     "scanners": {"four": {"kind": "corners", "angle": "22.5 deg", "rate": "8 Hz"}},
-    "footprint": {"beamlets": 7},
+    "footprint": {"beamlets": 7, "speckle": "none"},
     "draws": {"number": 2},
     "axes": {"instrument.telescope.optical_efficiency": [1, 0.01]},
 }  # fmt: skip

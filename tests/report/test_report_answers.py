@@ -13,7 +13,7 @@ from sweep.tasks import driver
 
 SPECKLED = GRID | {
     "target": {"radial_velocity": "150 m/s", "reflectance": 0.1, "roughness": "1 um"},
-    "footprint": {"beamlets": 1},
+    "footprint": {"beamlets": 1, "speckle": "none"},
     "draws": {"number": 60},
     "axes": {"target.range": {"step": ["500 m", "6 km", "500 m"]},
              "target.grazing_angle": ["30 deg", "90 deg"]},

@@ -13,7 +13,7 @@ from sweep.spec.reading import read_document
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SHIPPED = (
     "expanded_pattern", "forest_scan", "morpheus_three_beam", "oblique_descent",
-    "scan_pattern_comparison", "square_high_descent", "square_low_descent",
+    "scan_pattern_comparison", "speckled_descent", "square_high_descent", "square_low_descent",
 )  # fmt: skip
 GALE = EXPERIMENTS / "gale_crater_descent.yaml"
 

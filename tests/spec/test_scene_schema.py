@@ -115,7 +115,8 @@ def test_a_target_is_not_held_to_a_scene_nor_a_scene_to_a_target(validator):
 def test_the_shipped_scenes_are_those_of_the_thesis_and_two_more():
     assert {path.stem for path in SCENES} == {
         "expanded_pattern", "forest_scan", "gale_crater_descent", "morpheus_three_beam",
-        "oblique_descent", "scan_pattern_comparison", "square_high_descent", "square_low_descent",
+        "oblique_descent", "scan_pattern_comparison", "speckled_descent",
+        "square_high_descent", "square_low_descent",
     }  # fmt: skip
     for path in SCENES:
         if path.stem != "gale_crater_descent":

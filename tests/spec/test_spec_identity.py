@@ -120,6 +120,7 @@ def other_value(path):
         "instrument.processing.bins_counted": "all",
         "target.reflectance_law": "thesis",
         "footprint.phases": "coherent",
+        "footprint.speckle": "developed",
         "target.grazing_angle": "14 deg",
         "instrument.laser.beam_divergence": "101 urad",
         "instrument.laser.wavelength": "1551 nm",

@@ -20,7 +20,7 @@ SCENE: dict[str, Any] = {
         }
     },
     "scanners": {"three": {"kind": "cone", "beams": 3, "half_angle": "20 deg", "rate": "2 Hz"}},
-    "footprint": {"beamlets": 7},
+    "footprint": {"beamlets": 7, "speckle": "none"},
 }
 """A plane under a lidar that descends for 10 s."""
 

@@ -21,6 +21,7 @@ BASE: dict[str, Any] = {
         "processing": {"sample_rate": "600 MHz", "fft_size": "2^17", "tnr": 10},
     },
     "target": {"range": "2 km", "grazing_angle": "90 deg", "reflectance": 0.1},
+    "footprint": {"speckle": "none"},
 }
 
 

@@ -34,7 +34,7 @@ STUDY = {
         "radial_velocity": "20 m/s",
         "reflectance": 0.02,
     },
-    "footprint": {"beamlets": 9},
+    "footprint": {"beamlets": 9, "speckle": "none"},
     "axes": {
         "instrument.laser.power": ["1 W", "3 W"],
         "target.range": {"linear": ["10 m", "5 km"], "number": 12},

@@ -37,7 +37,7 @@ SCENE = {
         "three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": "4 Hz"},
         "line": {"kind": "line", "half_angle": "10 deg", "line_rate": "1 Hz", "rate": "8 Hz"},
     },
-    "footprint": {"beamlets": 7},
+    "footprint": {"beamlets": 7, "speckle": "none"},
     "draws": {"number": 5, "returns": 3},
     "seed": 3,
     "storage": {"block_shots": 60, "block_draws": 2},

@@ -256,7 +256,7 @@ def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))
     monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
-    spec = small(footprint={"beamlets": 7}, accuracy={"line_error": 1e-9})
+    spec = small(footprint={"beamlets": 7, "speckle": "none"}, accuracy={"line_error": 1e-9})
     measured(spec, store_path=tmp_path / "a.zarr", points=6, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load()
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
@@ -272,7 +272,7 @@ def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
         draws={"number": 20},
         target=STUDY["target"] | {"roughness": "10 um", "range": "2 km"},
         axes={"target.range": ["2 km", "3 km", "4 km", "5 km"]},
-        footprint={"beamlets": 7},
+        footprint={"beamlets": 7, "speckle": "none"},
     )
     measured(spec, store_path=tmp_path / "a.zarr", points=4, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load().set_index(rung="rung")
@@ -306,7 +306,7 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
     """What is computed beside a part takes part in its time, and changes nothing it sees."""
     monkeypatch.setattr(flight_bench, "TILE_SHOTS", 32)
-    bench = FlightBench(small_scene(footprint={"beamlets": 7}), 400)
+    bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)
     parts = bench.parts(64)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
     stretches = [bench._of(int(part[0])) for part in parts]
@@ -338,7 +338,9 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     """Statistics of a trial against those of the flight's own machinery, more rays and all."""
     from sweep.tasks.calling import TILE_SHOTS
 
-    spec = small_scene(footprint={"beamlets": rays}, accuracy={"tolerance": 1e-6})
+    spec = small_scene(
+        footprint={"beamlets": rays, "speckle": "none"}, accuracy={"tolerance": 1e-6}
+    )
     bench = FlightBench(spec, 10_000)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     part = bench.parts(1)[0]

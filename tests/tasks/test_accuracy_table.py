@@ -13,7 +13,7 @@ from sweep.tasks.accuracy_table import accuracy_table, rays_table
 
 ROUGH = {
     "target": STUDY["target"] | {"roughness": "10 um"},
-    "footprint": {"beamlets": 1},
+    "footprint": {"beamlets": 1, "speckle": "none"},
     "draws": {"limit": 400, "batch": 20},
 }
 
@@ -98,7 +98,7 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     laser = {"wavelength": "1550 nm", "power": "1 W", "beam_divergence": "50 mrad"}
     spec = small(
         instrument=STUDY["instrument"] | {"laser": laser},
-        footprint={"beamlets": "auto", "phases": "incoherent"},
+        footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"},
         axes={"target.grazing_angle": ["0.5 deg", "89 deg", "90 deg"]},
         target=STUDY["target"] | {"range": "10 km"},
     )
@@ -108,5 +108,5 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     assert row.where == "grazing_angle 0.5 deg"
     said = CliRunner().invoke(main, ["status", str(store)]).output
     assert "What more beamlets may change" in said and "2 of 3" in said
-    met = small(footprint={"beamlets": "auto", "phases": "incoherent"}, axes={})
+    met = small(footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={})
     assert rays_table(quiet(met, tmp_path / "met.zarr").store) == []

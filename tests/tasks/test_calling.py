@@ -69,7 +69,11 @@ def test_every_point_lies_in_one_tile_that_has_its_parameters():
 
 def test_few_points_tell_what_all_of_a_tile_call_for():
     """They settle only tiles that keep all that there is."""
-    spec = small(axes=WIDE, footprint={"phases": "incoherent"}, accuracy={"tolerance": 1e-2})
+    spec = small(
+        axes=WIDE,
+        footprint={"phases": "incoherent", "speckle": "none"},
+        accuracy={"tolerance": 1e-2},
+    )
     calling = Calling(spec, Grid(spec))
     tiles = np.arange(calling.tiles.number)
     kept = np.zeros((len(NAMES), tiles.size), bool)
@@ -123,7 +127,7 @@ def test_what_is_simulated_does_not_depend_on_blocks():
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(tolerance, phases):
-    footprint = {"beamlets": 9, "phases": phases}
+    footprint = {"beamlets": 9, "phases": phases, "speckle": "none"}
     sections = {"axes": WIDE, "footprint": footprint, "storage": {"block_points": 65536}}
     called = GridStudy(small(**sections, accuracy={"tolerance": tolerance})).evaluate(0)
     every = GridStudy(small(**sections, effects=FORCED, accuracy={"tolerance": 0})).evaluate(0)
@@ -167,7 +171,7 @@ def test_a_plan_is_made_once_for_a_tile(monkeypatch):
 def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
     """Its beamlets add as powers; rough ones' at random."""
     axes = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}
-    footprint = {"beamlets": 7, "phases": "incoherent"}
+    footprint = {"beamlets": 7, "phases": "incoherent", "speckle": "none"}
     draws = {"number": 50, "batch": 50}
     beside = small(axes=axes, footprint=footprint, draws=draws)
     alone = small(axes=axes | {"target.roughness": ["0 um"]}, footprint=footprint, draws=draws)

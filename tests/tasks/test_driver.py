@@ -82,7 +82,7 @@ ADAPTIVE = {
     "draws": {"limit": 60, "batch": 20},
     "accuracy": {"tolerance": 0.09, "confidence": 0.9},
     "target": STUDY["target"] | {"roughness": "10 um"},
-    "footprint": {"beamlets": 1},
+    "footprint": {"beamlets": 1, "speckle": "none"},
     "effects": {"signal_shot_noise": "on"},  # which tiles of several powers may keep for all
 }
 """Drawn until pd is known within 0.09, but 60 times at most."""

@@ -190,7 +190,10 @@ def test_points_whose_effects_are_others_in_the_larger_grid_are_computed_anew(tm
 
 
 COARSE = {**AXES, RANGE: ["1 km", "3 km"]}
-ROUGH = {"target": STUDY["target"] | {"roughness": "10 um"}, "footprint": {"beamlets": 1}}
+ROUGH = {
+    "target": STUDY["target"] | {"roughness": "10 um"},
+    "footprint": {"beamlets": 1, "speckle": "none"},
+}
 CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
 """Errors that are numbers, and do not follow the tolerance."""
 

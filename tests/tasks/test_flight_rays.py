@@ -47,7 +47,10 @@ DETECTED = "pd_up", "pd_doppler", "pd_down"
 
 def facets(tolerance=1e-2, beamlets="auto", **changes):
     """The flight at a tolerance."""
-    own = {"footprint": {"beamlets": beamlets}, "accuracy": {"tolerance": tolerance}}
+    own = {
+        "footprint": {"beamlets": beamlets, "speckle": "none"},
+        "accuracy": {"tolerance": tolerance},
+    }
     return SceneSpec.from_mapping(OVER_FACETS | own | changes, base=".")
 
 

@@ -160,7 +160,7 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
 def test_another_geometry_is_cast_anew(undisturbed, tmp_path):
     first = small_scene()
     for changes in (
-        {"footprint": {"beamlets": 8}},
+        {"footprint": {"beamlets": 8, "speckle": "none"}},
         {"platform": SCENE["platform"] | {"jitter": "10 urad"}},
         {"platform": SCENE["platform"] | {"lever_arm": ["0 m", "0 m", "1 m"]}},
     ):

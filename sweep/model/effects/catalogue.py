@@ -42,6 +42,7 @@ EFFECTS: tuple[Effect, ...] = (
     saturation.SATURATION,
     sidelobes.IMAGE,
     sidelobes.LEAKAGE,
+    speckle.FADING,
     pointing_jitter.POINTING_JITTER,
     speckle.SPECKLE,
     scintillation.SCINTILLATION,

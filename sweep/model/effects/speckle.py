@@ -23,6 +23,17 @@ alike than they are.
 
 It acts on the lines' amplitudes alone, before their spectrum; the mean echo, and so its shot
 noise, stays.
+
+**Fading**: developed speckle (kappa = 0) without draws, the default for surfaces. A sum of circular
+complex Gaussian amplitudes is one itself, in every bin, however wide the footprint; its mean power
+is what beamlets make that add as powers. A bin then crosses the threshold with Swerling's first
+chance, and two segments' bins as two correlated ones do. The segments share a speckle as far as it
+has not moved on between them: their amplitudes have the correlation
+
+    mu(dt) = sum_b P_b exp(2 pi i f beta_b dt) / sum_b P_b
+
+over the beamlets' powers, which is what Doppler shifts that differ by 1/dt or more destroy. It acts
+on the detection; leaked signal keeps its mean power.
 """
 
 import math
@@ -32,14 +43,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model import philox
+from sweep.model.detection import Fading
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
 
 _ROUGHNESS = "target.roughness"
+_LAW = "footprint.speckle"
 _FURTHEST = 5.0
 """Root mean squares of a bin's diffuse part that the largest of some bins keeps to but in one of a
 million draws."""
+
+
+_OF_DIRECT = (
+    "speckle is simulated for homodyne and heterodyne receivers: what direct detection sees "
+    "depends on how many speckles its aperture averages, of which nothing is known"
+)
+_AT_ONCE = 4096
+"""Footprints that are looked at together."""
 
 
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -134,10 +155,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
         which beamlets interfere: that is no factor on each beamlet's own echo.
     """
     if shots.architecture == "direct":
-        raise ValueError(
-            "speckle is simulated for homodyne and heterodyne receivers: what direct detection "
-            "sees depends on how many speckles its aperture averages, of which nothing is known"
-        )
+        raise ValueError(_OF_DIRECT)
     share = coherent_share(
         roughness=scene.parameters[_ROUGHNESS],
         wavelength=scene.parameters["instrument.laser.wavelength"],
@@ -168,6 +186,60 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
         incoherent=False,
         pedestal=shots.pedestal * brighter,
     )
+
+
+def fading_size(points: Points) -> Size | None:
+    """Change by taking the mean power for the power: pd is another law."""
+    smooth = points.by_roots or points.architecture == "direct"
+    return None if smooth or points.word(_LAW) == "none" else Size(magnitude=1.0)
+
+
+def fade(shots: Shots, scene: Scene) -> Shots:
+    """Detection in developed speckle, where the spec says that beamlets have no phases in common.
+
+    Raises
+    ------
+    ValueError
+        Of direct detection, as of :func:`draw`.
+    """
+    if shots.architecture == "direct":
+        raise ValueError(_OF_DIRECT)
+    if not shots.incoherent:
+        return shots
+    turn = np.asarray(shots.carriers[0] * shots.duration)  # [cycles per beta]
+    whole, rows = turn.ndim == 0, shots.row
+    found = np.ones((2, len(shots.doppler) if whole else shots.size), complex)
+    share = shots.amplitude**2
+    share = share / np.maximum(share.sum(axis=1), _SMALLEST)[:, None]
+    if shots.doppler.any():
+        for first in range(0, found.shape[1], _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            row = some if whole else rows[some]
+            cycles = shots.doppler[row] * (turn if whole else turn[some, None])
+            one = np.exp(2j * np.pi * cycles)
+            found[0, some] = (share[row] * one).sum(axis=1)
+            found[1, some] = (share[row] * one * one).sum(axis=1)
+    return replace(shots, fading=Fading(*(found[:, rows] if whole else found)))
+
+
+FADING = Effect(
+    name="fading",
+    about="developed speckle of a rough surface, in closed form",
+    stage="detection",
+    size=fading_size,
+    act=fade,
+    needs=("footprint", "doppler_spread"),
+    parameters=(
+        Parameter(
+            path=_LAW,
+            about="Echo of surfaces that are rough against the wavelength: developed, it fades as "
+            "speckle does, or none, it has its mean power. Coherent phases are those of a smooth "
+            "surface and do not fade; where target.roughness says how rough, take none",
+            default="developed",
+            options=("developed", "none"),
+        ),
+    ),
+)
 
 
 SPECKLE = Effect(

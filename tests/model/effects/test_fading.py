@@ -1,0 +1,199 @@
+"""Developed speckle in closed form: against draws, printed values, records, and flights' draws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sweep.model.returns as returns
+from sweep.model import philox
+from sweep.model.alarms import neighbour_correlation
+from sweep.model.detection import Fading, fading_together, found_pair
+from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
+from sweep.model.effects.catalogue import CORE
+from sweep.model.marcum import marcum_q1
+from sweep.model.outputs import DRAW_OUTPUTS
+from sweep.model.realisations import realise
+from sweep.model.shot import find, prepare, statistics
+from sweep.model.window import samples, window
+
+FADING = (*CORE, "fading")
+COUNTS = list(DRAW_OUTPUTS)
+
+
+def amplitudes(rng, size):
+    """Standard circular complex normal numbers."""
+    return (rng.normal(size=size) + 1j * rng.normal(size=size)) / np.sqrt(2)
+
+
+def of_one_bin(magnitude, level):
+    """Chances of a bin in noise of power 1 to be found, and to be missed."""
+    rule = 0, 0, np.empty((3, 0)), 0.0
+    return found_pair(np.array([magnitude]), np.ones(1, bool), 0, 5, rule, (np.sqrt(0.5), level))
+
+
+def db(value):
+    return 10 ** (value / 10)
+
+
+@pytest.mark.parametrize("snr", [0, 10, 20, 30])
+@pytest.mark.parametrize("alike", [0.0, 0.5, 1.0])
+def test_closed_forms_are_the_mean_over_a_million_draws(snr, alike):
+    rng, number, level = np.random.default_rng(snr + int(10 * alike)), 1_000_000, 3.0
+    first = amplitudes(rng, number)
+    second = alike * first + np.sqrt(1 - alike**2) * amplitudes(rng, number)
+    root = np.sqrt(db(snr))
+    up = np.abs(root * first + amplitudes(rng, number)) > level
+    down = np.abs(0.7 * root * second + amplitudes(rng, number)) > level
+    pd, weaker = of_one_bin(root, level)[0], of_one_bin(0.7 * root, level)[0]
+    both = fading_together(pd, weaker, np.sqrt(2) * level, np.asarray(alike))
+    for found, told in ((up.mean(), pd), ((up & down).mean(), both)):
+        assert abs(found - told) < 5 * np.sqrt(told * (1 - told) / number)
+
+
+@pytest.mark.parametrize(("snr", "pd"), [(6.8, 0.2036), (16.0, 0.7980)])
+def test_printed_values_of_swerlings_first_case(snr, pd):
+    level = np.sqrt(-np.log(1e-4))
+    found, missed = of_one_bin(np.sqrt(db(snr)), level)
+    assert found == pytest.approx(pd, abs=6e-5)
+    assert missed == pytest.approx(1 - pd, abs=6e-5)
+
+
+@pytest.mark.parametrize(("snr", "pd"), [(11.0, 0.1683), (13.0, 0.6287)])
+def test_printed_values_without_fading(snr, pd):
+    level = np.sqrt(-2 * np.log(1e-8))
+    assert marcum_q1(np.sqrt(2 * db(snr)), level).q == pytest.approx(pd, abs=6e-5)
+
+
+@pytest.mark.parametrize("width", [0.0, 1.0, 3.0, 8.0])
+@pytest.mark.parametrize(("name", "pad"), [("hamming", 1), ("hann", 2)])
+def test_any_bin_of_an_echo_is_found_as_often_as_in_drawn_records(name, pad, width):
+    """Lines of random amplitudes, in white noise, windowed and transformed."""
+    rng, size, level, number = np.random.default_rng(8), 64, 4.0, 20_000
+    shape, lines = window(name, size // pad), 25
+    taper, place = samples(name, size // pad), 20.3 + np.linspace(-0.5, 0.5, lines) * width
+    turns = np.outer(place, np.arange(taper.size)) / size
+    kernel = np.fft.fft(taper * np.exp(2j * np.pi * turns), size)
+    noise = (taper**2).sum()
+    kernel *= np.sqrt(db(15) * noise / (np.abs(kernel) ** 2).sum(axis=0).max())
+    magnitude = np.sqrt((np.abs(kernel) ** 2).sum(axis=0))
+    loud = np.flatnonzero(magnitude >= 0.5 * magnitude.max())
+    echo = np.zeros(size, bool)
+    echo[loud[0] - 2 * pad : loud[-1] + 2 * pad + 1] = True
+    record = taper * amplitudes(rng, (number, taper.size))
+    drawn = amplitudes(rng, (number, lines)) @ kernel + np.fft.fft(record, size)
+    share = (np.abs(drawn[:, echo]).max(axis=1) > level * np.sqrt(noise)).mean()
+    rule = 0, 2 * pad, np.empty((3, 0)), neighbour_correlation(shape, size)
+    levels = np.sqrt(noise / 2), level * np.sqrt(noise)
+    found, missed = found_pair(magnitude, echo, int(magnitude.argmax()), 0, rule, levels)
+    assert abs(found - share) < 0.015 + 4 * np.sqrt(share * (1 - share) / number)
+    assert found + missed == pytest.approx(1.0, abs=1e-12)
+
+
+def prepared(parameters, effects=FADING):
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
+
+
+@pytest.fixture
+def sloping(table_4_1):
+    """A beam across which velocities differ: its segments share a part of their speckle."""
+    return table_4_1() | {
+        "footprint.phases": "incoherent", "footprint.beamlets": 19, "target.range": 4000.0,
+        "target.grazing_angle": np.pi / 2, "instrument.laser.power": 0.3,
+        "target.transverse_velocity": 6.0, "footprint.pattern": "hexagonal",
+    }  # fmt: skip
+
+
+def test_it_is_what_drawn_speckle_comes_to(sloping):
+    """The random effect draws each beamlet's amplitude, and has a spectrum for each draw."""
+    shots = prepared(sloping)
+    assert 0.2 < abs(shots.fading.over[0]) < 0.98
+    outputs = statistics(shots)
+    number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
+    rough = sloping | {"target.roughness": np.inf}
+    drawn = [
+        statistics(each.shots)
+        for each in realise(rough, (*CORE, "speckle"), keys=key, draws=number)
+    ]
+    for name in ("pd_up", "pd_shot"):
+        values = np.concatenate([each[name] for each in drawn])
+        error = values.std() / np.sqrt(number)
+        # The random effect's largest bin may be another in each draw.
+        assert -5 * error - 0.004 < outputs[name][0] - values.mean() < 5 * error
+
+
+def test_correlations_are_the_sum_over_the_beamlets(sloping):
+    shots = prepared(sloping)
+    turn = 2j * np.pi * 299792458 / 1550e-9 * shots.doppler[0] * 500e-6
+    power = shots.amplitude[0] ** 2 / (shots.amplitude[0] ** 2).sum()
+    for found, segments in ((shots.fading.next, 1), (shots.fading.over, 2)):
+        assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=1e-4)
+
+
+@pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])
+def test_drawn_factors_have_the_correlations(near):
+    number = 200_000
+    far = 0.1 - 0.4j if near != 1.0 else 1.0
+    fading = Fading(np.array([near + 0j]), np.array([far + 0j]))
+    found = np.empty((3, number))
+    fading_of_draws(
+        np.array([3, 4], np.uint64), np.arange(number), fading.mixing()[:, 0].copy(), found
+    )
+    power = found**2
+    assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
+    pairs = np.corrcoef(power)[[0, 1, 0], [1, 2, 2]]  # of powers, |mu|^2
+    squares = np.abs([near, near, far]) ** 2
+    assert pairs == pytest.approx(squares, abs=15 / np.sqrt(number))
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping, noisy):
+    number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=7)
+    shots = prepared(sloping)
+    outputs = statistics(shots)
+    rows = Rows(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
+    counts = np.zeros((len(COUNTS), 1, 1), np.int64)
+    if noisy:
+        count_in_noise(rows, np.array([0, number]), shots, counts)
+    else:
+        count_by_chance(rows, np.array([0, number]), outputs, counts)
+    told = [outputs[f"pd_{name}"][0] for name in ("up", "down", "shot")]
+    share = counts[[0, 1, 3], 0, 0] / number
+    assert np.all(
+        np.abs(share - told) < 5 * np.sqrt(np.multiply(told, 1 - np.array(told)) / number)
+    )
+    assert told[2] > told[0] * told[1] + 0.02
+    method = "noise" if noisy else "probabilities"
+    drawn = returns.draw_returns(
+        shots, returns.groups(shots), keys=key, draws=number, method=method
+    )
+    paired = ((drawn.group[0, :, :, 0] == 0) & (drawn.group[0, :, :, 2] == 0)).any(axis=1)
+    assert paired.sum() == counts[3, 0, 0]
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, noisy):
+    number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=9)
+    shots = prepared(sloping | {"target.range": 8000.0})
+    apart = np.zeros(1, complex)
+    shots = replace(shots, fading=Fading(apart, apart))
+    method = "noise" if noisy else "probabilities"
+    found = returns.groups(shots)
+    drawn = returns.draw_returns(shots, found, keys=key, draws=number, method=method)
+    there = (drawn.group[0, :, 0, 0] == 0) & (drawn.group[0, :, 0, 2] == 0)
+    sigma, level = shots.line_deviation[0], shots.threshold[0]
+    up, down = found.magnitude[0, 0, 0], found.magnitude[0, 2, 0]
+    loud = drawn.snr[0, there, 0] > (level / sigma) ** 2  # of the weaker one: twice the least
+    told, higher = (
+        np.exp(-(factor * level**2) * (1 / (2 * sigma**2 + up**2) + 1 / (2 * sigma**2 + down**2)))
+        for factor in (1, 2)
+    )
+    chance = higher / told
+    assert abs(loud.mean() - chance) < 5 * np.sqrt(chance * (1 - chance) / there.sum())
+
+
+def test_a_smooth_surface_does_not_fade(sloping):
+    coherent = sloping | {"footprint.phases": "coherent"}
+    assert prepared(coherent).fading is None
+    assert np.array_equal(find(prepared(coherent)), find(prepared(coherent, CORE)))
