@@ -30,8 +30,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 52_652, "modules": 284, "lines of the model": 16_057, "modules of the model": 63,
-    "compiled functions": 114, "arguments of a compiled function": 10,
+    "lines": 53_352, "modules": 286, "lines of the model": 16_713, "modules of the model": 65,
+    "compiled functions": 124, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600

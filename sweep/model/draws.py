@@ -362,6 +362,7 @@ def draw_noise(draw, number, low, count, rule, room):
         room[0, i], room[1, i] = re, im
 
 
+@njit(cache=True, error_model="numpy")
 def _cross(address, stream, index, line, words, found):
     """Mark the draws in which a bin, with its noise, reaches the threshold.
 

@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sweep.model.returns as returns
 from sweep.model import philox
 from sweep.model.alarms import neighbour_correlation
 from sweep.model.detection import Fading, fading_together, found_pair
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
 from sweep.model.effects.catalogue import CORE
+from sweep.model.groups import groups
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.realisations import realise
+from sweep.model.returns import draw_returns
 from sweep.model.shot import find, prepare, statistics
 from sweep.model.window import samples, window
 
@@ -148,9 +149,10 @@ def test_drawn_factors_have_the_correlations(near):
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping, noisy):
+@pytest.mark.parametrize("rule", ["peak_bin", "any_bin"])
+def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping, noisy, rule):
     number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=7)
-    shots = prepared(sloping)
+    shots = prepared(sloping | {"instrument.processing.detection": rule})
     outputs = statistics(shots)
     rows = Rows(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
     counts = np.zeros((len(COUNTS), 1, 1), np.int64)
@@ -165,9 +167,7 @@ def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping
     )
     assert told[2] > told[0] * told[1] + 0.02
     method = "noise" if noisy else "probabilities"
-    drawn = returns.draw_returns(
-        shots, returns.groups(shots), keys=key, draws=number, method=method
-    )
+    drawn = draw_returns(shots, groups(shots), keys=key, draws=number, method=method)
     paired = ((drawn.group[0, :, :, 0] == 0) & (drawn.group[0, :, :, 2] == 0)).any(axis=1)
     assert paired.sum() == counts[3, 0, 0]
 
@@ -179,8 +179,8 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
     apart = np.zeros(1, complex)
     shots = replace(shots, fading=Fading(apart, apart))
     method = "noise" if noisy else "probabilities"
-    found = returns.groups(shots)
-    drawn = returns.draw_returns(shots, found, keys=key, draws=number, method=method)
+    found = groups(shots)
+    drawn = draw_returns(shots, found, keys=key, draws=number, method=method)
     there = (drawn.group[0, :, 0, 0] == 0) & (drawn.group[0, :, 0, 2] == 0)
     sigma, level = shots.line_deviation[0], shots.threshold[0]
     up, down = found.magnitude[0, 0, 0], found.magnitude[0, 2, 0]
