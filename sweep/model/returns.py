@@ -389,9 +389,7 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
         elif how.noisy:
             there = look(address, at, g, how, known, seen, tables, peaks[count])
         else:
-            chance = known.pd[i, s, g]
-            if s == 2:
-                chance = known.beside[i, 1 if up[g] else 0, g]
+            chance = known.beside[i, 1 if up[g] else 0, g] if s == 2 else known.pd[i, s, g]
             uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
             there = uniform < chance
             if there:
