@@ -162,13 +162,14 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     bins, signal = segment_spectrum(prepared, 0, k)
     noise = 0.0 if seed is None else drawn_noise(prepared, seed=seed, segment=k)[bins]
     magnitude = np.abs(signal + noise)
-    carrier = np.asarray(prepared.carriers[k]).item()
+    segment = prepared.waveform[k]
+    carrier = np.asarray(segment.carrier).item()
     beat = waveform.beat_frequency(
-        waveform.SIGNS[k],
+        segment.sign,
         carrier=carrier,
         chirp_rate=np.asarray(prepared.chirp_rate),
-        range=prepared.range[0],
-        radial_velocity=np.asarray(prepared.beta).flat[0] * SPEED_OF_LIGHT / 2,
+        range=prepared.range[0] - np.ravel(segment.nearer)[0],
+        radial_velocity=np.ravel(segment.beta)[0] * SPEED_OF_LIGHT / 2,
     )
     return Segment(
         name=NAMES[k],

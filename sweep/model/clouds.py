@@ -123,6 +123,8 @@ def _groups(
     somewhere = eyepoints._replace(
         range=np.where(seen, eyepoints.range, _NOWHERE),
         radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
+        acceleration=np.where(seen, eyepoints.acceleration, 0.0),
+        approach=np.where(seen, eyepoints.approach, 0.0),
     )
     given, ground = seen_ground(somewhere, parameters, surfaces)
     shots = prepare_cast(given, ground, *called)

@@ -22,11 +22,14 @@ from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.rays import Bundle, Caster, Pose
 from sweep.model.geometry.scanner import PointingJitter, Scanner, beamlet_rays
 from sweep.model.ground import Cast, Footprints, backscatter
-from sweep.model.preparation import Parameters, Shots
+from sweep.model.preparation import APPROACH, Parameters, Shots
 from sweep.model.shot import prepare_cast
 
 HEIGHT = "atmosphere.target_height"
 SUNLIGHT = "target.solar_irradiance"
+
+_FLATTEST = 0.01
+"""Sine of the grazing angle under which a surface is not taken to go on as a plane."""
 
 
 class Eyepoints(NamedTuple):
@@ -50,6 +53,10 @@ class Eyepoints(NamedTuple):
     """(n, b): R_b - R_0 [m]; nan for a beamlet that misses."""
     radial_velocity: np.ndarray
     """(n,): of the reference beamlet [m/s], positive when closing; nan where nothing is seen."""
+    acceleration: np.ndarray
+    """(n,): rate at which that grows [m/s^2]; nan where nothing is seen."""
+    approach: np.ndarray
+    """(n,): speed at which its range falls [m/s]; nan where nothing is seen."""
     velocity_offset: np.ndarray
     """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
     cos_incidence: np.ndarray
@@ -137,9 +144,12 @@ def observe(
     velocity = _radial_velocity(state, (rays, seen), bundle, moving, rotation)
     rows = np.arange(len(time))
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
+    turning = rotate(state.attitude, shots.turning)
+    acceleration, approach = _along_beam(state, turning, rays, bundle, moving, rotation)
     return Eyepoints(
         time, shots.beam, shots.cycle, state.position, state.velocity,
         rotate(state.attitude, shots.direction), bundle.range, bundle.offset, reference,
+        acceleration, approach,
         velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
     )  # fmt: skip
 
@@ -173,6 +183,49 @@ def _radial_velocity(
         receding = (seen * surface).sum(axis=-1)
         closing = np.where(bundle.body == body, closing - receding, closing)
     return closing
+
+
+def _along_beam(
+    state: State,
+    turning: np.ndarray,
+    rays: np.ndarray,
+    bundle: Bundle,
+    moving: Sequence[State | None],
+    rotation: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Closing acceleration [m/s^2] and falling of the range [m/s] along reference beamlets, (n,).
+
+    V is the velocity of the instrument against the body that is hit, which turns by w and is
+    thought to reach as far. The beam d sees the closing speed V.d, which grows by V'.d + V.d', and
+    meets the surface, a plane of normal n there, at a range that falls by
+    (V + R (d' - w x d)).n / d.n. Bodies are taken to turn at steady rates. ``turning`` is the
+    scanner's part of d', (n, 3).
+    """
+    rows, first = np.arange(len(rays)), np.maximum(bundle.reference, 0)
+    ray, body = rays[rows, first], bundle.body[rows, first]
+    turned = np.cross(state.rate, ray) + turning
+    velocity, acceleration = state.velocity.copy(), state.acceleration.copy()
+    sliding = turned.copy()
+    for number, motion in enumerate(moving):
+        if motion is None:
+            continue
+        here = (body == number)[:, None]
+        spin = motion.rate if rotation else 0.0 * motion.rate
+        against = state.velocity - motion.velocity
+        arm = state.position - motion.position
+        velocity = np.where(here, against - np.cross(spin, arm), velocity)
+        grows = state.acceleration - motion.acceleration - np.cross(spin, against)
+        acceleration = np.where(here, grows, acceleration)
+        sliding = np.where(here, turned - np.cross(spin, ray), sliding)
+    far = np.where(bundle.reference >= 0, bundle.range, np.nan)
+    grows = _dot(acceleration, ray) + _dot(velocity, turned)
+    steep = np.minimum(_dot(bundle.normal, ray), -_FLATTEST)
+    falls = _dot(velocity + far[:, None] * sliding, bundle.normal) / steep
+    return np.where(bundle.reference >= 0, grows, np.nan), falls
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
 
 
 def prepare_eyepoints(
@@ -241,6 +294,8 @@ def seen_ground(
         **parameters,
         "target.range": eyepoints.range,
         "target.radial_velocity": eyepoints.radial_velocity,
+        "target.acceleration": eyepoints.acceleration,
+        APPROACH: eyepoints.approach,
         PATH_ELEVATION: -np.arcsin(upwards),
         "target.reflectance": 1.0,
         HEIGHT: parameters.get(HEIGHT, 0.0) + height,

@@ -52,8 +52,9 @@ LEAST_WIDTH = 14 * BLOCK_SIZE
 COMMON = 16
 """Numbers of a point that its segments share; of each segment OWN follow."""
 
-OWN = 3
-"""Signed chirp rate [Hz/s]; carrier [Hz]; gain of the whitened spectrum."""
+OWN = 6
+"""Signed chirp rate [Hz/s]; carrier [Hz]; gain of the whitened spectrum; range by which it is
+nearer [m]; Doppler ratio; start [s]."""
 
 CHEBYSHEV = np.zeros((MOST_NODES + 1, MOST_NODES))
 for _n in range(1, MOST_NODES + 1):
@@ -124,11 +125,10 @@ def place_lines(p, segment, footprint, row, sizes, room):
     int
         Origin: the bin nearest to the beam's centre, -N/2 .. N/2.
     """
-    power = sizes[4] != 0
-    fft_size, length = sizes[0], sizes[1]
-    own = COMMON + OWN * segment
-    range_0, beta, scale, start = p[0], p[1], p[3] * p[own + 2], p[7]
-    rate, carrier = p[own], p[own + 1]
+    power, fft_size, length = sizes[4] != 0, sizes[0], sizes[1]
+    own, start = COMMON + OWN * segment, p[7]
+    rate, carrier, scale, nearer = p[own], p[own + 1], p[3] * p[own + 2], p[own + 3]
+    range_0, beta, drifted = p[0] - nearer, p[own + 4], 0.5 * SPEED_OF_LIGHT * p[own + 5]
     bins = fft_size / p[6]
     per_metre = rate * (2.0 / SPEED_OF_LIGHT)
     centre_frequency = carrier * beta - per_metre * (1.0 + beta) * range_0
@@ -138,12 +138,14 @@ def place_lines(p, segment, footprint, row, sizes, room):
     delta_0 = centre - turns - origin
     square_pole, sum_pole = 1.0 / (p[4] * p[5]), 1.0 / p[4] + 1.0 / p[5]
     high, low = quotient(2.0 * carrier, SPEED_OF_LIGHT)
-    phase_0 = -product_fraction(high, low, range_0) + fraction_of_cycle(centre_frequency * start)
+    phase_0 = -product_fraction(high, low, p[0]) + fraction_of_cycle(centre_frequency * start)
+    phase_0 += product_fraction(high, low, nearer)
     half_ratio = 0.5 * (length / fft_size)
     turn_0 = (length * origin % (2 * fft_size)) / (2.0 * fft_size)
     n = footprint.shape[2]
     for b in range(n):  # bins from the origin; the receiver's gain is 1 / (X + i BLOCK)
-        doppler, further = footprint[1, row, b], range_0 * footprint[0, row, b]
+        doppler = footprint[1, row, b]
+        further = p[0] * footprint[0, row, b] - drifted * doppler
         shift = (1.0 + beta) * further + (range_0 + further) * doppler
         beat = carrier * doppler - per_metre * shift
         frequency = centre_frequency + beat
@@ -158,12 +160,11 @@ def place_lines(p, segment, footprint, row, sizes, room):
         return origin
     square, per_bin = 0.5 * rate, start / bins
     for b in range(n):
-        further = range_0 * footprint[0, row, b]
+        further = p[0] * footprint[0, row, b] - drifted * footprint[1, row, b]
         delay = (range_0 + further) * (2.0 / SPEED_OF_LIGHT)
         phase = phase_0 - product_fraction(high, low, further)
         phase += fraction_of_cycle(square * delay * delay)
-        apart = room[PLACE, b] - delta_0
-        room[RE, b] = phase + apart * per_bin + half_ratio * room[PLACE, b]
+        room[RE, b] = phase + (room[PLACE, b] - delta_0) * per_bin + half_ratio * room[PLACE, b]
     if footprint.shape[0] > 3:
         for b in range(n):
             room[RE, b] += footprint[3 + segment, row, b]

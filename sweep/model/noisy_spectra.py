@@ -288,11 +288,9 @@ def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]
         bandwidth=_at(shots.bandwidth, i), duration=_at(shots.duration, i),
         sample_rate=shots.sample_rate[i], bin_width=np.asarray(width),
     )  # fmt: skip
-    walked = _at(shots.walk, i) * reported.radial_velocity  # within the record
-    return (
-        reported.range + walked - shots.range[i],
-        reported.radial_velocity - shots.radial_velocity[i],
-    )
+    velocity = reported.radial_velocity * (1 + _at(shots.slowing, i))
+    walked = _at(shots.walk, i) * velocity  # within the shot
+    return reported.range + walked - shots.range[i], velocity - shots.radial_velocity[i]
 
 
 def _carriers(shots: Shots, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

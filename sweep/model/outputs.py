@@ -205,6 +205,10 @@ SHOTS: dict[str, Output] = _over(("shot",), {
     "beam_radial_velocity": Output(
         "m s-1", "true radial velocity of the reference beamlet", CLOSING
     ),
+    "beam_acceleration": Output(
+        "m s-2", "rate at which the radial velocity of the reference beamlet grows"
+    ),
+    "beam_approach": Output("m s-1", "speed at which the range of the reference beamlet falls"),
     "beam_surface": Output("1", "surface that the reference beamlet hits", dtype="int16"),
 })  # fmt: skip
 """Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""

@@ -32,6 +32,9 @@ LASER, CHIRP, TELESCOPE, RECEIVER, PROCESSING = (
 BEAMLETS_ERROR = "footprint.beamlets_error"
 """Error of pd that the number of beamlets leaves, where that followed from the tolerance."""
 
+APPROACH = "target.approach"
+"""Speed [m/s] at which the range along the beam falls, where rays have told."""
+
 CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
 """Numbers that points must share to be prepared together; words they must share all."""
 
@@ -89,6 +92,10 @@ class Shots:
     """(n,): of the target on the beam's axis."""
     radial_velocity: np.ndarray
     """(n,): likewise; what the lines show of it is ``beta``."""
+    acceleration: np.ndarray
+    """Rate at which the radial velocity grows [m/s^2]."""
+    approach: np.ndarray
+    """Speed [m/s] at which the range along the beam falls (:func:`approach`)."""
     bandwidth: np.ndarray
     duration: np.ndarray
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -131,9 +138,13 @@ class Shots:
     """Whether beamlets add as powers."""
     phase: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
     """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
+    starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
+    """Time [s] from the shot's start to each segment's, in which the target moves on."""
     phase_errors: tuple[PhaseError, ...] = ()
     walk: np.ndarray | float = 0.0
-    """Seconds of closing by which the beat's range is below that at the segment's start, (n,)."""
+    """Seconds of closing by which the beats' range is below that at the shot's start, (n,)."""
+    slowing: np.ndarray | float = 0.0
+    """Share of the radial velocity by which the beats tell less, (n,)."""
     alike: bool = False
     """Whether many shots have the same phase errors, as those of a flight do not."""
     gaussian_width: np.ndarray | None = None
@@ -192,13 +203,16 @@ class Shots:
         """
         if self.noise_shape == "white":
             return np.ones((len(self.waveform), self.size))
-        delay = (2 / SPEED_OF_LIGHT) * self.range * (1 + self.beta)
         shape = {
             "detector_bandwidth": self.detector_bandwidth,
             "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
         }  # fmt: skip
         white = self.noise_sources.get(ADC_NOISE, 0.0) / self.quiet_variance
-        beats = (s.carrier * self.beta - s.chirp_rate * delay for s in self.waveform)
+        beats = (
+            s.carrier * s.beta
+            - s.chirp_rate * ((2 / SPEED_OF_LIGHT) * (self.range - s.nearer) * (1 + s.beta))
+            for s in self.waveform
+        )
         densities = (link.noise_density(beat, **shape) for beat in beats)
         return in_rows([(g + (1 - g) * white) ** -0.5 for g in densities], (self.size,))
 
@@ -257,11 +271,27 @@ class Shots:
     def waveform(self) -> tuple[waveform.Segment, ...]:
         """Segments of the waveform, one after the other; no output tells of Doppler's leakage."""
         return tuple(
-            waveform.Segment(name, sign, sign * self.chirp_rate, carrier, sign != 0)
-            for name, sign, carrier in zip(
-                waveform.SEGMENTS, waveform.SIGNS, self.carriers, strict=True
+            waveform.Segment(
+                name, sign, sign * self.chirp_rate, carrier, sign != 0,
+                self.approach * start + 0.5 * self.acceleration * start * start,
+                self.beta + doppler_ratio(self.acceleration * start), start,
             )
-        )
+            for name, sign, carrier, start in zip(
+                waveform.SEGMENTS, waveform.SIGNS, self.carriers, self.starts, strict=True
+            )
+        )  # fmt: skip
+
+    @property
+    def motion(self) -> dict[str, Any]:
+        """Range [m] and radial velocity [m/s], (n,); where they differ, tuples by segment."""
+        here: dict[str, Any] = {"range": self.range, "radial_velocity": self.radial_velocity}
+        if np.any(self.starts[-1]):
+            here["range"] = tuple(self.range - each.nearer for each in self.waveform)
+            if np.any(self.acceleration):
+                here["radial_velocity"] = tuple(
+                    self.radial_velocity + self.acceleration * start for start in self.starts
+                )
+        return here
 
     @property
     def segments(self) -> np.ndarray:
@@ -269,9 +299,10 @@ class Shots:
         return np.array([True, self.architecture != "direct", True])
 
     def point_table(self) -> np.ndarray:
-        """Numbers of each point as compiled code takes them, (16 + 3 segments, n).
+        """Numbers of each point as compiled code takes them, (16 + 6 segments, n).
 
-        What all segments share; of each the signed chirp rate [Hz/s], the carrier, the whitening.
+        What all segments share, and of each segment the signed chirp rate [Hz/s], the carrier,
+        the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
         """
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
@@ -282,7 +313,7 @@ class Shots:
         further = (
             x
             for each, gain in zip(self.waveform, self.whitening, strict=True)
-            for x in (each.chirp_rate, each.carrier, gain)
+            for x in (each.chirp_rate, each.carrier, gain, each.nearer, each.beta, each.start)
         )
         return in_rows((*columns, *further), (self.size,))
 
@@ -419,6 +450,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         tnr=p[PROCESSING + "tnr"],
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,
+        acceleration=p["target.acceleration"],
+        approach=approach(p),
         bandwidth=p[CHIRP + "bandwidth"],
         duration=p[CHIRP + "duration"],
         carriers=waveform.carrier_frequencies(
@@ -446,6 +479,21 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
     )
+
+
+def approach(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Speed at which the range along the beam falls [m/s], (n,) or scalar.
+
+    Not the radial velocity, where the beam slides over slanting ground: with V = v d + u e, d
+    along the beam and e across it towards the near side, a plane of normal n at the grazing angle
+    g is met at a range that falls by V.n / d.n = v + u cot g.
+    """
+    if APPROACH in p:
+        return p[APPROACH]
+    across = p["target.transverse_velocity"]
+    if not np.any(across):
+        return p["target.radial_velocity"]
+    return np.asarray(p["target.radial_velocity"] + across / np.tan(p["target.grazing_angle"]))
 
 
 def relative_amplitude(architecture: str, echo: np.ndarray) -> np.ndarray:

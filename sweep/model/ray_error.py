@@ -127,9 +127,10 @@ def _in_bin(
     shots: Shots, footprints: Footprints, s: int, some: np.ndarray, k: np.ndarray
 ) -> np.ndarray:
     """Powers, in one scale, that bins k (m,) of a segment have of some shots' lines, (m, b)."""
+    segment = shots.waveform[s]
     columns = (
-        shots.range, shots.beta, shots.chirp_rate, shots.sample_rate, shots.carriers[s],
-        shots.detector_bandwidth, shots.amplifier_bandwidth,
+        shots.range - segment.nearer, segment.beta, shots.chirp_rate, shots.sample_rate,
+        segment.carrier, shots.detector_bandwidth, shots.amplifier_bandwidth,
     )  # fmt: skip
     far, beta, rate, sample_rate, carrier, detector, amplifier = (
         np.broadcast_to(column, shots.size)[some, None] for column in columns

@@ -14,8 +14,9 @@ strongest group is detected, and a false alarm raised, in the very draws that ar
   strongest and its two neighbours), alike as the window makes it, so that another may be the
   largest, and in the bins of leaked signal; the largest of all other bins by its order statistic.
 
-The interpolated range is put right for what range walk moves it by, v_r (T_w + 2 t_0), by the
-velocity that is measured with it.
+Ranges and velocities are those at the shot's start, the instant of the truth. What range walk moves
+the interpolated range by, v_r (T_w + 2 t_0), and what motion between segments moves both by, is put
+right by the velocity that is measured with them; nothing tells of the acceleration.
 
 Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
 segments, which share what their speckles do; against probabilities the down segment's chance
@@ -256,12 +257,15 @@ def _beside(shots: Shots, found: Groups) -> np.ndarray:
 
 def beamlet_lines(shots: Shots) -> np.ndarray:
     """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets)."""
-    distance = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
-    distance = distance * _columns(shots, shots.range), 1 + shots.offset[shots.row]
-    beta = _columns(shots, shots.beta) + shots.doppler[shots.row]
-    lines = np.empty((shots.size, 3, beta.shape[1]))
-    for s, (sign, carrier) in enumerate(zip(waveform.SIGNS, shots.carriers, strict=True)):
-        beat = _columns(shots, carrier) * beta - sign * distance[0] * distance[1] * (1 + beta)
+    per_metre = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
+    distance = per_metre * _columns(shots, shots.range), 1 + shots.offset[shots.row]
+    own = shots.doppler[shots.row]
+    lines = np.empty((shots.size, 3, own.shape[1]))
+    for s, each in enumerate(shots.waveform):
+        beta = _columns(shots, each.beta) + own
+        drifted = SPEED_OF_LIGHT / 2 * own * _columns(shots, each.start)
+        far = distance[0] * distance[1] - per_metre * (_columns(shots, each.nearer) + drifted)
+        beat = _columns(shots, each.carrier) * beta - each.sign * far * (1 + beta)
         turns = beat / _columns(shots, shots.sample_rate)
         lines[:, s] = abs(turns - np.floor(turns + 0.5)) * shots.fft_size
     return lines
@@ -301,13 +305,18 @@ def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
     truth = _columns(shots, shots.radial_velocity) + doppler
     seen = np.maximum(drawn.beamlet, 0)
-    off = distance[..., FINE] - deepest[..., 0] * (1 + offset[point, seen])
+    # Up and down beat tell the range at half the time between them; acceleration adds to it.
+    last = _columns(shots, shots.starts[2], 2)
+    pulled = carrier / (bandwidth / duration) * _columns(shots, shots.acceleration, 3)
+    pulled = 0.5 * last * (pulled[..., 0] - _columns(shots, shots.approach, 2))
+    off = distance[..., FINE] - pulled - deepest[..., 0] * (1 + offset[point, seen])
     right = abs(off) <= reach * metre
     right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
     signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
     pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
-    # What the ground came nearer by within the record, which the measured velocity tells.
+    # What the ground came nearer by within the shot, which the measured velocity tells.
+    velocity[..., FINE] *= 1 + _columns(shots, shots.slowing, 2)
     distance[..., FINE] += velocity[..., FINE] * walk[..., 0]
     return Returns(
         distance[..., WHOLE], distance[..., FINE], velocity[..., WHOLE], velocity[..., FINE],

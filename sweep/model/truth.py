@@ -17,7 +17,9 @@ from sweep.model.preparation import Shots
 from sweep.model.waveform import SIGNS
 
 
-def spectrum(shots: Shots, i: int, segment: int, *, range_walk: bool = True) -> np.ndarray:
+def spectrum(
+    shots: Shots, i: int, segment: int, *, range_walk: bool = True, acceleration: bool = False
+) -> np.ndarray:
     """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
 
     Parameters
@@ -27,6 +29,8 @@ def spectrum(shots: Shots, i: int, segment: int, *, range_walk: bool = True) -> 
     range_walk : bool
         Whether the terms of the phase in t^2 are kept: the frequency drift while the target
         moves. The fast path leaves them out.
+    acceleration : bool
+        Whether the velocity drifts within the record.
 
     Notes
     -----
@@ -37,7 +41,9 @@ def spectrum(shots: Shots, i: int, segment: int, *, range_walk: bool = True) -> 
     total = np.zeros(shots.window.length, complex)
     power = np.zeros(half)
     for beamlet in range(shots.offset.shape[1]):
-        signal = analytic_record(shots, i, segment, beamlet, range_walk=range_walk)
+        signal = analytic_record(
+            shots, i, segment, beamlet, range_walk=range_walk, acceleration=acceleration
+        )
         total += signal
         if shots.incoherent:
             spectrum = np.fft.fft(w * signal, shots.fft_size) / 2
@@ -66,24 +72,41 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
 
 
 def analytic_record(
-    shots: Shots, i: int, segment: int, beamlet: int, *, range_walk: bool = True
+    shots: Shots,
+    i: int,
+    segment: int,
+    beamlet: int,
+    *,
+    range_walk: bool = True,
+    acceleration: bool = False,
 ) -> np.ndarray:
-    """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled."""
+    """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled.
+
+    The ground that the beam meets comes nearer by ``approach``, its scatterers by their own radial
+    velocity; both from the shot's start on. Where the two differ the beam slides over the ground:
+    scatterers take each other's place, and the beat has the delay of those that are there.
+    """
     sign, carrier = SIGNS[segment], float(_at(shots.carriers[segment], i))
-    beta = float(_at(shots.beta, i)) + float(shots.doppler[shots.row[i], beamlet])
+    own, begun = float(shots.doppler[shots.row[i], beamlet]), float(_at(shots.starts[segment], i))
+    closing, grows = float(_at(shots.approach, i)), float(_at(shots.acceleration, i))
+    alpha = grows / SPEED_OF_LIGHT
+    beta = float(_at(shots.beta, i)) + 2 * alpha * begun + own
     rate = float(_at(shots.chirp_rate, i))
     range_0 = float(shots.range[i])
     further = range_0 * float(shots.offset[shots.row[i], beamlet])
+    further -= SPEED_OF_LIGHT / 2 * own * begun
+    nearer = closing * begun + grows * begun**2 / 2
     t = float(_at(shots.acquisition_delay, i)) + np.arange(shots.window.length) / float(
         shots.sample_rate[i]
     )
-    delay_0 = 2 * (range_0 + further) / SPEED_OF_LIGHT
-    change = -beta * t  # tau(t) - tau_0
+    delay_0 = 2 * (range_0 - nearer + further) / SPEED_OF_LIGHT
+    change = -beta * t - acceleration * alpha * t**2  # tau(t) - tau_0
     chirped = change * (2 * delay_0 + change) / 2 - t * (delay_0 + change)
+    chirped += (closing - float(shots.radial_velocity[i])) / SPEED_OF_LIGHT * t**2
     if not range_walk:
         chirped = delay_0 * (change - t)
     cycles = -carrier * change + sign * rate * chirped
-    start = _start_phase(sign, carrier, rate, range_0, further)
+    start = _start_phase(sign, carrier, rate, range_0, further, nearer)
     beat = carrier * beta - sign * rate * delay_0 * (1 + beta)
     gain = link.transfer(
         np.array(beat),
@@ -96,9 +119,12 @@ def analytic_record(
     return amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start))
 
 
-def _start_phase(sign: int, carrier: float, rate: float, range_0: float, further: float) -> float:
+def _start_phase(
+    sign: int, carrier: float, rate: float, range_0: float, further: float, nearer: float
+) -> float:
     """-f tau_0 + s S tau_0^2 / 2, the phase at t = 0 [cycles], in exact fractions."""
-    delay = 2 * (Fraction(range_0) + Fraction(further)) / Fraction(SPEED_OF_LIGHT)
+    delay = Fraction(range_0) + Fraction(further) - Fraction(nearer)
+    delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
     phase = -Fraction(carrier) * delay + sign * Fraction(rate) * delay**2 / 2
     return float(phase - round(phase))
 

@@ -13,7 +13,8 @@ f_seg is the optical frequency at the segment's start: c/lambda for the up-chirp
 segment, c/lambda + B for the down-chirp. To leading order the beats are f_d - f_r, f_d and
 f_d + f_r with f_d = 2 v_r / lambda and f_r = S 2 R / c [T 2.8]; what is kept beyond that moves
 the down beat of Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of
-its own. Each segment starts with the target at range R: [T] does not move it in between.
+its own. By [T] each segment starts with the target at range R; that it moves on in between is an
+effect too.
 """
 
 from typing import NamedTuple
@@ -39,6 +40,12 @@ class Segment(NamedTuple):
     """Frequency that the delay turns into phase [Hz], (n,) or scalar."""
     leaks: bool
     """Tell whether leakage in it is looked at."""
+    nearer: np.ndarray | float
+    """Range by which the target has come nearer since the shot's start [m], (n,) or scalar."""
+    beta: np.ndarray | float
+    """Doppler ratio 2 v_r / c of the line on the axis, (n,) or scalar."""
+    start: np.ndarray | float
+    """Time since the shot's start [s]; 0 where the target stands still between segments."""
 
 
 class Resolution(NamedTuple):
@@ -58,6 +65,15 @@ def carrier_frequencies(
     """
     start = start_frequency if architecture == "direct" else SPEED_OF_LIGHT / np.asarray(wavelength)
     return start, start, start + bandwidth
+
+
+def segment_starts(architecture: str, duration: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Times [s] from the shot's start to that of up, Doppler and down segment.
+
+    They follow each other without a gap. Direct detection has no Doppler segment to wait for.
+    """
+    before = (0, 0, 1) if architecture == "direct" else (0, 1, 2)
+    return tuple(number * np.asarray(duration, float) for number in before)
 
 
 def beat_frequency(

@@ -22,6 +22,8 @@ _FIELDS = {
     "beam_direction": "direction",
     "beam_range": "range",
     "beam_radial_velocity": "radial_velocity",
+    "beam_acceleration": "acceleration",
+    "beam_approach": "approach",
     **{name: name for name in BEAMLETS},
 }
 """Field of :class:`Eyepoints` that each array holds."""

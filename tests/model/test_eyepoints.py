@@ -9,7 +9,7 @@ from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight, Nadir, Spin
 from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import cone, corners, fixed
+from sweep.model.geometry.scanner import LineScan, cone, corners, fixed
 from sweep.model.shot import evaluate, statistics
 from sweep.scenes.facets import clean
 
@@ -215,3 +215,52 @@ def test_any_stretch_of_a_flight_is_the_same_bit_for_bit():
     part = _observed(flight, beams=scanner_beams, index=np.array([33, 7, 20]))
     for all_shots, some in zip(whole[:-1], part[:-1], strict=True):
         assert np.array_equal(all_shots[[33, 7, 20]], some, equal_nan=True)
+
+
+def _turning(rate, arm=(0.0, 0.0, 0.0)):
+    """A falling instrument on an arm of a body that turns."""
+    path = ConstantAcceleration((0.0, 0.0, 900.0), (35.0, -10.0, -60.0), (1.0, 2.0, 11.4), 10.0)
+    return Flight(path, Spin(rate), arm)
+
+
+def _body(rate):
+    path = ConstantAcceleration((0.0, 0.0, 0.0), (3.0, -4.0, 5.0), (0.5, 0.2, -2.0), 10.0)
+    return Flight(path, Spin(rate))
+
+
+SLANTED = corners(0.2)[:1]
+MOTIONS = {
+    "falling straight down": (_turning((0.0, 0.0, 0.0)), fixed(np.array([[0, 0, -1.0]]), rate=1e4)),
+    "slanting beam": (_turning((0.0, 0.0, 0.0)), fixed(SLANTED, rate=1e4)),
+    "turning": (_turning((0.3, -0.2, 0.4)), fixed(SLANTED, rate=1e4)),
+    "on a lever arm": (_turning((0.3, -0.2, 0.4), (2.0, -1.0, 3.0)), fixed(SLANTED, rate=1e4)),
+    "resonant mirror": (_turning((0.0, 0.0, 0.0)), LineScan(0.3, 5.0, 1e4, wave="sine")),
+    "triangular sweep": (_turning((0.1, 0.0, 0.0)), LineScan(0.3, 5.0, 1e4, along=(0.2,))),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("body", [None, (0.0, 0.0, 0.0), (0.02, -0.05, 0.01)])
+def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
+    """Central differences over 0.1 ms to either side, on level ground or on moving."""
+    flight, scanner = MOTIONS[name]
+    seen = observe(
+        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster(_plane()),
+        beam_divergence=50e-6, number=7, bodies=None if body is None else [_body(body)],
+    )  # fmt: skip
+    grows = (seen.radial_velocity[2] - seen.radial_velocity[0]) / 2e-4
+    falls = (seen.range[0] - seen.range[2]) / 2e-4
+    assert seen.acceleration[1] == pytest.approx(grows, rel=1e-5, abs=1e-6)
+    assert seen.approach[1] == pytest.approx(falls, rel=1e-5)
+
+
+def test_level_flight_keeps_its_range_however_fast_the_ground_ahead_closes():
+    beams = cone(1, half_angle=np.radians(22.5))
+    seen = _observed(_flight(velocity=(100.0, 0.0, 0.0)), beams=beams)
+    assert seen.radial_velocity[0] == pytest.approx(100 * np.sin(np.radians(22.5)))
+    assert abs(seen.approach[0]) < 1e-9 and seen.acceleration[0] == 0
+
+
+def test_a_shot_that_sees_nothing_has_no_acceleration():
+    seen = _observed(_flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1))
+    assert np.isnan(seen.acceleration).tolist() == np.isnan(seen.approach).tolist() == [True, False]

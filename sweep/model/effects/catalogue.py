@@ -16,6 +16,7 @@ from sweep.model.effects import (
     pointing_jitter,
     saturation,
     scintillation,
+    segment_motion,
     sidelobes,
     speckle,
 )
@@ -28,6 +29,7 @@ EFFECTS: tuple[Effect, ...] = (
     doppler.DOPPLER,
     doppler.DOPPLER_SPREAD,
     doppler.ROTATION,
+    segment_motion.SEGMENT_MOTION,
     lag.LAG,
     atmosphere.EXTINCTION,
     noise_sources.SIGNAL_SHOT_NOISE,

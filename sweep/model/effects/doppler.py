@@ -33,7 +33,11 @@ def size(points: Points) -> Size | None:
     """
     if not points.has("target.radial_velocity"):
         return None
-    moved = np.abs(points.radial_velocity) * points.per_velocity
+    return moved_size(points, np.abs(points.radial_velocity) * points.per_velocity)
+
+
+def moved_size(points: Points, moved: np.ndarray) -> Size:
+    """Change of the largest bin by lines that all move by so many bins, by segment."""
     away = (moved > NOT_AWAY).any(axis=0)
     shift = np.where(away, 1.0, moved.max(axis=0))
     if away.all():

@@ -11,6 +11,9 @@ tau(t) = tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
 
 the first a frequency drift of 2 s S (2 v_r / c), of opposite sign in up and down chirp, none in the
 Doppler segment; the second mostly one of 2 a / lambda, positive when the radial velocity grows.
+Half of the first comes from the range, half from the chirp's rising Doppler shift. Where the range
+along the beam falls at another speed u than v_r, as the beam slides over slanting ground, its own
+half follows u: s S (u - v_r) / c t^2 more.
 Time runs from the segment's start: the line moves by the drift up to the middle of the record and
 spreads over what drifts within it.
 
@@ -206,6 +209,7 @@ def walk_phase(
     radial_velocity: np.ndarray,
     start: np.ndarray,
     duration: np.ndarray,
+    slide: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """Phase [cycles] that range walk adds to the line's, (n, m).
 
@@ -219,26 +223,31 @@ def walk_phase(
         Chirp rate B/T [Hz/s]; radial velocity at the segment's start [m/s], positive closing.
     start, duration : (n,) ndarray
         Acquisition delay t_0 and length L/fs of the record [s].
+    slide : (n,) ndarray
+        Speed by which the range along the beam falls faster than at the radial velocity [m/s].
     """
     beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
-    drift = sign * chirp_rate * beta * (1 + beta / 2)
+    drift = sign * chirp_rate * (beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT)
     return np.atleast_1d(drift)[:, None] * record_times(x, start=start, duration=duration) ** 2
 
 
 def walk_smear(points: Points) -> Smear | None:
     """The phase that range walk adds."""
-    if not points.has("target.radial_velocity"):
+    slide = points.approach - points.radial_velocity
+    if not points.has("target.radial_velocity") and not slide.any():
         return None
-    drift = points.signs * points.chirp_rate * points.beta * (1 + points.beta / 2)
-    return over_record(points, {2: drift})
+    each = points.beta * (1 + points.beta / 2) + slide / SPEED_OF_LIGHT
+    return over_record(points, {2: points.signs * points.chirp_rate * each})
 
 
 def walk(shots: Shots, scene: Scene) -> Shots:
     """The drift of the beat, in the record of the two chirps: at t that of R - 2 v_r t."""
+    velocity, slide = shots.motion["radial_velocity"], shots.approach - shots.radial_velocity
     shots = _with_phase(
-        shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=shots.radial_velocity
+        shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
     )
-    return replace(shots, walk=2 * shots.acquisition_delay + shots.record_duration)
+    within = 2 * shots.acquisition_delay + shots.record_duration
+    return replace(shots, walk=shots.walk + within)
 
 
 RANGE_WALK = Effect(
@@ -307,9 +316,8 @@ def accelerate(shots: Shots, scene: Scene) -> Shots:
         acceleration_phase,
         carrier=shots.carriers,
         chirp_rate=shots.chirp_rate,
-        range=shots.range,
-        radial_velocity=shots.radial_velocity,
-        acceleration=scene.parameters[_ACCELERATION],
+        acceleration=shots.acceleration,
+        **shots.motion,
     )
 
 
@@ -426,8 +434,7 @@ def bend_sweep(shots: Shots, scene: Scene) -> Shots:
         shots,
         sweep_phase,
         chirp_duration=shots.duration,
-        range=shots.range,
-        radial_velocity=shots.radial_velocity,
+        **shots.motion,
         **{shape: p[path] for shape, path in zip(_SHAPES, _PEAKS, strict=True)},
         periods=p[_PERIODS],
     )

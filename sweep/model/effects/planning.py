@@ -85,6 +85,7 @@ def plan(
     names = tuple(effect.name for effect in effects)
     decided = _decided(effects, modes or {})
     points.at_rest = decided.get("doppler") == "off"
+    points.at_one_range = decided.get("segment_motion") == "off"
     with np.errstate(all="ignore"):  # of what exceeds all numbers nothing is known: it is kept
         sizes = sizes_of(points, effects)
         leaking = None

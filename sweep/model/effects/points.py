@@ -28,6 +28,7 @@ from sweep.model.preparation import (
     LASER,
     PROCESSING,
     RECEIVER,
+    approach,
     link_scales,
     relative_amplitude,
 )
@@ -104,6 +105,8 @@ class Points:
         self.fft_size = self.whole(PROCESSING + "fft_size")
         self.at_rest = False
         """Whether the Doppler effect is off."""
+        self.at_one_range = False
+        """Whether the target stands still between segments."""
         self.smears: dict[str, Smear] = {}
         """Of the effects that smear lines, by name."""
         number = self.whole(resolution.BEAMLETS)
@@ -122,6 +125,8 @@ class Points:
         self.delay = 2 / SPEED_OF_LIGHT * self.range
         self.beta = 2 * self.radial_velocity / SPEED_OF_LIGHT
         """Doppler ratio."""
+        self.acceleration = self["target.acceleration"]
+        """[m/s^2]."""
         self.signs = self.columns(*(waveform.SIGNS[::2] if direct else waveform.SIGNS))
         coherent = self.word("footprint.phases") == "coherent"
         self.adds_amplitudes = coherent or direct
@@ -287,11 +292,40 @@ class Points:
     # Lines
 
     @cached_property
+    def approach(self) -> np.ndarray:
+        """Speed at which the range along the beam falls [m/s]."""
+        return np.asarray(approach(self._numbers))
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Time from the shot's start to each segment's [s]."""
+        starts = waveform.segment_starts(self.architecture, self[CHIRP + "duration"])
+        return self.columns(*(starts if len(self.signs) == 3 else starts[::2]))
+
+    @cached_property
     def frequency(self) -> np.ndarray:
         """Signed beat of the line on the axis [Hz], by segment."""
         beta = np.zeros(()) if self.at_rest else self.beta
-        beat = self.chirp_rate * self.delay * (1 + beta)
+        delay = self.delay
+        if not self.at_one_range:
+            half = self.acceleration * self.starts / SPEED_OF_LIGHT
+            delay = delay - (2 / SPEED_OF_LIGHT * self.approach + half) * self.starts
+            beta = beta + 2 * half
+        beat = self.chirp_rate * delay * (1 + beta)
         return self.carriers * beta - self.signs * beat
+
+    @cached_property
+    def metres_between(self) -> np.ndarray:
+        """Most metres by which the target moves from the shot's start to a segment's own."""
+        return (np.abs(self.approach) + np.abs(self.acceleration) * self.starts / 2) * self.starts
+
+    @cached_property
+    def bins_between(self) -> np.ndarray:
+        """Most bins by which its line moves in that time."""
+        faster = np.abs(self.acceleration) * self.starts
+        slope = np.abs(self.signs) * self.chirp_rate * (2 / SPEED_OF_LIGHT) / self.bin_width
+        nearer = slope * (1 + np.abs(self.beta)) * self.metres_between
+        return nearer + self.per_velocity * faster
 
     @cached_property
     def offset(self) -> np.ndarray:

@@ -17,9 +17,9 @@ exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and heights of 10 um (the
 up to lambda or so, beyond which kappa is 0). Depth beyond roughness lies in the beamlets' ranges,
 and what it does between the segments in their lines' phases. With the instrument moving across the
 beam the Doppler shifts differ over the footprint, which turns the beamlets against each other from
-one segment to the next; all begin at the same range, and what all beamlets share is left out.
-Coherent footprints with a share kappa left are taken not to turn, which makes their segments more
-alike than they are.
+one segment to the next. Motion between segments has that in the lines' phases; where it is left
+out it is done here, but for coherent footprints with a share kappa left, whose segments are then
+more alike than they are.
 
 It acts on the lines' amplitudes alone, before their spectrum; the mean echo, and so its shot
 noise, stays.
@@ -170,6 +170,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     amplitude = steady * magnitude
     # The steady share of a smooth shape is at the start of each segment what it is in the others.
     turning = shots.incoherent | (share < _SMOOTH)
+    turning &= not np.any(shots.starts[-1])  # else their lines have it
     interval = np.where(turning, shots.duration, 0.0) + np.zeros(shots.size)
     phase = np.empty((3, *cycles.shape))
     for s, carrier in enumerate(shots.carriers):

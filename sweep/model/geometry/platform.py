@@ -234,13 +234,15 @@ class State(NamedTuple):
     """Pose of a body in the world frame, (n, 3) or (n, 4) each.
 
     Position [m] and velocity [m/s] of the instrument, unit quaternion (w, x, y, z) from body to
-    world, angular velocity [rad/s].
+    world, angular velocity [rad/s]; acceleration of the instrument [m/s^2], as if that angular
+    velocity stayed as it is.
     """
 
     position: np.ndarray
     velocity: np.ndarray
     attitude: np.ndarray
     rate: np.ndarray
+    acceleration: np.ndarray
 
 
 def _within(t: np.ndarray, start: float, stop: float) -> np.ndarray:
@@ -435,4 +437,8 @@ class Flight:
         times = _within(t, self.start, self.stop)
         attitude, rate = self.attitude.turn(times, motion.velocity, motion.acceleration)
         arm = rotate(attitude, np.asarray(self.lever_arm, float))
-        return State(motion.position + arm, motion.velocity + np.cross(rate, arm), attitude, rate)
+        swung = np.cross(rate, arm)
+        return State(
+            motion.position + arm, motion.velocity + swung, attitude, rate,
+            motion.acceleration + np.cross(rate, swung),
+        )  # fmt: skip

@@ -97,6 +97,8 @@ class Shots(NamedTuple):
     """(n,) int64: number of the measurement cycle."""
     direction: np.ndarray
     """(n, 3): unit vectors in the body frame."""
+    turning: np.ndarray
+    """(n, 3): their rates of change there [1/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +161,8 @@ class BeamCycle:
         vectors, patterns, interval = self._steps
         cycle, place = np.divmod(np.asarray(index, np.int64), self.beams_per_cycle)
         beam = patterns[cycle % len(patterns), place]
-        return Shots(cycle / self.rate + place * interval, beam, cycle, vectors[beam])
+        still = np.zeros((beam.size, 3))
+        return Shots(cycle / self.rate + place * interval, beam, cycle, vectors[beam], still)
 
 
 def _begun(duration: float, rate: float, each: int, interval: float) -> int:
@@ -259,7 +262,14 @@ class LineScan:
         """Shots by number (n,), from 0; a cycle is one measurement of all beams."""
         cycle, beam = np.divmod(np.asarray(index, np.int64), self.beams)
         time = cycle / self.rate + beam * self.interval
-        return Shots(time, beam, cycle, self._pointing(time, beam))
+        along, across = np.asarray(self.along)[beam], self.across(time)
+        # The mirror turns the fan of beams about x: each keeps its angle towards forward.
+        level, sine, cosine = np.cos(along), np.sin(across), np.cos(across)
+        swept = level * self.across_rate(time)
+        return Shots(
+            time, beam, cycle, np.column_stack([np.sin(along), level * sine, -level * cosine]),
+            np.column_stack([0.0 * swept, swept * cosine, swept * sine]),
+        )  # fmt: skip
 
     def across(self, t: np.ndarray) -> np.ndarray:
         """Angle of the sweep from nadir towards the left [rad]; it starts at the right."""
@@ -268,11 +278,13 @@ class LineScan:
             return np.asarray(-self.half_angle * np.cos(math.pi * lines))
         return np.asarray(self.half_angle * (1 - 2 * np.abs(1 - lines % 2)))
 
-    def _pointing(self, t: np.ndarray, beam: np.ndarray) -> np.ndarray:
-        along, across = np.asarray(self.along)[beam], self.across(t)
-        # The mirror turns the fan of beams about x: each keeps its angle towards forward.
-        level = np.cos(along)
-        return np.column_stack([np.sin(along), level * np.sin(across), -level * np.cos(across)])
+    def across_rate(self, t: np.ndarray) -> np.ndarray:
+        """Rate of that angle [rad/s]; where it turns back, that of what follows."""
+        lines = np.asarray(t, float) * self.line_rate
+        if self.wave == "sine":
+            return np.asarray(self.half_angle * math.pi * self.line_rate * np.sin(math.pi * lines))
+        back = np.where(lines % 2 < 1, 1.0, -1.0)
+        return np.asarray(2 * self.half_angle * self.line_rate * back)
 
 
 Scanner = BeamCycle | LineScan

@@ -96,6 +96,11 @@ def sizes_of_many(rng, low, high):
 
 
 FURTHER = {
+    "segment_motion": lambda rng: {
+        "target.acceleration": sizes_of_many(rng, -9, 2),
+        "target.radial_velocity": sizes_of_many(rng, -9, 1),
+        "target.transverse_velocity": sizes_of_many(rng, -9, 1),
+    },
     "range_walk": lambda rng: {},
     "acceleration": lambda rng: {"target.acceleration": sizes_of_many(rng, -3, 3)},
     "chirp_nonlinearity": lambda rng: {

@@ -1,0 +1,239 @@
+"""Motion between segments: closed forms, the exact delay, and the fast path against the truth."""
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from engine import difference
+from scipy.constants import speed_of_light
+from small_scenes import flight, instrument, observed
+
+from sweep.model import segments, truth
+from sweep.model.effects.catalogue import CORE, DEFAULTS, names_of
+from sweep.model.eyepoints import prepare_eyepoints
+from sweep.model.geometry.mesh import Surface
+from sweep.model.geometry.scanner import cone, fixed
+from sweep.model.realisations import realise
+from sweep.model.returns import beamlet_lines, draw_returns, groups
+from sweep.model.shot import prepare
+from sweep.model.waveform import SIGNS
+from sweep.tasks.calling import ShotsCalling
+
+MOVING = (*CORE, "segment_motion")
+
+
+def prepared(parameters, effects=MOVING):
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
+
+
+def test_a_target_at_150_metres_a_second_is_7_5_centimetres_nearer_after_500_microseconds(
+    table_4_1,
+):
+    """S 2/c 7.5 cm is 1.0007 kHz a segment: less by S 2/c times both the range and beta."""
+    shots = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1))
+    assert [float(each.nearer) for each in shots.waveform] == pytest.approx([0, 0.075, 0.15])
+    still = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1), CORE)
+    bins = beamlet_lines(shots)[0, :, 0] - beamlet_lines(still)[0, :, 0]
+    moved = 2e12 * 2 * 0.15 / speed_of_light * (1 + 300 / speed_of_light) / (600e6 / 2**17)
+    np.testing.assert_allclose(bins, [0, 0, -moved], atol=1e-9)
+
+
+def test_acceleration_moves_the_doppler_shift_on_from_segment_to_segment(table_4_1):
+    """2 a t / lambda: 10 m/s^2 for 500 us is 6.45 kHz."""
+    parameters = table_4_1(range=2000.0, radial_velocity=100.0, beamlets=1)
+    moving, steady = (
+        beamlet_lines(prepared(parameters | {"target.acceleration": a}))[0, :, 0] for a in (10, 0)
+    )
+    kilohertz = (moving - steady) * 600e3 / 2**17
+    np.testing.assert_allclose(kilohertz, [0, 6.4516, 12.9032], rtol=1e-4)
+
+
+@pytest.mark.parametrize("architecture, later", [("homodyne", 2), ("direct", 1)])
+def test_the_down_chirp_follows_the_segments_that_there_are(architecture, later, table_4_1):
+    shots = prepared(table_4_1(architecture=architecture, radial_velocity=80.0))
+    assert float(shots.starts[2]) == later * 500e-6
+
+
+@pytest.mark.parametrize("segment", [0, 1, 2])
+@pytest.mark.parametrize("a", [0.0, -11.4, 900.0])
+def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, table_4_1):
+    """In 40 digits: R - v T - a T^2 / 2 from the shot's start, and each segment's own chirp."""
+    range_0, v, begun = 1400.0, -130.0, segment * 500e-6
+    shots = prepared(
+        table_4_1(
+            range=range_0, radial_velocity=v, beamlets=1, fft_size=512, sample_rate=1.2e6,
+            acquisition_delay=20e-6, detector_bandwidth=1e30, amplifier_bandwidth=1e30,
+        )
+        | {"target.acceleration": a}
+    )  # fmt: skip
+    record = truth.analytic_record(shots, 0, segment, 0, acceleration=True)
+    sign, carrier = SIGNS[segment], float(shots.carriers[segment])
+    expected = []
+    with mpmath.workdps(40):
+        for n in range(0, 512, 73):
+            t = 20e-6 + mpmath.mpf(n) / mpmath.mpf(1.2e6)
+            since = begun + t
+            delay = 2 * (range_0 - v * since - mpmath.mpf(a) * since**2 / 2) / 299792458
+            emitted = [carrier * at + sign * mpmath.mpf(2e12) * at**2 / 2 for at in (t - delay, t)]
+            cycles = emitted[0] - emitted[1]
+            expected.append(complex(mpmath.expjpi(2 * (cycles - mpmath.nint(cycles)))))
+    found = record[::73] / abs(record[::73])
+    # a range of 1400 m is rounded to 2e-13 m of 775 nm a turn, cycles of 1e5 to 1e-11
+    assert np.abs(found - expected).max() < 1e-5
+
+
+def drawn(number):
+    rng = np.random.default_rng((23, number))
+    scene = {
+        "architecture": ("homodyne", "heterodyne", "direct")[number % 3],
+        "phases": ("coherent", "incoherent")[number // 3 % 2],
+        "window": ("hann", "hamming", "rectangular", "kaiser(8.6)")[number % 4],
+        "beamlets": int(rng.integers(1, 60)), "fft_size": int(rng.choice([1000, 1023, 4096])),
+        "range": 10 ** rng.uniform(0.5, 4), "grazing_angle": rng.uniform(0.1, 1.5),
+        "beam_divergence": 10 ** rng.uniform(-5, -2.5), "radial_velocity": rng.uniform(-300, 300),
+        "acquisition_delay": float(rng.choice([0.0, 70e-6])),
+    }  # fmt: skip
+    further = {
+        "target.acceleration": rng.choice([-1, 1]) * 10 ** rng.uniform(0, 5),
+        "target.transverse_velocity": rng.uniform(-200, 200),
+    }
+    return scene, further
+
+
+def disagreement(shots, **kept):
+    return max(
+        difference(
+            shots,
+            segments.spectrum(shots, 0, int(segment))[1],
+            truth.spectrum(shots, 0, int(segment), **kept),
+        )
+        for segment in np.flatnonzero(shots.segments)
+    )
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_the_fast_path_is_the_truth_as_the_target_moves_on(number, table_4_1):
+    scene, further = drawn(number)
+    parameters = table_4_1(**scene) | further
+    assert disagreement(prepared(parameters), range_walk=False) < 1e-9, scene
+
+
+@pytest.mark.parametrize("number", range(0, 24, 5))
+def test_the_drift_within_a_record_is_that_of_its_own_segment(number, table_4_1):
+    """One beamlet: range walk, acceleration and a beam that slides, from where its segment is."""
+    scene, further = drawn(number)
+    parameters = table_4_1(**scene | {"beamlets": 1}) | further
+    shots = prepared(parameters, (*MOVING, "range_walk", "acceleration"))
+    assert disagreement(shots, acceleration=True) < 1e-8, scene
+
+
+@pytest.mark.parametrize("frequency", [0.0, 300e6, -600e6])
+def test_lines_meet_their_images_at_the_phase_of_where_they_have_come_to(frequency, table_4_1):
+    rate, carrier = 2e12, speed_of_light / 1550e-9
+    scene = table_4_1(range=1234.5, fft_size=1024, phases="coherent", beamlets=5)
+    v = (frequency + rate * 2 * 1234.5 / speed_of_light) / carrier * speed_of_light / 2
+    for a in (0.0, 3.0):
+        shots = prepared(scene | {"target.radial_velocity": -v, "target.acceleration": a})
+        assert disagreement(shots, range_walk=False) < 1e-9
+
+
+def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
+    """A millimetre a second for a millisecond is 1.3 cycles at 1550 nm, which phases show."""
+    rng = np.random.default_rng(3)
+    scene = table_4_1(fft_size=4096, phases="coherent", radial_velocity=20.0, range=900.0)
+    shots = prepared(scene | {"footprint.beamlets": 19})
+    own = replace(shots, doppler=rng.uniform(-1e-8, 1e-8, shots.offset.shape))
+    assert disagreement(own, range_walk=False) < 1e-9
+
+
+@pytest.mark.parametrize("velocity", [150.0, -90.0])
+@pytest.mark.parametrize("across", [0.0, 40.0])
+def test_what_is_reported_is_put_right_by_the_velocity_that_is_measured(
+    velocity, across, table_4_1
+):
+    """Down to 0.1 mm and 3 um/s; what slides over the slope is not known, nor put right."""
+    scene = table_4_1(
+        range=812.34, radial_velocity=velocity, power=100.0, beamlets=1, grazing_angle=1.1
+    )
+    shots = prepared(scene | {"target.transverse_velocity": across}, (*MOVING, "range_walk"))
+    keys = np.ones((1, 2), np.uint64)
+    found = draw_returns(shots, groups(shots), keys=keys, draws=400)
+    slid = across / np.tan(1.1)
+    within = 500e-6 + 2**17 / 600e6 / 2
+    off = np.median(found.range_interpolated[0, :, 0]) - 812.34
+    assert off == pytest.approx(-slid * within, abs=1e-4)
+    mixed = slid * 2e12 * 500e-6 / (speed_of_light / 1550e-9)
+    speed = np.median(found.radial_velocity_interpolated[0, :, 0])
+    assert speed == pytest.approx(velocity - mixed, abs=3e-6)
+
+
+TILT = np.radians(22.5)
+SLOWS = (100.0**2 - 30.0**2) / (2 * 400.0)
+"""Morpheus' deceleration from 100 to 30 m/s over 400 m [m/s^2]."""
+
+
+def of_flight(table_4_1, effects):
+    """The first shots of three beams, falling straight at level ground from 500 m."""
+    seen = observed(
+        flight((0.0, 0.0, 500.0), (0.0, 0.0, -100.0), acceleration=(0.0, 0.0, SLOWS), duration=6.0),
+        scanner=fixed(cone(3, half_angle=TILT), rate=1.0), index=np.arange(3), number=1,
+    )  # fmt: skip
+    ground = [Surface("ground", 0.1, "lambert")]
+    return prepare_eyepoints(seen, DEFAULTS | instrument(table_4_1, beamlets=1), ground, effects)
+
+
+def of_grid(table_4_1, effects):
+    """The same as a plane at 67.5 degrees."""
+    along = {"target.acceleration": -SLOWS * np.cos(TILT)}
+    across = {"target.transverse_velocity": 100.0 * np.sin(TILT)}
+    scene = table_4_1(
+        range=500.0 / np.cos(TILT), radial_velocity=100.0 * np.cos(TILT), beamlets=1,
+        grazing_angle=np.pi / 2 - TILT, reflectance_law="lambert", phases="incoherent",
+    )  # fmt: skip
+    return prepared(scene | along | across, effects)
+
+
+@pytest.mark.parametrize("made", [of_flight, of_grid])
+def test_morpheus_magnitudes_are_those_of_the_truth_that_decelerates(made, table_4_1):
+    """Without the acceleration they are off by a tenth, 14 kHz of drift over bins of 4.6 kHz."""
+    within = (*MOVING, "range_walk")
+    slowing, steady = (made(table_4_1, (*within, *also)) for also in (["acceleration"], []))
+    assert float(np.ravel(slowing.acceleration)[0]) == pytest.approx(-10.509, abs=1e-3)
+    assert float(np.ravel(slowing.approach)[0]) == pytest.approx(100.0 / np.cos(TILT))
+    assert disagreement(slowing, acceleration=True) < 1e-8
+    lost = disagreement(steady, acceleration=True)
+    assert 0.05 < lost < 0.3
+
+
+def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
+    """Deceleration by 11 m/s^2; a hovering lidar has neither."""
+    ground = [Surface("ground", 0.1, "lambert")]
+    called = []
+    for slows in (SLOWS, 0.0):
+        seen = observed(
+            flight(velocity=(0.0, 0.0, -slows), acceleration=(0.0, 0.0, slows)), number=7
+        )
+        calling = ShotsCalling(instrument(table_4_1, beamlets=7), ground, modes={}, rotating=False)
+        flags = calling.plans(seen, np.zeros(1, np.int64)).called(1).flags
+        called.append({"acceleration", "segment_motion"} & set(names_of(int(flags[0]))))
+    assert called == [{"acceleration", "segment_motion"}, set()]
+
+
+def test_speckles_turn_once_between_segments(table_4_1):
+    """By their own Doppler shifts, in the lines' phases or in the speckle's; never in both."""
+    scene = table_4_1(
+        range=900.0, phases="incoherent", beamlets=7, grazing_angle=np.pi / 2, radial_velocity=0.0,
+        beam_divergence=1e-3, fft_size=2**13,
+    )  # fmt: skip
+    rough = scene | {"target.roughness": 1e-3, "target.transverse_velocity": 3.0}
+    (one,), (other,) = (
+        realise(rough, (*CORE, *also), keys=np.ones((1, 2), np.uint64), draws=1)
+        for also in (["speckle"], ["speckle", "segment_motion"])
+    )
+    for segment in range(3):
+        first, second = (segments.spectrum(each.shots, 0, segment)[1] for each in (one, other))
+        np.testing.assert_allclose(first, second, atol=1e-5 * first.max())
+    starts = [segments.spectrum(one.shots, 0, segment)[1].max() for segment in (0, 2)]
+    assert abs(starts[0] / starts[1] - 1) > 0.05
