@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 53_352, "modules": 286, "lines of the model": 16_713, "modules of the model": 65,
+    "lines": 53_680, "modules": 287, "lines of the model": 17_040, "modules of the model": 66,
     "compiled functions": 124, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

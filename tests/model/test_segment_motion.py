@@ -14,8 +14,9 @@ from sweep.model.effects.catalogue import CORE, DEFAULTS, names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.scanner import cone, fixed
+from sweep.model.groups import groups
 from sweep.model.realisations import realise
-from sweep.model.returns import beamlet_lines, draw_returns, groups
+from sweep.model.returns import beamlet_lines, draw_returns
 from sweep.model.shot import prepare
 from sweep.model.waveform import SIGNS
 from sweep.tasks.calling import ShotsCalling
