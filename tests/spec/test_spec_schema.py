@@ -26,6 +26,7 @@ POINTS = {
     "transmit_power": 3 * 20082,
     "aperture": 3 * 20082,
     "fft_size": 3 * 20082,
+    "beam_coupling": 444,
     "beam_divergence": 6 * 30078,
     "speckled_target": 24 * 4,
     "cfar": 4 * 2 * 12,
@@ -57,7 +58,7 @@ def test_a_shipped_study_loads_and_agrees_with_the_schema(path, validator):
     validator.validate(spec.to_yaml_mapping())
 
 
-NEW = ("speckled_target", "cfar", "estimators")
+NEW = ("beam_coupling", "speckled_target", "cfar", "estimators")
 """Studies of what the thesis has nothing of."""
 
 
