@@ -169,7 +169,7 @@ def test_every_parameter_is_part_of_the_id(path):
     if path == "instrument.laser.beam_waist":  # one of the two that say how wide a beam is
         every |= {"instrument.laser.beam_divergence": "none", path: "4 mm"}
     if path == "footprint.speckle":
-        every |= {"target.roughness": 0}  # a stated one asks for no developed speckle
+        every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
     base, changed = spec(every), spec(every | {path: other_value(path)})
     assert changed.id != base.id
     (line,) = difference(base, changed)
