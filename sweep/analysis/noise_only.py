@@ -16,10 +16,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sweep.model.alarms import first_circular, independent_bins, neighbour_correlation
 from sweep.model.detectors import DETECTORS, FIXED
-from sweep.model.preparation import as_arrays
-from sweep.model.window import canonical_name, window
+from sweep.model.threshold import segment_bins, tnr_of
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -43,20 +41,10 @@ def bin_probability(tnr: float) -> float:
 def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
     """Independent bins that raise as many false alarms as a segment's, by a bin's chance of one.
 
-    From SI values by dotted path; as :meth:`sweep.model.preparation.Shots.counted_bins`.
+    From SI values by dotted path; :func:`sweep.model.threshold.segment_bins`.
     """
-    arrays, name = as_arrays(parameters), "instrument.processing."
-    size = int(arrays[name + "fft_size"])
-    is_all = parameters[name + "bins_counted"] == "all"
-    if parameters[name + "noise_bins"] == "independent":
-        return np.full(np.shape(bin_probability), float(size if is_all else size // 2))
-    taper = window(canonical_name(str(parameters[name + "window"])), int(arrays["record"]))
     level = np.sqrt(-2 * np.log(np.maximum(bin_probability, 1e-300)))
-    return independent_bins(
-        size if is_all else size // 2 + 1 - 2 * first_circular(taper, size),
-        level=level,
-        correlation=neighbour_correlation(taper, size),
-    )
+    return segment_bins(parameters, level)
 
 
 def segment_probability(bin_probability: np.ndarray, bins: ArrayLike) -> np.ndarray:
@@ -89,7 +77,7 @@ def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
             parameters |= {member.path: member.values[index] for member in axis.members}
         kind = parameters.get("instrument.processing.detector.kind", FIXED)
         if kind == FIXED:
-            in_a_bin = bin_probability(float(parameters["instrument.processing.tnr"]))
+            in_a_bin = bin_probability(float(tnr_of(parameters)))
         elif kind in DETECTORS:
             in_a_bin = float(parameters["instrument.processing.detector.pfa"])
         else:
@@ -101,19 +89,19 @@ def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
 
 
 def shot_with_leakage(
-    pfa_segment: Chances, pfa_shot: Chances, p_leakage_up: Chances, p_leakage_down: Chances
+    pfa_segment: Chances, pfa_both_chirps: Chances, p_leakage_up: Chances, p_leakage_down: Chances
 ) -> Chances:
     """Probability that noise or leakage raises an extra group in both chirp segments, 0..1.
 
     Parameters
     ----------
-    pfa_segment, pfa_shot
+    pfa_segment, pfa_both_chirps
         Of noise alone: in the up-chirp, and in both. The latter is a product, as the segments'
         numbers of bins differ.
     p_leakage_up, p_leakage_down
         Of leakage in each.
     """
-    down = pfa_shot / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
+    down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
     up = pfa_segment + p_leakage_up * (1 - pfa_segment)
     return up * (down + p_leakage_down * (1 - down))
 

@@ -14,6 +14,7 @@ from sweep.analysis.cuts import GRAZING_ANGLE
 from sweep.analysis.shot_spectra import Parameters, Segment, Shot, simulated
 from sweep.analysis.tabular import Block, Cell, Page, percent
 from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.threshold import WAYS
 from sweep.spec import Spec
 from sweep.spec.fields import parameter_rules
 
@@ -84,7 +85,8 @@ def _false_alarms(shot: Shot) -> Block:
     rows = [
         ["one bin, noise", f"{o['pfa_bin']:.4e}"],
         ["up-chirp segment, noise", f"{o['pfa_segment']:.4e}"],
-        ["both chirp segments, noise", f"{o['pfa_shot']:.4e}"],
+        ["both chirp segments, noise", f"{o['pfa_both_chirps']:.4e}"],
+        ["any segment, noise", f"{o['pfa_shot']:.4e}"],
         ["up-chirp segment, leakage", f"{o['p_leakage_up']:.4e}"],
         ["down-chirp segment, leakage", f"{o['p_leakage_down']:.4e}"],
     ]
@@ -98,7 +100,7 @@ _TOLD = (
     "target.range", "target.grazing_angle", "target.radial_velocity", "target.reflectance",
     "target.reflectance_law", "instrument.laser.power", "instrument.telescope.aperture",
     "instrument.laser.beam_divergence", "instrument.processing.fft_size",
-    "instrument.processing.window", "instrument.processing.tnr",
+    "instrument.processing.window", *WAYS,
 )  # fmt: skip
 
 
@@ -209,7 +211,9 @@ def _told(shot: Shot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
     rules = parameter_rules()
     told = []
     for path in paths:
-        value = shot.parameters[path]
+        value = shot.parameters.get(path)
+        if value is None:  # the threshold is set otherwise
+            continue
         if isinstance(value, str):
             text = value
         elif path == GRAZING_ANGLE:

@@ -16,11 +16,12 @@ from sweep.analysis.selection import Points, split
 from sweep.analysis.tabular import Block, Cell, Page, percent
 from sweep.analysis.tallies import Search, Tally, for_median, median, pieces, search, tallied
 from sweep.model.shot import evaluate
+from sweep.model.threshold import tnr_of
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
 
-VARIABLES = ["pfa_segment", "pfa_shot", "p_leakage_up", "p_leakage_down"]
+VARIABLES = ["pfa_segment", "pfa_both_chirps", "p_leakage_up", "p_leakage_down"]
 
 HELD = 0.9
 """Share of all leakage whose points are told."""
@@ -153,7 +154,9 @@ def _pieces(groups: Sequence[tuple[Points, str]]) -> Iterator[tuple[int, _Piece]
         along = groups[number][1]
         where = part.spread(along) if along else np.zeros(part.size)
         up, down = values["p_leakage_up"], values["p_leakage_down"]
-        shot = noise_only.shot_with_leakage(values["pfa_segment"], values["pfa_shot"], up, down)
+        shot = noise_only.shot_with_leakage(
+            values["pfa_segment"], values["pfa_both_chirps"], up, down
+        )
         known = np.isfinite(up) & np.isfinite(down)
         yield number, _Piece(up[known], down[known], shot[known], where[known])
 
@@ -205,14 +208,14 @@ def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     """
     first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
     parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
-    tnr = float(parameters["instrument.processing.tnr"])
+    tnr = float(tnr_of(parameters))
     bins = float(noise_only.bins_counted(parameters, noise_only.bin_probability(tnr)))
     found = evaluate(parameters)
     return Reference(
         tnr=tnr,
         bins=bins,
         closed_form=noise_only.shot_probability(tnr, bins),
-        model=float(found["pfa_shot"].item()),
+        model=float(found["pfa_both_chirps"].item()),
         model_bin=float(found["pfa_bin"].item()),
     )
 
@@ -252,7 +255,7 @@ def entries(
     groups = [
         (beyond(cut.of(part), spec, NEAREST), cut) for _, _, part in settled for cut in cuts(spec)
     ]
-    means = [tally.mean for tally in tallied([points for points, _ in groups], "pfa_shot")]
+    means = [tally.mean for tally in tallied([points for points, _ in groups], "pfa_both_chirps")]
     leaked = leakage([(points, cut.along) for points, cut in groups], spec)
     return [
         Entry(

@@ -354,7 +354,7 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
     if most > MANY_ALARMS:
         click.echo(
             f"warning: noise alone raises a false alarm in a shot with probability {most:.3g} "
-            f"(more than {MANY_ALARMS:g}): raise instrument.processing.tnr, or lower detector.pfa",
+            f"(more than {MANY_ALARMS:g}): raise the threshold, or lower detector.pfa",
             err=True,
         )
 

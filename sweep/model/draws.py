@@ -115,7 +115,7 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
         alone = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
     doppler = np.nan_to_num(outputs["pd_doppler"])
     noise_up = outputs["pfa_segment"]
-    both, one = outputs["log10_pfa_shot"], outputs["log10_pfa_segment"]
+    both, one = outputs["log10_pfa_both_chirps"], outputs["log10_pfa_segment"]
     some = np.isfinite(one)  # else the detection occupies every bin
     noise_down = np.where(some, 10 ** (both - np.where(some, one, 0.0)), 0.0)
     alarm_up = 1 - (1 - noise_up) * (1 - outputs["p_leakage_up"])

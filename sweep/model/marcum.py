@@ -244,6 +244,15 @@ def log_at_least_one(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
         return np.where(n > 0.0, found, -np.inf)
 
 
+def log_any(log_p: np.ndarray, log_q: np.ndarray) -> np.ndarray:
+    """Natural logarithm of the probability of either of two independent events, from theirs.
+
+    ln(p + q (1 - p)) <= 0, with their digits; -inf where neither happens.
+    """
+    with np.errstate(divide="ignore"):
+        return np.minimum(np.logaddexp(log_p, log_q + np.log(-np.expm1(log_p))), 0.0)
+
+
 def _tries(n: ArrayLike) -> np.ndarray:
     """Numbers of tries as float64; refuses impossible ones."""
     n = np.asarray(n, float)

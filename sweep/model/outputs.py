@@ -57,13 +57,19 @@ OUTPUTS: dict[str, Output] = {
         "probability of at least one false alarm in the up-chirp segment, from noise alone",
         "over the bins counted less those that the detection occupies; leakage is apart",
     ),
-    "pfa_shot": Output(
+    "pfa_both_chirps": Output(
         "1",
         "probability of a false alarm in the up- and in the down-chirp segment, from noise alone",
         "what Tables 4.3 to 4.5 of the thesis print",
     ),
+    "pfa_shot": Output(
+        "1",
+        "probability of at least one false alarm in any segment of a shot, from noise alone",
+        "the Doppler segment among them, where there is one",
+    ),
     "log10_pfa_bin": Output("1", "log10 of pfa_bin", "finite where pfa_bin underflows"),
     "log10_pfa_segment": Output("1", "log10 of pfa_segment", NO_BIN),
+    "log10_pfa_both_chirps": Output("1", "log10 of pfa_both_chirps", NO_BIN),
     "log10_pfa_shot": Output("1", "log10 of pfa_shot", NO_BIN),
     "p_leakage_up": Output(
         "1", "probability that leaked signal raises a further group, up-chirp", "over noise alone"
@@ -101,14 +107,15 @@ _PLACES = {
     "up": "the up-chirp segment",
     "down": "the down-chirp segment",
     "doppler": "the Doppler segment",
-    "shot": "both chirp segments",
 }
 DRAW_OUTPUTS: dict[str, Output] = {
     f"n_{name}_{segment}": Output("1", f"number of draws with a {event} in {place}", dtype="int64")
-    for name, event in (("detected", "detection"), ("false_alarm", "false alarm"))
-    for segment, place in _PLACES.items()
+    for name, event, both in (
+        ("detected", "detection", "shot"), ("false_alarm", "false alarm", "both_chirps"),
+    )
+    for segment, place in {**_PLACES, both: "both chirp segments"}.items()
     if (name, segment) != ("false_alarm", "doppler")
-}
+}  # fmt: skip
 
 ERROR_OUTPUTS: dict[str, Output] = _by_segment(
     "pd_{}_error",

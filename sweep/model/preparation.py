@@ -22,6 +22,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import Fading
 from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
+from sweep.model.threshold import tnr_of
 from sweep.model.window import Window, canonical_name, window
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
@@ -447,7 +448,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
         noise_shape=str(p[RECEIVER + "noise_shape"]),
-        tnr=p[PROCESSING + "tnr"],
+        tnr=tnr_of(p),
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,
         acceleration=p["target.acceleration"],

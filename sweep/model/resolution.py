@@ -64,6 +64,7 @@ from sweep.model.preparation import (
     categories,
     doppler_ratio,
 )
+from sweep.model.threshold import tnr_of
 from sweep.model.window import canonical_name, samples
 
 BEAMLETS = "footprint.beamlets"
@@ -228,7 +229,7 @@ def beamlets_needed(
 
 def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Most that pd changes, summed over the segments, for the relative change of a bin's power."""
-    b = detection.threshold(tnr=p[PROCESSING + "tnr"], bin_deviation=np.asarray(1.0))
+    b = detection.threshold(tnr=tnr_of(p), bin_deviation=np.asarray(1.0))
     a = 0.5 * (b + np.sqrt(b * b + 2))
     steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
     return np.asarray(_SEGMENTS * steepest / 2)

@@ -12,7 +12,7 @@ from sweep.model import waveform
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, PARAMETERS
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.ground import Cast, Ground, Plane
-from sweep.model.marcum import log_at_least_one
+from sweep.model.marcum import log_any, log_at_least_one
 from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots, as_arrays, bare
 from sweep.model.resolution import resolved_categories
@@ -187,12 +187,13 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
 
 
 def _false_alarms(shots: Shots, exempted: np.ndarray) -> dict[str, np.ndarray]:
-    """False alarms of noise alone: per bin, per (up-chirp) segment, per shot, with log10."""
+    """False alarms of noise alone: in a bin, the up-chirp, both chirps, any segment; with log10."""
     log_bin = -0.5 * (shots.threshold / shots.bin_deviation) ** 2
-    counted = shots.counted_bins(exempted)
-    log_up = log_at_least_one(log_bin, counted[0])
-    log_down = log_at_least_one(log_bin, counted[2])
-    logs = {"bin": log_bin, "segment": log_up, "shot": log_up + log_down}
+    exists = shots.segments[:, None]
+    counted = np.where(exists, shots.counted_bins(np.where(exists, exempted, 0.0)), 0.0)
+    up, doppler, down = log_at_least_one(log_bin, counted)
+    logs = {"bin": log_bin, "segment": up, "both_chirps": up + down}
+    logs["shot"] = log_any(log_any(up, doppler), down)
     return {f"pfa_{name}": np.exp(value) for name, value in logs.items()} | {
         f"log10_pfa_{name}": value / np.log(10) for name, value in logs.items()
     }

@@ -19,12 +19,11 @@ from sweep.analysis.figures import Study
 from sweep.analysis.selection import Points
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.shot import prepare
+from sweep.model.threshold import WAYS, tnr_of
 from sweep.report import lines, looks, wording
 from sweep.report.choosing import parts
 from sweep.report.page import Chart, Control, when
 from sweep.spec import Spec
-
-TNR = "instrument.processing.tnr"
 
 PLACES = 24
 """Places along a coordinate at which the noise is told by source."""
@@ -38,12 +37,13 @@ IN_A_BIN = np.logspace(-0.05, -16, 90)
 DRAWS = 400
 """Draws of each point whose characteristic is random."""
 
-WITH_LEAKAGE = "pfa_shot_with_leakage"
+WITH_LEAKAGE = "pfa_both_chirps_with_leakage"
 
 _SHORT = {
     "pfa_bin": "noise, one bin",
     "pfa_segment": "noise, a segment",
-    "pfa_shot": "noise, both",
+    "pfa_both_chirps": "noise, both",
+    "pfa_shot": "noise, any",
     "p_leakage_up": "leakage, up",
     "p_leakage_down": "leakage, down",
     WITH_LEAKAGE: "either, both",
@@ -310,7 +310,9 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
         made += along.lines([(line.points, variable) for line in own], name)
         named += own
     ruler = wording.Ruler.of(study, name, _values(found))
-    closed = noise_only.bin_probability(float(study.spec.parameters()[TNR]))
+    # The same for all points where no axis moves it, and no number of bins.
+    one = set(WAYS[:3]) & study.spec.parameters_off_axes().keys()
+    closed = noise_only.bin_probability(float(tnr_of(study.spec.parameters())))
     return Chart(
         heading="False alarms",
         alt=lines.alternative(
@@ -318,7 +320,7 @@ def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
         ),
         caption=wording.sentences(
             [f"A bin of noise alone crosses with probability {closed:.3g} in closed form"
-             if "tnr" not in study.dataset.coords else "",
+             if one else "",
              *lines.remarks(made),
              "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
              "Either: by noise or by leakage; both: in the up- and in the down-chirp of a shot",

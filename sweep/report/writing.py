@@ -265,6 +265,7 @@ MOST_ROWS = 1000
 
 COLUMNS = (
     "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
+    "pfa_both_chirps",
     "p_leakage_up", "false_alarms", "snr_up", "snr_doppler", "range_error",
     "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
     "radial_velocity_bound", "beamlets", "n_draws", "effects_error",

@@ -66,6 +66,7 @@ class Spec(Study):
             path: value
             for section in SECTIONS
             for path, value in values_of(getattr(self, section), section).items()
+            if value is not None
         }
 
     @cached_property

@@ -3,16 +3,18 @@
 Values are SI inside; what users write carries units.
 """
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic_core import PydanticCustomError
 
 from sweep.model.beam import COUPLINGS, SINGLE_MODE
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
+from sweep.model.threshold import PROCESSING, WAYS
 from sweep.spec.effect_fields import with_parameters
 from sweep.spec.method_rule import Method
-from sweep.spec.rules import Choice, Numeric
+from sweep.spec.rules import BROKEN_RULE, Choice, Numeric
 from sweep.spec.window_rule import Window
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
@@ -388,6 +390,16 @@ class Estimator(Part):
     ] = PEAK_BIN
 
 
+def _design_pfa(where: str) -> Numeric:
+    """Rule of a probability of a false alarm that the threshold is set by."""
+    return Numeric(
+        about=f"Instead of tnr: probability that noise alone raises a false alarm in {where}",
+        example="1e-6",
+        at_least="1e-300",
+        at_most="0.99",
+    )
+
+
 @with_parameters("instrument.processing")
 class Processing(Part):
     """Sampling, transform and threshold."""
@@ -409,14 +421,26 @@ class Processing(Part):
         ),
     ]
     tnr: Annotated[
-        float,
+        float | None,
         Numeric(
             about="Threshold over the standard deviation of a noise-only bin's magnitude",
             example="10",
             at_least="1e-6",
             at_most="1e6",
         ),
-    ]
+    ] = None
+    threshold_to_mean: Annotated[
+        float | None,
+        Numeric(
+            about="Instead of tnr: threshold over the mean of a noise-only bin's magnitude",
+            example="4",
+            at_least="1e-6",
+            at_most="1e6",
+        ),
+    ] = None
+    design_pfa_bin: Annotated[float | None, _design_pfa("a bin")] = None
+    design_pfa_segment: Annotated[float | None, _design_pfa("any bin of a segment")] = None
+    design_pfa_shot: Annotated[float | None, _design_pfa("any segment of a shot")] = None
     window: Annotated[
         str, Window(about="Window function, by scipy.signal's name, with its parameters")
     ] = "hamming"
@@ -454,6 +478,19 @@ class Processing(Part):
     ] = "correlated"
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
+
+    @model_validator(mode="after")
+    def _one_threshold(self) -> Self:
+        """Refuse a threshold that is not set, or that is set in several ways."""
+        ways = [way.removeprefix(PROCESSING) for way in WAYS]
+        given = [way for way in ways if getattr(self, way) is not None]
+        if len(given) != 1:
+            rule = (
+                f"sets the threshold by {' and by '.join(given)}" if given else "has no threshold"
+            )
+            remedy = "keep one of them" if given else f"write 'tnr: 10', or {', '.join(ways[1:])}"
+            raise PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": remedy})
+        return self
 
 
 class Instrument(Part):

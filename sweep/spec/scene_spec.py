@@ -137,7 +137,7 @@ class SceneSpec(Study):
             path: value
             for section in SECTIONS
             for path, value in values_of(getattr(self, section), section).items()
-            if not is_method(path)
+            if value is not None and not is_method(path)
         }
         rays = rays_needed(parameters, Accuracy.of(parameters))
         return parameters | {

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import ConfigDict, PrivateAttr, ValidationError
 
+from sweep.model.threshold import WAYS
 from sweep.spec.axes import Axis, Member
 from sweep.spec.axis_reading import paths_on_axes, read_axes
 from sweep.spec.beam_check import beam_findings
@@ -194,12 +195,14 @@ class Study(Part, ABC):
         parameters = self.parameters()
         findings = []
         for name, written in at.items():
-            path, rule = _parameter(name, parameters)
+            path, rule = _parameter(name, parameters | dict.fromkeys(WAYS))
             if rule is None:
                 suggestion = parameter_suggestion(name, parameters)
                 findings.append(Finding((name,), "is no parameter", suggestion, ABSENT))
                 continue
             try:
+                if path in WAYS:  # one takes another's place
+                    parameters = {p: v for p, v in parameters.items() if p not in WAYS}
                 parameters[path] = rule.read(written)
             except QuantityError as error:
                 findings.append(Finding((name,), error.rule, error.suggestion, written))

@@ -46,7 +46,8 @@ def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
         if isinstance(written, list) and path in parameter_rules():
             remedy = f"put several under axes: '{path}: [...]'"
             return Finding(location, "takes one value", remedy, written)
-        return Finding(location, context["rule"], context["suggestion"], written)
+        shown = ABSENT if isinstance(written, dict) else written
+        return Finding(location, context["rule"], context["suggestion"], shown)
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place), ABSENT)
     if kind == "extra_forbidden":

@@ -153,7 +153,7 @@ def test_a_roc_of_too_much_or_of_nothing_is_refused(surface):
 
 
 def test_false_alarms_are_counted_by_time_and_by_way(surface):
-    pfa = surface.pfa_shot.compute()
+    pfa = surface.pfa_both_chirps.compute()
     assert surface.sweep.false_alarms_per_second().values == pytest.approx((pfa / PERIODS).values)
     assert surface.sweep.false_alarms_per_second("20 Hz").values == pytest.approx(20 * pfa.values)
     # 20 shots a second at 180 km/h: one every 2.5 m, 400 a kilometre
@@ -170,16 +170,16 @@ def test_false_alarms_with_leakage_are_those_of_either_cause(surface):
     """By the chances of none: each segment is clean if neither noise nor leakage raises any."""
     ds = surface.compute()
     up = 1 - (1 - ds.pfa_segment) * (1 - ds.p_leakage_up)
-    down = 1 - (1 - ds.pfa_shot / ds.pfa_segment) * (1 - ds.p_leakage_down)
+    down = 1 - (1 - ds.pfa_both_chirps / ds.pfa_segment) * (1 - ds.p_leakage_down)
     found = ds.sweep.false_alarms_per_second(1.0, leakage=True)
     assert found.values == pytest.approx((up * down).values, rel=1e-6)
-    assert (found > ds.pfa_shot).any()
+    assert (found > ds.pfa_both_chirps).any()
 
 
 def test_the_duration_of_a_chirp_may_be_an_axis(tmp_path):
     axes = {"instrument.chirp.duration": ["400 us", "500 us"]}
     dataset = sweep.open(stored(tmp_path, axes))
-    rates = dataset.sweep.false_alarms_per_second() / dataset.pfa_shot
+    rates = dataset.sweep.false_alarms_per_second() / dataset.pfa_both_chirps
     assert rates.values == pytest.approx([1 / 1.2e-3, 1 / 1.5e-3])
 
 

@@ -62,7 +62,7 @@ def test_means_leave_out_ranges_up_to_5_m_and_count_no_point_twice(power, entrie
     _, _, dataset = power
     at_1_w = dataset.isel(power=0)
     chosen = (at_1_w.grazing_angle == 15) & (at_1_w.range > 5)
-    pfa = at_1_w.pfa_shot.values[chosen.values]
+    pfa = at_1_w.pfa_both_chirps.values[chosen.values]
     where = at_1_w.range.values[chosen.values]
     # 3500 m at 15 deg lies on two cuts
     assert where.size == 19 and entries[0].points == 18
@@ -86,7 +86,7 @@ def leaked(ranges, up, down, **further):
     """The leakage of made points along range."""
     noise = np.full(np.shape(up), 1e-4)
     values = {"p_leakage_up": up, "p_leakage_down": down, "pfa_segment": noise,
-              "pfa_shot": noise * 2e-4}  # fmt: skip
+              "pfa_both_chirps": noise * 2e-4}  # fmt: skip
     variables = {name: ([*further, "range"], np.asarray(v, float)) for name, v in values.items()}
     dataset = xr.Dataset(variables, {"range": ("range", ranges, {"units": "m"})})
     spec = study({"target.range": [f"{x} m" for x in ranges]})

@@ -158,9 +158,9 @@ def _draws(spec: Spec, results: Results, direct: np.ndarray) -> None:
         assert (results[name] <= batches).all(), f"{name} has more than all"
         if name != "n_detected_doppler":
             assert (results[name] >= 0).all(), name
-    for kind in ("detected", "false_alarm"):
+    for kind, joint in (("detected", "shot"), ("false_alarm", "both_chirps")):
         both = np.minimum(results[f"n_{kind}_up"], results[f"n_{kind}_down"])
-        assert (results[f"n_{kind}_shot"] <= both).all(), f"n_{kind}_shot"
+        assert (results[f"n_{kind}_{joint}"] <= both).all(), f"n_{kind}_{joint}"
     for name in ERROR_OUTPUTS if not spec.draws.whole_spectra else ():
         nan = np.isnan(results[name])
         assert (results[name][~nan] >= 0).all(), name

@@ -10,9 +10,13 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from written_values import STYLES, Style, cheaper, values
 
+from sweep.model.threshold import WAYS
 from sweep.spec.fields import rule_of, written_name
 from sweep.spec.list_rules import File
 from sweep.spec.structure import kind_of, models_at
+
+THRESHOLDS = tuple(way.rsplit(".", 1)[-1] for way in WAYS)
+"""Fields of which a spec has one."""
 
 SPREADS = (0.3, 0.3, 1.0, 1.0, 3.0)
 """Decades about the examples, of most fields of a spec."""
@@ -49,10 +53,13 @@ class Parts:
         @st.composite
         def made(draw: st.DrawFn) -> dict[str, Any]:
             style, written = Style(draw(STYLES)), {}
+            one = draw(st.sampled_from(THRESHOLDS)) if THRESHOLDS[0] in fields else ""
             for number, (name, (key, needed)) in enumerate(fields.items()):
                 if number % 12 == 11:
                     style = Style(draw(STYLES))
-                if needed or style.below(4) == 3:
+                if name in THRESHOLDS and name != one:
+                    continue
+                if needed or name == one or style.below(4) == 3:
                     written[key] = draw(self.field(model, name, spread))
             return {key: value for key, value in written.items() if value is not ...}
 

@@ -196,7 +196,9 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
             assert results[f"p_leakage_{name}"][0] == pytest.approx(leakage, rel=1e-6, abs=1e-15)
             alarms[name] = 1 - (1 - pfa) ** max(512 - len(excluded), 0)
         assert results["pfa_segment"][0] == pytest.approx(alarms["up"], rel=1e-10)
-        assert results["pfa_shot"][0] == pytest.approx(alarms["up"] * alarms["down"], rel=1e-10)
+        assert results["pfa_both_chirps"][0] == pytest.approx(
+            alarms["up"] * alarms["down"], rel=1e-10
+        )
 
 
 @pytest.mark.parametrize("tnr", [1e-3, 0.1, 1.0, 5.0, 12.0, 60.0, 1e3])

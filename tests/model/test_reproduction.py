@@ -49,13 +49,14 @@ def test_pfa_of_a_shot_is_that_both_chirps_alarm_in_any_of_all_bins(exponent, pr
     p = np.exp(-(4 - np.pi) / 4 * 100)
     segment = -np.expm1(2**exponent * np.log1p(-p))
     assert results["pfa_segment"][0] == pytest.approx(segment, rel=1e-9)
-    assert results["pfa_shot"][0] == pytest.approx(segment**2, rel=1e-9)
-    assert f"{results['pfa_shot'][0]:.2e}" == printed
+    assert results["pfa_both_chirps"][0] == pytest.approx(segment**2, rel=1e-9)
+    assert f"{results['pfa_both_chirps'][0]:.2e}" == printed
 
 
 def test_a_doubling_of_the_fft_makes_four_times_the_false_alarms(table_4_1):
     shots = [
-        dark(table_4_1, fft_size=2**e, bins_counted="all")["pfa_shot"][0] for e in (16, 17, 18)
+        dark(table_4_1, fft_size=2**e, bins_counted="all")["pfa_both_chirps"][0]
+        for e in (16, 17, 18)
     ]
     # Less N p of it, 1e-4, as alarms begin to coincide.
     assert shots[1] / shots[0] == pytest.approx(4.0, rel=1e-4)
@@ -95,7 +96,7 @@ def test_the_printed_false_alarm_rates_lie_8_to_36_percent_above_noise_alone(
     )
     for where, figure in zip(slices, printed, strict=True):
         scene = table_4_1(**where, bins_counted="all", beamlets=7, **dict([changed]))
-        ratio = figure / shot.evaluate(scene)["pfa_shot"].mean()
+        ratio = figure / shot.evaluate(scene)["pfa_both_chirps"].mean()
         assert 1.07 < ratio < 1.37
 
 

@@ -231,7 +231,7 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     got = _drawn(shots, draws=DRAWS, method=method)
     alarm = [
         1 - (1 - out["pfa_segment"]) * (1 - out["p_leakage_up"]),
-        1 - (1 - 10 ** (out["log10_pfa_shot"] - out["log10_pfa_segment"]))
+        1 - (1 - 10 ** (out["log10_pfa_both_chirps"] - out["log10_pfa_segment"]))
         * (1 - out["p_leakage_down"]),
     ]  # fmt: skip
     assert ((alarm[0] > 0.02) & (alarm[0] < 0.5)).all()

@@ -20,6 +20,7 @@ from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
 from sweep.model.shot import evaluate
+from sweep.model.threshold import TNR
 from sweep.report import detector
 from sweep.report.choosing import parts
 from sweep.report.writing import write
@@ -164,9 +165,9 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     for line in by_alarm.values():
         np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
     parameters = detector.parameters_at(study.spec, track.position(place))
-    of_model = evaluate(parameters | {detector.TNR: curve["curve_tnr"].values}, [])
+    of_model = evaluate(parameters | {TNR: curve["curve_tnr"].values}, [])
     for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
-                        ("in both chirps", "pfa_shot")):  # fmt: skip
+                        ("in both chirps", "pfa_both_chirps")):  # fmt: skip
         # the model leaves out the few bins in which the target lies
         np.testing.assert_allclose(by_alarm[alarm].x, of_model[name], rtol=2e-2, atol=1e-30)
 

@@ -7,7 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from written_specs import written
 
-from sweep.spec import Spec
+from sweep.analysis.tables import reference
+from sweep.model.threshold import PFA_SHOT, TNR, tnr_of
+from sweep.spec import Spec, SpecError
+from sweep.tasks.grid_study import GridStudy
 
 
 def axes_of(**kinds):
@@ -188,3 +191,21 @@ def test_ten_million_values_take_seconds(values):
     assert (spec.axes[0].size, len(spec.id)) == (10**7, 32)
     assert time.perf_counter() - start < 30.0  # one by one in Python it would be minutes
     assert len(spec.to_json()) < 5000
+
+
+def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
+    axes = {PFA_SHOT: {"log": [1e-9, 1e-3], "number": 3}}
+    spec = Spec.from_mapping(written({TNR: ..., PFA_SHOT: 1e-6}, axes=axes))
+    assert spec.parameters()[PFA_SHOT] == 1e-6 and TNR not in spec.parameters()
+    assert Spec.from_mapping(spec.to_yaml_mapping()).id == spec.id
+    found = GridStudy(spec).evaluate(0)
+    # all but the few bins that the target takes
+    assert found["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
+    at = spec.parameters_at({"tnr": 10})
+    assert at[TNR] == 10 and PFA_SHOT not in at
+    first = tnr_of(spec.parameters() | {PFA_SHOT: 1e-9})
+    assert reference(spec, {}).tnr == pytest.approx(float(first))
+    with pytest.raises(SpecError, match=r"has no threshold; write 'tnr: 10', or threshold_to_mean"):
+        Spec.from_mapping(written({TNR: ...}))
+    with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):
+        Spec.from_mapping(written({PFA_SHOT: 1e-6}, axes={TNR: [5, 10]}))

@@ -51,7 +51,7 @@ def test_what_does_not_fit_is_told(changes, draws, words):
 
 def test_closed_forms_make_no_figures_of_whole_spectra():
     figures = [
-        {"kind": "table", "variable": "pfa_shot", "rows": "range"},
+        {"kind": "table", "variable": "pfa_both_chirps", "rows": "range"},
         {"kind": "threshold_table", "by": "range"},
         {"kind": "slices", "variable": "false_alarms", "x": "range"},
     ]

@@ -53,6 +53,8 @@ FIELDS = [
     ("instrument.processing.fft_size", 100.5, "must be a whole number"),
     ("instrument.processing.fft_size", "2 GHz", "takes no unit"),
     ("instrument.processing.tnr", 0, "must be at least 1e-"),
+    ("instrument.processing.design_pfa_bin", 1, "must be at most 0.99"),
+    ("instrument.processing.threshold_to_mean", "4 V", "takes no unit"),
     ("instrument.processing.window", "haming", "did you mean 'hamming'?"),
     ("instrument.processing.window", "kaiser", "parameters that this window does not take"),
     ("instrument.processing.window", "kaiser(x)", "must be the name of a window"),

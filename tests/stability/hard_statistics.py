@@ -197,7 +197,7 @@ def all_or_none() -> float:
             bright = counts(method, number, power=1e3, range=100.0, tnr=20.0)
             dark = counts(method, number, reflectance=0.0, tnr=40.0)
             wrong += int(number - bright["n_detected_shot"].sum() + dark["n_detected_shot"].sum())
-            wrong += int(bright["n_false_alarm_shot"].sum() + dark["n_false_alarm_shot"].sum())
+            wrong += int(sum(x["n_false_alarm_both_chirps"].sum() for x in (bright, dark)))
     return float(wrong)
 
 

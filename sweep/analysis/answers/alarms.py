@@ -96,10 +96,10 @@ def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
     dataset, leakage
         As of :func:`false_alarms_per_second`.
     """
-    if "pfa_shot" not in dataset:
+    if "pfa_both_chirps" not in dataset:
         # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
         return dataset["false_alarms"]
-    noise = dataset["pfa_shot"]
+    noise = dataset["pfa_both_chirps"]
     if not leakage:
         return noise
     segments = (dataset["p_leakage_up"], dataset["p_leakage_down"])

@@ -16,10 +16,10 @@ COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
 Store = xr.Dataset | xr.DataTree
 
 SHOWN = (
-    *PROMISED, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_shot", "p_leakage_up",
-    "p_leakage_down", "snr_up", "snr_doppler", "snr_down", "noise_variance", "range_error",
-    "radial_velocity_error", "false_alarms", "range_rmse", "radial_velocity_rmse", "pfa_up",
-    "pfa_down", DETECTED,
+    *PROMISED, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
+    "log10_pfa_shot", "p_leakage_up", "p_leakage_down", "snr_up", "snr_doppler", "snr_down",
+    "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
+    "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED,
 )  # fmt: skip
 
 

@@ -17,18 +17,20 @@ for. Far from it, what was left out may change pd by more than the study's toler
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.answers.physical import parameter, spec_of
+from sweep.analysis.answers.physical import parameter, si, spec_of
 from sweep.analysis.answers.probability import named
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.marcum import marcum_q1
 from sweep.model.philox import point_keys
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate
+from sweep.model.threshold import TNR, WAYS, tnr_of
 from sweep.spec import Spec
 
 MOST_POINTS = 20_000
@@ -38,7 +40,6 @@ MOST_SIMULATED = 200
 SAME = 1e-9
 """Difference of pd up to which the closed form gives back what is stored."""
 
-TNR = "instrument.processing.tnr"
 CURVE_TNR = "curve_tnr"
 """Not `tnr`, which is the study's own where that is on an axis."""
 
@@ -94,7 +95,7 @@ def roc(
     dataset = dataset[_needed(dataset, segment)].compute()
     level = xr.DataArray(np.sqrt(-2 * np.log(chances)), dims=["pfa_bin"])
     pd, exact = _closed(dataset, segment, level)
-    tnr = level * parameter(dataset, TNR) / _own_level(dataset)
+    tnr = level * _own_tnr(dataset) / _own_level(dataset)
     result = xr.Dataset(
         {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
         {"pfa_bin": ("pfa_bin", chances)},
@@ -130,6 +131,22 @@ def _closed(
 def _own_level(dataset: xr.Dataset) -> xr.DataArray:
     """The study's own threshold over the noise per quadrature."""
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
+
+
+def _own_tnr(dataset: xr.Dataset) -> xr.DataArray:
+    """The study's own threshold-to-noise ratio at each point."""
+    spec, like = spec_of(dataset), dataset["log10_pfa_bin"]
+    if TNR in spec.parameters():
+        return parameter(dataset, TNR, spec)
+    places = [dict(zip(like.dims, at, strict=True)) for at in np.ndindex(like.shape)]
+    found = [tnr_of(_parameters_of(like.isel(at).coords, spec)) for at in places]
+    return like.copy(data=np.reshape(np.array(found, float), like.shape))
+
+
+def _parameters_of(coords: Mapping[Any, xr.DataArray], spec: Spec) -> dict[str, Any]:
+    """SI values of all parameters at a point, which has these coordinates."""
+    values = {str(c.attrs["path"]): c for c in coords.values() if "path" in c.attrs}
+    return spec.parameters() | {path: si(value).values.item() for path, value in values.items()}
 
 
 def _crossing(amplitude: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -173,10 +190,7 @@ def _curve(
     spec: Spec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chance of detection, and its half-width, at some threshold to noise ratios of a point."""
-    values = {str(c.attrs["path"]): c for c in point.coords.values() if "path" in c.attrs}
-    parameters = spec.parameters() | {
-        path: parameter(point, path, spec).values.item() for path in values
-    }
+    parameters = _parameters_of(point.coords, spec)
     known = np.isfinite(tnr)
     if not known.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
@@ -184,10 +198,12 @@ def _curve(
     pairs = zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True)
     effects = [name for name, mask in pairs if flags & mask]
     name = named("pd", segment)
-    arrays = {path: np.full(tnr.size, value) for path, value in parameters.items()} | {TNR: tnr}
+    arrays = {p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS}
+    arrays[TNR] = tnr
     if flags & _random_mask(point):
         # One key for all thresholds: the same draws, so that curves fall without noise.
-        row = [[v for p, v in sorted(parameters.items()) if p != TNR and not isinstance(v, str)]]
+        others = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
+        row = [[v for v in others.values() if not isinstance(v, str)]]
         keys = np.repeat(
             point_keys(np.array(row, float), domain=DOMAIN, seed=spec.seed), tnr.size, 0
         )

@@ -32,6 +32,7 @@ from sweep.model.preparation import (
     link_scales,
     relative_amplitude,
 )
+from sweep.model.threshold import tnr_of
 from sweep.model.window import Window, canonical_name, window
 
 _CHEBYSHEV = (1.4, 2.5, 8.0)
@@ -239,7 +240,9 @@ class Points:
     def threshold(self) -> np.ndarray:
         """Threshold over sigma."""
         return np.asarray(
-            detection.threshold(tnr=self[PROCESSING + "tnr"], bin_deviation=np.asarray(1.0))
+            detection.threshold(
+                tnr=tnr_of(self._words | self._numbers), bin_deviation=np.asarray(1.0)
+            )
         )
 
     # The target

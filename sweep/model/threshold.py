@@ -1,0 +1,128 @@
+"""Where the threshold is set: by its ratio to the noise, or by the false alarms that it lets pass.
+
+In a bin of noise alone |X| is Rayleigh distributed, of mean sigma sqrt(pi/2) and standard deviation
+sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
+
+    tnr                  b / sqrt(2 - pi/2), as the thesis has it
+    threshold_to_mean    b / sqrt(pi/2)
+    design_pfa_bin       exp(-b^2 / 2)
+    design_pfa_segment   chance that any bin counted in a segment crosses
+    design_pfa_shot      the same of a shot: of any of its segments, one after the other
+
+Design probabilities are those of noise alone, before a detection takes bins away.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sweep.model import alarms
+from sweep.model.detection import RAYLEIGH_DEVIATION
+from sweep.model.marcum import log_at_least_one
+from sweep.model.waveform import record_length
+from sweep.model.window import canonical_name, window
+
+PROCESSING = "instrument.processing."
+TNR, TO_MEAN, PFA_BIN, PFA_SEGMENT, PFA_SHOT = WAYS = tuple(
+    PROCESSING + name
+    for name in (
+        "tnr", "threshold_to_mean", "design_pfa_bin", "design_pfa_segment", "design_pfa_shot",
+    )
+)  # fmt: skip
+"""Parameters of which exactly one is given."""
+
+RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
+"""Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
+
+_HALVINGS = 60
+
+
+def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
+    """Threshold-to-noise ratio of points that share their words and sizes, however it is written.
+
+    Parameters
+    ----------
+    p : mapping
+        Dotted path to SI scalar or array, as for :func:`sweep.model.shot.prepare`; of the
+        parameters :data:`WAYS` exactly one.
+
+    Raises
+    ------
+    ValueError
+        None of them is there, or several.
+
+    Examples
+    --------
+    >>> four_times_the_mean = tnr_of({"instrument.processing.threshold_to_mean": 4.0})
+    >>> round(float(four_times_the_mean), 2)
+    7.65
+    """
+    given = [way for way in WAYS if way in p]
+    if len(given) != 1:
+        raise ValueError(f"give exactly one of {', '.join(WAYS)}, not {len(given)}")
+    value = np.asarray(p[given[0]], float)
+    if given[0] == TNR:
+        return value
+    if given[0] == TO_MEAN:
+        return value * (RAYLEIGH_MEAN / RAYLEIGH_DEVIATION)
+    if given[0] == PFA_BIN:
+        return np.sqrt(-2 * np.log(value)) / RAYLEIGH_DEVIATION
+    log_pfa = np.log(value)
+    if given[0] == PFA_SHOT:  # segments are independent
+        segments = 2 if str(p["instrument.receiver.architecture"]) == "direct" else 3
+        log_pfa = log_at_least_one(log_pfa, 1 / segments)
+    return level_of(log_pfa, _law(p)) / RAYLEIGH_DEVIATION
+
+
+def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Threshold over sigma at which a segment alarms with a given probability, (n,).
+
+    Parameters
+    ----------
+    log_pfa : (n,) ndarray
+        Natural logarithm of the probability, < 0.
+    law : callable
+        Logarithm of a segment's false-alarm probability, falling, at levels (n,) from 0 up.
+    """
+    # A bin alone alarms less often than n of them, and these no oftener than n each for itself.
+    low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        above = law(middle) > log_pfa
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return 0.5 * (low + high)
+
+
+def _law(p: Mapping[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
+    """Logarithm of the probability that noise alone raises an alarm in a segment, by the level."""
+    return lambda level: log_at_least_one(-0.5 * level**2, segment_bins(p, level))
+
+
+def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
+    """Independent bins that alarm as often as those of a segment that a detection takes none of.
+
+    As :meth:`sweep.model.preparation.Shots.counted_bins`.
+
+    Parameters
+    ----------
+    p : mapping
+        As of :func:`tnr_of`.
+    level : (n,) ndarray
+        Threshold over sigma, >= 0.
+    """
+    size = int(np.max(p[PROCESSING + "fft_size"]))
+    is_all = str(p[PROCESSING + "bins_counted"]) == "all"
+    if str(p[PROCESSING + "noise_bins"]) == "independent":
+        return np.full(np.shape(level), float(size if is_all else size // 2))
+    record = record_length(
+        fft_size=np.asarray(size),
+        duration=p["instrument.chirp.duration"],
+        acquisition_delay=p[PROCESSING + "acquisition_delay"],
+        sample_rate=p[PROCESSING + "sample_rate"],
+    )
+    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record)))
+    bins = size if is_all else max(size // 2 + 1 - 2 * alarms.first_circular(taper, size), 0)
+    correlation = alarms.neighbour_correlation(taper, size)
+    return alarms.independent_bins(bins, level=level, correlation=correlation)
