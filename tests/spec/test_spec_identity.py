@@ -173,14 +173,10 @@ def test_every_parameter_is_part_of_the_id(path):
     every = EVERY | spectra
     if path == "instrument.laser.beam_waist":  # one of the two that say how wide a beam is
         every |= {"instrument.laser.beam_divergence": "none", path: "4 mm"}
-<<<<<<< HEAD
     if path == "footprint.speckle":
         every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
-    base, changed = spec(every), spec(every | {path: other_value(path)})
-=======
     instead = {TNR: ...} if path in WAYS and path != TNR else {}
     base, changed = spec(every), spec(every | instead | {path: other_value(path)})
->>>>>>> ce3874c (Thresholds by the mean noise or by a design probability of false alarms; pfa_shot is any alarm of a shot, pfa_both_chirps what was called so)
     assert changed.id != base.id
     lines = difference(base, changed)
     assert len(lines) == 1 + len(instead)
