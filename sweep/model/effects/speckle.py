@@ -196,16 +196,12 @@ def fading_size(points: Points) -> Size | None:
 
 
 def fade(shots: Shots, scene: Scene) -> Shots:
-    """Detection in developed speckle, where the spec says that beamlets have no phases in common.
+    """Detection in developed speckle, where the spec asks for it and no phases are in common.
 
-    Raises
-    ------
-    ValueError
-        Of direct detection, as of :func:`draw`.
+    Direct detection averages over the speckles in its aperture, of which nothing is known.
     """
-    if shots.architecture == "direct":
-        raise ValueError(_OF_DIRECT)
-    if not shots.incoherent:
+    law = str(scene.parameters[_LAW])
+    if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots
     turn = np.asarray(shots.carriers[0] * shots.duration)  # [cycles per beta]
     whole, rows = turn.ndim == 0, shots.row
