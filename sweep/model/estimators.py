@@ -289,6 +289,29 @@ def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike
     return np.sqrt(variance) * np.asarray(sample_rate) / (2 * math.pi)
 
 
+def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayLike) -> np.ndarray:
+    """Standard deviation [Hz] of a beat's frequency by the random walk of its laser's phase.
+
+    That of the straight line through theta(t) - theta(t - tau), theta a Wiener process with the
+    variance Gamma |t| = 2 pi dnu |t|, by least squares over a record of the length T: with
+    r = tau / T, or 1 where the delay is longer,
+
+        var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
+
+    The most likely frequency in white noise errs by that, besides
+    :func:`beat_deviation`. Estimates that knew the walk's correlation could do better by a few
+    percent for short delays, by a fifth for r = 1/3.
+
+    Parameters
+    ----------
+    line_width, delay, duration : array_like
+        FWHM dnu of the laser's Lorentzian line [Hz]; echo delay tau, and record [s].
+    """
+    r = np.minimum(np.asarray(delay, float) / duration, 1.0)
+    walk = 12 * np.asarray(line_width, float) / np.asarray(duration, float)
+    return np.sqrt(walk * (1 - r + r**3 / 5) / (2 * math.pi)) * r
+
+
 def windowed_deviation(*, cnr: ArrayLike, window: Window, sample_rate: ArrayLike) -> np.ndarray:
     """Standard deviation [Hz] of the place of the largest |X(f)| of a windowed record.
 

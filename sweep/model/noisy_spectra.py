@@ -11,6 +11,9 @@ is what the spectrum is; in wider ones estimators see a smoother peak than speck
 developed speckle all bins of a draw fade together.
 A phase common to all bins makes no difference to circular noise and is left out.
 
+The phase of a laser of Lorentzian line width walks randomly: of each draw a walk is taken, at every
+sample, and turns the signal's record (:func:`sweep.model.effects.line_width.walked_phase`).
+
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
 |X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the
 strongest or one of the two beside it); adjacent flagged bins form a group, and a group outside the
@@ -27,18 +30,21 @@ import numpy as np
 from scipy import fft
 
 from sweep.model import waveform
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
 from sweep.model.draws import fading_of_draws
+from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
 from sweep.model.estimators import (
     ESTIMATORS,
     PEAK_BIN,
     Deviation,
     Estimator,
     beat_deviation,
+    phase_deviation,
     resolved_deviation,
 )
 from sweep.model.interpolation import interpolator, phasors, sub_bin
-from sweep.model.philox import STREAM_RECORD, normals, uniforms
+from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
 
@@ -85,6 +91,8 @@ class Signal(NamedTuple):
 def signal_of(shots: Shots, i: int, segment: int) -> Signal:
     """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down."""
     _, magnitude = segment_spectrum(shots, i, segment)
+    if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
+        magnitude = magnitude / math.sqrt(seen_line(window=shots.window, **laser)[0][0])
     half, window = shots.fft_size // 2, shots.window
     least = 0 if shots.real_ends else 1  # at DC and Nyquist, else taken for circular
     k = int(np.clip(np.argmax(magnitude), least, half - least))
@@ -122,24 +130,49 @@ def _tone_phases(place: float, shots: Shots) -> np.ndarray:
     return np.where(magnitude > 0, tone / np.where(magnitude > 0, magnitude, 1.0), 1.0)
 
 
-def noise_of(
+def _laser(shots: Shots, i: int) -> dict[str, np.ndarray]:
+    """Width of the laser's line [Hz]; delay of the echo and length of the record [s]."""
+    return {
+        "line_width": _at(shots.laser_width, i),
+        "delay": 2 * _at(shots.range, i) / SPEED_OF_LIGHT,
+        "duration": _at(shots.record_duration, i),
+    }
+
+
+def drawn_of(
     shots: Shots, i: int, segment: int, signal: Signal, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Noise (m, N/2 + 1) complex of some draws of point i's segment, by their numbers [V].
+    """Spectra (m or 1, N/2 + 1) complex of the signal in some draws, without noise [V]."""
+    laser, rate = _laser(shots, i), float(_at(shots.sample_rate, i))
+    if not laser["line_width"] > 0:
+        return signal.spectrum[None]
+    length, size = shots.window.length, shots.fft_size
+    delay = float(laser["delay"]) * rate
+    both = np.zeros(size, complex)  # spectrum of the analytic record
+    both[: size // 2 + 1] = 2 * signal.spectrum
+    both[[0, size // 2]] /= 2
+    record = fft.ifft(both)[:length]
+    per_sample, spectra = 2 * math.pi * float(laser["line_width"]) / rate, []
+    for draw in draws:
+        numbers = uniforms(
+            key[None], draw[None], STREAM_LASER_PHASE[segment],
+            walk_steps(delay=delay, length=length),
+        )  # fmt: skip
+        phase = walked_phase(normals(numbers)[0], per_sample=per_sample, delay=delay)
+        spectra.append(fft.rfft((record * np.exp(1j * phase)).real, size))
+    return np.array(spectra)
 
-    Where noise stands under the lines only (:attr:`Shots.pedestal`), the bins that the signal
-    occupies have more of it.
-    """
+
+def noise_of(
+    shots: Shots, i: int, segment: int, *, key: np.ndarray, draws: np.ndarray
+) -> np.ndarray:
+    """Noise (m, N/2 + 1) complex of some draws of point i's segment, by their numbers [V]."""
     length, stream = shots.window.length, STREAM_RECORD[segment]
     keys = np.broadcast_to(key, (draws.size, 2))
     record = normals(uniforms(keys, draws, stream, length + length % 2))[:, :length]
     record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
-    noise = np.array([fft.rfft(each, shots.fft_size) for each in record])
-    more = float(shots.line_deviation[i] / shots.bin_deviation[i])
-    if more != 1.0:
-        noise[:, signal.first : signal.last + 1] *= more
-    return noise
+    return np.array([fft.rfft(each, shots.fft_size) for each in record])
 
 
 def fading_of(shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray) -> np.ndarray:
@@ -245,8 +278,9 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     factors = fading_of(view.shots, view.i, key=view.key, draws=draws)
     for s, signal in enumerate(view.signals):
         if signal is not None:
-            noise = noise_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
-            spectra = signal.spectrum * factors[s][:, None] + noise
+            drawn = drawn_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
+            noise = noise_of(view.shots, view.i, s, key=view.key, draws=draws)
+            spectra = drawn * factors[s][:, None] + noise
             found[s] = look(spectra, signal, view)
             inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
             searched += inside - max(signal.last - signal.first + 1, 0)
@@ -264,11 +298,17 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def resolved_bound(view: View) -> Deviation:
-    """Cramer-Rao bound of range and velocity that are resolved from up and down beat."""
+    """Bound of range and velocity that are resolved from up and down beat.
+
+    Of Cramer and Rao in white noise, and what the laser's phase adds.
+    """
     shots, i = view.shots, view.i
     length, rate = shots.window.length, float(shots.sample_rate[i])
+    walk = phase_deviation(**_laser(shots, i))
     up, _, down = (
-        np.inf if s is None else beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate)
+        np.inf
+        if s is None
+        else np.hypot(beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate), walk)
         for s in view.signals
     )
     return resolved_deviation(

@@ -150,6 +150,8 @@ class Shots:
     """Whether many shots have the same phase errors, as those of a flight do not."""
     gaussian_width: np.ndarray | None = None
     """(n,): FWHM [Hz] of the beat's Gaussian line."""
+    laser_width: np.ndarray | float = 0.0
+    """FWHM [Hz] of the Lorentzian line of a laser, whose phase walks randomly, (n,)."""
     pedestal: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] that stands under the lines, and nowhere else."""
     noise_gain: np.ndarray | float = 1.0

@@ -18,7 +18,13 @@ from sweep.model.waveform import SIGNS
 
 
 def spectrum(
-    shots: Shots, i: int, segment: int, *, range_walk: bool = True, acceleration: bool = False
+    shots: Shots,
+    i: int,
+    segment: int,
+    *,
+    range_walk: bool = True,
+    acceleration: bool = False,
+    laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
 
@@ -31,6 +37,8 @@ def spectrum(
         moves. The fast path leaves them out.
     acceleration : bool
         Whether the velocity drifts within the record.
+    laser_phase : (L,) ndarray or float
+        Phase theta(t) - theta(t - tau) of the laser in each sample [rad].
 
     Notes
     -----
@@ -44,6 +52,7 @@ def spectrum(
         signal = analytic_record(
             shots, i, segment, beamlet, range_walk=range_walk, acceleration=acceleration
         )
+        signal *= np.exp(1j * np.asarray(laser_phase))
         total += signal
         if shots.incoherent:
             spectrum = np.fft.fft(w * signal, shots.fft_size) / 2

@@ -44,7 +44,7 @@ def spectra(
         Every effect is there that is not off and that the point has anything of.
     """
     from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
-    from sweep.model.noisy_spectra import fading_of, noise_of, signal_of
+    from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
 
     modes, key = spec.modes(), draw_keys(spec, parameters, 1)
@@ -63,8 +63,8 @@ def spectra(
             chosen = np.array([draw]) if random else numbers
             factors = fading_of(shots, i, key=key[0], draws=chosen)
             drawn.append(np.stack([
-                signal.spectrum * factors[s][:, None]
-                + noise_of(shots, i, s, signal, key=key[0], draws=chosen)
+                drawn_of(shots, i, s, signal, key=key[0], draws=chosen) * factors[s][:, None]
+                + noise_of(shots, i, s, key=key[0], draws=chosen)
                 for s, signal in zip(there, signals, strict=True)
             ], axis=1))  # fmt: skip
             found.append(signals)

@@ -97,3 +97,16 @@ def test_range_and_velocity_take_two_beats():
     assert found.radial_velocity == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e14))
     blind = estimators.resolved_deviation(up=3e3, down=np.inf, **given)
     assert np.isinf(blind.range) and np.isinf(blind.radial_velocity)
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 0.1, 0.334, 1.0, 3.0])
+def test_a_walking_phase_errs_as_the_straight_line_through_it_does(ratio):
+    """Least squares through samples whose covariance is the triangle Gamma (tau - |t|)."""
+    duration, width = 2e-6, 1e5
+    time = (np.arange(4000) + 0.5) / 4000 * duration
+    slope = (time - time.mean()) / ((time - time.mean()) ** 2).sum()
+    apart = np.abs(time[:, None] - time)
+    covariance = 2 * np.pi * width * np.maximum(ratio * duration - apart, 0.0)
+    expected = np.sqrt(slope @ covariance @ slope) / (2 * np.pi)
+    found = estimators.phase_deviation(line_width=width, delay=ratio * duration, duration=duration)
+    assert found == pytest.approx(expected, rel=0.02 if ratio < 0.01 else 1e-4)

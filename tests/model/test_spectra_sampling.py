@@ -5,8 +5,17 @@ import pytest
 
 from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.line_width import walk_steps, walked_phase
 from sweep.model.interpolation import noise_correlation
-from sweep.model.noisy_spectra import DETECTOR, ESTIMATOR, Methods, noise_of, signal_of
+from sweep.model.noisy_spectra import (
+    DETECTOR,
+    ESTIMATOR,
+    Methods,
+    drawn_of,
+    noise_of,
+    signal_of,
+)
 from sweep.model.outputs import DRAW_OUTPUTS, SPECTRA_OUTPUTS
 from sweep.model.sampling import Before, simulate
 from sweep.model.shot import evaluate, prepare
@@ -39,8 +48,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1
     """2.5 us are 1500 samples in 2048 points. 5 sigma of a mean over 300 spectra of 1000 bins."""
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
     ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
-    signal = signal_of(shots, 0, 0)
-    noise = noise_of(shots, 0, 0, signal, key=_keys(1)[0], draws=np.arange(300))[:, 8:-8]
+    noise = noise_of(shots, 0, 0, key=_keys(1)[0], draws=np.arange(300))[:, 8:-8]
     power = 2 * float(shots.bin_deviation[0]) ** 2
     independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
@@ -230,3 +238,45 @@ def test_methods_may_be_ones_own(table_4_1):
     found = _drawn(parameters, 5, methods=methods)
     assert (found["pd_shot"] == 1).all()
     assert (found["false_alarms"] == 0).all()  # one group, and the signal within it
+
+
+CHIRP_2_US = {
+    "instrument.processing.window": "rectangular", "instrument.processing.sample_rate": 500e6,
+    "instrument.chirp.bandwidth": 500e6, "instrument.chirp.duration": 2e-6,
+    "target.radial_velocity": 0.0, ESTIMATOR + "kind": "chirp_z",
+}  # fmt: skip
+WANDERING = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
+
+
+def test_ranges_err_by_the_walk_of_the_lasers_phase(table_4_1):
+    """100 kHz, 500 MHz in 2 us: known errors of 4.3 to 30.7 mm, and bounds to 38.8 mm."""
+    place = {"target.range": np.array([10.0, 20.0, 50.0, 75.0, 100.0])}
+    parameters = _points(table_4_1, **CHIRP_2_US) | WANDERING | place
+    found = _drawn(parameters, number=600, effects=("doppler", "line_width", "image"))
+    known = np.array([4.3e-3, 8.6e-3, 20.8e-3, 30.7e-3])
+    spread = 5 / np.sqrt(2 * 600)
+    np.testing.assert_allclose(found["range_rmse"][:4], known, rtol=0.05 + spread)
+    bounds = [4.3e-3, 8.5e-3, 20.3e-3, 29.8e-3, 38.8e-3]
+    np.testing.assert_allclose(found["range_bound"], bounds, rtol=0.1)
+
+
+def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
+    """As the time domain has it: the same phases in the record of the exact delay."""
+    parameters = _points(table_4_1, **CHIRP_2_US) | WANDERING | {"target.range": 50.0}
+    parameters |= {"footprint.beamlets": 1}
+    ((_, pure),) = prepare(parameters, ("doppler", "image"))
+    ((_, shots),) = prepare(parameters, ("doppler", "image", "line_width"))
+    key, draws, rate = _keys(1)[0], np.arange(3), 500e6
+    delay = 100.0 / SPEED_OF_LIGHT * rate
+    found = drawn_of(shots, 0, 2, signal_of(shots, 0, 2), key=key, draws=draws)
+    for draw, drawn in zip(draws, found, strict=True):
+        steps = walk_steps(delay=delay, length=shots.window.length)
+        numbers = philox.uniforms(key[None], np.array([draw]), philox.STREAM_LASER_PHASE[2], steps)
+        phase = walked_phase(
+            philox.normals(numbers)[0], per_sample=2 * np.pi * 1e5 / rate, delay=delay
+        )
+        expected = spectrum(pure, 0, 2, range_walk=False, laser_phase=phase)
+        # Magnitudes have the phases of a lone tone at a place that is known to some 1e-4 of a bin.
+        np.testing.assert_allclose(np.abs(drawn), expected, atol=0.01 * expected.max())
+    without = drawn_of(pure, 0, 2, signal_of(pure, 0, 2), key=key, draws=draws)
+    assert without.shape == (1, 1025)  # nothing is drawn of a pure tone

@@ -37,7 +37,8 @@ _PARAMETERS = {
     "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
     "duration": "chirp.duration", "sample_rate": "processing.sample_rate",
     "fft_size": "processing.fft_size", "window": "processing.window",
-    "delay": "processing.acquisition_delay",
+    "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
+    "line_shape": "laser.line_shape",
 }  # fmt: skip
 
 
@@ -169,6 +170,11 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
             snr=seen / main_lobe(shape.name, length)(np.abs(offset)) ** 2, window=shape
         )
         deviation = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
+        walked = estimators.phase_deviation(
+            line_width=np.where(p["line_shape"] == "lorentzian", p["line_width"], 0.0),
+            delay=2 * p["range"] / SPEED_OF_LIGHT, duration=length / rate,
+        )  # fmt: skip
+        deviation = np.hypot(deviation, walked)
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
     found = estimators.resolved_deviation(

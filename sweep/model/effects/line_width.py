@@ -17,6 +17,11 @@ exp(i (theta(t - tau) - theta(t))) has the autocorrelation
 a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest, which is taken at its
 height under the line. A record shorter than the delay sees lags below its
 own length only: there the record's length takes the delay's place in the split.
+
+|X| does not tell a phase that the whole record has, and of what turns with it little at all: of the
+phase, less its mean under the window, the mean of exp(i phi) is the line that |X| sees, and only
+the part of the pedestal in phase with that changes |X| (:func:`seen_line`). Both are drawn as they
+are where whole spectra are (:func:`walked_phase`).
 """
 
 import math
@@ -57,6 +62,12 @@ _FEW_LAGS = 0.1
 
 _SIGMAS = 6.0
 """Standard deviations of a Gaussian line beyond which there is no light to speak of."""
+
+_PLACES = 256
+"""Places of the record at which the mean phase is taken off."""
+
+_LEAST = 1e-100
+"""Share of a line's power that is none, and by which it can be divided."""
 
 _MOST_NOISE = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
@@ -210,6 +221,116 @@ def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarr
     return np.asarray(power - 2 * at_delay * ((past * past - past + 1 / 6) / 2))
 
 
+def seen_line(
+    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
+) -> tuple[np.ndarray, np.ndarray]:
+    """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
+
+    Parameters
+    ----------
+    line_width, delay, duration, window
+        As of :func:`power_under_line`.
+
+    Returns
+    -------
+    share : (n,) ndarray
+        Of the power |C W(0)|^2 in the line, 0..1: more than :func:`coherent_share`.
+    in_phase : (n,) ndarray
+        Mean square of what is in phase with it, over |C|^2 of the line, >= 0: as noise, half of
+        this is the pedestal's share.
+
+    Notes
+    -----
+    With C(t, s) the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
+    window w, the line is m = sum w E, and its fellow sum w E w E cosh C - m^2. As
+    C(t, s) = c(t - s) - q(t) - q(s), c the triangle Gamma (tau - |t|), each exponential is one of a
+    lag times one of t and one of s: autocorrelations of w and of w exp(2 q), on 256 places.
+    """
+    power = power_under_line(line_width=line_width, delay=delay, duration=duration, window=window)
+    gamma = np.broadcast_to(2 * np.pi * np.asarray(line_width) * duration, power.shape)
+    lag = np.broadcast_to(np.minimum(np.asarray(delay) / duration, 1.0), power.shape)
+    w, twice = _places(window)
+    x, variance, less = np.arange(w.size) / w.size, gamma * lag, np.exp(-gamma * lag)
+
+    def integral(t: np.ndarray) -> np.ndarray:
+        return np.where(t > 1, twice(1.0) + (t - 1) * twice(1.0, 1), twice(np.clip(t, 0, 1)))
+
+    apart, at = lag[:, None], integral(x)
+    mean = gamma[:, None] * (integral(x + apart) - 2 * at + integral(x - apart))
+    mean -= 0.5 * (w * mean).sum(axis=1)[:, None]
+    # a line that is gone needs no care
+    mean = np.where(variance[:, None] < _GONE, mean, 0.0)
+    once, double = np.exp(mean), w * np.exp(2 * mean)
+    sums = (w * once).sum(axis=1), double.sum(axis=1)
+    nodes, weight = _gauss_legendre(128)
+    time = 0.5 * (nodes + 1) * lag[:, None]
+    # A transform at a time: bits do not depend on how many there are.
+    spectra = [np.abs(np.fft.rfft(each, 2 * w.size)) ** 2 for each in double]
+    r = np.array([
+        np.interp(u * w.size, np.arange(w.size + 1), np.fft.irfft(s)[: w.size + 1])
+        for u, s in zip(time, spectra, strict=True)
+    ]).reshape(time.shape)  # fmt: skip
+    lost = -np.expm1(-gamma[:, None] * (lag[:, None] - time)) * r * weight
+    crossed = lost.sum(axis=1) * lag * w.size
+    total = window.sum**2
+    pedestal = 0.5 * (1 + sums[1] ** 2 - crossed) - sums[0] ** 2
+    share = np.maximum(less * sums[0] ** 2, _LEAST)
+    return share, np.maximum(0.5 * power + less * pedestal * total, 0.0)
+
+
+@lru_cache(maxsize=16)
+def _places(window: Window) -> "tuple[np.ndarray, CubicSpline]":
+    """The window at places of the record, of sum 1, and its integral's integral, of slope 1."""
+    from scipy.interpolate import CubicSpline  # slow to import
+
+    w, x = samples(window.name, _PLACES), np.arange(_PLACES + 1) / _PLACES
+    twice = CubicSpline(x, np.append(w, w[0]) / w.mean()).antiderivative(2)
+    return w / w.sum(), twice
+
+
+def walk_steps(*, delay: float, length: int) -> int:
+    """Steps of a random walk that :func:`walked_phase` takes for a delay [samples], an even number.
+
+    One that is longer than the record is none of its samples' past: the record's length will do.
+    """
+    return 2 * (length + min(math.floor(delay), length))
+
+
+def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.ndarray:
+    """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
+
+    Parameters
+    ----------
+    steps : (walk_steps,) ndarray
+        Standard normal numbers.
+    per_sample : float
+        Variance of theta's change from sample to sample, Gamma / fs.
+    delay : float
+        tau [samples].
+
+    Returns
+    -------
+    (L,) ndarray
+        0 at first.
+
+    Notes
+    -----
+    Each step between samples is taken in two, before and after the place in it at which delayed
+    samples lie: so delays need not be whole.
+    """
+    before, after = steps.reshape(2, -1)
+    part = delay - math.floor(delay)
+    before, after = (
+        before * math.sqrt(per_sample * (1 - part)),
+        after * math.sqrt(per_sample * part),
+    )
+    length = before.size - math.floor(delay)
+    length = max(length, before.size // 2)
+    now = (before + after)[before.size - length + 1 :]
+    then = before[1:length] + after[: length - 1]
+    return np.concatenate([[0.0], np.cumsum(now - then)])
+
+
 @lru_cache(maxsize=16)
 def autocorrelation(window: Window) -> "CubicSpline":
     """Sum_n w_n w_(n+j) as a function of the lag j, 0..L [samples]."""
@@ -286,12 +407,13 @@ def act(shots: Shots, scene: Scene) -> Shots:
         "delay": delay,
         "duration": shots.record_duration,
     }
-    below = power_under_line(window=shots.window, **timing)
+    share, in_phase = seen_line(window=shots.window, **timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
         shots,
-        beat_scale=shots.beat_scale * np.sqrt(coherent_share(**timing)),
-        pedestal=power * below / shots.window.energy,
+        beat_scale=shots.beat_scale * np.sqrt(share),
+        laser_width=timing["line_width"],
+        pedestal=power * 2 * in_phase / shots.window.energy,
     )
 
 

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_width
+from sweep.model.shot import evaluate, prepare
+from sweep.model.truth import analytic_record
 from sweep.model.window import samples, transform, window
 
 WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
@@ -157,3 +160,67 @@ def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_ene
     # Lags up to a hundredth of the record: the window's autocorrelation has hardly fallen there.
     density = line_width.density_under_line(**laser)
     np.testing.assert_allclose(found, form.energy * RATE * density, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hamming", "hann"])
+@pytest.mark.parametrize("delays", [64, 4, 0.5])
+@pytest.mark.parametrize("g", [0.4, 3.8])
+def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
+    """Sums over all pairs of samples, of phases less their mean under the window."""
+    length = 1024
+    n, w, delay = np.arange(length), samples(name, length), length / delays
+    covariance = g * np.maximum(1 - np.abs(n[:, None] - n) / delay, 0.0)
+    shared = covariance @ w / w.sum()
+    rest = covariance - shared[:, None] - shared + w @ shared / w.sum()
+    line = w * np.exp(-np.diag(rest) / 2)
+    expected = line @ (np.cosh(rest) - 1) @ line
+    laser = {"line_width": np.array([g / (2 * np.pi * delay)]), "delay": np.array([delay])}
+    form = window(name, length)
+    share, in_phase = line_width.seen_line(duration=np.array([float(length)]), window=form, **laser)
+    np.testing.assert_allclose(share * form.sum**2, line.sum() ** 2, rtol=1e-4)
+    np.testing.assert_allclose(in_phase, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("delay", [3.0, 20.3, 700.5])
+def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(delay):
+    """Of what differs by u samples the variance is 2 Gamma min(u, tau), to 5 sigma."""
+    rng, per_sample, number = np.random.default_rng(5), 1e-3, 2000
+    steps = line_width.walk_steps(delay=delay, length=LENGTH)
+    phases = np.array([
+        line_width.walked_phase(rng.standard_normal(steps), per_sample=per_sample, delay=delay)
+        for _ in range(number)
+    ])  # fmt: skip
+    assert phases.shape == (number, LENGTH)
+    for u in (1, 10, 19, 21, 200):
+        expected = 2 * per_sample * min(u, delay)
+        for start in (0, LENGTH - 1 - u):
+            found = (phases[:, start + u] - phases[:, start]).var()
+            assert found == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
+
+
+@pytest.mark.parametrize("g", [0.4, 1.3, 3.8])
+def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1, g):
+    """A delay of a sixteenth of the record, at thresholds below and above the line."""
+    length, rate, number, rng = 4096, 600e6, 3000, np.random.default_rng(6)
+    delay = length // 16
+    point = table_4_1(range=SPEED_OF_LIGHT * delay / rate / 2, fft_size=length, power=1e-4) | {
+        "target.radial_velocity": 0.0,
+        "footprint.beamlets": 1,
+    }
+    ((_, shots),) = prepare(point, ("doppler",))
+    record = samples("hamming", length) * analytic_record(shots, 0, 0, 0) / 2
+    peak = np.abs(np.fft.fft(record)).argmax()
+    record *= np.exp(-2j * np.pi * peak * np.arange(length) / length)
+    walk = rng.standard_normal((number, length + delay)).cumsum(axis=1) * np.sqrt(g / delay)
+    seen = np.exp(1j * (walk[:, delay:] - walk[:, :length])) @ record
+    noise = rng.standard_normal(number) + 1j * rng.standard_normal(number)
+    for line in (0.7, 1.0, 1.3):  # over the threshold, by the pure line's power
+        factor = line * shots.threshold[0] * np.exp(g / 2) / abs(record.sum())
+        drawn = np.abs(factor * seen + shots.bin_deviation[0] * noise) >= shots.threshold[0]
+        changes = {
+            "instrument.laser.power": 1e-4 * factor**2,
+            "instrument.laser.line_width": g * rate / (2 * np.pi * delay),
+            "instrument.laser.line_shape": "lorentzian",
+        }
+        found = float(evaluate(point | changes, ("doppler", "line_width"))["pd_up"][0])
+        assert drawn.mean() == pytest.approx(found, abs=5 * np.sqrt(found * (1 - found) / number))
