@@ -287,7 +287,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     known = Known(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
-        np.full((1, 3), alarm), np.ones(1),
+        np.full((1, 3), alarm), np.ones(1), np.ones((1, 2, 1)), np.empty((1, 0)),
     )  # fmt: skip
     seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
@@ -295,7 +295,9 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
 
     def drawn(number):
         address = key[0], key[1], number
-        count = draw_peaks(address, (0, 0), how, known, seen, tables, peaks, which)
+        count = draw_peaks(
+            address, (0, 0), how, known, seen, tables, peaks, which, np.zeros(1, bool)
+        )
         return peaks[0].copy() if count else None
 
     return drawn

@@ -88,7 +88,8 @@ def _errors(
     values |= {
         name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
     }
-    values["walks"] = _walks(dataset)
+    values["walks"] = _simulates(dataset, "range_walk")
+    values["moves"] = _simulates(dataset, "segment_motion")
     snr = [dataset[f"snr_{name}"] for name in _NAMES]
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
@@ -119,11 +120,11 @@ def _errors(
     return result.assign_attrs(dataset.attrs)
 
 
-def _walks(dataset: xr.Dataset) -> xr.DataArray:
-    """Mask of points with range walk, which moves the peak off the beat at the record's start."""
+def _simulates(dataset: xr.Dataset, effect: str) -> xr.DataArray:
+    """Mask of points at which an effect is simulated, as those that move peaks off their beats."""
     attributes = dataset["effects"].attrs
     masks = dict(zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True))
-    return (dataset["effects"] & int(masks["range_walk"])) > 0
+    return (dataset["effects"] & int(masks[effect])) > 0
 
 
 def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators.Deviation:
@@ -155,9 +156,11 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     )  # fmt: skip
     chirp_rate = p["bandwidth"] / p["duration"]
     deviations = []
-    for sign, carrier, seen in zip(waveform.SIGNS, carriers, snr, strict=True):
+    for segment, sign in enumerate(waveform.SIGNS):
+        carrier, seen = carriers[segment], snr[segment]
+        moved = np.where(p["moves"], segment * p["radial_velocity"] * p["duration"], 0.0)
         beat = waveform.beat_frequency(
-            sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"],
+            sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
             radial_velocity=p["radial_velocity"],
         )  # fmt: skip
         # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
