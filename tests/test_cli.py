@@ -326,14 +326,17 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
         "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100000}"
     )
     (here / "huge.yaml").write_text(text.replace("storage: {block_points: 8}", ""))
-    refused(sweep("run", "huge.yaml"), "10,000,000,000 points", "TB", "--yes")
-    assert sweep("run", "huge.yaml").stderr.count("\n") == 1 and not (here / "results").exists()
-    assert "takes --yes: 10,000,000,000 points" in sweep("plan", "huge.yaml").stdout
+    asked = sweep("run", "huge.yaml")
+    refused(asked, "10,000,000,000 points", "TB", "--yes")
+    assert asked.stderr.count("\n") == 1 and not (here / "results").exists()
     begun = []
     monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
     assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
     monkeypatch.setattr(telling, "MEASURED", 10)
     assert sweep("run", "small.yaml").exit_code == 0 and len(begun) == 2
+    with monkeypatch.context() as fewer:
+        fewer.setattr(telling, "MOST_POINTS", 79)
+        assert "takes --yes: 80 points" in sweep("plan", "small.yaml").stdout
     monkeypatch.setattr(telling, "MOST_SECONDS", 1e-9)
     refused(sweep("run", "small.yaml"), "of one core: say --yes to begin it")
 

@@ -23,7 +23,7 @@ SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
 OF_EACH_KIND = (
     "quickstart", "single_shot_45deg", "speckled_target", "cfar", "threshold",
-    "morpheus_three_beam", "forest_scan", "scan_pattern_comparison",
+    "morpheus_three_beam", "forest_scan",
 )  # fmt: skip
 """Run each time; `make test-all` has all."""
 

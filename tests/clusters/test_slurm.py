@@ -107,6 +107,7 @@ def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environm
     assert tree(store) == tree(here / "plain.zarr")
 
 
+@pytest.mark.slow
 def test_jobs_that_the_batch_system_refuses_are_told_at_once(here, environment):
     cluster = yaml.safe_load((here / "slurm.yaml").read_text())
     cluster["job"]["queue"] = "absent"

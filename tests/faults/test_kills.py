@@ -16,7 +16,6 @@ import pytest
 from small import evaluated, logged, receipts, small, tree
 
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import StoreError
 from sweep.tasks.status import status
 from sweep.tasks.verify import verify
 
@@ -131,6 +130,7 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     assert tree(store) == undisturbed
 
 
+@pytest.mark.slow
 def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with (
@@ -142,17 +142,6 @@ def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed)
         output, _ = client.communicate(timeout=120)
         assert "the scheduler is gone" in output
         assert client.returncode == 0
-    finish(tmp_path, undisturbed)
-
-
-def test_a_plain_loop_killed(tmp_path, undisturbed):
-    store = tmp_path / "small.zarr"
-    with client_process(tmp_path, "none") as client:
-        wait_for(lambda: len(receipts(store)) >= 3)
-        with pytest.raises(StoreError, match=f"is being written by process {client.pid} on"):
-            resume(store, progress=False, scheduler="none")
-        os.kill(client.pid, signal.SIGKILL)
-        client.wait()
     finish(tmp_path, undisturbed)
 
 
@@ -190,6 +179,7 @@ def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp
     assert tree(store) == undisturbed
 
 
+@pytest.mark.slow
 def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:

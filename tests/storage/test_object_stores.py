@@ -53,7 +53,13 @@ def troubled(number, method, path):
     return {3: ERROR, 7: SLOW, 12: ERROR, 17: DROP}.get(number % 20, PASS)
 
 
-@pytest.mark.parametrize("workers", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize(
+    "workers",
+    [
+        pytest.param({"scheduler": "none"}, marks=pytest.mark.slow),
+        {"workers": 2, "processes": False},
+    ],
+)
 def test_the_bytes_are_those_of_a_store_on_disk_whatever_the_network_does(
     faults, place, undisturbed, workers
 ):

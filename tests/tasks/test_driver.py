@@ -32,7 +32,7 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
     "place",
     [
         pytest.param({"workers": 1}, marks=pytest.mark.slow),
-        {"workers": 2},
+        pytest.param({"workers": 2}, marks=pytest.mark.slow),
         pytest.param({"workers": 4}, marks=pytest.mark.slow),
         {"workers": 2, "processes": False},
     ],
@@ -222,7 +222,7 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
 def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
     path = tmp_path / "small.zarr"
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
-        outcome = run(small(), store=path, progress=False, workers=2, evaluate=deadly({4}))
+        outcome = run(small(), store=path, progress=False, workers=1, evaluate=deadly({4}))
     assert [failure.block for failure in outcome.failures] == [4]
     assert outcome.failures[0].error.startswith("KilledWorker")
     assert outcome.blocks_done == 11
