@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import HealthCheck, Phase, assume, given, reject, settings
 from hypothesis import strategies as st
 from plain_study import INSTRUMENT
 from random_studies import drop, mended, studies
@@ -130,7 +130,10 @@ def test_without_movement_up_and_down_chirp_are_alike(written):
 @given(written=studies())
 def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
     written = mended(written)
-    spec = Spec.from_mapping(written)
+    try:
+        spec = Spec.from_mapping(written)
+    except SpecError:  # mended as far as that is known
+        reject()
     again = from_stored(spec.to_json())
     assert again.id == spec.id
     ours, theirs = GridStudy(spec).evaluate(0), GridStudy(again).evaluate(0)

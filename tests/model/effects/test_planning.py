@@ -234,7 +234,8 @@ def smeared(table_4_1, phases, law, **changes):
     own = {name: value for name, value in changes.items() if "." not in name}
     further = {path: value for path, value in changes.items() if "." in path}
     straight = {"beamlets": 1, "grazing_angle": np.pi / 2, "phases": phases}
-    parameters = DEFAULTS | table_4_1(**straight, reflectance_law=law, **own) | further
+    steady = {"footprint.speckle": "none"}
+    parameters = DEFAULTS | table_4_1(**straight, reflectance_law=law, **own) | steady | further
     names = kept_in(planned(points_of(parameters), asked, 8e-4), 0)
     return shot.evaluate(parameters, names), shot.evaluate(parameters, CERTAIN)
 
