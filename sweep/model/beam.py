@@ -60,7 +60,7 @@ DEFAULTS: dict[str, float | str] = {
     COUPLING: SINGLE_MODE, DIVERGENCE: 0.0, WAIST: 0.0, QUALITY: 1.0, FOCUS: 0.0,
     RECEIVED_WAIST: 0.0,
 }  # fmt: skip
-"""What parameters of a beam are where nothing is said; 0: not given, collimated, or as the sent."""
+"""Defaults of a beam's parameters; 0: not given, collimated, or as the sent one."""
 
 WIDEST = math.pi / 2
 """Full angle [rad] beyond which a footprint is taken to be no wider."""
@@ -133,7 +133,7 @@ def overlap(sent: Beam, received: Beam, range: ArrayLike, offset: ArrayLike = 0.
 
 
 def is_single_mode(p: Parameters) -> bool:
-    """Whether the receiver of points of one category sees one mode alone."""
+    """True where the receiver of points of one category sees one mode alone."""
     return str(p[COUPLING]) == SINGLE_MODE and str(p[ARCHITECTURE]) != "direct"
 
 
@@ -196,7 +196,7 @@ def shape(p: Parameters) -> dict[str, Any]:
 
 
 def is_thesis(p: Parameters) -> bool:
-    """Whether all footprints are as wide as divergence times range, [T]'s law."""
+    """True where all footprints are as wide as divergence times range, [T]'s law."""
     return not (is_single_mode(p) or np.any(p[WAIST]) or np.any(p[FOCUS]))
 
 

@@ -159,7 +159,7 @@ def mark(magnitude, count, level, exempt, beside):
 
 @njit(cache=True, error_model="numpy")
 def is_end(bin_, ends):
-    """Whether a bin is DC or Nyquist, where noise is real; ``ends`` is N, or 0 where none is."""
+    """True for DC and Nyquist, where noise is real; ``ends`` is N, or 0 where none is."""
     return ends > 0 and (bin_ == 0 or 2 * bin_ == ends)
 
 

@@ -59,7 +59,7 @@ SOURCE_DIGITS = 28.0
 """-ln of the error of sources, and a little for the poles of a window on either side."""
 
 FINER = 11.0
-"""By how much more the polynomials of the record's ends are told."""
+"""Digits, as of e, by which polynomials of the record's ends are told more closely."""
 
 WINDOW = 8
 """Bins within which lines are shared out together; these share the bins that tables hold."""

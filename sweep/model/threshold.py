@@ -1,4 +1,4 @@
-"""Where the threshold is set: by its ratio to the noise, or by the false alarms that it lets pass.
+"""The threshold: by its ratio to the noise, or by the false alarms that it lets pass.
 
 In a bin of noise alone |X| is Rayleigh distributed, of mean sigma sqrt(pi/2) and standard deviation
 sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:

@@ -36,7 +36,7 @@ _ONE_MODE = {beam.COUPLING: _is(beam.SINGLE_MODE), beam.ARCHITECTURE: _is_not("d
 
 
 def beam_findings(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> Iterator[Finding]:
-    """What is wrong with the beams of a study's grid.
+    """Mistakes in the beams of a study's grid.
 
     Parameters
     ----------

@@ -45,13 +45,13 @@ def why_not(path: str) -> tuple[str, str]:
 
 
 class Arrangement(NamedTuple):
-    """What says where beamlets go."""
+    """Words that say where beamlets go."""
 
     pattern: str
     phases: str
     architecture: str
     thesis: bool
-    """Whether they go as far as divergence times range, whatever the wavelength."""
+    """True where they go as far as divergence times range, whatever the wavelength."""
 
     @property
     def beamlets(self) -> str:

@@ -107,7 +107,7 @@ class Points:
         self.at_rest = False
         """Whether the Doppler effect is off."""
         self.at_one_range = False
-        """Whether the target stands still between segments."""
+        """True where the target stands still between segments."""
         self.smears: dict[str, Smear] = {}
         """Of the effects that smear lines, by name."""
         number = self.whole(resolution.BEAMLETS)
