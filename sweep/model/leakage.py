@@ -44,6 +44,7 @@ from sweep.model.spectrum import (
     ZERO,
     add_far,
     envelope_from,
+    is_turned,
     magnitudes,
     run_of,
     seen,
@@ -278,8 +279,8 @@ def _far_values(points, centre, origin, lines, digits, form, sizes, tangent, roo
 
     To e^-digits, but for lines so few that each stands for itself.
     """
-    power, way = sizes[4] != 0, -1 if origin < 0 else 1
     n, lowest, highest = lines
+    power, way = sizes[4] != 0, -1 if is_turned(origin, lowest, highest, sizes[7]) else 1
     for turn in range(2 if sizes[7] == IMAGED else 1):
         towards = way if turn == 0 else -way
         shift = tangent_of(centre - towards * origin, sizes[0], tangent)

@@ -371,7 +371,7 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
     """
     power, view = sizes[4] != 0, sizes[7]
     n, lowest, highest, sources, faint = lines
-    sign = -1 if origin < 0 and view != COMPLEX else 1
+    sign = -1 if is_turned(origin, lowest, highest, view) else 1
     many = shifts.shape[1] > 0
     if many:
         room[SUM, :count] = 0.0
@@ -426,9 +426,15 @@ def reach_of(level, weight, form):
 
 
 @njit(cache=True, error_model="numpy")
+def is_turned(origin, lowest, highest, view):
+    """Whether lines are seen at the bins of their negative frequencies."""
+    return origin + 0.5 * (lowest + highest) < 0.0 and view != COMPLEX
+
+
+@njit(cache=True, error_model="numpy")
 def seen(origin, lowest, highest, sizes):
     """Lowest and highest place at which lines are seen, in bins; 0 .. N/2 where they fold."""
-    if origin < 0 and sizes[7] != COMPLEX:
+    if is_turned(origin, lowest, highest, sizes[7]):
         return -origin - highest, -origin - lowest
     return origin + lowest, origin + highest
 

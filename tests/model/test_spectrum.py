@@ -27,7 +27,7 @@ from sweep.model.lines import (
 )
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.segments import tangents
-from sweep.model.shot import prepare
+from sweep.model.shot import CORE, prepare
 from sweep.model.spectrum import A_IM, A_RE, MOST_CELLS, OUT, ROOM, reach_of
 from sweep.model.spectrum import magnitudes as magnitudes_of
 from sweep.model.window import COSINE_SUMS, samples, window
@@ -389,3 +389,15 @@ def test_a_tabulated_window_has_its_height_beside_the_line(table_4_1, delta):
     rest = prepare(parameters | {"target.radial_velocity": 1e-9})
     ((_, near),) = rest
     np.testing.assert_allclose(magnitude, segment_spectrum(near, 0, 1)[1], rtol=1e-4, atol=1e-18)
+
+
+@pytest.mark.parametrize("delta", [0.02, 0.3, 0.48, 0.52])
+def test_without_images_a_beat_beside_dc_shows_alike_in_either_chirp(table_4_1, delta):
+    """Range beats of resting targets are each other's negatives; |X| is that of the positive."""
+    p = table_4_1(beamlets=1, radial_velocity=0.0)
+    rate = p["instrument.chirp.bandwidth"] / p["instrument.chirp.duration"]
+    width = p["instrument.processing.sample_rate"] / p["instrument.processing.fft_size"]
+    p["target.range"] = delta * width / rate * speed_of_light / 2
+    ((_, shots),) = prepare(p, set(CORE) - {"image"})
+    up, down = (segment_spectrum(shots, 0, segment)[1] for segment in (0, 2))
+    np.testing.assert_allclose(up[:40], down[:40], rtol=1e-6)
