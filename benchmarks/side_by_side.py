@@ -4,11 +4,11 @@
     python benchmarks/side_by_side.py published rough_ground --rounds 9
 
 `make side-by-side` does all of it. Each version runs in a process of its own, with its own compiled
-kernels, through `sweep.load` and `sweep.run(scheduler="none")` alone. A study is run whole and as a
-small part of itself; the processor's time for a point is the difference of the two over the points
-that the small one lacks, so that what a run costs once (reading, ground, the store) does not count.
-The versions change places each round, and the ratio is the median over rounds. Times drift with the
-machine; ratios hardly do.
+kernels and experiments, through `sweep.load` and `sweep.run(scheduler="none")` alone. A study is
+run whole and as a small part of itself; the processor's time for a point is the difference of the
+two over the points that the small one lacks, so that what a run costs once (reading, ground, the
+store) does not count. The versions change places each round, and the ratio is the median over
+rounds. Times drift with the machine; ratios hardly do.
 """
 
 import argparse
@@ -72,9 +72,9 @@ STUDIES = {
 }  # fmt: skip
 
 
-def written(study: Study, overrides: dict[str, Any]) -> dict[str, Any]:
-    """The experiment as plain data, with what is put onto it."""
-    experiments = ROOT / "experiments"
+def written(checkout: Path, study: Study, overrides: dict[str, Any]) -> dict[str, Any]:
+    """The experiment of a check-out as plain data, with overrides."""
+    experiments = checkout / "experiments"
     spec = named(yaml.safe_load((experiments / f"{study.experiment}.yaml").read_text()))
     instrument = spec["instrument"]
     instrument = {"file": instrument} if isinstance(instrument, str) else instrument
@@ -121,7 +121,7 @@ class Version:
     """A process that runs studies by the check-out in a folder."""
 
     def __init__(self, name: str, checkout: Path) -> None:
-        self.name = name
+        self.name, self._checkout = name, checkout
         apart = {
             "PYTHONPATH": str(checkout),
             "NUMBA_CACHE_DIR": str(FOLDER / f"kernels_{name}"),
@@ -147,9 +147,15 @@ class Version:
         spent, points = json.loads(answer)
         return spent, points
 
-    def a_point(self, whole: Path, part: Path) -> float:
-        """Processor time of a point [s] that the whole has and the part lacks."""
-        (all_, points), (few, fewer) = self.run(whole), self.run(part)
+    def a_point(self, study: Study, folder: Path) -> float:
+        """Processor time of a point [s] that the whole study has and its part lacks."""
+        spent = []
+        for name, overrides in (("whole", study.whole), ("part", study.part)):
+            file = folder / f"{name}_{self.name}.yaml"
+            spec = written(self._checkout, study, overrides)
+            file.write_text(yaml.safe_dump(spec, sort_keys=False))
+            spent.append(self.run(file))
+        (all_, points), (few, fewer) = spent
         return (all_ - few) / (points - fewer)
 
     def close(self) -> None:
@@ -172,15 +178,10 @@ def check_out(commit: str) -> Path:
 def measured(versions: list[Version], study: Study, rounds: int) -> list[list[float]]:
     """Times of a point [s], (rounds, versions), after a round that may compile."""
     with tempfile.TemporaryDirectory() as folder:
-        files = []
-        for name, overrides in (("whole", study.whole), ("part", study.part)):
-            file = Path(folder) / f"{name}.yaml"
-            file.write_text(yaml.safe_dump(written(study, overrides), sort_keys=False))
-            files.append(file)
         times = []
         for count in range(rounds + 1):
             order = versions if count % 2 else versions[::-1]
-            spent = {version.name: version.a_point(*files) for version in order}
+            spent = {version.name: version.a_point(study, Path(folder)) for version in order}
             times.append([spent[version.name] for version in versions])
         return times[1:]
 
