@@ -8,6 +8,9 @@ A shot that sees nothing has noise alone in its record. It has no group of bins 
 and none that could not raise a false alarm, so its false alarms are the largest of all bins that
 are counted: drawn like those of any other shot, from the same addresses.
 
+A shot sees the air once: all its draws have the scintillation of its own key, and so have its
+probabilities.
+
 Results of a shot do not depend on the shots and draws that are computed with it.
 """
 
@@ -15,15 +18,17 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.catalogue import CORE, DEFAULTS
+from sweep.model.effects.effect import Realisation, Scene
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
 from sweep.model.outputs import POINTS, STATISTICS
-from sweep.model.preparation import Parameters, Shots
+from sweep.model.preparation import Parameters, Shots, as_arrays
 from sweep.model.ray_error import ray_error
+from sweep.model.realisations import random_effects
 from sweep.model.returns import Returns, draw_returns
 from sweep.model.shot import prepare_cast
 
@@ -96,7 +101,8 @@ def cloud(
         part = slice(first, first + step)
         seen = eyepoints.some(part)
         own = None if flags is None else flags[part]
-        shots, rays, found = _groups(seen, parameters, surfaces, returns, (effects, own))
+        called = effects, own, keys[part]
+        shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
         drawn = draw_returns(
             shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
         )
@@ -116,10 +122,13 @@ def _groups(
     parameters: Parameters,
     surfaces: Sequence[Surface],
     most: int,
-    called: tuple[Collection[str], np.ndarray | None],
+    called: tuple[Collection[str], np.ndarray | None, np.ndarray],
 ) -> tuple[Shots, Footprints, Groups]:
-    """Prepared shots, what their rays hit, and groups in their spectra; none for no target."""
-    seen = eyepoints.seen
+    """Prepared shots, what their rays hit, and groups in their spectra; none for no target.
+
+    `called`: names of effects, flags of each shot, and the shots' keys.
+    """
+    (effects, flags, keys), seen = called, eyepoints.seen
     somewhere = eyepoints._replace(
         range=np.where(seen, eyepoints.range, _NOWHERE),
         radial_velocity=np.where(seen, eyepoints.radial_velocity, 0.0),
@@ -127,7 +136,11 @@ def _groups(
         approach=np.where(seen, eyepoints.approach, 0.0),
     )
     given, ground = seen_ground(somewhere, parameters, surfaces)
-    shots = prepare_cast(given, ground, *called)
+    shots = prepare_cast(given, ground, effects, flags)
+    scene = Scene(as_arrays(DEFAULTS | dict(given)), ground)
+    for effect in random_effects(effects):
+        if effect.draw is not None:
+            shots = effect.draw(shots, scene, Realisation(keys, np.zeros(shots.size, np.int64)))
     found = groups(shots, most=most)
     if not seen.all():
         blind = ~seen

@@ -175,18 +175,19 @@ def without_draws(
 def not_in_flights(
     values: Mapping[str, Any], axes: tuple[Axis, ...], modes: Mapping[str, str]
 ) -> Iterator[Finding]:
-    """Random effects that are asked for in a flight, where none of them is drawn yet.
+    """Random effects that are asked for in a flight, and that only grids draw.
 
     Parameters are those of :func:`effect_findings`.
     """
-    rule = "is not drawn in flights yet"
+    rule = "is not drawn in flights"
     for effect in EFFECTS:
-        if effect.is_random and modes.get(effect.name) == ON:
+        of_target = any(parameter.path.startswith("target.") for parameter in effect.parameters)
+        if (effect.turn or of_target) and effect.is_random and modes.get(effect.name) == ON:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield Finding((SECTION, effect.name), rule, f"leave it out{instead}", ON)
     for effect, parameter in _random_and_there(values, axes, modes):
-        if parameter.path.startswith("target."):
-            continue  # a flight has no target, which is told where one is written
+        if effect.turn is None:
+            continue  # drawn, or of a target, which a flight has not and which is told elsewhere
         remedy = f"leave it out, or set effects.{effect.name}: off"
         yield Finding(place_on_grid(parameter.path, axes), rule, remedy, ABSENT)
 

@@ -7,7 +7,8 @@ from small_scenes import flight, instrument, observed, plate
 
 from sweep.model import clouds, philox
 from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import CORE, EFFECTS, NAMES, flags_of, names_of
+from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, flags_of, names_of
+from sweep.model.effects.scintillation import both_ways, turbulence_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone
@@ -360,3 +361,26 @@ def test_no_shots_give_no_points(table_4_1):
 def test_an_unknown_way_to_draw_is_refused(table_4_1):
     with pytest.raises(ValueError, match="probabilities, noise"):
         _cloud(_edge([ON_GROUND]), _strong(table_4_1), method="dice")
+
+
+@pytest.mark.parametrize("law", ["log_normal", "gamma_gamma"])
+def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
+    """Power factors of mean 1 and the variance (1 + I_out) (1 + I_back) - 1 of both ways."""
+    number = 3000
+    air = {"atmosphere.turbulence": "uniform", "atmosphere.structure_constant": 3e-14,
+           "atmosphere.scintillation_law": law, "atmosphere.path": "level"}  # fmt: skip
+    p = instrument(table_4_1, fft_size=2**12) | air
+    seen = observed(flight(position=(0.0, 0.0, 300.0)), number=1).some(np.zeros(number, int))
+    effects = set(CORE) - {"signal_shot_noise"}
+    still = _cloud(seen.some([0]), p, effects=effects)["snr_up"][0]
+    found = _cloud(seen, p, effects=effects | {"scintillation"}, draws=2)
+    factor = found["snr_up"] / still
+    given = prepare_eyepoints(seen.some([0]), p, [GROUND, TABLE])
+    legs = both_ways(turbulence_of(DEFAULTS | p), DEFAULTS | p, np.array([given.range[0]]))
+    variance = np.exp(sum(v[0] for leg in legs for v in leg)) - 1
+    assert 0.02 < variance < 1
+    assert abs(factor.mean() - 1) < 5 * np.sqrt(variance / number)
+    spread = np.var((factor - 1) ** 2)
+    assert abs(factor.var() - variance) < 5 * np.sqrt(spread / number)
+    alone = _cloud(seen.some([7]), p, effects=effects | {"scintillation"}, keys=_keys([7]))
+    assert alone["snr_up"][0] == found["snr_up"][7]

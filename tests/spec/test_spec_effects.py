@@ -236,18 +236,19 @@ def test_what_only_says_how_a_random_effect_acts_asks_for_no_draws():
 
 
 @pytest.mark.parametrize("name", RANDOM.values())
-def test_a_random_effect_is_not_asked_of_a_flight(name):
-    (mistake,) = mistakes(SceneSpec, flight({f"effects.{name}": "on"}))
-    assert mistake.startswith(f"effects.{name}: is not drawn in flights yet")
+def test_a_flight_draws_its_air_and_refuses_other_random_effects(name):
+    found = mistakes(SceneSpec, flight({f"effects.{name}": "on"}))
+    if name == "scintillation":
+        assert not found
+        return
+    (mistake,) = found
+    assert mistake.startswith(f"effects.{name}: is not drawn in flights")
     assert ("platform.jitter" in mistake) is (name == "pointing_jitter")
     assert not mistakes(SceneSpec, flight({f"effects.{name}": "off"}))
 
 
-def test_turbulence_over_a_flight_is_refused_unless_it_is_left_out():
-    turbulent = {"atmosphere.turbulence": "hufnagel_valley"}
-    (mistake,) = mistakes(SceneSpec, flight(turbulent))
-    assert mistake.startswith("atmosphere.turbulence: is not drawn in flights yet")
-    assert not mistakes(SceneSpec, flight(turbulent | {"effects.scintillation": "off"}))
+def test_a_flight_has_turbulence_but_no_target():
+    assert not mistakes(SceneSpec, flight({"atmosphere.turbulence": "hufnagel_valley"}))
     (mistake,) = mistakes(SceneSpec, flight({"target": {"roughness": "1 um"}}))
     assert mistake.startswith("target: is no field")
 
