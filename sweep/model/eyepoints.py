@@ -57,6 +57,8 @@ class Eyepoints(NamedTuple):
     """(n,): rate at which that grows [m/s^2]; nan where nothing is seen."""
     approach: np.ndarray
     """(n,): speed at which its range falls [m/s]; nan where nothing is seen."""
+    turn_rate: np.ndarray
+    """(n,): rate at which its direction turns [rad/s], by scanner and platform."""
     velocity_offset: np.ndarray
     """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
     cos_incidence: np.ndarray
@@ -145,11 +147,11 @@ def observe(
     rows = np.arange(len(time))
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
     turning = rotate(state.attitude, shots.turning)
-    acceleration, approach = _along_beam(state, turning, rays, bundle, moving, rotation)
+    acceleration, approach, turn_rate = _along_beam(state, turning, rays, bundle, moving, rotation)
     return Eyepoints(
         time, shots.beam, shots.cycle, state.position, state.velocity,
         rotate(state.attitude, shots.direction), bundle.range, bundle.offset, reference,
-        acceleration, approach,
+        acceleration, approach, turn_rate,
         velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
     )  # fmt: skip
 
@@ -192,8 +194,8 @@ def _along_beam(
     bundle: Bundle,
     moving: Sequence[State | None],
     rotation: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Closing acceleration [m/s^2] and falling of the range [m/s] along reference beamlets, (n,).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Closing acceleration, speed at which the range falls, turn rate of reference beamlets, (n,).
 
     V is the velocity of the instrument against the body that is hit, which turns by w and is
     thought to reach as far. The beam d sees the closing speed V.d, which grows by V'.d + V.d', and
@@ -221,7 +223,8 @@ def _along_beam(
     grows = _dot(acceleration, ray) + _dot(velocity, turned)
     steep = np.minimum(_dot(bundle.normal, ray), -_FLATTEST)
     falls = _dot(velocity + far[:, None] * sliding, bundle.normal) / steep
-    return np.where(bundle.reference >= 0, grows, np.nan), falls
+    turns = np.sqrt(_dot(turned, turned))
+    return np.where(bundle.reference >= 0, grows, np.nan), falls, turns
 
 
 def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -296,6 +299,7 @@ def seen_ground(
         "target.radial_velocity": eyepoints.radial_velocity,
         "target.acceleration": eyepoints.acceleration,
         APPROACH: eyepoints.approach,
+        beam.SCAN_RATE: parameters.get(beam.SCAN_RATE, 0.0) + eyepoints.turn_rate,
         PATH_ELEVATION: -np.arcsin(upwards),
         "target.reflectance": 1.0,
         HEIGHT: parameters.get(HEIGHT, 0.0) + height,

@@ -216,6 +216,9 @@ SHOTS: dict[str, Output] = _over(("shot",), {
         "m s-2", "rate at which the radial velocity of the reference beamlet grows"
     ),
     "beam_approach": Output("m s-1", "speed at which the range of the reference beamlet falls"),
+    "beam_turn_rate": Output(
+        "rad s-1", "rate at which the direction of the reference beamlet turns"
+    ),
     "beam_surface": Output("1", "surface that the reference beamlet hits", dtype="int16"),
 })  # fmt: skip
 """Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""

@@ -24,6 +24,7 @@ _FIELDS = {
     "beam_radial_velocity": "radial_velocity",
     "beam_acceleration": "acceleration",
     "beam_approach": "approach",
+    "beam_turn_rate": "turn_rate",
     **{name: name for name in BEAMLETS},
 }
 """Field of :class:`Eyepoints` that each array holds."""

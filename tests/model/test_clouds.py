@@ -5,13 +5,13 @@ import pytest
 from scipy import stats
 from small_scenes import flight, instrument, observed, plate
 
-from sweep.model import clouds, philox
+from sweep.model import beam, clouds, philox
 from sweep.model.clouds import cloud
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, flags_of, names_of
 from sweep.model.effects.scintillation import both_ways, turbulence_of
 from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone
+from sweep.model.geometry.scanner import BeamCycle, LineScan, PointingJitter, cone
 from sweep.model.groups import groups
 from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
@@ -384,3 +384,20 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
     assert abs(factor.var() - variance) < 5 * np.sqrt(spread / number)
     alone = _cloud(seen.some([7]), p, effects=effects | {"scintillation"}, keys=_keys([7]))
     assert alone["snr_up"][0] == found["snr_up"][7]
+
+
+def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
+    """exp(-2 d^2 / (w_T^2 + w_L^2)) of the echo, d the way of the beam's axis while light returns."""
+    p = DEFAULTS | instrument(table_4_1, fft_size=2**12, coupling="single_mode")
+    p["instrument.laser.beam_waist"] = 5e-3
+    scanner = LineScan(0.4, 40.0, 1e4)
+    seen = observed(flight(position=(0.0, 0.0, HEIGHT)), scanner=scanner, index=[300], number=1)
+    rate, far = seen.turn_rate[0], seen.range[0]
+    found, straight = (
+        _cloud(seen, p, effects=(*set(CORE) - {"signal_shot_noise"}, *more))["snr_up"][0]
+        for more in (["lag"], [])
+    )
+    (waist, _), apart = beam.beams(p), 2 * rate * far**2 / 299792458.0
+    expected = np.exp(-2 * apart**2 / (2 * waist.radius(far) ** 2))
+    assert 0.1 < expected < 0.95
+    assert found / straight == pytest.approx(expected, rel=1e-6)

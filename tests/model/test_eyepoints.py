@@ -252,6 +252,8 @@ def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
     falls = (seen.range[0] - seen.range[2]) / 2e-4
     assert seen.acceleration[1] == pytest.approx(grows, rel=1e-5, abs=1e-6)
     assert seen.approach[1] == pytest.approx(falls, rel=1e-5)
+    turned = np.linalg.norm(seen.direction[2] - seen.direction[0]) / 2e-4
+    assert seen.turn_rate[1] == pytest.approx(turned, rel=1e-5, abs=1e-9)
 
 
 def test_level_flight_keeps_its_range_however_fast_the_ground_ahead_closes():

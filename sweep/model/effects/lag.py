@@ -49,8 +49,8 @@ LAG = Effect(
     parameters=(
         Parameter(
             path=beam.SCAN_RATE,
-            about="Rate at which a scan turns the beams; single_mode only, as the two that follow, "
-            "which add to its lag where their signs agree",
+            about="Rate at which a scan turns the beams, in flights besides scanner and platform; "
+            "single_mode only, as the two that follow, which add to its lag where signs agree",
             example="100 deg/s",
             limits=("-1e6 rad/s", "1e6 rad/s"),
         ),
