@@ -387,7 +387,7 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
 
 
 def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
-    """exp(-2 d^2 / (w_T^2 + w_L^2)) of the echo, d the way of the beam's axis while light returns."""
+    """Of the echo exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d what the axis moves by meanwhile."""
     p = DEFAULTS | instrument(table_4_1, fft_size=2**12, coupling="single_mode")
     p["instrument.laser.beam_waist"] = 5e-3
     scanner = LineScan(0.4, 40.0, 1e4)
