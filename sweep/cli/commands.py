@@ -66,7 +66,7 @@ class Commands(click.Group):
             raise
         except Exception as error:
             from sweep.model.unsupported import UnsupportedShot
-            from sweep.scenes.errors import SceneError
+            from sweep.scenes.files import SceneError
             from sweep.spec import SpecError
             from sweep.storage.objects import ObjectStoreError, worded
             from sweep.storage.unreplaced import ReplacedError

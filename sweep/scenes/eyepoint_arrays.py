@@ -47,15 +47,9 @@ def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Eyepoints that stored arrays stand for.
+    """Eyepoints of stored arrays by name, and power fractions of the beamlets (b,).
 
-    Parameters
-    ----------
-    arrays : mapping
-        Arrays of SHOTS and BEAMLETS by name, (n,), (n, 3) or (n, b); further ones are not looked
-        at.
-    weight : (b,) ndarray
-        Power fractions of the beamlets.
+    Arrays beyond SHOTS and BEAMLETS are not looked at.
 
     Raises
     ------

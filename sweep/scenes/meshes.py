@@ -1,57 +1,234 @@
-"""Triangle meshes: whatever trimesh loads, in metres, placed in the scene."""
+"""Triangles that scenes are made of: from files, of simple solids, and cleaned into meshes."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sweep.model.geometry.quaternion import about, multiply, normalise
-from sweep.scenes.errors import SceneError, existing
-from sweep.scenes.facets import Facets, join
+from sweep.model.geometry.mesh import Mesh, normals, require_shapes, round_centre
+from sweep.model.geometry.quaternion import about, rotate
+from sweep.scenes.files import SceneError, existing
 from sweep.units import QuantityError, read_unit
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+_CLEAR = 1e-12
+"""Normal over the product of two edges above which no rounding can have made it."""
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
 """Formats whose specification makes y the vertical; for the others z is taken to be it."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Where an object stands.
+@dataclass(frozen=True, eq=False)
+class Facets:
+    """A soup of triangles.
 
     Parameters
     ----------
-    translation : (3,) sequence of float
-        World position of the object's own origin [m].
-    rotation : (4,) sequence of float
-        Quaternion (w, x, y, z), object to world; scaled to length 1.
-    scale : float
-        Size factor, > 0, on top of the units.
+    vertices : (n, 3) float64 ndarray
+        Positions relative to `origin` [m].
+    faces : (m, 3) int64 ndarray
+        Rows of `vertices`, counter-clockwise as seen from outside (or above).
+    surface : (m,) int16 ndarray
+        Index of each face's surface in the scene's list.
+    origin : (3,) float64 ndarray
+        World position of the zero of `vertices` [m]. Terrain lies millions of metres from the
+        zero of its map; a vertex that is kept apart from that offset loses no digits to it.
     """
 
-    translation: Sequence[float] = (0.0, 0.0, 0.0)
-    rotation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
-    scale: float = 1.0
+    vertices: np.ndarray
+    faces: np.ndarray
+    surface: np.ndarray
+    origin: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        surface: int = 0,
+        origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    ) -> Facets:
+        """Facets that share one surface."""
+        faces = np.asarray(faces, np.int64).reshape(-1, 3)
+        return cls(
+            np.asarray(vertices, float).reshape(-1, 3),
+            faces,
+            np.full(len(faces), surface, np.int16),
+            np.asarray(origin, float),
+        )
+
+    def placed(
+        self, *, rotation: Sequence[float] | np.ndarray = UPRIGHT, scale: float = 1.0
+    ) -> Facets:
+        """Facets scaled, then turned about their origin by a unit quaternion (w, x, y, z)."""
+        return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
+
+    def mesh(self) -> tuple[Mesh, Report]:
+        """Mesh fit to be cast at, in the world frame, and what was done to make it so."""
+        mesh, report = clean(self.vertices, self.faces, self.surface)
+        return replace(mesh, origin=mesh.origin + self.origin), report
 
 
-IN_PLACE = Placement()
+def join(parts: Sequence[Facets]) -> Facets:
+    """All parts, one at least, as one, relative to the first one's origin."""
+    origin = parts[0].origin
+    shifts = np.cumsum([0, *(len(part.vertices) for part in parts)])[:-1]
+    return Facets(
+        np.concatenate([part.vertices + (part.origin - origin) for part in parts]),
+        np.concatenate([part.faces + shift for part, shift in zip(parts, shifts, strict=True)]),
+        np.concatenate([part.surface for part in parts]),
+        origin,
+    )
+
+
+@dataclass(frozen=True)
+class Report:
+    """Counts of facets that `clean` was given, found and mended; `_WORDS` has their meaning."""
+
+    vertices: int
+    faces: int
+    non_finite: int = 0
+    degenerate: int = 0
+    duplicate: int = 0
+    merged: int = 0
+    unreferenced: int = 0
+    open_edges: int = 0
+    crowded_edges: int = 0
+    opposed_edges: int = 0
+    inside_out: int = 0
+
+    def text(self) -> str:
+        """One line for people: what was given, and of the rest what is not zero."""
+        counts = {words: getattr(self, name) for name, words in _WORDS.items()}
+        said = [words.format(count) for words, count in counts.items() if count]
+        given = f"{self.faces} faces on {self.vertices} vertices"
+        return "; ".join([given, *(said or ["nothing to mend"])])
+
+
+_WORDS = {
+    "non_finite": "{} faces without data dropped",
+    "degenerate": "{} faces without area dropped",  # a repeated vertex, or three in one line
+    "duplicate": "{} duplicate faces dropped",  # in whatever winding
+    "merged": "{} coincident vertices merged",
+    "unreferenced": "{} unused vertices dropped",
+    "open_edges": "{} open edges (not watertight)",  # a face on one side only
+    "crowded_edges": "{} edges of more than two faces",
+    "opposed_edges": "{} edges with one side's normal inverted",
+    "inside_out": "closed, with normals pointing inwards",  # 1 where it is so
+}
+
+
+def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Mesh, Report]:
+    """Mesh fit to be cast at, and what was done to make it so.
+
+    Faces without data, without area or given twice are dropped, coincident vertices merged,
+    unused ones dropped, and the rest centred. Holes, crowded edges and inverted normals change
+    nothing for rays, which see both sides of a face; they are counted. Faces keep their order.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array_like of float
+        Coordinates [m]; not finite where there is no data.
+    faces : (m, 3) array_like of int
+        Vertices of each face, 0..n-1.
+    surface : (m,) array_like of int, or int
+        Surface of each face, or of all.
+
+    Raises
+    ------
+    ValueError
+        The arrays' shapes do not fit, a face names a vertex that does not exist, or no face is
+        left.
+    """
+    points, corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
+    kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
+    require_shapes(points, corners, kinds)
+    given = {"vertices": len(points), "faces": len(corners)}
+    has_data = np.isfinite(points)[corners].all(axis=(1, 2))
+    corners, kinds = corners[has_data], kinds[has_data]
+    _require_faces(len(corners), len(has_data))
+    used = np.unique(corners)
+    points = points[used] + 0.0  # -0 and 0 are one place
+    kept, place = _distinct(points)
+    corners, merged = place[np.searchsorted(used, corners)], len(used) - len(kept)
+    points = points[kept]
+    origin = round_centre(points)
+    points -= origin
+    has_area = np.flatnonzero(_have_area(points, corners))
+    first = has_area[_distinct(np.sort(corners[has_area], axis=1))[0]]
+    _require_faces(len(first), len(has_data))
+    kept = np.unique(corners[first])
+    mesh = Mesh(points[kept], np.searchsorted(kept, corners[first]), kinds[first], origin)
+    counts = {
+        "non_finite": int((~has_data).sum()),
+        "degenerate": len(corners) - len(has_area),
+        "duplicate": len(has_area) - len(first),
+        "merged": merged,
+        "unreferenced": given["vertices"] - merged - len(kept),
+    }
+    return mesh, Report(**given, **counts, **_edge_counts(mesh))
+
+
+def _require_faces(left: int, given: int) -> None:
+    if left == 0:
+        raise ValueError(f"of {given} faces none is left that a ray could hit")
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that repeat no earlier one, by index, rising; and the place of every row among them."""
+    order = np.lexsort(rows.T)  # stable: the first of those alike is the first given
+    is_new = np.ones(len(rows), dtype=bool)
+    is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    kept = np.sort(order[is_new])
+    place = np.empty(len(rows), dtype=np.int64)
+    place[order] = np.searchsorted(kept, order[is_new])[np.cumsum(is_new) - 1]
+    return kept, place
+
+
+def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mask of the faces (m, 3) whose corners are apart and not in one line, exactly."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    b, c = b - a, c - a
+    longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
+    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _CLEAR * longest)
+    doubtful = np.flatnonzero(~has_area)
+    exact, _ = normals(vertices[faces[doubtful]].transpose(1, 2, 0))
+    has_area[doubtful] = exact.any(axis=0)
+    return has_area
+
+
+def _edge_counts(mesh: Mesh) -> dict[str, int]:
+    """Counts of `Report` that are about edges and winding."""
+    start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end)
+    key = low * len(mesh.vertices) + high
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    number = np.diff(first, append=len(key))
+    sense = np.add.reduceat(np.where(start < end, 1, -1)[order], first)
+    counts = {
+        "open_edges": int((number == 1).sum()),
+        "crowded_edges": int((number > 2).sum()),
+        "opposed_edges": int(((number == 2) & (sense != 0)).sum()),
+    }
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    inwards = np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0  # six times the volume enclosed
+    return counts | {"inside_out": int(inwards and not any(counts.values()))}
 
 
 def read_mesh(
-    path: str | Path,
-    *,
-    unit: str | None = None,
-    up: str | None = None,
-    placement: Placement = IN_PLACE,
+    path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Facets of a mesh file, all its parts.
-
-    Nothing is mended here: degenerate and duplicate faces are dropped, and reported, when the
-    scene is put together.
+    """Facets of a mesh file, all its parts; nothing is mended here.
 
     Parameters
     ----------
@@ -62,75 +239,44 @@ def read_mesh(
     up : str, optional
         Its vertical axis, ``y`` or ``z``; by default y for glTF, as its specification says, and
         z for all else.
-    placement : Placement
-        Where it stands.
+    scale : float
+        Factor on top of the units, > 0.
 
     Raises
     ------
     SceneError
-        For a file that is missing, can not be loaded or holds no triangles; or a unit, an axis or
-        a placement that is none.
+        For a file that is missing, can not be loaded or holds no triangles, or an unknown unit.
     """
-    path = existing(path)
-    upwards = up or ("y" if path.suffix.lower() in _Y_UP_FORMATS else "z")
-    if upwards not in ("y", "z"):
-        raise SceneError(path, f"has '{up}' for its vertical axis", "write 'y' or 'z'")
-    scene = _loaded(path)
-    parts = [_part(mesh, matrix) for mesh, matrix in _meshes(scene)]
-    parts = [part for part in parts if len(part.faces)]
-    if not parts:
-        raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
-    rotation, scale = _checked(path, placement)
-    if upwards == "y":
-        rotation = multiply(rotation, about(0, math.pi / 2))
-    return join(parts).placed(
-        translation=placement.translation,
-        rotation=rotation,
-        scale=scale * _metres(path, unit or scene.units),
-    )
-
-
-def _loaded(path: Path) -> Any:
-    """Scene of a mesh file, nothing merged or mended."""
     import trimesh
 
+    path = existing(path)
     try:
-        return trimesh.load_scene(str(path), process=False)
+        scene: Any = trimesh.load_scene(str(path), process=False)
     except ImportError as error:
         remedy = "install what it asks for, or export to OBJ, PLY, STL or glTF"
         raise SceneError(path, f"needs another package ({error})", remedy) from None
     except Exception as error:  # parsers of dozens of formats fail in as many ways
         known = ", ".join(sorted(trimesh.available_formats()))
         raise SceneError(path, f"is no mesh that can be read ({error})", f"use {known}") from None
+    parts = [part for node in sorted(scene.graph.nodes_geometry) for part in _parts(scene, node)]
+    if not parts:
+        raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
+    y_up = path.suffix.lower() in _Y_UP_FORMATS if up is None else up == "y"
+    rotation = about(0, math.pi / 2) if y_up else UPRIGHT
+    return join(parts).placed(rotation=rotation, scale=scale * _metres(path, unit or scene.units))
 
 
-def _meshes(scene: Any) -> list[tuple[Any, np.ndarray]]:
-    """Meshes of a scene with their transforms to its frame; points and curves are passed over."""
-    placed = (scene.graph[node] for node in sorted(scene.graph.nodes_geometry))
-    named = ((scene.geometry[name], matrix) for matrix, name in placed)
-    return [(geometry, matrix) for geometry, matrix in named if hasattr(geometry, "faces")]
-
-
-def _part(mesh: Any, matrix: np.ndarray) -> Facets:
-    """Facets of one mesh of a file, in the file's frame."""
+def _parts(scene: Any, node: str) -> Iterator[Facets]:
+    """Facets of one mesh of a file, in the file's frame; none of points and curves."""
+    matrix, name = scene.graph[node]
+    mesh = scene.geometry[name]
+    if not len(getattr(mesh, "faces", ())):
+        return
     vertices = np.asarray(mesh.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored part is inside out
-    return Facets.of(vertices, faces)
-
-
-def _checked(path: Path, placement: Placement) -> tuple[np.ndarray, float]:
-    """Rotation and scale of a placement, if they are such."""
-    try:
-        rotation = normalise(np.asarray(placement.rotation, float))
-    except ValueError as error:
-        raise SceneError(path, f"is turned by no rotation ({error})", "give (w, x, y, z)") from None
-    if not (placement.scale > 0 and math.isfinite(placement.scale)):
-        raise SceneError(path, f"is scaled by {placement.scale}", "make it a positive number")
-    if np.shape(placement.translation) != (3,) or not np.isfinite(placement.translation).all():
-        raise SceneError(path, "is placed nowhere", "give three coordinates in metres")
-    return rotation, placement.scale
+    yield Facets.of(vertices, faces)
 
 
 def _metres(path: Path, unit: str | None) -> float:
@@ -141,3 +287,27 @@ def _metres(path: Path, unit: str | None) -> float:
         return read_unit(unit, si_unit="m", example="mm").to_si(1)  # type: ignore[arg-type]
     except QuantityError as error:
         raise SceneError(path, f"has lengths in '{unit}' ({error})", "state a unit") from None
+
+
+def sphere(*, radius: float, subdivisions: int) -> Facets:
+    """An icosahedron, refined; its corners lie on the sphere and its faces within.
+
+    Each of `subdivisions` cuts every face in four: n of them make 20 * 4^n faces, which lie within
+    ``0.3 radius / 4^n`` of the sphere.
+    """
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Facets.of(np.asarray(ball.vertices), np.asarray(ball.faces))
+
+
+def box(*, size: Sequence[float]) -> Facets:
+    """A box of 12 facets, facing outwards, of these lengths along x, y and z [m]."""
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
+    faces = []
+    for axis, side in itertools.product(range(3), (0, 1)):
+        far, near = 4 >> ((axis + 1) % 3), 4 >> ((axis + 2) % 3)
+        first = (4 >> axis) * side
+        a, b, c, d = first, first + far, first + far + near, first + near
+        faces += [(a, b, c), (a, c, d)] if side else [(a, c, b), (a, d, c)]
+    return Facets.of(corners, np.array(faces))

@@ -1,7 +1,8 @@
-"""Craters and boulders: how many of a size lie on an area, and what they look like.
+"""Craters, boulders and trees: how many lie on an area, and what they look like.
 
 Simple impact craters are carved into a grid of heights; boulders are half-ellipsoids of facets,
-set on the ground.
+set on the ground. Broad-leaved trees have a tapered trunk, and leaves as loose facets in an
+ellipsoid.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import exp1
 
-from sweep.scenes.facets import Facets
-from sweep.scenes.terrain import Terrain
+from sweep.scenes.meshes import Facets, join
+from sweep.scenes.terrain import Bounds, Terrain
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,9 @@ Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
 
 
 def lunar_craters(*, equilibrium_diameter: float = math.inf) -> PowerLaws:
-    """Craters in equilibrium up to a diameter, and as they were produced beyond it.
+    """Craters in equilibrium up to a diameter [m], and as they were produced beyond it.
 
-    Parameters
-    ----------
-    equilibrium_diameter : float
-        Diameter [m] at which the two laws cross, > 0; it grows with the age of the ground.
+    That diameter, at which the two laws cross, grows with the age of the ground.
     """
     if math.isinf(equilibrium_diameter):
         return PowerLaws((TRASK,))
@@ -83,10 +81,6 @@ class MartianRocks:
     """
 
     cover: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.cover < 1:
-            raise ValueError(f"the rocks' cover must lie between 0 and 1, not {self.cover}")
 
     @property
     def decay(self) -> float:
@@ -124,22 +118,13 @@ def scatter(
     generator: np.random.Generator,
     law: Law,
     *,
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     smallest: float,
     largest: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Independent places (x, y) and diameters [m] on a rectangle, in falling order of diameter.
 
-    The number is Poisson with the law's mean; places are uniform.
-
-    Parameters
-    ----------
-    generator, law
-        Source of randomness; size-frequency law.
-    bounds : (x least, y least, x largest, y largest) of float
-        The rectangle [m].
-    smallest, largest : float
-        Diameters within which the law is drawn [m], 0 < smallest < largest.
+    The number is Poisson with the law's mean between the two diameters; places are uniform.
 
     Raises
     ------
@@ -213,34 +198,17 @@ def draw_craters(
     generator: np.random.Generator,
     law: Law,
     *,
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     smallest: float,
     largest: float,
     least_fresh: float = 0.1,
 ) -> Craters:
-    """Craters that reach into a rectangle, largest first.
+    """Craters that reach into a rectangle, largest first; `scatter` has the parameters.
 
-    Ground in equilibrium holds craters of every state from fresh to all but gone. Their freshness
-    is drawn evenly: a simplification, as wear by diffusion leaves more of the shallow ones.
-
-    Parameters
-    ----------
-    generator, law
-        Source of randomness; size-frequency law, such as `lunar_craters`.
-    bounds : (x least, y least, x largest, y largest) of float
-        The rectangle [m]; craters centred outside whose ejecta reach in are drawn too.
-    smallest, largest : float
-        Diameters within which the law is drawn [m].
-    least_fresh : float
-        Freshness is uniform from here to 1; 1 makes all fresh.
-
-    Raises
-    ------
-    ValueError
-        For a freshness outside 0..1, and as `scatter`.
+    Those centred outside whose ejecta reach in are drawn too. Ground in equilibrium holds craters
+    of every state from fresh to all but gone. Their freshness is drawn evenly from `least_fresh` to
+    1: a simplification, as wear by diffusion leaves more of the shallow ones.
     """
-    if not 0 <= least_fresh <= 1:
-        raise ValueError(f"the least freshness must lie within 0 and 1, not {least_fresh}")
     margin = REACH * largest / 2
     wider = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
     x, y, diameter = scatter(generator, law, bounds=wider, smallest=smallest, largest=largest)
@@ -283,30 +251,6 @@ def _window(centre: float, reach: float, step: float, number: int) -> tuple[slic
     return slice(start, stop), np.arange(start, stop) * step - centre
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Form of boulders.
-
-    Parameters
-    ----------
-    height_ratio : float
-        Height above the ground over diameter, > 0; 0.5 is a hemisphere.
-    elongation : float
-        Long over short axis of the outline, drawn evenly from 1 to this; >= 1.
-    subdivisions : int
-        Refinement of the half-octahedron under the dome, 0..4: a boulder has
-        4^(n+1) facets and 8 2^n of a skirt below the ground.
-    """
-
-    height_ratio: float = 0.5
-    elongation: float = 1.5
-    subdivisions: int = 2
-
-    def __post_init__(self) -> None:
-        if not (self.height_ratio > 0 and self.elongation >= 1 and 0 <= self.subdivisions <= 4):
-            raise ValueError("boulders need a height ratio > 0, an elongation >= 1 and 0..4 levels")
-
-
 def draw_boulders(
     generator: np.random.Generator,
     law: Law,
@@ -314,8 +258,10 @@ def draw_boulders(
     *,
     smallest: float,
     largest: float,
-    shape: Shape,
-    bounds: tuple[float, float, float, float] | None = None,
+    bounds: Bounds | None = None,
+    height_ratio: float = 0.5,
+    elongation: float = 1.5,
+    subdivisions: int = 2,
 ) -> Facets:
     """Boulders on a terrain, from a size-frequency law.
 
@@ -324,34 +270,31 @@ def draw_boulders(
 
     Parameters
     ----------
-    generator, law
-        Source of randomness; size-frequency law, such as `MartianRocks`.
-    terrain : Terrain
-        Ground that they stand on.
-    smallest, largest, bounds
+    generator, law, smallest, largest, bounds
         As of `scatter`; by default within the terrain's bounds.
-    shape : Shape
-        Their form.
-
-    Raises
-    ------
-    ValueError
-        As `scatter`.
+    terrain
+        Ground that they stand on.
+    height_ratio
+        Height above the ground over diameter, > 0; 0.5 is a hemisphere.
+    elongation
+        Long over short axis of the outline, drawn evenly from 1 to this; >= 1.
+    subdivisions
+        Refinement of the half-octahedron under the dome: 4^(n+1) facets, and 8 2^n of a skirt.
     """
     x, y, diameter = scatter(
         generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
     )
-    elongation = generator.uniform(1.0, shape.elongation, len(x))
+    stretch = generator.uniform(1.0, elongation, len(x))
     heading = generator.uniform(0.0, math.pi, len(x))
     z = terrain.height_at(x, y)
     stands = np.isfinite(z)
     centre = np.column_stack([x, y, z])[stands] - terrain.origin
-    diameter, stretch = diameter[stands, None], np.sqrt(elongation[stands, None])
-    dome, faces = half_ball(shape.subdivisions)
+    diameter, stretch = diameter[stands, None], np.sqrt(stretch[stands, None])
+    dome, faces = half_ball(subdivisions)
     long, across = dome[:, 0] * (diameter / 2 * stretch), dome[:, 1] * (diameter / 2 / stretch)
     c, s = np.cos(heading[stands, None]), np.sin(heading[stands, None])
     # The skirt goes as deep as half a diameter: no gap under a boulder on a slope up to 45 deg.
-    up = np.where(dome[:, 2] > 0, shape.height_ratio, 0.5) * dome[:, 2] * diameter
+    up = np.where(dome[:, 2] > 0, height_ratio, 0.5) * dome[:, 2] * diameter
     vertices = np.stack([c * long - s * across, s * long + c * across, up], axis=-1)
     vertices += centre[:, None, :]
     shift = np.arange(len(centre)) * len(dome)
@@ -360,19 +303,10 @@ def draw_boulders(
 
 
 def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit dome above z = 0 with a skirt down to z = -1, facing outwards.
+    """Unit dome above z = 0 with a skirt down to z = -1, facing outwards: vertices, faces.
 
-    The outline's area is pi exactly, its corners lying a little outside the unit circle.
-
-    Parameters
-    ----------
-    subdivisions : int
-        Times that each facet of the half-octahedron is cut into four.
-
-    Returns
-    -------
-    (n, 3) ndarray, (m, 3) ndarray
-        Vertices, the top first, and faces, counter-clockwise from outside.
+    The outline's area is pi exactly, its corners lying a little outside the unit circle. The top is
+    the first vertex. Each subdivision cuts every facet of the half-octahedron into four.
     """
     side = 2**subdivisions
     points: list[np.ndarray] = []
@@ -404,3 +338,139 @@ def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     polygon = around / 2 * math.sin(2 * math.pi / around)
     vertices[:, :2] *= math.sqrt(math.pi / polygon)
     return vertices, np.concatenate([*faces, *walls])
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Mean measures of the trees of a clump.
+
+    Leaves lie at random, with the spherical distribution of leaf angles (every direction of the
+    leaf's normal is as likely as any other), so that the chance of a gap along a ray is Beer's law,
+    ``exp(-G * density * path)`` with ``G = 1/2``: de Wit, Photosynthesis of Leaf Canopies (1965);
+    Ross, The Radiation Regime and Architecture of Plant Stands (1981).
+    """
+
+    height: float = 12.0  # from the ground to the top of the crown [m]
+    crown_diameter: float = 7.0  # [m]
+    crown_base: float = 3.0  # height of the crown's lower end [m]
+    trunk_diameter: float = 0.4  # at the ground [m]; a third of it at the top
+    leaf_length: float = 0.30  # diagonals of a leaf, which is a rhombus [m]
+    leaf_width: float = 0.20
+    leaf_area_index: float = 2.0  # one-sided leaf area over that of the crown's outline
+    variation: float = 0.25  # sizes of trees are drawn evenly within this share of the mean
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.crown_base < self.height:
+            raise ValueError("a tree's crown must begin above the ground and below its height")
+
+    @property
+    def leaf_area(self) -> float:
+        """One-sided area of a leaf [m^2]."""
+        return self.leaf_length * self.leaf_width / 2
+
+    @property
+    def leaves(self) -> int:
+        """Number of leaves of a tree of mean size."""
+        crown = math.pi * self.crown_diameter**2 / 4
+        return round(self.leaf_area_index * crown / self.leaf_area)
+
+
+LEAVES, TRUNKS = 0, 1
+"""Surface indices."""
+
+
+def clump(
+    generator: np.random.Generator,
+    terrain: Terrain,
+    *,
+    centre: tuple[float, float],
+    radius: float,
+    number: int,
+    tree: Tree,
+) -> Facets:
+    """A clump of trees on a terrain, their trunks at least half a crown apart.
+
+    They stand no farther than `radius` [m] from a world position (x, y).
+
+    Raises
+    ------
+    ValueError
+        Where the trees do not find room, or one would stand where there is no ground.
+    """
+    parts = []
+    for x, y in _places(generator, centre, radius, number, tree.crown_diameter / 2):
+        z = float(terrain.height_at(np.array(x), np.array(y)))
+        if not math.isfinite(z):
+            raise ValueError(f"a tree at ({x:.1f}, {y:.1f}) m would stand beside the ground")
+        foot = np.array([x, y, z]) - terrain.origin
+        size = 1 + tree.variation * generator.uniform(-1.0, 1.0)
+        for facets in (trunk(tree, size), crown(generator, tree, size)):
+            parts.append(
+                Facets(facets.vertices + foot, facets.faces, facets.surface, terrain.origin)
+            )
+    return join(parts)
+
+
+def _places(
+    generator: np.random.Generator,
+    centre: tuple[float, float],
+    radius: float,
+    number: int,
+    apart: float,
+) -> list[tuple[float, float]]:
+    """Places in a disc, no two nearer than `apart` [m], by throwing darts."""
+    places: list[tuple[float, float]] = []
+    for _ in range(1000 * number):
+        if len(places) == number:
+            break
+        far, round_ = radius * math.sqrt(generator.random()), 2 * math.pi * generator.random()
+        x, y = centre[0] + far * math.cos(round_), centre[1] + far * math.sin(round_)
+        if all(math.hypot(x - px, y - py) >= apart for px, py in places):
+            places.append((x, y))
+    if number < 1 or len(places) < number:
+        raise ValueError(
+            f"{number} trees {apart:g} m apart do not fit in a clump of radius {radius:g} m"
+        )
+    return places
+
+
+def trunk(tree: Tree, size: float = 1.0) -> Facets:
+    """Tapered prism from half a metre below the foot to the middle of the crown."""
+    sides = 8
+    top = (tree.crown_base + tree.height) / 2
+    angle = 2 * math.pi * np.arange(sides) / sides
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    lower = ring * tree.trunk_diameter / 2 - [0.0, 0.0, 0.5]
+    upper = ring * tree.trunk_diameter / 6 + [0.0, 0.0, top]
+    a, b = np.arange(sides), np.roll(np.arange(sides), -1)
+    faces = np.concatenate(
+        [np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])]
+    )
+    return Facets.of(size * np.concatenate([lower, upper]), faces, surface=TRUNKS)
+
+
+def crown(generator: np.random.Generator, tree: Tree, size: float = 1.0) -> Facets:
+    """Leaves with their centres spread evenly over an ellipsoid, the tree's foot at the origin.
+
+    A larger tree has more leaves, not larger ones: the leaf area index stays.
+    """
+    number = round(tree.leaves * size**2)
+    axes = _directions(generator, number)
+    ball = axes * np.cbrt(generator.random(number))[:, None]
+    half = np.array([tree.crown_diameter, tree.crown_diameter, tree.height - tree.crown_base]) / 2
+    middle = np.array([0.0, 0.0, (tree.height + tree.crown_base) / 2])
+    centres = size * (ball * half + middle)
+    along = _directions(generator, number)
+    across = np.cross(along, _directions(generator, number))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along, across = along * tree.leaf_length / 2, across * tree.leaf_width / 2
+    corners = [centres + along, centres + across, centres - along, centres - across]
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    faces = 4 * np.arange(number)[:, None, None] + halves
+    return Facets.of(np.stack(corners, axis=1), faces, surface=LEAVES)
+
+
+def _directions(generator: np.random.Generator, number: int) -> np.ndarray:
+    """Unit vectors, evenly over the sphere, (number, 3)."""
+    vectors = generator.standard_normal((number, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

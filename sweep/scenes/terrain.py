@@ -1,4 +1,4 @@
-"""Ground as a grid of heights: its triangles, refining, and random relief.
+"""Ground as a grid of heights: its triangles, pieces, refining, and random relief.
 
 Heights sit at the grid's nodes; row i lies at y = i dy and column j at x = j dx from the grid's
 first node, so a raster that runs southwards has dy < 0. A cell of four nodes becomes two
@@ -14,18 +14,22 @@ ground have nothing to do with each other.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
 
-from sweep.scenes.facets import Facets
+from sweep.scenes.meshes import Facets
 
 _NEGLIGIBLE = 1e-6
 """Share of the variance that may be missing where rounding makes a spectrum negative."""
 
 _AT_ONCE = 1 << 20
 """Nodes whose covariance is worked out at a time."""
+
+Bounds = tuple[float, float, float, float]
+"""World (x least, y least, x largest, y largest) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +58,13 @@ class Terrain:
             raise ValueError(f"the grid's steps must be finite and other than 0, not {spacing}")
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """World (x least, y least, x largest, y largest) [m]."""
+    def bounds(self) -> Bounds:
+        """Edges of the grid."""
         rows, columns = self.heights.shape
         x = sorted((0.0, (columns - 1) * self.spacing[0]))
         y = sorted((0.0, (rows - 1) * self.spacing[1]))
-        east, north = self.origin[:2]
-        edges = x[0] + east, y[0] + north, x[1] + east, y[1] + north
-        return tuple(float(edge) for edge in edges)  # type: ignore[return-value]
+        east, north = self.origin[:2].tolist()
+        return x[0] + east, y[0] + north, x[1] + east, y[1] + north
 
     @property
     def centre(self) -> np.ndarray:
@@ -193,6 +196,51 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
     return Terrain(smoothed, terrain.spacing, terrain.origin)
 
 
+def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
+    """The part of a terrain within a square about (x, y) [m], widened to whole grid steps.
+
+    Raises
+    ------
+    ValueError
+        Where the square holds no cell of the terrain.
+    """
+    cuts, corner = [], terrain.origin.copy()
+    for axis in (1, 0):
+        step, number = terrain.spacing[axis], terrain.heights.shape[1 - axis]
+        middle = (centre[axis] - terrain.origin[axis]) / step
+        reach = size / 2 / abs(step)
+        # A hair past a node is that node: positions come from sums that were rounded.
+        first = max(math.floor(middle - reach + 1e-9), 0)
+        last = min(math.ceil(middle + reach - 1e-9), number - 1)
+        if last <= first:
+            raise _no_ground(centre, size)
+        corner[axis] += first * step
+        cuts.append(slice(first, last + 1))
+    return Terrain(terrain.heights[cuts[0], cuts[1]], terrain.spacing, corner)
+
+
+def square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Bounds:
+    """Bounds of a square about (x, y) [m], as far as there is ground.
+
+    Raises
+    ------
+    ValueError
+        Where the square holds nothing of the terrain.
+    """
+    west, south, east, north = terrain.bounds
+    (x, y), half = centre[:2], size / 2
+    bounds = max(x - half, west), max(y - half, south), min(x + half, east), min(y + half, north)
+    if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        raise _no_ground(centre, size)
+    return bounds
+
+
+def _no_ground(centre: Sequence[float], size: float) -> ValueError:
+    return ValueError(
+        f"there is no ground within {size / 2:g} m of ({centre[0]:g}, {centre[1]:g}) m"
+    )
+
+
 def fractal(
     generator: np.random.Generator,
     *,
@@ -202,7 +250,7 @@ def fractal(
     rms_slope: float,
     baseline: float,
 ) -> np.ndarray:
-    """Self-affine relief: a fractional Brownian surface, (rows, columns) [m].
+    """Self-affine relief: a fractional Brownian surface, (rows, columns) [m], 0 at its first node.
 
     The difference of height of any two nodes, a distance L apart in any direction, is normal with
     the standard deviation ``rms_slope * baseline * (L / baseline)**hurst``: the deviogram by which
@@ -213,33 +261,19 @@ def fractal(
 
     Parameters
     ----------
-    generator : numpy.random.Generator
+    generator
         Source of randomness; the same state gives the same ground.
-    shape : (rows, columns) of int
-        Nodes.
-    spacing : (dx, dy) of float
-        Grid steps [m]; signs are ignored.
-    hurst : float
+    shape, spacing
+        Nodes (rows, columns); grid steps (dx, dy) [m], whose signs are ignored.
+    hurst
         Hurst exponent, 0 < . < 1: 0.5 is a random walk, towards 1 is smooth. Lunar ground has a
         median near 0.95 in the highlands and 0.76 in the maria over 57 m to 2.7 km
         (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
-    rms_slope : float
+    rms_slope
         Standard deviation of height differences over `baseline`, divided by it; >= 0.
-    baseline : float
+    baseline
         Distance at which that slope is stated [m], > 0.
-
-    Returns
-    -------
-    ndarray
-        Heights, 0 at the first node.
-
-    Raises
-    ------
-    ValueError
-        For parameters outside their ranges.
     """
-    if not (0 < hurst < 1 and rms_slope >= 0 and baseline > 0):
-        raise ValueError("relief needs 0 < Hurst exponent < 1, a slope >= 0 and a baseline > 0")
     steps = abs(spacing[1]), abs(spacing[0])
     span = math.hypot(*((n - 1) * step for n, step in zip(shape, steps, strict=True)))
     # In units of the grid's diagonal, the longest distance that must be right is 1.
@@ -285,25 +319,10 @@ def hills(
 
     The covariance of two nodes L apart is ``rms_height**2 * exp(-(L / correlation_length)**2)``,
     and the slope along each axis has the standard deviation
-    ``sqrt(2) * rms_height / correlation_length``.
-
-    Parameters
-    ----------
-    generator, shape, spacing
-        As of `fractal`; steps finer than a third of the correlation length.
-    rms_height : float
-        Standard deviation of the height [m], >= 0.
-    correlation_length : float
-        Distance at which the correlation has fallen to 1/e [m], > 0.
-
-    Raises
-    ------
-    ValueError
-        For parameters outside their ranges.
+    ``sqrt(2) * rms_height / correlation_length``. Other parameters are as of `fractal`; steps are
+    finer than a third of the correlation length.
     """
     steps = abs(spacing[1]), abs(spacing[0])
-    if not (rms_height >= 0 and correlation_length > 3 * max(steps)):
-        raise ValueError("hills need a height >= 0 and a correlation length over three grid steps")
     unit = [step / correlation_length for step in steps]
     # Beyond 6 correlation lengths the covariance is 2e-16: the two ends of the torus are apart.
     longest = max((n - 1) * step for n, step in zip(shape, unit, strict=True))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.geometry.platform import Attitude, Flight, Nadir, Track, Waypoints
 from sweep.model.geometry.quaternion import from_heading
-from sweep.scenes.errors import SceneError, existing
+from sweep.scenes.files import SceneError, existing
 from sweep.units import QuantityError, read_unit
 
 COLUMNS = {
@@ -29,38 +28,15 @@ _HEADING = re.compile(r"\s*([A-Za-z]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
 _EXAMPLE = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Waypoints of a table.
-
-    Parameters
-    ----------
-    time : (n,) ndarray
-        Rising times [s].
-    position : (n, 3) ndarray
-        Positions [m].
-    attitude : (n, 4) ndarray or None
-        Quaternions (w, x, y, z), body to world; None where the table has no attitude.
-    """
+class Table(NamedTuple):
+    """Waypoints of a table."""
 
     time: np.ndarray
+    """(n,): rising times [s]."""
     position: np.ndarray
+    """(n, 3) [m]."""
     attitude: np.ndarray | None
-
-    def flight(self, *, smooth: bool = True, without_attitude: Attitude | None = None) -> Flight:
-        """The flight through the waypoints.
-
-        Parameters
-        ----------
-        smooth : bool
-            Join positions by a cubic spline; False by straight lines.
-        without_attitude : Attitude, optional
-            Law for a table without attitude; pointing down by default.
-        """
-        law: Attitude = without_attitude or Nadir()
-        if self.attitude is not None:
-            law = Track(self.time, self.attitude)
-        return Flight(Waypoints(self.time, self.position, smooth=smooth), law)
+    """(n, 4): quaternions (w, x, y, z), body to world; None where the table has no attitude."""
 
 
 def read_waypoints(path: str | Path) -> Table:
@@ -79,19 +55,15 @@ def read_waypoints(path: str | Path) -> Table:
     path = existing(path)
     lines = _lines(path)
     if len(lines) < 3:
-        raise SceneError(
-            path,
-            "holds fewer than two waypoints",
-            f"write a header ({_EXAMPLE}) and a line for each",
-        )
+        remedy = f"write a header ({_EXAMPLE}) and a line for each"
+        raise SceneError(path, "holds fewer than two waypoints", remedy)
     factors = _header(path, lines[0][1])
     rows = np.array([_row(path, number, cells, len(factors)) for number, cells in lines[1:]])
     table = {name: rows[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
     falls = np.flatnonzero(np.diff(table["time"]) <= 0)
     if len(falls):
-        raise SceneError(
-            path, f"line {lines[falls[0] + 2][0]}: the time does not rise", "sort the lines by time"
-        )
+        line = lines[falls[0] + 2][0]
+        raise SceneError(path, f"line {line}: the time does not rise", "sort the lines by time")
     position = np.column_stack([table[name] for name in "xyz"])
     return Table(table["time"], position, _attitude(path, table))
 
@@ -103,10 +75,9 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     except UnicodeDecodeError:
         raise SceneError(path, "is no text in UTF-8", "save the table as CSV") from None
     reader = csv.reader(text.splitlines(), skipinitialspace=True)
-    numbered = ((reader.line_num, row) for row in reader)
     return [
-        (number, row)
-        for number, row in numbered
+        (reader.line_num, row)
+        for row in reader
         if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
     ]
 
@@ -135,22 +106,21 @@ def _factor(path: Path, name: str, unit: str) -> float:
         if unit not in ("", "1"):
             raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
         return 1.0
+    example = f"{name} [{si}]"
     try:
         if not unit:
             raise QuantityError("has none")
-        return read_unit(unit, si_unit=si, example=f"{name} [{si}]").to_si(1)  # type: ignore[arg-type]
+        return read_unit(unit, si_unit=si, example=example).to_si(1)  # type: ignore[arg-type]
     except QuantityError as error:
-        raise SceneError(
-            path, f"the unit of column '{name}' {error.rule}", f"write e.g. {name} [{si}]"
-        ) from None
+        rule = f"the unit of column '{name}' {error.rule}"
+        raise SceneError(path, rule, f"write e.g. {example}") from None
 
 
 def _row(path: Path, number: int, cells: list[str], columns: int) -> list[float]:
     """Numbers of a line."""
     if len(cells) != columns:
-        raise SceneError(
-            path, f"line {number} has {len(cells)} cells under {columns} columns", "fill or cut it"
-        )
+        rule = f"line {number} has {len(cells)} cells under {columns} columns"
+        raise SceneError(path, rule, "fill or cut it")
     try:
         values = [float(cell) for cell in cells]
     except ValueError:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from sweep.scenes.digests import file_digest
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError, file_digest
 from sweep.spec.fields import Key, leaves
 from sweep.spec.list_rules import File
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.spec.files import Files
 from sweep.spec.mistakes import ABSENT, Finding, Location
 from sweep.spec.motion import Motion, Platform, Span, Tracked, WaypointPath

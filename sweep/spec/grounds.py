@@ -11,7 +11,7 @@ import numpy as np
 
 import sweep.spec.quantities as of
 from sweep.model.ground import LAWS
-from sweep.scenes.raster import MOST_CELLS, raster_digest, read_raster
+from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.instrument import Part
 from sweep.spec.list_rules import File, Several
 from sweep.spec.rules import Choice, Numeric, Text
@@ -199,8 +199,8 @@ class Jacksboro(PlacedGround):
 
     def grid(self, files: Files | None) -> Terrain:
         """Heights of the survey."""
-        from sweep.scenes.defaults import jacksboro
-        from sweep.scenes.pieces import piece
+        from sweep.scenes.rasters import jacksboro
+        from sweep.scenes.terrain import piece
 
         survey = jacksboro()
         if self.size is None:
@@ -280,7 +280,7 @@ class ArrayGround(PlacedGround):
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the file."""
-        from sweep.scenes.grids import read_array
+        from sweep.scenes.rasters import read_array
 
         spacing, missing = (self.spacing[0], self.spacing[1]), self.no_data
         path = files.path(self.file)
@@ -299,7 +299,7 @@ class ImageGround(PlacedGround):
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the image."""
-        from sweep.scenes.grids import read_image
+        from sweep.scenes.rasters import read_image
 
         path = files.path(self.file)
         return read_image(path, pixel=self.pixel, black=self.black, white=self.white)

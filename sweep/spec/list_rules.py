@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sweep.scenes.digests import file_digest
+from sweep.scenes.files import file_digest
 from sweep.spec.mistakes import near_miss
 from sweep.spec.rules import Numeric, Rule
 from sweep.units import QuantityError

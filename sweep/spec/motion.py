@@ -196,7 +196,7 @@ class Tracked(Part):
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
         """The law of attitude."""
-        from sweep.scenes.errors import SceneError
+        from sweep.scenes.files import SceneError
         from sweep.scenes.waypoints import read_waypoints
 
         if self.file is None:

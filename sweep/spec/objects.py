@@ -17,7 +17,7 @@ from sweep.spec.rules import Choice, Numeric, Text
 from sweep.spec.streams import generator
 
 if TYPE_CHECKING:
-    from sweep.scenes.facets import Facets
+    from sweep.scenes.meshes import Facets
     from sweep.scenes.scattered import Law
     from sweep.scenes.terrain import Terrain
     from sweep.spec.files import Files
@@ -67,12 +67,9 @@ class MeshObject(Solid):
 
     def shape(self, files: Files) -> Facets:
         """Its facets before they are turned."""
-        from sweep.scenes.meshes import Placement, read_mesh
+        from sweep.scenes.meshes import read_mesh
 
-        placement = Placement(scale=self.scale)
-        return read_mesh(
-            files.path(self.file), unit=self.unit, up=self.up, placement=placement
-        )  # fmt: skip
+        return read_mesh(files.path(self.file), unit=self.unit, up=self.up, scale=self.scale)
 
 
 class Sphere(Solid):
@@ -86,7 +83,7 @@ class Sphere(Solid):
 
     def shape(self, files: Files) -> Facets:
         """Its facets about its centre."""
-        from sweep.scenes.solids import sphere
+        from sweep.scenes.meshes import sphere
 
         return sphere(radius=self.radius, subdivisions=self.subdivisions)
 
@@ -99,7 +96,7 @@ class Box(Solid):
 
     def shape(self, files: Files) -> Facets:
         """Its facets about its middle."""
-        from sweep.scenes.solids import box
+        from sweep.scenes.meshes import box
 
         return box(size=self.size)
 
@@ -169,8 +166,8 @@ class Boulders(Material):
         ValueError
             For too many of them, or none of the ground within the square.
         """
-        from sweep.scenes.pieces import square
-        from sweep.scenes.scattered import Shape, draw_boulders
+        from sweep.scenes.scattered import draw_boulders
+        from sweep.scenes.terrain import square
 
         bounds = None
         if self.within is not None:
@@ -181,8 +178,10 @@ class Boulders(Material):
             ground,
             smallest=self.smallest,
             largest=self.largest,
-            shape=Shape(self.height_ratio, self.elongation, self.subdivisions),
             bounds=bounds,
+            height_ratio=self.height_ratio,
+            elongation=self.elongation,
+            subdivisions=self.subdivisions,
         )
 
 
@@ -226,7 +225,7 @@ class Trees(Part):
         ValueError
             Where they do not find room, or one would stand beside the ground.
         """
-        from sweep.scenes.trees import Tree, clump
+        from sweep.scenes.scattered import Tree, clump
 
         return clump(
             generator("trees", self.seed),

@@ -165,7 +165,7 @@ def _placed_origin(name: str, parts: Parts) -> Iterator[Finding]:
 
 def _file_findings(parts: Parts, base: Path) -> Iterator[Finding]:
     """Files that are missing or can not be read."""
-    from sweep.scenes.errors import SceneError
+    from sweep.scenes.files import SceneError
 
     things = [((*OBJECTS, name), thing) for name, thing in parts.objects.items()]
     if parts.platform is not None:

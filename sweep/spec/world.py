@@ -11,8 +11,8 @@ import numpy as np
 from sweep.model.geometry.mesh import Mesh, Surface, merge
 from sweep.model.geometry.platform import Flight
 from sweep.model.geometry.rays import Caster
-from sweep.scenes.errors import SceneError
-from sweep.scenes.facets import Facets
+from sweep.scenes.files import SceneError
+from sweep.scenes.meshes import Facets
 from sweep.scenes.terrain import Terrain
 from sweep.spec.files import Files
 from sweep.spec.grounds import Ground, PlacedGround

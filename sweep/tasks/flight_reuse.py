@@ -17,7 +17,7 @@ import numpy as np
 
 from sweep.model.outputs import NAVIGATION, POINTS, STATISTICS
 from sweep.model.resolution import by_tolerance
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.spec import Spec
 from sweep.storage import opening
 from sweep.storage.locations import Location

@@ -10,7 +10,7 @@ from judging import Verdict, kind_of, look_at_mistake
 from spoilt_specs import Spoilt
 
 from sweep.cli import main
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.spec import SpecError, load
 
 DONE, MISTAKE = 0, 2

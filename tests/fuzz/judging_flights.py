@@ -9,8 +9,8 @@ from judging import Verdict, kind_of, look_at_mistake, strictly
 
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.unsupported import UnsupportedShot
-from sweep.scenes.errors import SceneError
 from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy

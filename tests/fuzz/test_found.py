@@ -182,7 +182,7 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
 
 
 def test_boulders_beside_the_ground_are_refused():
-    from sweep.scenes.pieces import square
+    from sweep.scenes.terrain import square
     from sweep.spec.drawn_grounds import Plane
     from sweep.spec.files import Files
 

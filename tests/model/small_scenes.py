@@ -6,7 +6,7 @@ from sweep.model.eyepoints import observe
 from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import fixed
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 LEVEL = 1.0, 0.0, 0.0, 0.0
 DOWN = np.array([[0.0, 0.0, -1.0]])

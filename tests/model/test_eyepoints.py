@@ -11,7 +11,7 @@ from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight, N
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import LineScan, cone, corners, fixed
 from sweep.model.shot import evaluate, statistics
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 LEVEL = 1.0, 0.0, 0.0, 0.0
 GROUND = Surface("ground", 0.1, "lambert")

@@ -13,7 +13,7 @@ from sweep.model.geometry.mesh import Surface
 from sweep.model.groups import groups
 from sweep.model.ray_error import folded, ray_error
 from sweep.model.resolution import more_rays, rays_needed
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 RAYS = Accuracy.rays
 

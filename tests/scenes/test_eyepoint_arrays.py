@@ -9,7 +9,7 @@ from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import cone, fixed
 from sweep.model.outputs import BEAMLETS, SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays, to_arrays
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,13 @@
-import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import trimesh
 from facet_areas import areas
 
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.quaternion import about
-from sweep.scenes.errors import SceneError
-from sweep.scenes.meshes import Placement, read_mesh
+from sweep.model.geometry.mesh import Mesh, Surface, merge
+from sweep.scenes.files import SceneError
+from sweep.scenes.meshes import clean, read_mesh
 
 BOX = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
 
@@ -47,8 +46,9 @@ def test_a_box_is_the_same_box_in_every_format(file, name):
     ("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("km", 1e3), ("inch", 0.0254), (None, 1.0)]
 )
 def test_lengths_in_a_stated_unit_become_metres(file, unit, metres):
-    box = read_mesh(file(BOX, "box.ply"), unit=unit)
-    np.testing.assert_allclose(extents(box), metres * np.array([1, 2, 3]), rtol=1e-6)
+    for scale in (1.0, 10.0):
+        box = read_mesh(file(BOX, "box.ply"), unit=unit, scale=scale)
+        np.testing.assert_allclose(extents(box), scale * metres * np.array([1, 2, 3]), rtol=1e-6)
 
 
 def test_what_was_up_in_gltf_is_up_in_the_scene(file):
@@ -61,15 +61,6 @@ def test_what_was_up_in_gltf_is_up_in_the_scene(file):
     cone = read_mesh(file(tall, "cone.glb"))
     tip = cone.vertices + cone.origin
     assert tip[tip[:, 2].argmax(), 2] == pytest.approx(5.0)
-
-
-def test_an_object_is_scaled_turned_and_set_where_it_is_placed(file):
-    path = file(BOX, "box.ply")
-    placement = Placement((100.0, 200.0, 4e6), tuple(3 * about(2, math.pi / 2)), scale=10.0)
-    box = read_mesh(path, unit="cm", placement=placement)
-    np.testing.assert_allclose(extents(box), (0.2, 0.1, 0.3), rtol=1e-6)
-    np.testing.assert_allclose(box.origin, (100, 200, 4e6))
-    np.testing.assert_allclose(box.vertices.mean(axis=0), 0, atol=1e-9)
 
 
 def test_the_parts_of_a_scene_stand_where_its_graph_puts_them(file):
@@ -104,10 +95,6 @@ def test_surfaces_that_cannot_be_are_refused():
     [
         ({"unit": "seconds"}, "seconds"),
         ({"unit": "furlonks"}, "furlonks"),
-        ({"up": "x"}, "vertical axis"),
-        ({"placement": Placement(scale=0.0)}, "scaled by 0"),
-        ({"placement": Placement(rotation=(0, 0, 0, 0))}, "no rotation"),
-        ({"placement": Placement(translation=(0, math.nan, 0))}, "placed nowhere"),
     ],
 )
 def test_a_mesh_that_is_oddly_placed_is_refused_with_file_rule_and_remedy(file, options, said):
@@ -128,3 +115,138 @@ def test_files_that_are_no_mesh_are_refused(tmp_path):
             read_mesh(tmp_path / name)
     with pytest.raises(SceneError, match="does not exist"):
         read_mesh(tmp_path / "gone.stl")
+
+
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+CUBE = np.array(
+    [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]
+)  # fmt: skip
+
+
+def world(mesh):
+    """Exact world coordinates of a mesh's triangles."""
+    corners = mesh.vertices[mesh.faces]
+    return [
+        [[Fraction(x) + Fraction(o) for x, o in zip(v, mesh.origin, strict=True)] for v in triangle]
+        for triangle in corners.tolist()
+    ]
+
+
+def exact(vertices, faces):
+    return [[[Fraction(x) for x in v] for v in triangle] for triangle in vertices[faces].tolist()]
+
+
+def test_a_clean_closed_mesh_needs_nothing():
+    mesh, report = clean(CORNERS, CUBE, 3)
+    assert not (report.open_edges or report.crowded_edges)
+    assert report.text() == "12 faces on 8 vertices; nothing to mend"
+    assert (mesh.surface == 3).all()
+    assert world(mesh) == exact(CORNERS, CUBE)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 4e6, 3.39e6 + 1 / 3])
+def test_centring_moves_no_vertex(offset):
+    rng = np.random.default_rng(1)
+    vertices = offset + 2000.0 * rng.random((300, 3))
+    faces = rng.permutation(300).reshape(100, 3)
+    mesh, _ = clean(vertices, faces, 0)
+    assert np.abs(mesh.vertices).max() <= 2000.0
+    assert world(mesh) == exact(vertices, faces)
+
+
+def test_faces_without_data_are_dropped_and_the_rest_kept_in_order():
+    vertices = np.vstack([CORNERS, [[np.nan, 0, 0], [0, np.inf, 0]]])
+    faces = np.vstack([CUBE[:5], [[0, 1, 8]], CUBE[5:], [[9, 1, 2]]])
+    surface = np.arange(14)
+    mesh, report = clean(vertices, faces, surface)
+    assert (report.non_finite, report.unreferenced) == (2, 2)
+    assert mesh.surface.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
+    assert world(mesh) == exact(CORNERS, CUBE)
+
+
+def test_faces_without_area_are_dropped_but_the_thinnest_with_area_is_kept():
+    vertices = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1e-12, 0], [0, 0, 5], [1, 1, 5]]
+    faces = [[0, 1, 2], [0, 2, 3], [4, 4, 5], [0, 1, 4]]
+    mesh, report = clean(vertices, faces, [0, 1, 2, 3])
+    assert report.degenerate == 2
+    assert mesh.surface.tolist() == [1, 3]
+
+
+def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_copies():
+    vertices = np.vstack([CORNERS, CORNERS, -0.0 * CORNERS[:1]])
+    faces = np.vstack([CUBE, CUBE[:4, ::-1], CUBE[3:4] + 8, [[16, 12, 13]]])
+    surface = np.r_[np.zeros(12, int), np.ones(6, int)]
+    mesh, report = clean(vertices, faces, surface)
+    assert report.duplicate == 6
+    assert (report.merged, report.unreferenced) == (4, 5)
+    assert (mesh.surface == 0).all()
+    assert world(mesh) == exact(CORNERS, CUBE)
+    assert not (report.open_edges or report.crowded_edges)
+
+
+def test_a_soup_of_separate_triangles_becomes_watertight():
+    vertices = CORNERS[CUBE].reshape(-1, 3)
+    mesh, report = clean(vertices, np.arange(36).reshape(12, 3), 0)
+    assert report.merged == 28
+    assert not (report.open_edges or report.crowded_edges)
+    assert len(mesh.vertices) == 8
+
+
+def test_holes_fins_and_inverted_faces_are_counted_and_kept():
+    faces = CUBE.copy()
+    faces[4] = faces[4, ::-1]
+    vertices = np.vstack([CORNERS, [[2, 2, 2]]])
+    mesh, report = clean(vertices, np.vstack([faces[:-1], [[0, 1, 8]]]), 0)
+    assert len(mesh.faces) == 12
+    assert report.open_edges or report.crowded_edges
+    assert report.open_edges == 3 + 2  # the missing face's and the fin's free ones
+    assert report.crowded_edges == 1
+    assert report.opposed_edges == 3
+    assert "not watertight" in report.text()
+
+
+def test_a_closed_mesh_turned_inside_out_is_reported():
+    assert clean(CORNERS, CUBE, 0)[1].inside_out == 0
+    inverted = clean(CORNERS, CUBE[:, ::-1], 0)[1]
+    assert inverted.inside_out == 1
+    assert "inwards" in inverted.text()
+
+
+def test_merged_meshes_keep_every_triangle_where_it_was():
+    near, _ = clean(CORNERS, CUBE, 0)
+    far, _ = clean(CORNERS + np.array([4e6, -3e6, 0.5]), CUBE, 1)
+    both = merge([near, far])
+    assert world(both) == world(near) + world(far)
+    assert both.surface.tolist() == [0] * 12 + [1] * 12
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "surface", "match"),
+    [
+        (CORNERS, np.empty((0, 3), int), [], "none is left"),
+        (CORNERS, [[0, 0, 1]], [0], "none is left"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], [0], "none is left"),
+        (CORNERS, [[0, 1, 8]], [0], "outside 0..7"),
+        (CORNERS, [[0, 1, -1]], [0], "outside 0..7"),
+        (CORNERS, [[0.0, 1.0, 2.0]], [0], "integers"),
+        (CORNERS[:, :2], [[0, 1, 2]], [0], "shape"),
+        (CORNERS, CUBE, [0, 1], "as many surfaces"),
+    ],
+)
+def test_what_no_ray_could_hit_is_refused(vertices, faces, surface, match):
+    with pytest.raises(ValueError, match=match):
+        clean(vertices, faces, surface)
+
+
+def test_a_mesh_made_by_hand_is_checked_too():
+    with pytest.raises(ValueError, match="at least one triangle"):
+        Mesh(CORNERS, np.empty((0, 3), np.int32), np.empty(0, np.int16), np.zeros(3))
+    with pytest.raises(ValueError, match="finite"):
+        Mesh(CORNERS * np.nan, CUBE, np.zeros(12), np.zeros(3))
+    with pytest.raises(ValueError, match="origin"):
+        Mesh(CORNERS, CUBE, np.zeros(12), np.zeros(2))
+    with pytest.raises(ValueError, match="no mesh"):
+        merge([])

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model.geometry.quaternion import about
-from sweep.scenes.facets import Facets, join
-from sweep.scenes.grids import read_image
-from sweep.scenes.raster import read_raster
-from sweep.scenes.terrain import Terrain, refine, smooth
+from sweep.scenes import terrain as ground_
+from sweep.scenes.meshes import Facets, join
+from sweep.scenes.rasters import read_image, read_raster
+from sweep.scenes.terrain import Terrain, fractal, hills, refine, smooth
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 GALE = DATA / "gale_crater_hirise_1m.tif"
@@ -130,11 +130,11 @@ def test_joined_facets_keep_their_place_digits_and_surfaces():
     assert list(np.unique(both.surface, return_counts=True)[1]) == [8, 18]
 
 
-def test_a_placed_object_is_scaled_turned_and_moved_in_that_order():
-    corner = Facets.of([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]])
-    moved = corner.placed(translation=(10, 20, 30), rotation=about(2, math.pi / 2), scale=2.0)
+def test_a_placed_object_is_scaled_and_turned_about_its_origin():
+    corner = Facets.of([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30))
+    placed = corner.placed(rotation=about(2, math.pi / 2), scale=2.0)
     corners = [[10, 22, 30], [8, 20, 30], [10, 20, 32]]
-    np.testing.assert_allclose(moved.vertices + moved.origin, corners, atol=1e-12)
+    np.testing.assert_allclose(placed.vertices + placed.origin, corners, atol=1e-12)
 
 
 def test_facets_become_a_mesh_at_the_same_place():
@@ -206,9 +206,93 @@ def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
 def test_real_lunar_ground_in_grey_levels_loses_its_terraces_when_smoothed():
     ground = read_image(APOLLO, pixel=2.0, white=49.0)
     step = 49.0 / 255
-    assert ground.bounds == (0.0, 0.0, 512.0, 512.0)
+    assert ground.bounds == (0.0, -512.0, 512.0, 0.0)
     smoothed = smooth(ground, width=4.0)
     flat = (np.diff(ground.heights, axis=1) == 0).mean()
     assert flat > 0.2  # a fifth of the steps lie on one grey level
     assert (np.diff(smoothed.heights, axis=1) == 0).mean() < 1e-3
     assert np.abs(smoothed.heights - ground.heights).mean() < step
+
+
+FIVE_SIGMA = 5.0
+
+
+def surfaces(number, **parameters):
+    return np.stack([fractal(np.random.default_rng(seed), **parameters) for seed in range(number)])
+
+
+@pytest.mark.parametrize("hurst", [0.2, 0.5, 0.75, 0.8, 0.95])
+def test_differences_of_height_follow_the_power_law_at_every_distance_and_direction(hurst):
+    """From one step to the grid's diagonal: single pairs of nodes over many surfaces.
+
+    Each surface gives one normal number a pair, so that the mean square over n of them has a
+    relative standard deviation of sqrt(2/n).
+    """
+    number, dx, dy = 600, 0.5, 2.0
+    z = surfaces(number, shape=(24, 80), spacing=(dx, dy), hurst=hurst, rms_slope=0.2, baseline=3.0)
+    ends = [(0, 0, 0, 1), (0, 0, 1, 0), (5, 70, 5, 30), (2, 3, 20, 9), (23, 0, 0, 79)]
+    for i, j, k, m in ends:
+        length = math.hypot((i - k) * dy, (j - m) * dx)
+        expected = (0.2 * 3.0 * (length / 3.0) ** hurst) ** 2
+        found = ((z[:, i, j] - z[:, k, m]) ** 2).mean()
+        assert found == pytest.approx(expected, rel=FIVE_SIGMA * math.sqrt(2 / number))
+
+
+@pytest.mark.parametrize("hurst", [0.05, 0.5, 0.74, 0.76, 0.95, 0.99])
+@pytest.mark.parametrize("shape", [(40, 40), (16, 200)])
+def test_the_embedding_is_a_covariance(hurst, shape):
+    """The spectrum on the torus is not negative, so that nothing was cut off the surface."""
+    period, _, covariance = ground_._stein(2 * hurst)
+    step = 1 / math.hypot(*shape)
+    size = ground_.fft.next_fast_len(math.ceil(period / step), real=True)
+    along = np.minimum(np.arange(size), size - np.arange(size)) * step
+    power = np.fft.fft2(covariance(np.hypot(along[:, None], along))).real
+    assert -power[power < 0].sum() <= 1e-9 * power.sum()
+
+
+def test_opposite_edges_have_nothing_to_do_with_each_other():
+    """On a torus the first and last column would be neighbours."""
+    z = surfaces(300, shape=(8, 64), spacing=(1, 1), hurst=0.8, rms_slope=1.0, baseline=1.0)
+    across = ((z[:, 0, -1] - z[:, 0, 0]) ** 2).mean()
+    assert across > 0.5 * 63**1.6
+
+
+def test_the_same_seed_gives_the_same_ground_and_another_seed_another():
+    parameters = {
+        "shape": (20, 30), "spacing": (1.0, -1.0), "hurst": 0.7, "rms_slope": 0.1, "baseline": 5.0,
+    }  # fmt: skip
+    once, again, other = (fractal(np.random.default_rng(seed), **parameters) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(once, again)
+    assert once.shape == (20, 30) and np.abs(once - other).max() > 0.1
+
+
+def test_the_ground_scales_with_its_slope():
+    parameters = {"shape": (9, 9), "spacing": (1.0, 1.0), "hurst": 0.6, "baseline": 2.0}
+    gentle = fractal(np.random.default_rng(3), rms_slope=0.1, **parameters)
+    steep = fractal(np.random.default_rng(3), rms_slope=0.3, **parameters)
+    np.testing.assert_allclose(steep, 3 * gentle, rtol=1e-12)
+
+
+def test_hills_have_the_height_slope_and_correlation_they_were_asked_for():
+    """Ensembles of two nodes far apart and of one step, against the Gaussian covariance."""
+    number, rms, length = 800, 4.0, 10.0
+    z = np.stack(
+        [
+            hills(
+                np.random.default_rng(seed),
+                shape=(12, 40),
+                spacing=(1.0, 1.0),
+                rms_height=rms,
+                correlation_length=length,
+            )
+            for seed in range(number)
+        ]
+    )
+    relative = FIVE_SIGMA * math.sqrt(2 / number)
+    assert (z[:, 5, 20] ** 2).mean() == pytest.approx(rms**2, rel=relative)
+    slope = (z[:, 5, 21] - z[:, 5, 19]) / 2
+    # The difference over two steps of 0.1 correlation lengths falls 1 % short of the slope.
+    assert (slope**2).mean() == pytest.approx(2 * rms**2 / length**2, rel=relative + 0.02)
+    covariance = (z[:, 5, 20] * z[:, 5, 30]).mean()
+    spread = rms**2 * math.sqrt((1 + math.exp(-2)) / number)
+    assert covariance == pytest.approx(rms**2 * math.exp(-1), abs=FIVE_SIGMA * spread)

@@ -3,9 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from sweep.model.geometry.platform import AlongTrack
 from sweep.model.geometry.quaternion import about, from_heading, multiply, rotate
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.scenes.waypoints import read_waypoints
 
 PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
@@ -28,23 +27,13 @@ def test_units_of_the_header_become_si(table):
     assert path.attitude is None
 
 
-def test_a_table_without_attitude_flies_pointing_down_or_as_it_is_told(table):
-    path = read_waypoints(table(PLAIN))
-    state = path.flight().state(path.time)
-    np.testing.assert_allclose(state.position, path.position, atol=1e-9)
-    np.testing.assert_allclose(rotate(state.attitude, [0, 0, -1]), [[0, 0, -1]] * 3, atol=1e-15)
-    flight = path.flight(smooth=False, without_attitude=AlongTrack())
-    nose = rotate(flight.state(np.array([1.0])).attitude, [1.0, 0, 0])[0]
-    np.testing.assert_allclose(nose, np.array([25, 0, -25]) / math.hypot(25, 25), atol=1e-12)
-
-
 def test_angles_of_a_table_turn_the_body_left_up_and_left_side_up(table):
     text = (
         "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [mrad]\n"
         "0, 0, 0, 9, 90, 0, 0\n1, 0, 0, 9, 0, 30, 0\n2, 0, 0, 9, 0, 0, 100\n"
     )
     path = read_waypoints(table(text))
-    q = path.flight().state(path.time).attitude
+    q = path.attitude
     np.testing.assert_allclose(rotate(q[0], [1.0, 0, 0]), [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(
         rotate(q[1], [1.0, 0, 0]), [math.cos(math.pi / 6), 0, 0.5], atol=1e-12
@@ -58,16 +47,13 @@ def test_angles_left_out_are_zero(table):
     np.testing.assert_allclose(path.attitude, expected, atol=1e-15)
 
 
-def test_quaternions_of_a_table_are_joined_by_slerp(table):
+def test_quaternions_of_a_table_are_taken_as_they_are(table):
     first, last = about(2, 0.2), multiply(about(2, 0.2), about(0, 1.0))
     rows = "\n".join(
         ",".join(str(v) for v in (t, 0, 0, 9, *q)) for t, q in ((0, first), (10, last))
     )
     path = read_waypoints(table(f"time [s],x [m],y [m],z [m],qw,qx,qy,qz\n{rows}\n"))
-    middle = path.flight().state(np.array([5.0]))
-    expected = multiply(about(2, 0.2), about(0, 0.5))
-    np.testing.assert_allclose(np.abs(middle.attitude @ expected), 1, atol=1e-12)
-    assert np.linalg.norm(middle.rate) == pytest.approx(0.1)
+    np.testing.assert_allclose(path.attitude, [first, last], atol=1e-15)
 
 
 def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):

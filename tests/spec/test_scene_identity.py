@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
 from sweep.spec.fields import leaves
 from sweep.spec.grounds import OPTICAL
@@ -283,7 +283,7 @@ def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
 
 
 def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
-    from sweep.scenes.digests import file_digest
+    from sweep.scenes.files import file_digest
 
     for name, side in (("a", 1.0), ("b", 2.0)):
         (tmp_path / name).mkdir()

@@ -10,7 +10,7 @@ from written_scenes import BOULDERS, BOX, HILLS, RELIEF, SPHERE, TREES, with_obj
 
 from sweep.model.eyepoints import observe
 from sweep.model.geometry.rays import Pose
-from sweep.scenes.errors import SceneError
+from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec
 
 FAR = np.array([4_000_123.375, 777_000.25])
@@ -151,7 +151,7 @@ def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
 
 
 def test_jacksboro_is_cut_about_its_middle_and_refined_through_its_posts():
-    from sweep.scenes.defaults import jacksboro
+    from sweep.scenes.rasters import jacksboro
 
     survey = jacksboro()
     row, column = 150, 250
@@ -290,7 +290,7 @@ def test_solids_are_what_they_are_called():
 
 @pytest.mark.parametrize("subdivisions", [1, 3])
 def test_facets_of_a_sphere_lie_as_near_as_promised(subdivisions):
-    from sweep.scenes.solids import box, sphere
+    from sweep.scenes.meshes import box, sphere
 
     ball = sphere(radius=2.0, subdivisions=subdivisions)
     middles = np.linalg.norm(ball.vertices[ball.faces].mean(axis=1), axis=1)

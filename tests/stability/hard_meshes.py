@@ -9,7 +9,7 @@ from cases import Family
 from exact_rays import fractions, last_places, nearest, plane_distance
 
 from sweep.model.geometry.rays import Caster
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 FAMILY = Family(
     "Meshes",

@@ -15,7 +15,7 @@ import pytest
 from sweep.model.geometry import quaternion
 from sweep.model.geometry.mesh import merge
 from sweep.model.geometry.rays import Caster, Pose
-from sweep.scenes.facets import clean
+from sweep.scenes.meshes import clean
 
 GALE = Path(__file__).parents[4] / "shared" / "data" / "gale_crater_hirise_1m.tif"
 PHASE_PER_METRE = 4.0 * np.pi / 1.55e-6

@@ -1,8 +1,9 @@
-"""Heights from georeferenced rasters: whatever rasterio reads, with its scale in metres."""
+"""Heights from files: georeferenced rasters, NumPy arrays, grey images, and a sample survey."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.scenes.degrees import metres_per_degree as degree_of
-from sweep.scenes.errors import SceneError, existing
-from sweep.scenes.terrain import Terrain
+from sweep.scenes.files import SceneError, existing
+from sweep.scenes.terrain import Bounds, Terrain
 
 MOST_CELLS = 50_000_000
 """Heights read at once at most: 100 million triangles."""
@@ -31,17 +31,18 @@ _SOURCE = re.compile(r"<Source(?:Filename|Dataset)([^>]*)>([^<]*)<")
 _SUBDATASET = re.compile(r"[A-Z0-9_]{2,}:")
 _LARGEST_VRT = 1 << 26
 
-_METRE = {"", "m", "metre", "meter", "metres", "meters"}
-_FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937}
+_METRES = dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0) | {
+    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937,
+}  # fmt: skip
 
-Window = tuple[float, float, float, float]
+WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
 
 
 def read_raster(
     path: str | Path,
     *,
     band: int = 1,
-    window: Window | None = None,
+    window: Bounds | None = None,
     metres_per_degree: tuple[float, float] | None = None,
     pixel: float | None = None,
 ) -> Terrain:
@@ -85,7 +86,7 @@ def read_raster(
 
 
 def raster_digest(path: str | Path) -> str:
-    """Digest of a raster's heights, spacing and frame, as :func:`sweep.scenes.digests.file_digest`.
+    """Digest of a raster's heights, spacing and frame, as :func:`sweep.scenes.files.file_digest`.
 
     They may come from other files: those that a .vrt names, a world file, a mask.
 
@@ -190,16 +191,16 @@ def _suggestion(data: Any) -> str:
     datum = described.get("datum") or described.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
     if "radius" in ellipsoid:
-        sizes = degree_of(middle, radius=float(ellipsoid["radius"]), flattening=0.0)
+        sizes = degree_at(middle, radius=float(ellipsoid["radius"]), flattening=0.0)
     elif "inverse_flattening" in ellipsoid:
         radius, inverse = ellipsoid["semi_major_axis"], ellipsoid["inverse_flattening"]
-        sizes = degree_of(middle, radius=float(radius), flattening=1 / float(inverse))
+        sizes = degree_at(middle, radius=float(radius), flattening=1 / float(inverse))
     else:
-        sizes = degree_of(middle)
+        sizes = degree_at(middle)
     return f"[{sizes[0]:.1f}, {sizes[1]:.1f}]"
 
 
-def _view(path: Path, data: Any, transform: Any, window: Window | None) -> Any:
+def _view(path: Path, data: Any, transform: Any, window: Bounds | None) -> Any:
     """Rows and columns to read."""
     from rasterio.windows import Window as Pixels
 
@@ -234,10 +235,164 @@ def _heights(path: Path, data: Any, band: int, view: Any) -> np.ndarray:
     """Heights [m], NaN where the raster has no data."""
     heights = _values(data, band, view)
     heights[~np.isfinite(heights)] = np.nan
+    _require_heights(path, heights)
+    unit = (data.units[band - 1] or "").strip().lower()
+    if unit not in _METRES:
+        raise SceneError(path, f"has heights in '{unit}'", "convert them to metres with gdal_calc")
+    return (heights * data.scales[band - 1] + data.offsets[band - 1]) * _METRES[unit]
+
+
+def _require_heights(path: Path, heights: np.ndarray) -> None:
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
-    unit = (data.units[band - 1] or "").strip().lower()
-    if unit not in _METRE and unit not in _FEET:
-        raise SceneError(path, f"has heights in '{unit}'", "convert them to metres with gdal_calc")
-    factor = _FEET.get(unit, 1.0)
-    return (heights * data.scales[band - 1] + data.offsets[band - 1]) * factor
+
+
+def read_array(
+    path: str | Path,
+    *,
+    spacing: tuple[float, float],
+    name: str | None = None,
+    no_data: float | None = None,
+) -> Terrain:
+    """Terrain of a NumPy file, ``.npy`` or ``.npz``, whose first height is at the world's origin.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    spacing : (dx, dy) of float
+        Step from column to column and from row to row [m]; dy < 0 where row 0 is the northern one.
+    name : str, optional
+        Array of an ``.npz`` that holds the heights [m]; not needed where it holds only one grid.
+    no_data : float, optional
+        Value that stands for a missing height, beside NaN.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing or holds no grid of numbers.
+    """
+    path = existing(path)
+    try:
+        loaded: Any = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise SceneError(path, f"is no NumPy file ({error})", "write it with numpy.save") from None
+    if isinstance(loaded, np.ndarray):
+        return _grid(path, loaded, spacing, no_data)
+    with loaded:
+        return _grid(path, _member(path, loaded, name), spacing, no_data)
+
+
+def _member(path: Path, loaded: Any, name: str | None) -> np.ndarray:
+    """The array of an archive that holds the heights."""
+    choose = f"name one of: {', '.join(loaded.files)}"
+    if name is None:
+        grids = [key for key in loaded.files if loaded[key].ndim == 2]
+        if len(grids) != 1:
+            raise SceneError(path, f"holds {len(grids)} grids", choose)
+        name = grids[0]
+    if name not in loaded.files:
+        raise SceneError(path, f"holds no '{name}'", choose)
+    return np.asarray(loaded[name])
+
+
+def _grid(
+    path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
+) -> Terrain:
+    """Terrain of an array of heights."""
+    if values.ndim != 2 or min(values.shape) < 2 or values.dtype.kind not in "iuf":
+        raise SceneError(
+            path,
+            f"holds {values.dtype} of shape {values.shape}",
+            "heights are a two-dimensional array of numbers",
+        )
+    if values.size > MOST_CELLS:
+        raise SceneError(path, f"holds more than {MOST_CELLS:.0e} heights", "cut a part out of it")
+    heights = values.astype(float)
+    heights[~np.isfinite(heights) | (values == no_data)] = np.nan
+    _require_heights(path, heights)
+    try:
+        return Terrain(heights, spacing, np.zeros(3))
+    except ValueError as error:
+        raise SceneError(path, str(error), "state steps in metres") from None
+
+
+def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: float) -> Terrain:
+    """Terrain of a grey image: row 0 is the northern one, its first pixel at the world's origin.
+
+    Heights come in steps of one grey level: smooth them before trusting slopes
+    (`sweep.scenes.terrain.smooth`).
+
+    Parameters
+    ----------
+    path : str or Path
+        Image of 8 or 16 bits, one band.
+    pixel : float
+        Size of a pixel on the ground [m], > 0.
+    black, white : float
+        Heights of black and of full white [m].
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing, no image, in colour, or of another depth.
+    """
+    levels = _grey(existing(path))
+    heights = black + (white - black) * levels / np.iinfo(levels.dtype).max
+    return _grid(Path(path), heights, (pixel, -pixel))
+
+
+def _grey(path: Path) -> np.ndarray:
+    """Grey levels of an image, as stored."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            mode, levels = image.mode, np.asarray(image)
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        raise SceneError(path, f"is no image that can be read ({error})", "use PNG") from None
+    if mode == "RGB" and (levels[..., :1] == levels).all():
+        return np.asarray(levels[..., 0])
+    if mode != "L" and not mode.startswith("I;16"):
+        raise SceneError(
+            path, f"has pixels of mode {mode}", "save it in grey, 8 or 16 bits a pixel"
+        )
+    return np.asarray(levels, np.uint8 if mode == "L" else np.uint16)
+
+
+def degree_at(
+    latitude: float, *, radius: float = WGS84_RADIUS, flattening: float = WGS84_FLATTENING
+) -> tuple[float, float]:
+    """Metres of a degree of longitude and of latitude at a geodetic latitude [deg].
+
+    Exact at that latitude only: over a grid of h degrees the east-west scale is off by up to
+    ``tan(latitude) h/2`` at its edges, 0.2 % for a quarter of a degree at 37 deg. Radius [m] at the
+    equator and flattening are the ellipsoid's, 0 for a sphere.
+    """
+    square = flattening * (2 - flattening)
+    phi = math.radians(latitude)
+    shrink = 1 - square * math.sin(phi) ** 2
+    across = radius / math.sqrt(shrink)
+    along = radius * (1 - square) / shrink**1.5
+    return math.radians(across * math.cos(phi)), math.radians(along)
+
+
+def jacksboro() -> Terrain:
+    """Heights of the Jacksboro fault, Tennessee, that come with matplotlib: 30 km by 32 km.
+
+    From a survey at 3 arc seconds (USGS): a post is 74 m from east to west and 92 m from north to
+    south. World coordinates are metres from its middle; heights are above sea level.
+    """
+    from matplotlib.cbook import get_sample_data
+
+    sample: Any = get_sample_data("jacksboro_fault_dem.npz")
+    with sample as data:
+        heights = data["elevation"].astype(float)
+        dx, dy = float(data["dx"]), float(data["dy"])
+        # The sample names its northern edge ymin; the grid's middle is the same either way.
+        middle = (float(data["ymin"]) + float(data["ymax"])) / 2
+    east, north = degree_at(middle)
+    spacing = dx * east, -dy * north
+    rows, columns = heights.shape
+    west, top = -(columns - 1) / 2 * spacing[0], -(rows - 1) / 2 * spacing[1]
+    return Terrain(heights, spacing, np.array([west, top, 0.0]))

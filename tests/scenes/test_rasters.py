@@ -7,11 +7,18 @@ import warnings
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 from rasterio import Affine
 
-from sweep.scenes.degrees import metres_per_degree
-from sweep.scenes.errors import SceneError
-from sweep.scenes.raster import raster_digest, read_raster
+from sweep.scenes.files import SceneError
+from sweep.scenes.rasters import (
+    degree_at,
+    jacksboro,
+    raster_digest,
+    read_array,
+    read_image,
+    read_raster,
+)
 
 HEIGHTS = np.arange(20, dtype=np.float32).reshape(4, 5)
 SOUTHWARDS = Affine(2.0, 0.0, 500_000.0, 0.0, -3.0, 4_000_000.0)
@@ -108,7 +115,7 @@ def test_degrees_become_metres_of_a_stated_size(tiff):
         read_raster(path)
     # The remedy gives the size on the raster's own ellipsoid, to be copied.
     said = str(refused.value).split("[")[1].split("]")[0].split(",")
-    assert [float(size) for size in said] == pytest.approx(metres_per_degree(36.498333), abs=0.06)
+    assert [float(size) for size in said] == pytest.approx(degree_at(36.498333), abs=0.06)
 
 
 def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
@@ -167,7 +174,7 @@ def test_files_that_are_no_raster_or_not_there_are_refused(tmp_path, tiff):
 
 
 def test_a_raster_too_large_to_read_asks_for_a_window(tiff, monkeypatch):
-    monkeypatch.setattr("sweep.scenes.raster.MOST_CELLS", 15)
+    monkeypatch.setattr("sweep.scenes.rasters.MOST_CELLS", 15)
     with pytest.raises(SceneError, match="give a window"):
         read_raster(tiff())
     assert read_raster(tiff(), window=(5e5, 3_999_988.0, 500_006.0, 4e6)).heights.size == 12
@@ -192,8 +199,8 @@ def test_a_degree_of_longitude_and_of_latitude_are_those_of_the_ellipsoid():
 
     north, _ = quad(speed, 44.5, 45.5)
     east = math.radians(point(45.0)[0])
-    assert metres_per_degree(45.0) == pytest.approx((east, north), rel=1e-6)
-    assert metres_per_degree(60.0, radius=1e6, flattening=0.0) == pytest.approx(
+    assert degree_at(45.0) == pytest.approx((east, north), rel=1e-6)
+    assert degree_at(60.0, radius=1e6, flattening=0.0) == pytest.approx(
         (math.radians(5e5), math.radians(1e6))
     )
 
@@ -281,3 +288,105 @@ def test_what_is_no_plain_file_is_refused_unread(tmp_path):
             read(tmp_path / "dem.tif")
         with pytest.raises(SceneError, match="no file of this machine; fetch it"):
             read("/vsicurl/http://127.0.0.1:9/dem.tif")
+
+
+GRID = np.arange(12.0).reshape(3, 4)
+STEPS = {"spacing": (2.0, -2.0)}
+
+
+def saved(path, image):
+    Image.fromarray(image).save(path)
+    return path
+
+
+def test_an_array_is_read_with_its_holes_steps_and_origin(tmp_path):
+    heights = GRID.copy()
+    heights[1, 1], heights[2, 2] = np.nan, -1e4
+    np.save(tmp_path / "z.npy", heights)
+    ground = read_array(tmp_path / "z.npy", no_data=-1e4, **STEPS)
+    expected = np.where(np.isin(GRID, [5.0, 10.0]), np.nan, GRID)
+    np.testing.assert_array_equal(ground.heights, expected)
+    assert ground.spacing == (2.0, -2.0)
+
+
+def test_the_grid_of_an_archive_is_found_or_named(tmp_path):
+    path = tmp_path / "z.npz"
+    np.savez(path, elevation=GRID, dx=np.array(3.0))
+    np.testing.assert_array_equal(read_array(path, **STEPS).heights, GRID)
+    np.savez(path, elevation=GRID, slope=2 * GRID)
+    np.testing.assert_array_equal(read_array(path, name="slope", **STEPS).heights, 2 * GRID)
+    with pytest.raises(SceneError, match="2 grids; name one of: elevation, slope"):
+        read_array(path, **STEPS)
+    with pytest.raises(SceneError, match="holds no 'z'"):
+        read_array(path, name="z", **STEPS)
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.arange(5.0), "two-dimensional"),
+        (np.full((3, 3), np.nan), "too few heights"),
+        (np.array([["a", "b"], ["c", "d"]]), "numbers"),
+        (np.ones((3, 3), complex), "numbers"),
+    ],
+)
+def test_arrays_that_are_no_ground_are_refused(tmp_path, array, said):
+    np.save(tmp_path / "z.npy", array)
+    with pytest.raises(SceneError, match=said):
+        read_array(tmp_path / "z.npy", **STEPS)
+
+
+def test_a_step_of_nothing_and_a_file_of_objects_are_refused(tmp_path):
+    np.save(tmp_path / "z.npy", GRID)
+    with pytest.raises(SceneError, match="steps"):
+        read_array(tmp_path / "z.npy", spacing=(0.0, 1.0))
+    np.save(tmp_path / "objects.npy", np.array([{}, {}], object), allow_pickle=True)
+    with pytest.raises(SceneError, match="no NumPy file"):
+        read_array(tmp_path / "objects.npy", **STEPS)
+
+
+@pytest.mark.parametrize(("kind", "top"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_grey_levels_become_heights_between_black_and_white(tmp_path, kind, top):
+    levels = np.array([[0, top, 0], [top // 5, 0, top]], kind)
+    path = saved(tmp_path / "z.png", levels)
+    ground = read_image(path, pixel=2.0, black=-10.0, white=40.0)
+    np.testing.assert_allclose(ground.heights, [[-10, 40, -10], [0, -10, 40]])
+    # The picture's top is north.
+    assert ground.height_at(np.array(0.0), np.array(-2.0)) == pytest.approx(0.0)
+    assert ground.height_at(np.array(2.0), np.array(0.0)) == pytest.approx(40.0)
+
+
+def test_a_grey_picture_in_three_equal_bands_is_grey(tmp_path):
+    levels = np.array([[0, 51], [102, 255]], np.uint8)
+    path = saved(tmp_path / "z.png", np.stack([levels] * 3, axis=-1))
+    ground = read_image(path, pixel=1.0, white=5.0)
+    np.testing.assert_allclose(ground.heights, [[0, 1], [2, 5]])
+
+
+def test_pictures_that_are_no_heights_are_refused(tmp_path):
+    colours = saved(tmp_path / "c.png", np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
+    with pytest.raises(SceneError, match="RGB; save it in grey"):
+        read_image(colours, pixel=1.0, white=5.0)
+    palette = tmp_path / "p.png"
+    Image.fromarray(np.zeros((3, 3), np.uint8)).convert("P").save(palette)
+    with pytest.raises(SceneError, match="mode P"):
+        read_image(palette, pixel=1.0, white=5.0)
+    nonsense = tmp_path / "n.png"
+    nonsense.write_text("no picture")
+    with pytest.raises(SceneError, match="no image"):
+        read_image(nonsense, pixel=1.0, white=5.0)
+    with pytest.raises(SceneError, match="does not exist"):
+        read_image(tmp_path / "x.png", pixel=1.0, white=5.0)
+
+
+def test_the_default_terrain_has_the_size_and_heights_of_the_survey():
+    """344 x 403 posts of 3 arc seconds, 236 to 1076 m; a minute of latitude is a nautical mile."""
+    ground = jacksboro()
+    assert ground.heights.shape == (344, 403)
+    assert (ground.heights.min(), ground.heights.max()) == (236, 1076)
+    assert -ground.spacing[1] == pytest.approx(1852 / 20, rel=2e-3)
+    # On a sphere their ratio would be the cosine of the latitude; the flattening adds under 0.7 %.
+    ratio = ground.spacing[0] / -ground.spacing[1] / np.cos(np.radians(36.59))
+    assert 1 < ratio < 1.007
+    west, south, east, north = ground.bounds
+    assert (west, south) == pytest.approx((-east, -north))
