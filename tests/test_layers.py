@@ -30,7 +30,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 54_095, "modules": 288, "lines of the model": 17_386, "modules of the model": 67,
+    "lines": 53_676, "modules": 280, "lines of the model": 17_386, "modules of the model": 67,
     "compiled functions": 125, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
