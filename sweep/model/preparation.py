@@ -270,7 +270,7 @@ class Shots:
         phases = self.phase if self.phase.size else ()
         return np.stack([self.offset, self.doppler, self.amplitude, *phases])
 
-    @property
+    @cached_property
     def waveform(self) -> tuple[waveform.Segment, ...]:
         """Segments of the waveform, one after the other; no output tells of Doppler's leakage."""
         return tuple(
