@@ -11,14 +11,15 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 MAY_IMPORT = {
     "units": {"units"},
+    "extras": {"extras"},
     "storage": {"storage"},
     "model": {"model"},
     "scenes": {"scenes", "model", "units"},
     "spec": {"spec", "scenes", "model", "units"},
-    "tasks": {"tasks", "storage", "spec", "scenes", "model", "units"},
+    "tasks": {"tasks", "extras", "storage", "spec", "scenes", "model", "units"},
     "analysis": {"analysis", "storage", "spec", "scenes", "model", "units"},
     "report": {"report", "analysis", "storage", "spec", "scenes", "model", "units"},
-    "cli": {"cli", "tasks", "report", "analysis", "storage", "spec", "scenes", "model", "units"},
+    "cli": {"cli", "extras", "tasks", "report", "analysis", "storage", "spec", "scenes", "model", "units"},
     "__init__": {"tasks", "analysis", "spec"},
 }
 """Imports run one way; analysis and report read stores, however they were computed."""
@@ -30,7 +31,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 53_676, "modules": 280, "lines of the model": 17_386, "modules of the model": 67,
+    "lines": 53_705, "modules": 281, "lines of the model": 17_386, "modules of the model": 67,
     "compiled functions": 125, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

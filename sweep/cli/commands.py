@@ -65,6 +65,7 @@ class Commands(click.Group):
         except (click.exceptions.Exit, click.ClickException, click.Abort):
             raise
         except Exception as error:
+            from sweep.extras import remedy
             from sweep.model.unsupported import UnsupportedShot
             from sweep.scenes.files import SceneError
             from sweep.spec import SpecError
@@ -77,7 +78,9 @@ class Commands(click.Group):
                 UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
-            if isinstance(said, told):
+            if line := remedy(said):
+                click.echo(line, err=True)
+            elif isinstance(said, told):
                 click.echo(str(said), err=True)
             elif isinstance(said, OSError) and said.filename and said.errno in UNUSABLE:
                 place = f"{said.filename}: {said.strerror}"

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from sweep.extras import remedy
 from sweep.spec.cluster_fields import Bounds
 from sweep.spec.clusters import (
     SSH,
@@ -159,7 +160,7 @@ def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> A
                 return batch.start(cluster, bounds)
             return ssh.start(cluster, bounds)
     except (OSError, RuntimeError, ImportError) as error:
-        raise ClusterError(f"no workers could be started: {error}") from error
+        raise ClusterError(f"no workers could be started: {remedy(error) or error}") from error
 
 
 def _keep(started: Any, cluster: AnyCluster, bounds: Bounds) -> None:

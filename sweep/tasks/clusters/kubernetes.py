@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
+from sweep.extras import remedy
 from sweep.spec.cluster_fields import Bounds
 from sweep.spec.clusters import Kubernetes
 from sweep.tasks.clusters import common
@@ -44,7 +45,7 @@ def deployed(cluster: Kubernetes, bounds: Bounds) -> Iterator[str]:
         from kr8s import APITimeoutError, NotFoundError, ServerError
         from kr8s.objects import Service, new_class
     except ImportError as error:
-        raise ClusterError(f"{error}: pip install 'sweep[kubernetes]'") from error
+        raise ClusterError(remedy(error) or str(error)) from error
     refused = (APITimeoutError, HTTPError, NotFoundError, OSError, ServerError, ValueError)
     with ExitStack() as stack:
         try:
@@ -131,7 +132,7 @@ def resource(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any]:
     try:
         from dask_kubernetes.operator import make_cluster_spec
     except ImportError as error:
-        raise ClusterError(f"{error}: pip install 'sweep[kubernetes]'") from error
+        raise ClusterError(remedy(error) or str(error)) from error
     worker = cluster.worker
     size = {"cpu": str(worker.threads), "memory": str(int(worker.memory))}
     asked: dict[str, Any] = make_cluster_spec(

@@ -1,0 +1,40 @@
+"""Packages that only some studies need: each has an extra, and a missing one is one line."""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from sweep.cli import main
+from sweep.extras import EXTRAS, remedy
+
+ROOT = Path(__file__).parents[1]
+OPTIONAL = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def imported(extra):
+    """Modules of an extra's own packages."""
+    names = {re.match(r"[\w-]+", each)[0] for each in OPTIONAL[extra]}
+    return {name.replace("-", "_").lower() for name in names}
+
+
+@pytest.mark.parametrize("module", EXTRAS)
+def test_every_optional_module_is_brought_by_its_extra(module):
+    brought = imported(EXTRAS[module])
+    assert module in brought or EXTRAS[module] == "kubernetes"  # its own packages' dependencies
+    assert EXTRAS[module] in OPTIONAL["all"][0]
+
+
+def test_a_missing_package_is_one_line_that_tells_what_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    found = CliRunner().invoke(main, ["status", "s3://bucket/study.zarr"], catch_exceptions=False)
+    assert found.exit_code == 2
+    assert found.output == "obstore is not installed: pip install 'sweep[cloud]'\n"
+
+
+def test_other_errors_have_no_remedy():
+    assert remedy(ModuleNotFoundError("No module named 'mine'", name="mine")) == ""
+    assert remedy(ValueError("trimesh")) == ""
