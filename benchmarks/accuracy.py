@@ -9,14 +9,12 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from sweep.analysis import canvas
-from sweep.analysis.accuracy import report, text
+from shared import DOCS, EXPERIMENTS, table
+
+from sweep.analysis import accuracy, accuracy_figure, canvas
 from sweep.spec import load
 from sweep.tasks.accuracy.run import measure
 from sweep.tasks.accuracy.rungs import WRITTEN, Rung
-
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
 
 
 class Study(NamedTuple):
@@ -148,31 +146,25 @@ Take the cheapest setting that meets the error you can live with: for most studi
 def section(name: str, study: Study, time_limit: float) -> str:
     """A study's part of the page; its figure is drawn."""
     spec = Rung(name="", kind=WRITTEN, overrides=study.overrides).of(
-        load(ROOT / "experiments" / f"{study.experiment}.yaml")
+        load(EXPERIMENTS / f"{study.experiment}.yaml")
     )
     with tempfile.TemporaryDirectory() as folder:
         store = Path(folder) / f"{name}.zarr"
         measure(spec, store_path=store, time_limit=time_limit)
-        dataset, settings = report.opened(store)
-    picture = canvas.save(report.sheet(dataset, settings), DOCS / f"accuracy_{name}.png")
+        dataset, settings = accuracy_figure.opened(store)
+    picture = canvas.save(accuracy_figure.sheet(dataset, settings), DOCS / f"accuracy_{name}.png")
     put = ", ".join(f"`{k}: {v}`" for k, v in study.overrides.items() if k != "title")
     source = f"`experiments/{study.experiment}.yaml`" + (f" with {put}" if put else "")
     parts = [
         f"## {study.heading}",
         f"{study.about} ({source})",
         f"![Error over time of each setting]({picture.name})",
-        "\n".join(f"- {sentence}" for sentence in text.sentences(dataset, settings)),
-        table(text.CHEAPEST, text.cheapest_rows(settings)),
+        "\n".join(f"- {sentence}" for sentence in accuracy.sentences(dataset, settings)),
+        table(accuracy.CHEAPEST, accuracy.cheapest_rows(settings)),
         "All settings; `front`: none is both as fast and as accurate.",
-        table(text.COLUMNS, text.rows(settings)),
+        table(accuracy.COLUMNS, accuracy.rows(settings)),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def table(columns, rows) -> str:
-    """A table in Markdown."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def main() -> None:

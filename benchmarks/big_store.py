@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import ndtr
+from shared import experiment
 
 ANGLES, CHUNK = 90, 65_536
 BYTES_A_POINT = 8 * 27 + 4
@@ -24,48 +25,39 @@ BYTES_A_POINT = 8 * 27 + 4
 
 def spec_of(gigabytes, block_points=CHUNK, powers=100, figures=()):
     """A study of about so many GB of results."""
-    from sweep.spec import load
-
     ranges = max(2, round(gigabytes * 1e9 / BYTES_A_POINT / ANGLES / powers))
-    spec = load(Path(__file__).parents[1] / "experiments" / "quickstart.yaml")
-    mapping = spec.to_yaml_mapping() | {
-        "title": "Made up",
-        "axes": {
+    return experiment(
+        "quickstart",
+        title="Made up",
+        axes={
             "instrument.laser.power": {"log": ["1 W", "10 W"], "number": powers},
             "target.range": {"linear": ["100 m", "20 km"], "number": ranges},
             "target.grazing_angle": {"linear": ["20 deg", "90 deg"], "number": ANGLES},
         },
-        "storage": {"block_points": block_points},
-        "figures": list(figures),
-    }
-    return type(spec).from_mapping(mapping)
+        storage={"block_points": block_points},
+        figures=list(figures),
+    )
 
 
 def make(path, spec):
-    """The store, every block written with the closed form of `expected`."""
+    """The store, every block written with the closed form of `deviate`; its size [B]."""
     from sweep.tasks import store
     from sweep.tasks.grid_study import GridStudy
-    from sweep.tasks.store import Arrays
 
     study = GridStudy(spec)
     store.create(path, study)
-    arrays, receipts = Arrays(path, study), []
-    names = list(study.chunks(0))
+    arrays, receipts = store.Arrays(path, study), []
     for block in range(study.n_blocks):
-        extent = study.grid.extent(block)
-        p = study.grid.parameters(block)
+        extent, p = study.grid.extent(block), study.grid.parameters(block)
         z = deviate(p["target.range"], p["target.grazing_angle"], p["instrument.laser.power"])
-        values = z.reshape(extent)
-        of = {"pd_shot": ndtr(values), "miss_shot": ndtr(-values)}
-        values = np.round(values)  # what is only summarised packs well, to spare the disk
-        arrays.write(block, {
-            name: np.zeros(extent, np.uint32) if name == "effects" else of.get(name, values)
-            for name in names
-        })  # fmt: skip
-        receipts.append(
-            json.dumps({"block": block, "points": study.block_size(block), "time": 0.0})
-        )
-    (Path(path) / ".sweep" / "receipts.jsonl").write_text("\n".join(receipts) + "\n")
+        z = z.reshape(extent)
+        # What is only summarised packs well, to spare the disk.
+        results = dict.fromkeys(study.chunks(block), np.round(z))
+        results |= {"pd_shot": ndtr(z), "miss_shot": ndtr(-z), "effects": np.zeros(extent, "u4")}
+        arrays.write(block, results)
+        receipt = {"block": block, "points": study.block_size(block), "time": 0.0}
+        receipts.append(json.dumps(receipt) + "\n")
+    (Path(path) / ".sweep" / "receipts.jsonl").write_text("".join(receipts))
     return study.points * BYTES_A_POINT
 
 
@@ -79,11 +71,20 @@ def farthest(grazing_angle, power):
     return 6000 * np.sqrt(power) * np.sin(grazing_angle) ** 0.5
 
 
+def peak_mb():
+    """Largest resident size of this process."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def reduce(path):
     """Summary and maximum range of a store; seconds, and the largest error of the range [m]."""
-    import sweep
+    import dask.array  # noqa: F401
+    import zarr  # noqa: F401
 
-    begun = time.perf_counter()
+    import sweep
+    import sweep.analysis.opening
+
+    idle, begun = peak_mb(), time.perf_counter()
     dataset = sweep.open(path)
     whole = dataset.sweep.summary().compute()
     limit = dataset.sweep.maximum_range().unbroken.compute()
@@ -95,19 +96,9 @@ def reduce(path):
         "seconds": taken,
         "points": int(whole.pd_shot.sel(statistic="number")),
         "error": float(abs(limit - exact).where(inside).max()),
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "idle_mb": idle,
+        "peak_mb": peak_mb(),
     }
-
-
-def idle():
-    """Largest resident size [MB] of a process that has imported all and opened nothing."""
-    code = (
-        "import resource, sweep.analysis.opening, dask.array, zarr;"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
-    )
-    return float(
-        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout
-    )
 
 
 def main():
@@ -129,9 +120,8 @@ def main():
         command = [sys.executable, __file__, "--read", str(path)]
         found = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     print(f"{found['points']:,} points: summary, maximum range: {found['seconds']:.0f} s")
-    print(
-        f"largest resident size {found['peak_mb']:.0f} MB ({idle():.0f} MB of it with nothing read)"
-    )
+    print(f"largest resident size {found['peak_mb']:.0f} MB "
+          f"({found['idle_mb']:.0f} MB of it with nothing read)")  # fmt: skip
     print(f"largest error of the maximum range {found['error']:.2g} m")
 
 

@@ -12,9 +12,8 @@ from pathlib import Path
 from time import process_time
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from shared import EXPERIMENTS, show
 
 import sweep
 from sweep.model.effects.catalogue import names_of
@@ -22,7 +21,6 @@ from sweep.tasks.accuracy.rungs import ADAPTIVE, FIXED, Rung, ladder
 from sweep.tasks.calling import Called
 from sweep.tasks.flight_study import FlightStudy
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FLIGHTS = ("morpheus_three_beam", "oblique_descent", "gale_crater_descent", "square_low_descent",
            "square_high_descent", "forest_scan", "expanded_pattern")  # fmt: skip
 TOLERANCES = (1e-1, 1e-3)
@@ -36,11 +34,11 @@ class Unplanned(FlightStudy):
         super().__init__(planned.spec, planned.path)
         self._planned, self._called = planned, {}
 
-    def call(self, part, eyepoints, *, first=0) -> Called:
+    def call(self, part, eyepoints, numbers) -> Called:
         """What is simulated of shots, planned once."""
-        if (part, first) not in self._called:
-            self._called[part, first] = self._planned.call(part, eyepoints, first=first)
-        return self._called[part, first]
+        if (part, numbers[0]) not in self._called:
+            self._called[part, numbers[0]] = self._planned.call(part, eyepoints, numbers)
+        return self._called[part, numbers[0]]
 
 
 def stored(rung: Rung, spec, path: Path) -> FlightStudy:
@@ -80,8 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*FLIGHTS, []])
     names = parser.parse_args().names or FLIGHTS
-    table = Table("flight", "shots", "tolerance", "adaptive", "times as fast as fixed",
-                  "as fixed, unplanned")  # fmt: skip
+    rows = []
     for name in track(names, transient=True):
         spec = sweep.load(EXPERIMENTS / f"{name}.yaml")
         for tolerance in TOLERANCES:
@@ -91,8 +88,10 @@ def main() -> None:
             faster = np.median(spent / spent[:, :1], axis=0)
             own = f"{1e3 * np.median(spent[:, 0]):.3g} ms"
             ratios = (f"{ratio:.3f}" for ratio in faster[1:])
-            table.add_row(name, f"{studies[0].points:,}", f"{tolerance:g}", own, *ratios)
-    Console().print(table)
+            rows.append([name, f"{studies[0].points:,}", f"{tolerance:g}", own, *ratios])
+    head = ["flight", "shots", "tolerance", "adaptive", "times as fast as fixed",
+            "as fixed, unplanned"]  # fmt: skip
+    show(head, rows)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,12 @@
 Run with `make detectors`, a minute on one core. Writes the tables and figures of docs/detectors.md.
 """
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
+from shared import DOCS, put, table
 
 from sweep.analysis import canvas
 from sweep.model import estimators
@@ -25,8 +25,6 @@ from sweep.model.detectors import (
 from sweep.model.estimators import ESTIMATORS
 from sweep.model.window import window
 
-DOCS = Path(__file__).parents[1] / "docs"
-PAGE = DOCS / "detectors.md"
 CFAR = (CA, OS, GOCA)
 LENGTH, TRAINING, GUARD, PFA = 1024, 32, 4, 1e-3
 RECORDS = 4000
@@ -196,32 +194,16 @@ def ratios(found: dict[str, dict[str, np.ndarray]]) -> Iterator[list[str]]:
         yield cells
 
 
-def table(head: list[str], rows: Iterator[list[str]]) -> str:
-    """A table in Markdown."""
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, *rows)]
-    return "\n".join([lines[0], "|" + " --- |" * len(head), *lines[1:]])
-
-
-def put(text: str, name: str, content: str) -> str:
-    """The page with a table put between its marks."""
-    begin, end = f"<!-- {name}: written by make detectors -->\n", "<!-- up to here -->\n"
-    before, mark, rest = text.partition(begin)
-    _, stop, after = rest.partition(end)
-    if not mark or not stop:
-        sys.exit(f"{PAGE} lacks the lines that the table of {name} stands between")
-    return before + begin + content + "\n" + end + after
-
-
 def main() -> None:
     """Tables and figures, in their page and beside it."""
     found = {name: errors(name) for name in ("rectangular", "hamming")}
-    text = PAGE.read_text(encoding="utf-8")
-    head = ["window", "padding", *DETECTORS]
-    text = put(text, "false alarms", table(head, false_alarms()))
-    text = put(text, "losses", table(["training cells", "pfa", *CFAR], losses()))
-    head = ["", *(f"{name}, {d} dB" for name in found for d in (16, 24, 40))]
-    text = put(text, "estimators", table(head, ratios(found)))
-    PAGE.write_text(text, encoding="utf-8")
+    heads = ["", *(f"{name}, {d} dB" for name in found for d in (16, 24, 40))]
+    for name, head, rows in (
+        ("false alarms", ["window", "padding", *DETECTORS], false_alarms()),
+        ("losses", ["training cells", "pfa", *CFAR], losses()),
+        ("estimators", heads, ratios(found)),
+    ):
+        put("detectors.md", name, table(head, rows))
     draw_masking(DOCS / "detectors_masking.png")
     draw_estimators(found, DOCS / "detectors_estimators.png")
 

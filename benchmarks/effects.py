@@ -8,22 +8,20 @@ of an experiment after the other; quote the ratios. Writes docs/effects_table.md
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.progress import Progress
+from shared import DOCS, EXPERIMENTS, line
 
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.spec import SceneSpec, Spec
+from sweep.spec import SceneSpec, Spec, SpecError, load
 from sweep.spec.reading import read_document
 from sweep.tasks import driver
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.studies import study_of
 
-ROOT = Path(__file__).parents[1]
-TABLE = ROOT / "docs" / "effects_table.md"
 TOLERANCES = (1e-1, 1e-2, 1e-3)
 DRAWS = 1000
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
@@ -60,42 +58,29 @@ def variant(path: Path, tolerance: float | None) -> Spec | SceneSpec:
     return kind.from_mapping(written, base=path.parent)
 
 
-def blocks(spec: Spec | SceneSpec, folder: Path) -> Iterator[tuple[int, int, dict]]:
-    """Blocks of a study: number of them, points, results."""
-    store = folder / "study.zarr"
-    if isinstance(spec, SceneSpec) and not (folder / "eyepoints").exists():
+def evaluated(spec: Spec | SceneSpec, folder: Path, told: Progress, title: str) -> Variant:
+    """Probabilities of detection at every point, and the time that they took."""
+    store, flight = folder / "study.zarr", isinstance(spec, SceneSpec)
+    if flight and not (folder / "eyepoints").exists():
         driver.run(spec, store=store, progress=False)  # casts the rays
     study = study_of(spec, store)
     study.compile()
-    for block in range(study.n_blocks):
-        yield study, block, study.block_size(block)
-
-
-def evaluated(spec: Spec | SceneSpec, folder: Path, told: Progress, title: str) -> Variant:
-    """Probabilities of detection at every point, and the time that they took."""
     found: dict[str, list[np.ndarray]] = {}
+    bar = told.add_task(title, total=study.points)
     total = planning = 0.0
-    bar = None
-    for study, block, size in blocks(spec, folder):
-        bar = told.add_task(title, total=study.points) if bar is None else bar
-        plan = planned(study, block)
-        begun = time.perf_counter()
+    for block in range(study.n_blocks):
+        begun = time.perf_counter()  # of a grid a plan is kept, of a flight it is made again
+        study.called(block) if isinstance(study, FlightStudy) else study.calling.of_block(block)
+        planned = time.perf_counter()
         results = study.evaluate(block)
-        total += time.perf_counter() - begun + (0 if isinstance(study, FlightStudy) else plan)
-        planning += plan
+        total += time.perf_counter() - (planned if flight else begun)
+        planning += planned - begun
         for name, values in results.items():
             if name.rsplit("/", 1)[-1] in PROBABILITIES:
                 found.setdefault(name, []).append(values.ravel())
-        told.update(bar, advance=size)
+        told.update(bar, advance=study.block_size(block))
     told.remove_task(bar)
     return Variant(total, planning, {name: np.concatenate(parts) for name, parts in found.items()})
-
-
-def planned(study, block: int) -> float:
-    """Time that a block's plan takes by itself: of a grid it is kept, of a flight made again."""
-    begun = time.perf_counter()
-    study.called(block) if isinstance(study, FlightStudy) else study.calling.of_block(block)
-    return time.perf_counter() - begun
 
 
 def largest_change(one: Variant, other: Variant) -> float:
@@ -122,32 +107,29 @@ def row(path: Path, told: Progress) -> str:
             if change > tolerance:
                 print(f"{name}: {change:.2e} exceeds {tolerance:g}", file=sys.stderr)
     share = f"{100 * called.planning / called.seconds:.1f} %" if called.planning else "-"
-    cells = [name.replace("_", " "), f"{points:,}", f"{every.seconds:.1f} s", *cells, share]
-    return "| " + " | ".join(cells) + " |"
+    return line([name.replace("_", " "), f"{points:,}", f"{every.seconds:.1f} s", *cells, share])
 
 
 def main() -> None:
     """The whole table."""
-    paths = sorted((ROOT / "experiments").glob("*.yaml"))
-    if names := sys.argv[1:]:
-        paths = [path for path in paths if path.stem in names]
+    names = sys.argv[1:]
     head = ["experiment", "points", "all on", *(f"at {t:g}" for t in TOLERANCES), "planning"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    lines = [line(head), line(["---"] * len(head))]
     with Progress() as told:
-        for path in paths:
+        for path in sorted(EXPERIMENTS.glob("*.yaml")):
+            if names and path.stem not in names:
+                continue
             if why := left_out(path):
                 print(f"{path.stem}: {why}", file=sys.stderr)
                 continue
             lines.append(row(path, told))
             print(lines[-1], flush=True)
     if not names:
-        TABLE.write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")
+        (DOCS / "effects_table.md").write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")
 
 
 def left_out(path: Path) -> str:
     """Why an experiment is not looked at: a file is not here, or it has no probabilities."""
-    from sweep.spec import SpecError, load
-
     try:
         spec = load(path)
     except SpecError as error:

@@ -19,12 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from shared import EXPERIMENTS, TABLE_4_1, loaded, plain
 
 import sweep
 
-ROOT = Path(__file__).parents[1]
-EXPERIMENTS = ROOT / "experiments"
 TOLERANCE = 1e-9
 SEED = 2029
 FEW_DRAWS = 20
@@ -63,39 +61,16 @@ def spelled(member: Any, place: int) -> str:
     return str(value) if isinstance(value, str) else f"{float(value)!r} {member.units}".strip()
 
 
-def loaded(written: dict[str, Any]) -> Any:
-    """A study from plain data."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "study.yaml"
-        file.write_text(yaml.safe_dump(written, sort_keys=False))
-        return sweep.load(file)
-
-
-def named(written: Any) -> Any:
-    """The same with keys that YAML reads as true (`on`) as they were written."""
-    if isinstance(written, list):
-        return [named(each) for each in written]
-    if not isinstance(written, dict):
-        return written
-    return {"on" if key is True else key: named(value) for key, value in written.items()}
-
-
 def experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every shipped experiment, exact and thinned."""
     for file in sorted(EXPERIMENTS.glob("*.yaml")):
         if file.stem in LEFT_OUT:
             continue
-        written = named(yaml.safe_load(file.read_text()))
-        instrument = written["instrument"]
-        if isinstance(instrument, str):
-            instrument = {"file": instrument}
-        instrument["file"] = str(EXPERIMENTS / instrument["file"])
-        written["instrument"] = instrument
+        written = plain(EXPERIMENTS, file.stem)
         written["accuracy"] = {"tolerance": TOLERANCE}
         if "draws" in written:
             few = {k: v for k, v in written["draws"].items() if k not in ("limit", "number")}
             written["draws"] = few | {"number": FEW_DRAWS}
-        written.pop("figures", None)
         written.pop("storage", None)
         few_points = points // 10 if "draws" in written else points
         yield file.stem, grid(written, few_points, np.random.default_rng(SEED))
@@ -113,7 +88,7 @@ def random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
                 {
                     "title": name,
                     "instrument": {
-                        "file": str(EXPERIMENTS / "instruments" / "table_4_1.yaml"),
+                        "file": str(TABLE_4_1),
                         "processing": {
                             "window": window,
                             "fft_size": "2^12",

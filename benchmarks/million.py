@@ -16,50 +16,31 @@ import time
 from pathlib import Path
 
 import psutil
-import scale_page
 import yaml
-from rich.console import Console
-from rich.table import Table
 from scale import receipt_lines
+from shared import EXPERIMENTS, plain, put, show, table
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-SIDE = 1000
-DONE = 900_000
-FURTHER = 100
-"""Blocks that are waited for."""
-
-LINE = 330
-"""Bytes of a receipt, some."""
-
+SIDE, DONE = 1000, 900_000
+FURTHER, LINE = 100, 330
+"""Blocks that are waited for; bytes of a receipt, some."""
 WAIT = 300.0
 
 
 def spec_at(folder: Path) -> Path:
     """A spec of a million points, a block each."""
-    from sweep.spec.reading import read_document
-
-    mapping = read_document(EXPERIMENTS / "quickstart.yaml").value | {
-        "instrument": str(EXPERIMENTS / "instruments" / "table_4_1.yaml"),
-        "axes": {
-            "target.range": {"linear": ["10 m", "5 km"], "number": SIDE},
-            "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": SIDE},
-        },
-        "storage": {"block_points": 1},
-        "figures": [],
+    axes = {
+        "target.range": {"linear": ["10 m", "5 km"], "number": SIDE},
+        "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": SIDE},
     }
+    written = plain(EXPERIMENTS, "quickstart") | {"axes": axes, "storage": {"block_points": 1}}
     path = folder / "million.yaml"
-    path.write_text(yaml.safe_dump(mapping))
+    path.write_text(yaml.safe_dump(written))
     return path
 
 
 def log_of(store: Path) -> Path:
     """The log of receipts."""
     return store / ".sweep" / "receipts.jsonl"
-
-
-def size_of(path: Path) -> int:
-    """Bytes of a file, 0 where there is none."""
-    return path.stat().st_size if path.exists() else 0
 
 
 def command(*words: str) -> subprocess.Popen:
@@ -70,17 +51,18 @@ def command(*words: str) -> subprocess.Popen:
     )
 
 
-def until_at_work(store: Path, *words: str) -> tuple[float, float]:
-    """Seconds until a command's first blocks are committed, and its memory [MB]; then Ctrl-C."""
-    before, begun = size_of(log_of(store)), time.perf_counter()
+def until_at_work(store: Path, *words: str) -> list[str]:
+    """Time until a command's first blocks are committed, and its memory; then Ctrl-C."""
+
+    def size() -> int:
+        return log_of(store).stat().st_size if log_of(store).exists() else 0
+
+    before, begun = size(), time.perf_counter()
     child = command(*words, "--workers", "2")
     process, first, most = psutil.Process(child.pid), 0.0, 0
-    while True:
+    while (further := size() - before) <= FURTHER * LINE:
         most = max(most, process.memory_info().rss)
-        further = size_of(log_of(store)) - before
         first = first or (time.perf_counter() - begun if further > 0 else 0.0)
-        if further > FURTHER * LINE:
-            break
         if child.poll() is not None or time.perf_counter() - begun > WAIT:
             raise RuntimeError(child.communicate()[0])
         time.sleep(0.01)
@@ -88,44 +70,41 @@ def until_at_work(store: Path, *words: str) -> tuple[float, float]:
     told, _ = child.communicate(timeout=WAIT)
     if child.returncode == 0 or "Traceback" in told:
         raise RuntimeError(told)
-    return first, most / 1e6
+    return cells(first or time.perf_counter() - begun, most)
 
 
-def status(store: Path) -> tuple[float, float, str]:
-    """Seconds that `sweep status` takes, its memory [MB], and what it says."""
+def status(store: Path) -> list[str]:
+    """Time that `sweep status` takes, and its memory; what it says is printed."""
     begun = time.perf_counter()
     child = command("status", str(store))
     assert child.stdout is not None
-    told = child.stdout.read()
+    print(child.stdout.read())
     _, code, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(code)
-    return time.perf_counter() - begun, usage.ru_maxrss * 1024 / 1e6, told
+    return cells(time.perf_counter() - begun, usage.ru_maxrss * 1024)
+
+
+def cells(seconds: float, memory: float) -> list[str]:
+    """Time [s] and memory [B] as the table has them."""
+    return [f"{seconds:.1f} s", f"{memory / 1e6:.0f} MB"]
 
 
 def main() -> None:
     """All of it."""
-    rows = []
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        spec, store = spec_at(folder), folder / "million.zarr"
-        seconds, memory = until_at_work(store, "run", str(spec), "--store", str(store))
-        rows.append(["`run`, first block committed", "0", f"{seconds:.1f} s", f"{memory:.0f} MB"])
-        for done in (f"{FURTHER:,}", f"{DONE:,}"):
-            seconds, memory, told = status(store)
-            rows.append(["`status`", done, f"{seconds:.1f} s", f"{memory:.0f} MB"])
-            Console().print(told)
-            seconds, memory = until_at_work(store, "resume", str(store))
-            rows.append(["`resume`, first block committed", done, f"{seconds:.1f} s",
-                         f"{memory:.0f} MB"])  # fmt: skip
-            if done == f"{FURTHER:,}":
+        spec, store = spec_at(Path(name)), Path(name) / "million.zarr"
+        run = until_at_work(store, "run", str(spec), "--store", str(store))
+        rows = [["`run`, first block committed", "0", *run]]
+        for done in (FURTHER, DONE):
+            rows.append(["`status`", f"{done:,}", *status(store)])
+            again = until_at_work(store, "resume", str(store))
+            rows.append(["`resume`, first block committed", f"{done:,}", *again])
+            if done == FURTHER:
                 with open(log_of(store), "ab") as log:
                     log.writelines(receipt_lines(DONE, points=1))
     head = ["command", "blocks done before", "time", "memory"]
-    table = Table(*head)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
-    scale_page.put("million", head, rows)
+    show(head, rows)
+    put("scale.md", "million", table(head, rows))
 
 
 if __name__ == "__main__":

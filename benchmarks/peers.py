@@ -29,10 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 import psutil
-import scale_page
 import xarray as xr
-from rich.console import Console
-from rich.table import Table
+from shared import experiment, put, show, table
 
 SIDE = 100
 POINTS = SIDE * SIDE
@@ -45,7 +43,6 @@ FAR_BEHIND = 0.8
 SECOND = 1.0
 BLOCKS_OF_A_SECOND = 100
 NAMES = ("a", "b", "c")
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 
 def burn(seconds: float) -> None:
@@ -104,17 +101,11 @@ def ideal(workers: int) -> float:
 
 def study(block_points: int = BATCH):
     """A grid of 100 x 100 points."""
-    from sweep.spec import Spec
-    from sweep.spec.reading import read_document
-
-    mapping = read_document(EXPERIMENTS / "quickstart.yaml").value
-    mapping["axes"] = {
+    axes = {
         "target.range": {"linear": ["10 m", "5 km"], "number": SIDE},
         "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": SIDE},
     }
-    mapping["storage"] = {"block_points": block_points}
-    mapping["figures"] = []
-    return Spec.from_mapping(mapping, base=EXPERIMENTS)
+    return experiment("quickstart", axes=axes, storage={"block_points": block_points})
 
 
 @contextmanager
@@ -132,28 +123,24 @@ def ours(workers: int, folder: Path):
 
 def blocks_of_ms(held, block):
     """A block's arrays a millisecond a point later; their values are those of no model."""
-    size = held.block_size(block)
-    values = np.arange(size, dtype=float)
-    burn(MILLISECOND * size)
-    return filled(held, block, values)
+    burn(MILLISECOND * held.block_size(block))
+    return filled(held, block)
 
 
 def blocks_of_seconds(held, block):
     """A block's arrays a second later."""
     burn(SECOND)
-    return filled_at_once(held, block)
+    return filled(held, block)
 
 
-def filled(held, block: int, values: np.ndarray) -> dict[str, np.ndarray]:
+def filled(held, block: int) -> dict[str, np.ndarray]:
     """Arrays of the shapes and types that a block has, with numbers that don't compress away."""
-    shapes = {layout.name: layout for layout in held.arrays()}
-    results = {}
+    layouts = {layout.name: layout for layout in held.arrays()}
+    values, results = np.arange(held.block_size(block), dtype=float), {}
     for name, position in held.chunks(block).items():
-        layout = shapes[name]
-        shape = tuple(
-            min((p + 1) * c, s) - p * c
-            for p, c, s in zip(position, layout.chunks, layout.shape, strict=True)
-        )
+        layout = layouts[name]
+        sizes = zip(position, layout.chunks, layout.shape, strict=True)
+        shape = [min((p + 1) * c, s) - p * c for p, c, s in sizes]
         results[name] = np.resize(values, shape).astype(layout.dtype)
     return results
 
@@ -162,19 +149,8 @@ def rehearse(client, folder: Path) -> None:
     """Have every worker import what it will need, as any long study has after seconds."""
     import sweep
 
-    spec = study(2500)
-    sweep.run(
-        spec,
-        store=folder / "rehearsal.zarr",
-        client=client,
-        progress=False,
-        evaluate=filled_at_once,
-    )
-
-
-def filled_at_once(held, block):
-    """A block's arrays, at once."""
-    return filled(held, block, np.arange(held.block_size(block), dtype=float))
+    store = folder / "rehearsal.zarr"
+    sweep.run(study(2500), store=store, client=client, progress=False, evaluate=filled)
 
 
 @contextmanager
@@ -184,9 +160,8 @@ def our_client(workers: int):
     from sweep.tasks import cluster
 
     here = cluster.of_workers(Local(kind="local"), workers)
-    with cluster.connected(
-        here, most=workers, processes=True, say=lambda text: None
-    ) as reached:  # fmt: skip
+    quietly = {"processes": True, "say": lambda text: None}
+    with cluster.connected(here, most=workers, **quietly) as reached:
         reached.client.wait_for_workers(workers)
         yield reached.client
 
@@ -338,12 +313,10 @@ def rows(shares: dict[str, list[Shares]], workers: int) -> list[list[str]]:
     """Lines of the table, the fastest first."""
     lines = []
     for name, each in sorted(shares.items(), key=lambda item: -middle(item[1])):
-        rate = middle(each) * workers / MILLISECOND
-        best = max(share.wall for share in each)
+        rate, best = middle(each) * workers / MILLISECOND, max(share.wall for share in each)
         processor = statistics.median(share.processor for share in each)
-        lines.append(
-            [name, f"{rate:,.0f}", f"{middle(each):.1%}", f"{best:.1%}", f"{processor:.1%}"]
-        )
+        told = (f"{middle(each):.1%}", f"{best:.1%}", f"{processor:.1%}")
+        lines.append([name, f"{rate:,.0f}", *told])
     return lines
 
 
@@ -371,19 +344,15 @@ def main() -> None:
                 shares[name].append(Shares(*apart("--one", name, *workers)))
     lost = apart("--one", "second", *workers)[0]
     head = ["contender", "points a second", "of the ideal", "best round", "of the processor's time"]
-    table = Table(*head)
     lines = rows(shares, asked.workers)
-    for line in lines:
-        table.add_row(*line)
     said = (
         f"For {BLOCKS_OF_A_SECOND} blocks of a second {lost:.1%} of the wall time of "
         f"{asked.workers} workers was not the blocks' own."
     )
-    console = Console(width=110)
-    console.print(table)
-    console.print(said)
+    show(head, lines)
+    print(said)
     if not asked.names:
-        scale_page.put("peers", head, lines, said)
+        put("scale.md", "peers", f"{table(head, lines)}\n\n{said}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Writes docs/promise.md.
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +15,12 @@ import promise_drawn
 import promise_instruments
 from rich.console import Console
 from rich.progress import Progress
+from shared import DOCS, EXPERIMENTS, table
 
 from sweep.model.accuracy import Accuracy
 from sweep.spec import SceneSpec, Spec, SpecError, load
-from sweep.tasks.accuracy.bench import Bench, Seen, Trial
+from sweep.tasks.accuracy.bench import Bench, GridBench, Seen, Trial
 from sweep.tasks.accuracy.flight_bench import FlightBench
-from sweep.tasks.accuracy.grid_bench import GridBench
 from sweep.tasks.accuracy.measure import FIXED_AS_AT, PROMISED, apart
 from sweep.tasks.accuracy.rungs import (
     ADAPTIVE,
@@ -36,9 +35,8 @@ from sweep.tasks.accuracy.rungs import (
     Rung,
     ladder,
 )
+from sweep.tasks.grid import Grid
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "promise.md"
 POINTS, SEED, ROUNDS = 1000, 2017, 5
 STRETCH = 4096
 """Points that are timed together: what one costs depends on those beside it in its block."""
@@ -181,7 +179,7 @@ class Found(NamedTuple):
 def known(spec: Spec | SceneSpec) -> Found:
     """Tolerances of a study without draws."""
     flight = isinstance(spec, SceneSpec)
-    bench = FlightBench(spec, POINTS) if flight else GridBench(spec, POINTS, SEED)
+    bench = FlightBench(spec, POINTS) if flight else GridBench(spec, POINTS, drawn_points(spec))
     whole = ladder(spec)
     at = {float(r.overrides[TOLERANCE]): r for r in whole.rungs if r.kind == ADAPTIVE}
     whole = whole.with_fixed({t: bench.effects(at[t]) for t in FIXED_AS_AT}, TOLERANCES)
@@ -216,6 +214,13 @@ def known(spec: Spec | SceneSpec) -> Found:
     trial, label = seen[whole.reference.name], f"{FINEST_RAYS:,} rays and more"
     last = with_more_rays(bench, whole, trial, label, MORE_RAYS)
     return Found(rows, [*rays, last])
+
+
+def drawn_points(spec: Spec) -> np.ndarray:
+    """Numbers of points, each as likely, without repetition."""
+    points = Grid(spec).points
+    chosen = np.random.default_rng(SEED).choice(points, min(POINTS, points), replace=False)
+    return np.sort(chosen)
 
 
 def worst_of(errors: Sequence[np.ndarray]) -> float:
@@ -264,33 +269,31 @@ def spread_cell(errors: np.ndarray, tolerance: float) -> str:
     return f"{share}{small(np.quantile(told, 0.9))}, {small(told.max())}"
 
 
-def lines_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
+def lines_of(name: str, rows: Sequence[Row]) -> Iterator[list[str]]:
     """Rows of the table."""
     for row in rows:
         cells = [cell(errors, row.tolerance) for errors in row.errors]
-        shown = [name, f"{len(row.errors[0]):,}", f"{row.tolerance:g}", *cells]
         times = [
             f"{1e6 * seconds:.3g}" if np.isfinite(seconds) else "-"
             for seconds in (row.seconds, row.fixed, row.front)
         ]
-        yield "| " + " | ".join([*shown, *times]) + " |"
+        yield [name, f"{len(row.errors[0]):,}", f"{row.tolerance:g}", *cells, *times]
 
 
-def rays_of(name: str, rows: Sequence[Row]) -> Iterator[str]:
+def rays_of(name: str, rows: Sequence[Row]) -> Iterator[list[str]]:
     """Rows of the table of rays."""
     for row in rows:
         cells = [spread_cell(errors, row.tolerance) for errors in row.errors]
-        which = row.label or f"{row.tolerance:g}"
-        yield "| " + " | ".join([name, which, *cells, f"{1e6 * row.seconds:.3g}"]) + " |"
+        yield [name, row.label or f"{row.tolerance:g}", *cells, f"{1e6 * row.seconds:.3g}"]
 
 
-def costs_of(name: str, ratios: Sequence[float]) -> str:
+def costs_of(name: str, ratios: Sequence[float]) -> list[str]:
     """A row of a table of costs: ratios by tolerance, and whether they rise."""
     there = [ratio for ratio in ratios if np.isfinite(ratio)]
     rise = max(there) / max(there[0], 1.0) if there else np.nan
     told = "kept" if rise <= DEARER else f"NOT kept: {rise:.2f} times"
     cells = [f"{ratio:.2f}" if np.isfinite(ratio) else "-" for ratio in ratios]
-    return "| " + " | ".join([name, *cells, told if there else "no front"]) + " |"
+    return [name, *cells, told if there else "no front"]
 
 
 def missed(name: str, rows: Sequence[Row]) -> Iterator[str]:
@@ -310,23 +313,22 @@ class Page:
 
     def __init__(self) -> None:
         self._short: list[str] = []
-        self._table: list[str] = []
-        self._rays: list[str] = []
-        self._fronts: list[str] = []
-        self._costs: list[str] = []
-        self._drawn: list[str] = []
-        self._instruments: list[str] = []
+        self._table: list[list[str]] = []
+        self._rays: list[list[str]] = []
+        self._fronts: list[list[str]] = []
+        self._costs: list[list[str]] = []
+        self._further: dict[str, list[str]] = {"drawn": [], "instruments": []}
 
     def draw(self) -> None:
         """Look at instruments drawn at random."""
         missed, text = promise_instruments.section(POINTS, np.random.default_rng())
         self._short += missed
-        self._instruments.append(text)
+        self._further["instruments"].append(text)
 
     def add(self, stem: str) -> None:
         """Look at an experiment."""
         experiment, overrides = VARIANTS.get(stem, (stem, {}))
-        name, path = stem.replace("_", " "), ROOT / "experiments" / f"{experiment}.yaml"
+        name, path = stem.replace("_", " "), EXPERIMENTS / f"{experiment}.yaml"
         try:
             spec = load(path)
         except SpecError as error:
@@ -338,7 +340,7 @@ class Page:
         elif not isinstance(spec, SceneSpec) and spec.draws.any:
             rows, off = promise_drawn.drawn(path, spec)
             self._short += promise_drawn.verdicts(name, rows, float(spec.accuracy.confidence))
-            self._drawn.append(promise_drawn.section(name, rows, off, spec))
+            self._further["drawn"].append(promise_drawn.section(name, rows, off, spec))
         else:
             self._know(name, known(spec))
 
@@ -351,31 +353,25 @@ class Page:
 
     def text(self) -> str:
         """The whole text."""
-        tolerances = [f"{tolerance:g}" for tolerance in TOLERANCES]
         heads = ["experiment", "points", "tolerance", *WHAT, "us", "fixed", "front"]
-        by_tolerance = header(["experiment", *tolerances, "no faster"])
-        front, fixed = ("\n".join([by_tolerance, *rows]) for rows in (self._fronts, self._costs))
+        by_tolerance = ["experiment", *(f"{t:g}" for t in TOLERANCES), "no faster"]
+        front, fixed = (table(by_tolerance, rows) for rows in (self._fronts, self._costs))
         parts = [
             HEAD.strip(),
             "\n".join(self._short) if self._short else "Every tolerance is kept.",
-            "\n".join([header(heads), *self._table]),
-            *self._drawn,
-            *self._instruments,
+            table(heads, self._table),
+            *self._further["drawn"],
+            *self._further["instruments"],
             RAYS.strip(),
-            "\n".join([header(["experiment", "tolerance", *WHAT, "us"]), *self._rays]),
+            table(["experiment", "tolerance", *WHAT, "us"], self._rays),
             COSTS.strip().format(margin=DEARER - 1, front=front, fixed=fixed),
         ]
         return "\n\n".join(parts) + "\n"
 
 
-def header(heads: Sequence[str]) -> str:
-    """Two lines of Markdown."""
-    return "| " + " | ".join(heads) + " |\n|" + " --- |" * len(heads)
-
-
 def main() -> None:
     """The whole page, or some experiments' rows."""
-    every = sorted([*VARIANTS, *(path.stem for path in (ROOT / "experiments").glob("*.yaml"))])
+    every = sorted([*VARIANTS, *(path.stem for path in EXPERIMENTS.glob("*.yaml"))])
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*every, INSTRUMENTS, []])
     asked = parser.parse_args()
@@ -391,7 +387,7 @@ def main() -> None:
     if asked.names:
         print(text.removeprefix(HEAD))
     else:
-        PAGE.write_text(text, encoding="utf-8")
+        (DOCS / "promise.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

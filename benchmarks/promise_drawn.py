@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
+from shared import table
 
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.speckle import coherent_share
@@ -171,20 +172,18 @@ def covered(row: Drawn, confidence: float) -> tuple[np.ndarray, np.ndarray]:
     return share, (share - confidence) / np.sqrt(confidence * (1 - confidence) / number)
 
 
-def table(rows: Sequence[Drawn], confidence: float) -> Iterator[str]:
-    """Lines of Markdown."""
-    yield "| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS)
+def rows_of(rows: Sequence[Drawn], confidence: float) -> Iterator[list[str]]:
+    """Rows of the table."""
     for row in rows:
         shares, sigmas = covered(row, confidence)
         within = (row.error <= row.tolerance).all(axis=0)
         told = [f"{share:.1%} ({s:+.1f})" for share, s in zip(shares, sigmas, strict=True)]
         some = row.decided.any(axis=0)
-        cells = [
+        yield [
             f"{row.tolerance:g}", f"{within.size:,}", f"{within.mean():.2%}", f"{some.sum():,}",
             f"{within[some].mean():.2%}", *told, f"{row.draws.mean():,.0f}",
             f"{1e6 * row.seconds:,.0f}",
         ]  # fmt: skip
-        yield "| " + " | ".join(cells) + " |"
 
 
 def section(name: str, rows: Sequence[Drawn], off: float, spec: Spec) -> str:
@@ -196,4 +195,4 @@ def section(name: str, rows: Sequence[Drawn], off: float, spec: Spec) -> str:
         name=name.capitalize(), points=points, seeds=seeds, nodes=NODES, off=off,
         confidence=confidence, sigmas=SIGMAS,
     )  # fmt: skip
-    return head.strip() + "\n\n" + "\n".join(table(rows, confidence))
+    return head.strip() + "\n\n" + table(COLUMNS, rows_of(rows, confidence))

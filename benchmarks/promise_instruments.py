@@ -5,25 +5,20 @@ jitter of the beam; held at each tolerance against all effects on at the tightes
 what each point calls for by itself: no neighbour lends it an effect.
 """
 
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
+from shared import TABLE_4_1, loaded, table
 
 from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
 from sweep.model.effects.planning import plan
 from sweep.model.effects.points import Points
 from sweep.model.resolution import effects_tolerance
 from sweep.model.shot import DEFAULTS
-from sweep.spec import load
 from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid
 
-ROOT = Path(__file__).parents[1]
-TABLE = ROOT / "experiments" / "instruments" / "table_4_1.yaml"
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
 FOOTPRINTS = (("coherent", 1), ("incoherent", 1), ("coherent", 37), ("incoherent", 37))
@@ -68,7 +63,7 @@ def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
         yield {
             "title": f"{window} {phases} {beamlets} {asked}",
             "instrument": {
-                "file": str(TABLE),
+                "file": str(TABLE_4_1),
                 "processing": {"window": window, "fft_size": sizes[window],
                                "sample_rate": f"{SAMPLE_RATE!r} Hz"},
             },
@@ -119,10 +114,7 @@ def _point(rng: np.random.Generator, asked: str) -> dict[str, str]:
 
 def off(written: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES) -> list[Off]:
     """How far off a study's points are at each tolerance."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "study.yaml"
-        file.write_text(yaml.safe_dump(written, sort_keys=False))
-        spec = load(file)
+    spec = loaded(written)
     grid = Grid(spec)
     parameters = DEFAULTS | grid.parameters_at(np.arange(grid.points))
     points = Points(parameters)
@@ -182,10 +174,9 @@ where it is asked for.
 def section(number: int, rng: np.random.Generator) -> tuple[list[str], str]:
     """What is not kept, in words; and the part of the page."""
     found = [off(written) for written in studies(number, rng)]
-    lines = ["| tolerance | points | " + " | ".join(WHAT) + " |", "|" + " --- |" * (2 + len(WHAT))]
-    missed = []
+    missed, rows = [], []
     for k, tolerance in enumerate(TOLERANCES):
-        together = Off(*map(np.concatenate, zip(*(rows[k] for rows in found), strict=True)))
+        together = Off(*map(np.concatenate, zip(*(each[k] for each in found), strict=True)))
         cells = []
         for what, errors in zip(WHAT, together, strict=False):
             there = errors[np.isfinite(errors)]
@@ -193,6 +184,6 @@ def section(number: int, rng: np.random.Generator) -> tuple[list[str], str]:
             cells.append(f"{100 * share:.2f} %, {there.max():.1e}")
             if share < KEPT:
                 missed.append(f"- random instruments at {tolerance:g}: {what} of {1 - share:.2%}")
-        lines.append(f"| {tolerance:g} | {together.pd.size:,} | " + " | ".join(cells) + " |")
+        rows.append([f"{tolerance:g}", f"{together.pd.size:,}", *cells])
     head = SECTION.strip().format(number=number, near=NEAR)
-    return missed, head + "\n\n" + "\n".join(lines)
+    return missed, head + "\n\n" + table(["tolerance", "points", *WHAT], rows)

@@ -19,9 +19,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-
-PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
-BEGIN, END = "<!-- engine: begin -->", "<!-- engine: end -->"
+from shared import experiment, put, table
 
 BLOCKS = (10**4, 10**5, 10**6, 10**7)
 MOST_FILES = 10**6
@@ -91,18 +89,16 @@ def timed(what):
 
 def blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
-    from sweep.spec import load
     from sweep.storage.receipts import read_receipts
     from sweep.tasks.grid import Grid
     from sweep.tasks.journal import Journal
     from sweep.tasks.listing import listed
     from sweep.tasks.todo import Todo
 
-    spec = load(Path(__file__).parents[1] / "experiments" / "quickstart.yaml")
     axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip
-    mapping = spec.to_yaml_mapping() | {"axes": axes, "storage": {"block_points": 1}, "figures": []}
-    grid, _, planned = timed(lambda: Grid(type(spec).from_mapping(mapping)))
+    spec = experiment("quickstart", axes=axes, storage={"block_points": 1})
+    grid, _, planned = timed(lambda: Grid(spec))
     assert grid.n_blocks == n_blocks
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     _, _, opening = timed(lambda: Journal(store))
@@ -124,16 +120,14 @@ def blocks(n_blocks, store):
 
 
 def block_rows(directory):
-    """Lines of the table of blocks."""
-    yield "| blocks | grid | log opened | log read | folders of one array | handing out | memory |"
-    yield "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+    """Rows of the table of blocks."""
     for n_blocks in BLOCKS:
         store = filled(directory, n_blocks)
         command = [sys.executable, __file__, "--blocks", str(n_blocks), "--store", str(store)]
         told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         *seconds, memory = json.loads(told.splitlines()[-1])
         cells = ["-" if s != s else f"{s:.2g} s" for s in seconds]
-        yield f"| {n_blocks:,} | {' | '.join(cells)} | {memory:,.0f} MB |"
+        yield [f"{n_blocks:,}", *cells, f"{memory:,.0f} MB"]
         shutil.rmtree(store)
 
 
@@ -157,13 +151,11 @@ def nap_for(seconds):
 
 
 def worker_rows(slots, lengths, measured):
-    """Lines of the table of workers."""
+    """Rows of the table of workers."""
     import dask
     from distributed import Client, LocalCluster
 
     dask.config.set({"distributed.worker.profile.enabled": False})  # it looks at every thread
-    yield "| tasks of | tasks/s | slots busy | scheduler and client, a task |"
-    yield "| ---: | ---: | ---: | ---: |"
     threads = 50
     with (
         LocalCluster(
@@ -176,7 +168,7 @@ def worker_rows(slots, lengths, measured):
         for seconds in lengths:
             rate, cpu = through(client, seconds, measured)
             busy = min(1.0, rate * seconds / slots)
-            yield f"| {seconds:g} s | {rate:,.0f} | {100 * busy:.0f} % | {1e3 * cpu:.2g} ms |"
+            yield [f"{seconds:g} s", f"{rate:,.0f}", f"{100 * busy:.0f} %", f"{1e3 * cpu:.2g} ms"]
 
 
 def through(client, seconds, measured):
@@ -202,10 +194,9 @@ def through(client, seconds, measured):
     return rate, spent
 
 
-def write(of_blocks, of_workers):
-    """Put the tables into the page, between the marks, and leave the rest of it."""
-    text = f"""{BEGIN}
-## Blocks
+def text(of_blocks, of_workers):
+    """Their part of the page."""
+    return f"""## Blocks
 
 {platform.processor() or platform.machine()}, {os.cpu_count()} processors,
 Python {platform.python_version()}. Seconds of processor time of a process of its own; memory beyond
@@ -216,7 +207,7 @@ blocks write (a grid without draws has 27), where the store has
 that many: from 10^9 points on blocks grow, so that a study has some 16,000 of them, half a million
 files, unless it asks for smaller ones.
 
-{chr(10).join(of_blocks)}
+{of_blocks}
 
 ## Workers
 
@@ -226,13 +217,7 @@ is the processor time of scheduler, client and workers together. Where that time
 second comes near one, no more go through. Longer tasks are the
 remedy, and the engine makes them so (above).
 
-{chr(10).join(of_workers)}
-{END}"""
-    page = PAGE.read_text() if PAGE.exists() else "# How far it goes\n\n" + BEGIN + END + "\n"
-    if BEGIN not in page:
-        page = f"{page.rstrip()}\n\n{BEGIN}{END}\n"
-    head, _, rest = page.partition(BEGIN)
-    PAGE.write_text(head + text + rest.partition(END)[2])
+{of_workers}"""
 
 
 def main():
@@ -247,11 +232,14 @@ def main():
         blocks(given.blocks, given.store)
         return
     with tempfile.TemporaryDirectory() as directory:
-        of_blocks = list(block_rows(directory))
-    print("\n".join(of_blocks))
-    of_workers = list(worker_rows(given.slots, TASK_SECONDS, given.seconds))
-    print("\n".join(of_workers))
-    write(of_blocks, of_workers)
+        head = ["blocks", "grid", "log opened", "log read", "folders of one array", "handing out",
+                "memory"]  # fmt: skip
+        of_blocks = table(head, block_rows(directory))
+    print(of_blocks)
+    head = ["tasks of", "tasks/s", "slots busy", "scheduler and client, a task"]
+    of_workers = table(head, worker_rows(given.slots, TASK_SECONDS, given.seconds))
+    print(of_workers)
+    put("scale.md", "engine", text(of_blocks, of_workers))
 
 
 if __name__ == "__main__":

@@ -8,42 +8,34 @@ itself lets be had is told by plain loops over the same blocks in as many proces
 
 import argparse
 import multiprocessing
-import statistics
 import tempfile
 import time
 from pathlib import Path
 
-import scale_page
+import numpy as np
 from peers import our_client, processor_time
-from rich.console import Console
-from rich.table import Table
+from shared import experiment, put, show, table
 
 import sweep
 from sweep.spec import Spec
-from sweep.spec.reading import read_document
 from sweep.tasks.cluster import cores
 from sweep.tasks.grid_study import GridStudy
-
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 
 def study(points: int, block_points: int) -> Spec:
     """The published study over so many ranges a grazing angle."""
-    mapping = read_document(EXPERIMENTS / "range_angle.yaml").value
-    mapping["axes"]["target.range"] = {"linear": ["1 m", "10 km"], "number": points // 90}
-    mapping["storage"] = {"block_points": block_points}
-    mapping["figures"] = []
-    return Spec.from_mapping(mapping, base=EXPERIMENTS)
+    axes = experiment("range_angle").to_yaml_mapping()["axes"]
+    axes |= {"target.range": {"linear": ["1 m", "10 km"], "number": points // 90}}
+    return experiment("range_angle", axes=axes, storage={"block_points": block_points})
 
 
 def measure(spec: Spec, workers: int) -> tuple[float, float]:
     """Seconds of wall time, and of the processor's in all."""
     with tempfile.TemporaryDirectory() as name, our_client(workers) as client:
-        folder = Path(name)
         options = {"client": client, "progress": False}
-        sweep.run(study(90 * 2 * workers, 45), store=folder / "rehearsal.zarr", **options)
+        sweep.run(study(90 * 2 * workers, 45), store=Path(name) / "rehearsal.zarr", **options)
         begun, taken = time.perf_counter(), processor_time()
-        outcome = sweep.run(spec, store=folder / "scaling.zarr", **options)
+        outcome = sweep.run(spec, store=Path(name) / "scaling.zarr", **options)
         wall, taken = time.perf_counter() - begun, processor_time() - taken
     assert outcome.complete
     return wall, taken
@@ -82,32 +74,22 @@ def main() -> None:
     asked = parser.parse_args()
     numbers = [n for n in (2**i for i in range(20)) if n <= asked.most]
     spec = study(asked.points, asked.block_points)
-    seen: dict[int, list[tuple[float, float]]] = {n: [] for n in numbers}
-    loops: dict[int, list[float]] = {n: [] for n in numbers}
-    for _ in range(asked.rounds):
-        for number in numbers:
-            seen[number].append(measure(spec, number))
-            loops[number].append(plain(spec, number))
-    head = [
-        "workers", "seconds", "times as fast as one", "plain loops, times as fast as one",
-        "processor's time, times one's",
-    ]  # fmt: skip
-    rows = []
-    for number in numbers:
-        pairs = list(zip(seen[number], seen[1], strict=True))
-        faster = statistics.median(one[0] / own[0] for own, one in pairs)
-        dearer = statistics.median(own[1] / one[1] for own, one in pairs)
-        seconds = statistics.median(own[0] for own in seen[number])
-        pairs = zip(loops[number], loops[1], strict=True)
-        possible = statistics.median(one / own for own, one in pairs)
-        rows.append(
-            [f"{number}", f"{seconds:.1f}", f"{faster:.2f}", f"{possible:.2f}", f"{dearer:.3f}"]
-        )
-    table = Table(*head)
-    for row in rows:
-        table.add_row(*row)
-    Console(width=100).print(table)
-    scale_page.put("scaling", head, rows)
+    # (rounds, numbers of workers, 3): wall time, the processor's time, time of plain loops
+    times = np.array([
+        [[*measure(spec, number), plain(spec, number)] for number in numbers]
+        for _ in range(asked.rounds)
+    ])  # fmt: skip
+    seconds = np.median(times[..., 0], axis=0)
+    faster, _, possible = np.median(times[:, :1] / times, axis=0).T
+    dearer = np.median(times[..., 1] / times[:, :1, 1], axis=0)
+    head = ["workers", "seconds", "times as fast as one", "plain loops, times as fast as one",
+            "processor's time, times one's"]  # fmt: skip
+    rows = [
+        [f"{number}", f"{s:.1f}", f"{f:.2f}", f"{p:.2f}", f"{d:.3f}"]
+        for number, s, f, p, d in zip(numbers, seconds, faster, possible, dearer, strict=True)
+    ]
+    show(head, rows)
+    put("scale.md", "scaling", table(head, rows))
 
 
 if __name__ == "__main__":

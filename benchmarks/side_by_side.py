@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
+from shared import ROOT, plain
 
-ROOT = Path(__file__).parents[1]
 EARLIER = "9b29f45"
 FOLDER = ROOT / "results" / "side_by_side"
 FLIGHT = 1.3
@@ -74,32 +74,17 @@ STUDIES = {
 
 def written(checkout: Path, study: Study, overrides: dict[str, Any]) -> dict[str, Any]:
     """The experiment of a check-out as plain data, with overrides."""
-    experiments = checkout / "experiments"
-    spec = named(yaml.safe_load((experiments / f"{study.experiment}.yaml").read_text()))
-    instrument = spec["instrument"]
-    instrument = {"file": instrument} if isinstance(instrument, str) else instrument
-    spec["instrument"] = instrument | {"file": str(experiments / instrument["file"])}
-    spec.pop("figures", None)
+    spec = plain(checkout / "experiments", study.experiment)
     for path, value in overrides.items():
         section, _, rest = path.partition(".")
-        if section == "axes":
-            spec["axes"][rest] = value
-            continue
+        sections, name = (
+            ([], rest) if section == "axes" else (rest.split(".")[:-1], rest.rpartition(".")[2])
+        )
         inner = spec.setdefault(section, {})
-        *sections, name = rest.split(".")
         for each in sections:
             inner = inner[each]
         inner[name] = value
     return spec
-
-
-def named(value: Any) -> Any:
-    """The same with keys that YAML reads as true (`on`) as they were written."""
-    if isinstance(value, list):
-        return [named(each) for each in value]
-    if not isinstance(value, dict):
-        return value
-    return {"on" if key is True else key: named(inner) for key, inner in value.items()}
 
 
 def serve() -> None:

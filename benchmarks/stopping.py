@@ -5,20 +5,17 @@ until their half-width is within the tolerance, by the shipped rule (sweep.model
 looking after every batch. Writes the table in docs/draws.md.
 """
 
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.progress import track
+from shared import put, table
 
 from sweep.model.accuracy import COUNTED, Accuracy, Interval, bounded_mean, half_width
 from sweep.model.marcum import marcum_q1
 from sweep.model.sampling import PIECE, looks, settle
 
-PAGE = Path(__file__).parents[1] / "docs" / "draws.md"
-BEGIN, END = "<!-- written by make stopping -->\n", "<!-- up to here -->\n"
 CONFIDENCE, BATCH, LIMIT = 0.95, 100, 10**7
 TOLERANCES = (0.1, 0.03, 0.01)
 THRESHOLD = 6.5
@@ -132,7 +129,7 @@ KINDS = {
 }
 
 
-def rows() -> Iterator[str]:
+def rows() -> Iterator[list[str]]:
     """Rows of the table."""
     cases = [(k, t, e) for k in KINDS for t in TOLERANCES for e in ("shipped", "every batch")]
     for kind, tolerance, ends in track(cases, description="simulating"):
@@ -144,24 +141,13 @@ def rows() -> Iterator[str]:
         ]
         worst = min(cells, key=lambda c: c.coverage)
         biased = max(cells, key=lambda c: abs(c.bias))
-        most = max(cells, key=lambda c: c.draws)
-        yield (
-            f"| {kind} | {tolerance:g} | {ends} | {100 * worst.coverage:.1f} % at {worst.pd:.4g} "
-            f"| {biased.bias / tolerance:+.3f} at {biased.pd:.4g} | {most.draws:,.0f} |"
-        )
-
-
-def main() -> None:
-    """The table, in its page."""
-    head = ["drawn", "tolerance", "looks", "least coverage", "largest bias / tolerance", "draws"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head), *rows()]
-    text = PAGE.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    if not after:
-        sys.exit(f"{PAGE} lacks the lines that the table stands between")
-    PAGE.write_text(before + BEGIN + "\n".join(lines) + "\n" + END + after, encoding="utf-8")
+        yield [
+            kind, f"{tolerance:g}", ends, f"{100 * worst.coverage:.1f} % at {worst.pd:.4g}",
+            f"{biased.bias / tolerance:+.3f} at {biased.pd:.4g}",
+            f"{max(c.draws for c in cells):,.0f}",
+        ]  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    head = ["drawn", "tolerance", "looks", "least coverage", "largest bias / tolerance", "draws"]
+    put("draws.md", "stopping", table(head, rows()))

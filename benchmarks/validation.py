@@ -6,9 +6,10 @@ stand here: what its tables print, and what its text says of its pictures, in ou
 
 import argparse
 import math
-from pathlib import Path
 
 import numpy as np
+import shared
+from shared import DOCS, EXPERIMENTS, ROOT
 
 import sweep
 from sweep.analysis import labels, noise_only
@@ -19,8 +20,6 @@ from sweep.analysis.tables import entries
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec import load
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "validation.md"
 TABLE = ("shown", "experiment", "ours", "the thesis", "difference, and why")
 
 # Where a verdict turns; each is made of the numbers beside it by one of these.
@@ -80,15 +79,9 @@ def agrees(condition):
     return "agrees" if condition else "does not agree"
 
 
-def line(cells):
-    """A row of a Markdown table."""
-    return f"| {' | '.join(cells)} |"
-
-
 def table(heading, columns, rows):
     """A Markdown table under a heading."""
-    lines = [line(columns), line(["---"] * len(columns)), *map(line, rows)]
-    return "\n".join(["", f"## {heading}", "", *lines, ""])
+    return f"\n## {heading}\n\n{shared.table(columns, rows)}\n"
 
 
 def thresholds():
@@ -144,7 +137,7 @@ def chapter_4():
 
 def shot_4_2():
     """Fig. 4.2."""
-    spec = load(ROOT / "experiments" / "single_shot_2000m.yaml")
+    spec = load(EXPERIMENTS / "single_shot_2000m.yaml")
     ((_, parameters),) = chosen(spec, {})
     shot = simulated(parameters)
     bins = {"m": range_bin(parameters), "m/s": velocity_bin(parameters)}
@@ -431,7 +424,7 @@ def spread_in_shots(ds, name):
 
 def open_spec(name):
     """The study of an experiment."""
-    return load(ROOT / "experiments" / f"{name}.yaml")
+    return load(EXPERIMENTS / f"{name}.yaml")
 
 
 def layers(ds, shown, name):
@@ -516,8 +509,7 @@ def main():
         return
     if missing:
         raise SystemExit(f"there is no store of {', '.join(missing)}: `make validation` makes them")
-    PAGE.write_text(page(), encoding="utf-8")
-    print(PAGE.relative_to(ROOT))
+    (DOCS / "validation.md").write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -382,8 +382,8 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]
         assert (row.points, row.met) == (80, int((widths <= 0.1).sum()))
-        assert row.half_width == widths.max() and row.missed == row.half_width - 0.1
-        assert row.draws == 60 and row.needed == -(-60 * (row.half_width / 0.1) ** 2 // 1)
+        assert row.error == widths.max() and row.missed == row.error - 0.1
+        assert row.number == 60 and row.needed == -(-60 * (row.error / 0.1) ** 2 // 1)
         worst = np.argwhere(widths.values == float(widths.max()))[0]
         assert row.where.startswith(f"range {float(store.range[worst[0]]):.4g} m, power ")
         for result in (run, told):

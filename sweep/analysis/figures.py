@@ -163,9 +163,11 @@ def draw(
 def _drawn(store_path: Location, directory: str | Path | None, form: str) -> list[Path]:
     """All of it, whichever kind of store."""
     if read_attributes(store_path)["kind"] == ACCURACY:
-        from sweep.analysis.accuracy import report
+        from sweep.analysis import accuracy_figure
 
-        return report.draw(store_path, None if directory is None else Path(directory), form)
+        return accuracy_figure.draw(
+            store_path, None if directory is None else Path(directory), form
+        )
     stem = store_path.name.removesuffix(".zarr")
     directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
     if read_attributes(store_path)["kind"] == SCENE:

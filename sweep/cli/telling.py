@@ -12,7 +12,7 @@ from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.accuracy_table import AccuracyRow, RaysRow
+    from sweep.tasks.accuracy_table import Row
     from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.session import Outcome
 
@@ -119,7 +119,7 @@ def tell_accuracy(store: Location) -> None:
             "at",
         )
     if rays := rays_table(store):
-        kind, each = ("rays", "shot") if rays[0].scanner else ("beamlets", "point")
+        kind, each = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
             f"What more {kind} may change",
             ["", f"{kind} a {each}", "met", "worst", "missed by", "at"],
@@ -128,24 +128,24 @@ def tell_accuracy(store: Location) -> None:
         )
 
 
-def _rays_cells(row: RaysRow) -> list[str]:
+def _rays_cells(row: Row) -> list[str]:
     return [
-        row.scanner,
-        f"{row.rays:,.0f}, at most {row.most:,}",
-        f"{row.met:,} of {row.shots:,}",
+        row.name,
+        f"{row.mean:,.0f}, at most {row.most:,}",
+        f"{row.met:,} of {row.points:,}",
         f"{row.error:.3g}",
         f"{row.missed:.2g}",
         row.where,
     ]
 
 
-def _accuracy_cells(row: AccuracyRow) -> list[str]:
+def _accuracy_cells(row: Row) -> list[str]:
     return [
         row.name,
         f"{row.met:,} of {row.points:,}",
-        f"{row.half_width:.3g}",
+        f"{row.error:.3g}",
         f"{row.missed:.2g}",
-        f"{row.draws:,}",
+        f"{row.number:,}",
         f"{row.needed:,.0f}" if row.needed < float("inf") else "-",
         row.where,
     ]
@@ -426,17 +426,19 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
     if not measured:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
         sys.exit(INCOMPLETE)
-    from sweep.analysis.accuracy import report, text
+    from sweep.analysis import accuracy, accuracy_figure
 
-    dataset, settings = report.opened(store)
+    dataset, settings = accuracy_figure.opened(store)
     print_table(
         "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
-        list(text.SHORT), text.short_rows(settings), "setting",
+        list(accuracy.SHORT), accuracy.short_rows(settings), "setting",
     )  # fmt: skip
     print_table(
-        "Cheapest setting for each error", list(text.CHEAPEST), text.cheapest_rows(settings),
+        "Cheapest setting for each error",
+        list(accuracy.CHEAPEST),
+        accuracy.cheapest_rows(settings),
         "cheapest setting",
-    )  # fmt: skip
-    for sentence in text.sentences(dataset, settings):
+    )
+    for sentence in accuracy.sentences(dataset, settings):
         click.echo(sentence)
-    return [store, *report.draw(store)], dataset.attrs["stopped"] != "interrupted"
+    return [store, *accuracy_figure.draw(store)], dataset.attrs["stopped"] != "interrupted"

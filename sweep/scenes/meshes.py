@@ -228,18 +228,17 @@ def _edge_counts(mesh: Mesh) -> dict[str, int]:
 def read_mesh(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Facets of a mesh file, all its parts; nothing is mended here.
+    """Facets of a mesh file (STL, OBJ, PLY, glTF ...), all its parts; nothing is mended here.
 
     Parameters
     ----------
-    path : str or Path
-        The file: STL, OBJ, PLY, glTF and more.
-    unit : str, optional
+    path
+        The file.
+    unit
         Unit of its lengths, such as ``mm``; by default the one the file states, or else metres.
-    up : str, optional
-        Its vertical axis, ``y`` or ``z``; by default y for glTF, as its specification says, and
-        z for all else.
-    scale : float
+    up
+        Its vertical axis, ``y`` or ``z``; by default y for glTF, as its specification says.
+    scale
         Factor on top of the units, > 0.
 
     Raises

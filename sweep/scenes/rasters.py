@@ -53,15 +53,13 @@ def read_raster(
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    band : int
-        Band that holds the heights, from 1.
-    window : (west, south, east, north) of float, optional
-        Part to read, in the raster's own coordinates; all of it by default.
-    metres_per_degree : (east, north) of float, optional
-        Size of a degree, for a raster in degrees of longitude and latitude.
-    pixel : float, optional
+    path, band
+        The file; the band that holds the heights, from 1.
+    window
+        West, south, east, north of the part to read, in the raster's own coordinates.
+    metres_per_degree
+        East and north, for a raster in degrees of longitude and latitude.
+    pixel
         Size of a pixel [m], for a raster that states no scale; its lower left corner is then the
         world's origin.
 
@@ -123,11 +121,9 @@ def _opened(path: Path) -> Iterator[Any]:
         with rasterio.Env(**_NO_NETWORK), rasterio.open(path) as data:
             yield data
     except rasterio.errors.RasterioError as error:
-        raise SceneError(
-            path,
-            f"is no raster that can be read ({error.__cause__ or error})",
-            "convert it to a GeoTIFF; nothing is fetched over the network",
-        ) from None
+        rule = f"is no raster that can be read ({error.__cause__ or error})"
+        remedy = "convert it to a GeoTIFF; nothing is fetched over the network"
+        raise SceneError(path, rule, remedy) from None
 
 
 def _look_for_sources(path: Path, seen: set[Path]) -> None:
@@ -136,10 +132,8 @@ def _look_for_sources(path: Path, seen: set[Path]) -> None:
         content = file.read(_LARGEST_VRT) if b"<VRTDataset" in file.peek(1024)[:1024] else b""
     for attributes, name in _SOURCE.findall(content.decode(errors="replace")):
         if "://" in name or "/vsi" in name:
-            raise SceneError(
-                path, f"is no raster that can be read (its source is {name})",
-                "fetch that: nothing is fetched over the network",
-            )  # fmt: skip
+            rule = f"is no raster that can be read (its source is {name})"
+            raise SceneError(path, rule, "fetch that: nothing is fetched over the network")
         source = path.parent / unescape(name) if '"1"' in attributes else Path(unescape(name))
         if source not in seen and not _SUBDATASET.match(name):
             _look_for_sources(existing(source), seen | {source})
@@ -152,11 +146,8 @@ def _straight(path: Path, data: Any, pixel: float | None) -> Any:
     transform = data.transform
     if data.crs is None and transform.is_identity:
         if pixel is None or not pixel > 0:
-            raise SceneError(
-                path,
-                "states no scale",
-                "state the size of a pixel in metres, or read a grey picture as an image",
-            )
+            remedy = "state the size of a pixel in metres, or read a grey picture as an image"
+            raise SceneError(path, "states no scale", remedy)
         return Affine(pixel, 0.0, 0.0, 0.0, -pixel, data.height * pixel)
     if pixel is not None:
         raise SceneError(path, "states its own scale", "leave the size of a pixel out")
@@ -170,11 +161,9 @@ def _scale(path: Path, data: Any, stated: tuple[float, float] | None) -> tuple[f
     """Metres of a unit of the raster's coordinates, eastwards and northwards."""
     if data.crs is not None and data.crs.is_geographic:
         if stated is None:
-            raise SceneError(
-                path,
-                "is in degrees, which have no fixed size in metres",
-                f"state metres_per_degree, here {_suggestion(data)}, or reproject it with gdalwarp",
-            )
+            rule, sizes = "is in degrees, which have no fixed size in metres", _suggestion(data)
+            remedy = f"state metres_per_degree, here {sizes}, or reproject it with gdalwarp"
+            raise SceneError(path, rule, remedy)
         if not min(stated) > 0:
             raise SceneError(path, f"has a degree of {stated} m", "make both sizes positive")
         return stated
@@ -212,16 +201,12 @@ def _view(path: Path, data: Any, transform: Any, window: Bounds | None) -> Any:
         left, right = (round(min(max(c, 0), data.width)) for c in columns)
         top, bottom = (round(min(max(r, 0), data.height)) for r in rows)
         if not (west < east and south < north and right - left > 1 and bottom - top > 1):
-            raise SceneError(
-                path, f"has no ground within {window}", f"it covers {tuple(data.bounds)}"
-            )
+            covered = f"it covers {tuple(data.bounds)}"
+            raise SceneError(path, f"has no ground within {window}", covered)
         view = Pixels(left, top, right - left, bottom - top)
     if view.width * view.height > MOST_CELLS:
-        raise SceneError(
-            path,
-            f"has {view.width:.0f} x {view.height:.0f} heights, more than {MOST_CELLS:.0e}",
-            f"give a window within {tuple(data.bounds)}",
-        )
+        rule = f"has {view.width:.0f} x {view.height:.0f} heights, more than {MOST_CELLS:.0e}"
+        raise SceneError(path, rule, f"give a window within {tuple(data.bounds)}")
     return view
 
 
@@ -258,13 +243,13 @@ def read_array(
 
     Parameters
     ----------
-    path : str or Path
+    path
         The file.
-    spacing : (dx, dy) of float
+    spacing
         Step from column to column and from row to row [m]; dy < 0 where row 0 is the northern one.
-    name : str, optional
+    name
         Array of an ``.npz`` that holds the heights [m]; not needed where it holds only one grid.
-    no_data : float, optional
+    no_data
         Value that stands for a missing height, beside NaN.
 
     Raises
@@ -301,11 +286,8 @@ def _grid(
 ) -> Terrain:
     """Terrain of an array of heights."""
     if values.ndim != 2 or min(values.shape) < 2 or values.dtype.kind not in "iuf":
-        raise SceneError(
-            path,
-            f"holds {values.dtype} of shape {values.shape}",
-            "heights are a two-dimensional array of numbers",
-        )
+        rule = f"holds {values.dtype} of shape {values.shape}"
+        raise SceneError(path, rule, "heights are a two-dimensional array of numbers")
     if values.size > MOST_CELLS:
         raise SceneError(path, f"holds more than {MOST_CELLS:.0e} heights", "cut a part out of it")
     heights = values.astype(float)
@@ -320,22 +302,13 @@ def _grid(
 def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: float) -> Terrain:
     """Terrain of a grey image: row 0 is the northern one, its first pixel at the world's origin.
 
-    Heights come in steps of one grey level: smooth them before trusting slopes
-    (`sweep.scenes.terrain.smooth`).
-
-    Parameters
-    ----------
-    path : str or Path
-        Image of 8 or 16 bits, one band.
-    pixel : float
-        Size of a pixel on the ground [m], > 0.
-    black, white : float
-        Heights of black and of full white [m].
+    Heights [m] are from that of black to that of full white, in steps of one grey level: smooth
+    them before trusting slopes (`sweep.scenes.terrain.smooth`). Pixels are of a size on the ground.
 
     Raises
     ------
     SceneError
-        For a file that is missing, no image, in colour, or of another depth.
+        For a file that is missing, no image, in colour, or of another depth than 8 or 16 bits.
     """
     levels = _grey(existing(path))
     heights = black + (white - black) * levels / np.iinfo(levels.dtype).max
@@ -354,9 +327,8 @@ def _grey(path: Path) -> np.ndarray:
     if mode == "RGB" and (levels[..., :1] == levels).all():
         return np.asarray(levels[..., 0])
     if mode != "L" and not mode.startswith("I;16"):
-        raise SceneError(
-            path, f"has pixels of mode {mode}", "save it in grey, 8 or 16 bits a pixel"
-        )
+        remedy = "save it in grey, 8 or 16 bits a pixel"
+        raise SceneError(path, f"has pixels of mode {mode}", remedy)
     return np.asarray(levels, np.uint8 if mode == "L" else np.uint16)
 
 

@@ -25,26 +25,40 @@ if TYPE_CHECKING:
     from sweep.spec import Axis, Spec
 
 
-@dataclass(frozen=True)
-class AccuracyRow:
-    """How well one of the probabilities of detection is known over the grid."""
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """How well a probability of detection is known; or all, for what a scanner's rays leave."""
 
     name: str
-    points: int  # that are computed and have it
+    """Of the probability or the scanner; none for a grid's beamlets, which are counted as rays."""
+    points: int  # that are computed and have it; of a flight shots, times places along the axes
     met: int  # of these, within the tolerance
-    half_width: float  # at the worst point, that of the largest excess over its tolerance
+    error: float  # a half-width, where it is drawn: that of the largest excess over its tolerance
     tolerance: float  # there
     where: str
-    draws: int  # that it has had
-    needed: float  # that would do, about; nan where these did, inf where none would
+    number: int  # of draws, or of rays, that it has had there
+    mean: float  # the same of all points
+    most: int
 
     @property
     def missed(self) -> float:
         """By how much the tolerance is missed at the worst point; 0 where it is met."""
-        return max(0.0, self.half_width - self.tolerance)
+        return max(0.0, self.error - self.tolerance)
+
+    @property
+    def needed(self) -> float:
+        """Draws that would do there, about, as the half-width's square falls with them.
+
+        nan where these did; inf where none would.
+        """
+        if not self.missed:
+            return math.nan
+        if not self.tolerance:
+            return math.inf
+        return math.ceil(self.number * (self.error / self.tolerance) ** 2)
 
 
-def accuracy_table(store: str | Location) -> list[AccuracyRow]:
+def accuracy_table(store: str | Location) -> list[Row]:
     """A row for each probability that is promised; none where nothing is drawn or computed.
 
     Raises
@@ -59,7 +73,7 @@ def accuracy_table(store: str | Location) -> list[AccuracyRow]:
     return list(_rows(path, study))
 
 
-def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
+def _rows(store: Location, study: GridStudy) -> Iterator[Row]:
     from sweep.model.outputs import PROMISED
 
     spec, found = study.spec, {name: _Worst() for name in PROMISED}
@@ -70,38 +84,10 @@ def _rows(store: Location, study: GridStudy) -> Iterator[AccuracyRow]:
             worst.add(width, tolerance[place], draws, tuple(part.start for part in place))
     for name, worst in found.items():
         if worst.points:
-            yield AccuracyRow(
-                name=name,
-                points=worst.points,
-                met=worst.met,
-                half_width=worst.half_width,
-                tolerance=worst.tolerance,
-                where=_place(spec.axes, worst.index),
-                draws=worst.draws,
-                needed=_needed(worst.draws, worst.half_width, worst.tolerance),
-            )
+            yield worst.row(name, _place(spec.axes, worst.index))
 
 
-@dataclass(frozen=True)
-class RaysRow:
-    """How well a scanner's probabilities and magnitudes are known, for what its rays leave."""
-
-    scanner: str  # none for a grid, whose points and beamlets are counted as shots and rays
-    shots: int  # that are computed and see something, times places along the axes
-    met: int  # of these, within the tolerance
-    error: float  # of the worst
-    tolerance: float
-    where: str
-    rays: float  # of a shot, in the mean
-    most: int  # of any shot
-
-    @property
-    def missed(self) -> float:
-        """By how much the tolerance is missed by the worst shot; 0 where it is met."""
-        return max(0.0, self.error - self.tolerance) if self.shots > self.met else 0.0
-
-
-def rays_table(store: str | Location) -> list[RaysRow]:
+def rays_table(store: str | Location) -> list[Row]:
     """A row for each scanner; none where the tolerance does not say how many rays there are.
 
     Of a grid one row, with no scanner, where even the most beamlets are too few for some points.
@@ -117,30 +103,25 @@ def rays_table(store: str | Location) -> list[RaysRow]:
         return [row] if (row := _of_beamlets(path, study)).missed else []
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
-    return [row for scanner in study.scanners if (row := _of_rays(path, study, scanner)).shots]
+    return [row for scanner in study.scanners if (row := _of_rays(path, study, scanner)).points]
 
 
-def _of_beamlets(path: Location, study: GridStudy) -> RaysRow:
-    worst, total, most = _Worst(), 0, 0
+def _of_beamlets(path: Location, study: GridStudy) -> Row:
+    worst = _Worst()
     tolerance = np.broadcast_to(_tolerance(study.spec), study.grid.shape)
     tolerance = np.maximum(Accuracy(tolerance).for_beamlets, Accuracy.least_rays_tolerance)
     names = "beamlets_error", "beamlets"
     for place, (error, number) in pieces(path, study, names, done_blocks(path, study)):
-        start, number = tuple(part.start for part in place), np.nan_to_num(number)
-        worst.add(error, tolerance[place], number.astype(np.int64), start)
-        total, most = total + int(number.sum()), max(most, int(number.max()))
-    where, mean = _place(study.spec.axes, worst.index), total / max(worst.points, 1)
-    return RaysRow(
-        "", worst.points, worst.met, worst.half_width, worst.tolerance, where, mean, most
-    )  # fmt: skip
+        start = tuple(part.start for part in place)
+        worst.add(error, tolerance[place], np.nan_to_num(number), start)
+    return worst.row("", _place(study.spec.axes, worst.index))
 
 
-def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
-    names = "beamlets_error", "beamlets", "time"
+def _of_rays(path: Location, study: FlightStudy, scanner: str) -> Row:
     arrays: Any = open_group(path)[scanner]
-    errors, numbers, times = (arrays[name] for name in names)
+    errors, numbers = arrays["beamlets_error"], arrays["beamlets"]
     stretches, worst = study.scanners[scanner], _Worst()
-    tolerance, rays, most = float(study.spec.accuracy.tolerance), 0, 0
+    tolerance = float(study.spec.accuracy.tolerance)
     for block in np.flatnonzero(receipted(path, study)).tolist():
         own, part = study.part(block)
         if own is stretches and part.draws == 0:
@@ -148,44 +129,49 @@ def _of_rays(path: Location, study: FlightStudy, scanner: str) -> RaysRow:
             there = *(slice(i, i + 1) for i in part.axes), slice(first, stop)
             error = np.asarray(errors[there])
             number = np.where(np.isfinite(error), np.asarray(numbers[there]), 0)
-            rays, most = rays + int(number.sum()), max(most, int(number.max(initial=0)))
-            start, undrawn = (*part.axes, first), np.zeros(error.shape, np.int64)
-            worst.add(error, np.full(error.shape, tolerance), undrawn, start)
+            worst.add(error, np.full(error.shape, tolerance), number, (*part.axes, first))
     where = ""
     if worst.points:
         *axes, shot = worst.index
         where = f"{_place(study.spec.axes, tuple(axes))}, " if axes else ""
-        where += f"time {float(np.asarray(times[shot])):.4g} s"
-    mean = rays / max(worst.points, 1)
-    return RaysRow(
-        scanner, worst.points, worst.met, worst.half_width, tolerance, where, mean, most
-    )  # fmt: skip
+        where += f"time {float(np.asarray(arrays['time'][shot])):.4g} s"
+    return worst.row(scanner, where)
 
 
 @dataclass
 class _Worst:
-    """Points whose half-width is known, and that which is furthest above its tolerance."""
+    """Points whose error is known, and that which is furthest above its tolerance."""
 
     points: int = 0
     met: int = 0
     over: float = -math.inf
-    half_width: float = math.nan
+    error: float = math.nan
     tolerance: float = math.nan
-    draws: int = 0
+    number: int = 0
     index: tuple[int, ...] = ()
+    total: int = 0
+    most: int = 0
+
+    def row(self, name: str, where: str) -> Row:
+        """A row of the table."""
+        shared = ("points", "met", "error", "tolerance", "number", "most")
+        own = {each: getattr(self, each) for each in shared}
+        return Row(name=name, where=where, mean=self.total / max(self.points, 1), **own)
 
     def add(
-        self, width: np.ndarray, tolerance: np.ndarray, draws: np.ndarray, start: tuple[int, ...]
+        self, error: np.ndarray, tolerance: np.ndarray, number: np.ndarray, start: tuple[int, ...]
     ) -> None:
         """Take in some points of the grid, the first of which is at ``start``."""
-        known = np.isfinite(width)
-        over = np.where(known, width - tolerance, -np.inf)
+        known = np.isfinite(error)
+        over = np.where(known, error - tolerance, -np.inf)
         self.points += int(known.sum())
         self.met += int((over <= 0).sum() - (~known).sum())
+        self.total += int(number.sum())
+        self.most = max(self.most, int(number.max(initial=0)))
         at = np.unravel_index(np.argmax(over), over.shape)
         if over[at] > self.over:
-            self.over, self.half_width = float(over[at]), float(width[at])
-            self.tolerance, self.draws = float(tolerance[at]), int(draws[at])
+            self.over, self.error = float(over[at]), float(error[at])
+            self.tolerance, self.number = float(tolerance[at]), int(number[at])
             self.index = tuple(first + int(i) for first, i in zip(start, at, strict=True))
 
 
@@ -196,13 +182,6 @@ def _tolerance(spec: Spec) -> np.ndarray:
             if member.path == "accuracy.tolerance":
                 return np.asarray(member.values).reshape(-1, *(1,) * (len(spec.axes) - k - 1))
     return np.asarray(spec.accuracy.tolerance)
-
-
-def _needed(draws: int, half_width: float, tolerance: float) -> float:
-    """Draws that would bring a half-width down to a tolerance, as its square falls with them."""
-    if half_width <= tolerance:
-        return math.nan
-    return math.ceil(draws * (half_width / tolerance) ** 2) if tolerance > 0 else math.inf
 
 
 def _place(axes: tuple[Axis, ...], index: tuple[int, ...]) -> str:

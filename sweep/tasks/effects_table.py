@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import compress
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.tasks.calling import TILE_SHOTS, Calling
 from sweep.tasks.grid import Grid
 from sweep.tasks.plan import timed
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
     from sweep.tasks.flight_study import FlightStudy
 
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
@@ -65,15 +67,8 @@ class EffectsTable:
 def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
     """Effects of a study of a grid, from the plans of its tiles.
 
-    Parameters
-    ----------
-    spec
-        The study.
-    costs
-        Whether to measure what effects cost, in a second or so.
+    ``costs``: whether to measure what effects cost, in a second or so.
     """
-    from sweep.model.effects.catalogue import EFFECTS
-
     calling = Calling(spec, Grid(spec))
     number = calling.tiles.number
     tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
@@ -81,34 +76,21 @@ def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
     change, error = np.empty(kept.shape), np.empty(len(tiles))
     for chosen, plan in calling.plans(tiles):
         kept[:, chosen], change[:, chosen], error[chosen] = plan.kept, plan.change, plan.error
-
-    def cost(name: str, called: np.ndarray) -> float:
-        return _cost(spec, calling, tiles[called], name) if costs else math.nan
-
-    return EffectsTable(
-        rows=_rows(
-            spec.modes(), kept, change,
-            weight=np.array([_points(calling, tile) for tile in tiles.tolist()]),
-            where=lambda some: _region(spec, calling, tiles[some]),
-            cost=cost,
-        ),
-        tolerance=float(spec.accuracy.tolerance),
-        error=float(error.max()),
+    sizes = [math.prod(_shape(calling.tiles.points(tile))) for tile in tiles.tolist()]
+    return _table(
+        spec,
+        _Planned(kept, change, error, np.array(sizes)),
+        where=lambda some: _region(spec, calling, tiles[some]),
+        cost=lambda name, called: _cost(spec, calling, tiles[called], name) if costs else math.nan,
         looked_at=len(tiles) / number,
-    )  # fmt: skip
+    )
 
 
 def flight_effects_table(study: FlightStudy) -> EffectsTable:
-    """Effects of a study of a scene, at the first place along its axes.
-
-    Parameters
-    ----------
-    study
-        The study.
-    """
+    """Effects of a study of a scene, at the first place along its axes."""
     from sweep.scenes.eyepoint_arrays import from_arrays
 
-    plans, times, weights, total = [], [], [], 0
+    found, times, total = [], [], 0
     for eyepoints in study.eyepoint_studies():
         index = eyepoints.tiles(FLIGHT_TILES)
         seen = from_arrays(eyepoints.cast(index), eyepoints.weight)
@@ -116,42 +98,47 @@ def flight_effects_table(study: FlightStudy) -> EffectsTable:
         planned = study.planned(part, seen, index // TILE_SHOTS)
         total += eyepoints.points
         if planned is not None:
-            plans.append(planned.plan)
-            first = np.searchsorted(planned.tile, np.arange(planned.tile[-1] + 1))
+            plan, shots = planned.plan, np.bincount(planned.tile)
+            found.append(_Planned(plan.kept, plan.change, plan.error, shots))
+            first = np.searchsorted(planned.tile, np.arange(shots.size))
             times.append(seen.time[planned.shots][first])
-            weights.append(np.bincount(planned.tile))
-    tolerance = float(study.spec.accuracy.tolerance)
-    if not plans:
+    if not found:
+        tolerance = float(study.spec.accuracy.tolerance)
         return EffectsTable(rows=(), tolerance=tolerance, error=0.0, looked_at=1.0)
-    time_, weight = np.concatenate(times), np.concatenate(weights)
-    return EffectsTable(
-        rows=_rows(
-            study.spec.modes(),
-            np.concatenate([plan.kept for plan in plans], axis=1),
-            np.concatenate([plan.change for plan in plans], axis=1),
-            weight=weight,
-            where=lambda some: _times(time_[some]),
-            cost=lambda name, called: math.nan,
-        ),
-        tolerance=tolerance,
-        error=max(float(plan.error.max()) for plan in plans),
-        looked_at=float(weight.sum() / total),
+    together = _Planned(*(np.concatenate(each, axis=-1) for each in zip(*found, strict=True)))
+    time = np.concatenate(times)
+    return _table(
+        study.spec,
+        together,
+        where=lambda some: _times(time[some]),
+        cost=lambda name, called: math.nan,
+        looked_at=float(together.weight.sum() / total),
     )
 
 
-def _rows(
-    modes: Mapping[str, str],
-    kept: np.ndarray,
-    change: np.ndarray,
+class _Planned(NamedTuple):
+    """Plans of m tiles."""
+
+    kept: np.ndarray
+    """(effects, m)"""
+    change: np.ndarray
+    error: np.ndarray
+    """(m,)"""
+    weight: np.ndarray
+    """(m,): points of each."""
+
+
+def _table(
+    spec: Spec | SceneSpec,
+    planned: _Planned,
     *,
-    weight: np.ndarray,
     where: Callable[[np.ndarray], str],
     cost: Callable[[str, np.ndarray], float],
-) -> tuple[EffectRow, ...]:
-    """A row for each effect, from what is kept and changed in tiles of so many points each."""
-    from sweep.model.effects.catalogue import EFFECTS
-
-    return tuple(
+    looked_at: float,
+) -> EffectsTable:
+    """The table, from what is kept and changed in tiles."""
+    modes, weight = spec.modes(), planned.weight
+    rows = tuple(
         EffectRow(
             name=effect.name,
             about=effect.about,
@@ -162,8 +149,10 @@ def _rows(
             at=where(np.arange(changes.size) == changes.argmax()),
             cost=cost(effect.name, called) if called.any() else math.nan,
         )
-        for effect, called, changes in zip(EFFECTS, kept, change, strict=True)
+        for effect, called, changes in zip(EFFECTS, planned.kept, planned.change, strict=True)
     )
+    tolerance, error = float(spec.accuracy.tolerance), float(planned.error.max())
+    return EffectsTable(rows=rows, tolerance=tolerance, error=error, looked_at=looked_at)
 
 
 def _times(times: np.ndarray) -> str:
@@ -171,8 +160,8 @@ def _times(times: np.ndarray) -> str:
     return f"time {low:.4g} s" if low == high else f"time {low:.4g}..{high:.4g} s"
 
 
-def _points(calling: Calling, tile: int) -> int:
-    return int(np.prod([s.stop - s.start for s in calling.tiles.points(tile)]))
+def _shape(slices: tuple[slice, ...]) -> tuple[int, ...]:
+    return tuple(s.stop - s.start for s in slices)
 
 
 def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
@@ -195,35 +184,31 @@ def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
 
 def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
     """Share of the time of points that an effect takes, from points with it and without."""
-    chosen = tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]
-    spent = total = 0.0
-    for tile in chosen.tolist():
-        numbers, names = _some_points(calling, tile)
-        best = {}
-        for effects in (names, tuple(n for n in names if n != name)):
-            best[effects] = min(_timed(spec, calling, numbers, effects) for _ in range(ROUNDS))
-        spent += best[names] - min(best.values())
-        total += best[names]
-    return spent / total
-
-
-def _some_points(calling: Calling, tile: int) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Numbers of some points of a tile, and the effects that it calls for."""
-    from sweep.model.effects.catalogue import NAMES
-
-    slices = calling.tiles.points(tile)
-    shape = tuple(s.stop - s.start for s in slices)
-    few = np.unique(np.linspace(0, int(np.prod(shape)) - 1, COST_POINTS).astype(np.int64))
-    along = np.unravel_index(few, shape) if shape else ()
-    at = [i + s.start for i, s in zip(along, slices, strict=True)]
-    numbers = np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few
-    ((_, plan),) = calling.plans(np.array([tile]))
-    return numbers, tuple(n for n, kept in zip(NAMES, plan.kept[:, 0], strict=True) if kept)
-
-
-def _timed(spec: Spec, calling: Calling, numbers: np.ndarray, effects: tuple[str, ...]) -> float:
-    parameters = calling.tiles.grid.parameters_at(numbers)
     if spec.draws.whole_spectra:  # what an effect costs does not go by what looks at spectra
         draws = spec.draws.model_copy(update={"method": "probabilities"})
         spec = spec.model_copy(update={"draws": draws})
-    return sum(timed(spec, parameters, len(numbers), effects, most_draws=COST_DRAWS))
+    spent = total = 0.0
+    for tile in tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]:
+        parameters = calling.tiles.grid.parameters_at(numbers := _some_points(calling, int(tile)))
+        ((_, plan),) = calling.plans(np.array([tile]))
+        names = tuple(compress(NAMES, plan.kept[:, 0]))
+        with_it, without = (
+            min(
+                sum(timed(spec, parameters, len(numbers), effects, most_draws=COST_DRAWS))
+                for _ in range(ROUNDS)
+            )
+            for effects in (names, tuple(n for n in names if n != name))
+        )
+        spent += max(with_it - without, 0.0)
+        total += with_it
+    return spent / total
+
+
+def _some_points(calling: Calling, tile: int) -> np.ndarray:
+    """Numbers of some points of a tile."""
+    slices = calling.tiles.points(tile)
+    shape = _shape(slices)
+    few = np.unique(np.linspace(0, math.prod(shape) - 1, COST_POINTS).astype(np.int64))
+    along = np.unravel_index(few, shape) if shape else ()
+    at = [i + s.start for i, s in zip(along, slices, strict=True)]
+    return np.asarray(np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few)

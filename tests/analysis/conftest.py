@@ -1,5 +1,10 @@
+import sys
+from pathlib import Path
+
 import pytest
 from drawn_scenes import flown
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis.accuracy import report, settings, text
+from sweep.analysis import accuracy as settings
+from sweep.analysis import accuracy_figure as report
 from sweep.analysis.opening import NotAStoreError
 
 MADE_UP = [
@@ -92,10 +93,14 @@ def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
         ("auto at 1e-06", "all effects on"),
     ]
     assert [d.times_faster for d in duels] == pytest.approx([1.2, 0.9, 5.0])
-    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
+    (told,) = [
+        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+    ]
     assert "0.9 to 5 times" in told and "NOT kept, by 2 s in all; planning takes 2 s; with" in told
     dataset.seconds[5] *= 1.02  # 0.918 of its time: within the 10 %
-    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
+    (told,) = [
+        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+    ]
     assert told.endswith(": kept.")
 
 
@@ -105,7 +110,9 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
     worst = settings.against_fixed(settings.settings_in(dataset))[1]
     # Rounds of 30, 20, 40 us against 27, 18, 36, and 3 us a point besides.
     assert worst.with_besides(3e-6) == pytest.approx(30 / 33)
-    (told,) = [s for s in text.sentences(dataset, settings.settings_in(dataset)) if "single" in s]
+    (told,) = [
+        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+    ]
     assert "0.9 to 5 times" in told and told.endswith(
         "NOT kept, by 2e-05 s in all; planning takes 2e-05 s; with the study's store it is 0.91 "
         "times as fast."
@@ -114,7 +121,7 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
 
 def test_a_store_of_an_earlier_version_does_not_say_what_storing_takes(dataset):
     del dataset.attrs["storing_seconds"]
-    told = text.sentences(dataset, settings.settings_in(dataset))
+    told = settings.sentences(dataset, settings.settings_in(dataset))
     assert "take 20 s on one core. Nothing tried" in told[0] and "NOT kept, by 2 s" in told[1]
 
 
@@ -122,7 +129,9 @@ def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
     none = dataset.isel(rung=[0, 1, 2, 3, 10])
     duels = settings.against_fixed(settings.settings_in(none))
     assert all(d.other is None and d.times_faster == np.inf for d in duels)
-    assert any("no fixed setting" in s for s in text.sentences(none, settings.settings_in(none)))
+    assert any(
+        "no fixed setting" in s for s in settings.sentences(none, settings.settings_in(none))
+    )
 
 
 def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
@@ -132,7 +141,7 @@ def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
     assert described.adaptive.name == "auto at 0.1" and improved.adaptive.name == "auto at 0.001"
     assert described.times_faster == pytest.approx(9.0)
     assert improved.times_faster == pytest.approx(6.0)
-    told = " ".join(text.sentences(dataset, settings.settings_in(dataset)))
+    told = " ".join(settings.sentences(dataset, settings.settings_in(dataset)))
     assert "the closed form is 6 times as fast as thesis 2^12, 8 times" in told
     assert (
         "9 times as fast as thesis 2^12" in told
@@ -155,7 +164,7 @@ def test_one_slow_trial_of_two_does_not_count():
 
 def test_with_other_beamlets_than_the_thesis_has_nothing_is_asked_for(dataset):
     dataset.attrs["thesis_beamlets"] = 19
-    told = " ".join(text.sentences(dataset, settings.settings_in(dataset)))
+    told = " ".join(settings.sentences(dataset, settings.settings_in(dataset)))
     assert "9 times as fast as thesis 2^12" in told and "At least 5 times" not in told
     assert "With this scene's 19 beamlets" in told
 
@@ -194,7 +203,7 @@ def test_where_errors_are_random_most_of_the_points_count(dataset):
 
 
 def test_the_page_has_every_setting_and_the_sentences(dataset):
-    found = text.page(dataset, settings.settings_in(dataset)).text()
+    found = settings.page(dataset, settings.settings_in(dataset)).text()
     assert all(name in found for name, *_ in MADE_UP)
     assert "all 1,000,000 points take 20 s on one core, and at least 0.5 s to be stored" in found
     assert (

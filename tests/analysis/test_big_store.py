@@ -1,9 +1,8 @@
 """A store goes through memory piece by piece; `benchmarks/big_store.py` does it with 10 GB."""
 
-import importlib.util
 import tracemalloc
-from pathlib import Path
 
+import big_store
 import pytest
 from zarr.storage import LocalStore
 
@@ -17,18 +16,9 @@ FIGURES = [
      "where": {"grazing_angle": "20 deg"}},
     {"kind": "table", "variable": "pd_shot", "rows": "power"},
 ]  # fmt: skip
-FILE = Path(__file__).parents[2] / "benchmarks" / "big_store.py"
 
 
-@pytest.fixture(scope="module")
-def big_store():
-    spec = importlib.util.spec_from_file_location("big_store", FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def stores(big_store, directory, gigabytes, block_points):
+def stores(directory, gigabytes, block_points):
     """Stores with their sizes [B]."""
     made = {}
     for size in gigabytes:
@@ -55,29 +45,29 @@ def growth(work, sizes, monkeypatch):
     return (peaks[1] - peaks[0]) / (more - less)
 
 
-def test_memory_does_not_grow_with_the_store(big_store, tmp_path, monkeypatch):
+def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
     def reduce(path):
         found = big_store.reduce(path)
         assert found["points"] == sweep.open(path).attrs["points"]
         assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
 
     # Dask's list of pieces alone: with one chunk a piece it takes twice as much as these stores.
-    sizes = stores(big_store, tmp_path, (0.001, 0.006), 500)
+    sizes = stores(tmp_path, (0.001, 0.006), 500)
     assert growth(reduce, sizes, monkeypatch) < 0.3
 
 
 @pytest.mark.slow
-def test_neither_does_that_of_its_figures(big_store, tmp_path, monkeypatch):
+def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
     monkeypatch.setattr(surface, "MOST_COLUMNS", 20)
     monkeypatch.setattr(along, "STRETCHES", 5)
     monkeypatch.setattr(canvas, "save", lambda sheet, path: path)
-    sizes = stores(big_store, tmp_path, (0.006, 0.024), 2000)
+    sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37
     assert growth(lambda path: draw(path, tmp_path), sizes, monkeypatch) < 0.15
 
 
-def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(big_store, tmp_path, monkeypatch):
+def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(tmp_path, monkeypatch):
     path = tmp_path / "small.zarr"
     big_store.make(path, big_store.spec_of(0.01, block_points=900))
     dataset = sweep.open(path)

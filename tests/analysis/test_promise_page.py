@@ -1,10 +1,9 @@
 """The exact means that docs/promise.md holds drawn points against."""
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import numpy as np
+import promise_drawn
 import pytest
 
 from sweep.model.outputs import PROMISED
@@ -23,23 +22,13 @@ FEW = {
 
 
 @pytest.fixture(scope="module")
-def maker():
-    path = ROOT / "benchmarks" / "promise_drawn.py"
-    found = importlib.util.spec_from_file_location("promise_drawn", path)
-    module = importlib.util.module_from_spec(found)
-    sys.modules["promise_drawn"] = module
-    found.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
 def few():
     shipped = load(ROOT / "experiments" / "speckled_target.yaml")
     return Rung(name="", kind=WRITTEN, overrides=FEW | {"figures": []}).of(shipped)
 
 
-def test_exact_means_are_those_of_many_draws(maker, few):
-    means, off = maker.exact(few)
+def test_exact_means_are_those_of_many_draws(few):
+    means, off = promise_drawn.exact(few)
     study = GridStudy(few)
     found = study.evaluate(0)
     assert study.grid.n_blocks == 1 and off < 1e-12
@@ -49,14 +38,14 @@ def test_exact_means_are_those_of_many_draws(maker, few):
         assert ((error > 1e-4) & (error < 0.01)).sum() >= 4
 
 
-def test_coverage_is_that_of_the_points_where_draws_decide(maker):
+def test_coverage_is_that_of_the_points_where_draws_decide():
     error = np.tile([0.0, 0.02, 0.04, 0.2], (4, 25))
     decided = np.tile([False, True, True, True], (4, 25))
-    row = maker.Drawn(0.1, error, np.full_like(error, 0.1), decided, np.ones(100), 1.0)
-    share, sigmas = maker.covered(row, 0.95)
+    row = promise_drawn.Drawn(0.1, error, np.full_like(error, 0.1), decided, np.ones(100), 1.0)
+    share, sigmas = promise_drawn.covered(row, 0.95)
     assert share == pytest.approx(2 / 3)
     assert sigmas == pytest.approx((2 / 3 - 0.95) / np.sqrt(0.95 * 0.05 / 75))
-    told = list(maker.verdicts("it", [row], 0.95))
+    told = list(promise_drawn.verdicts("it", [row], 0.95))
     assert len(told) == 5 and "75.0%" in told[0]
-    told = "\n".join(maker.table([row], 0.95))
-    assert "| 75.00% | 75 | 66.67% | 66.7% (-11.3) |" in told
+    (cells,) = promise_drawn.rows_of([row], 0.95)
+    assert cells[2:6] == ["75.00%", "75", "66.67%", "66.7% (-11.3)"]

@@ -1,8 +1,10 @@
-import csv
-import math
-from pathlib import Path
+"""Marcum's Q and chances among many: laws that they obey.
 
-import mpmath as mp
+Digits are held by `tests/stability/hard_marcum.py` and `hard_chances.py`.
+"""
+
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,100 +19,11 @@ from sweep.model.marcum import (
     marcum_q1_pair,
 )
 
-REFERENCE = Path(__file__).parents[2] / "../shared/reference/marcum_q1.csv"
 ACCURACY = 2e-15  # what the docstrings promise
-SMALLEST = mp.mpf("1e-305")  # below, float64 itself runs out of digits
-
-SMALLEST_STEP = mp.mpf("5e-324")
 CHANCES_ACCURACY = 1e-15
 
-LEVELS = [1e-8, 0.3, 1.19, 1.21, 5.4, 5.5, 31.0, 1e4]
-HARD_POINTS = [
-    *((a, b) for a in (0.0, 1e-5, 1.0, 5.477) for b in (1e-160, 1e-9, 0.5, 1.2, 6.55, 38.0, 1e3)),
-    *((a, b) for a in (0.0, 0.05, 0.1) for b in (0.1, 0.11, 0.15)),
-    *((x, x) for x in LEVELS),
-    *((x, x * (1 + 1e-13)) for x in LEVELS),
-    *((x + 9.0, x) for x in LEVELS),
-    *((x, x + 9.0) for x in LEVELS),
-    *((x, x + 38.5) for x in LEVELS),
-    *((x + 37.5, x) for x in LEVELS),
-    *((30.0 / x, x) for x in (1.0, 2.0, 8.0, 40.0)),
-    (20.0, 70.0), (1e4, 1.0), (1e4, 2e4), (1e8, 1e8), (1e8, 1e8 + 1), (1e8 + 30, 1e8), (1e-3, 1e8),
-]  # fmt: skip
-FAINT = [1e-150, 1e-20, 1e-8, 1e-3, 0.03, 0.14, 0.3, 0.49, 0.52, 0.9, 1.99, 2.01, 5.0, 30.0]
-EXCESS_POINTS = [
-    *((a, b) for a in FAINT for b in (1e-9, 0.1, 1.0, 2.0, 6.55, 14.4, 37.0)),
-    # Either side of where the sum changes its length: ab at both ends of each length.
-    *((a, ab / a) for a in (0.14, 0.49, 0.7, 1.9) for ab in (0.322, 0.324, 1.67, 1.68, 2.8)),
-    *((a, ab / a) for a in (0.14, 0.49, 0.7, 1.9) for ab in (3.63, 3.64, 5.6, 7.99, 8.01)),
-]
 without_deadline = settings(deadline=None)  # the first call may compile
 amplitudes = st.floats(0.0, 60.0)
-tries = st.one_of(st.sampled_from([0.5, 1.0, 2.0, 65536.0, 131072.0]), st.floats(1e-3, 1e9))
-
-
-def gauss(function, edges):
-    """Integral of a smooth function between consecutive edges."""
-    return mp.quad(function, edges, method="gauss-legendre")
-
-
-def rice_tails(a, b):
-    """(Q1, 1-Q1) to 20 digits or more: the density of the Rice distribution, integrated.
-
-    Over its value at b, since the quadrature stops at an absolute error.
-    """
-    a, b = mp.mpf(a), mp.mpf(b)
-    steps = [2**i / max(mp.mpf(1), abs(b - a)) for i in range(-1, 8)]
-
-    def density(r):
-        return r * mp.exp(-((r - a) ** 2) / 2 - a * r) * mp.besseli(0, a * r)
-
-    def ratio(r):
-        return density(r) / at_b
-
-    at_b = density(b)
-    if b > a and b > 1:
-        q = at_b * gauss(ratio, [b, *(b + step for step in steps)])
-        return q, 1 - q
-    edges = [0, *(b - step for step in reversed(steps) if step < b), b]
-    p = at_b * b * gauss(lambda t: ratio(b * t), [edge / b for edge in edges])
-    return 1 - p, p
-
-
-def worst_error(values, q, p):
-    """Worst relative error of (q, p) among those that float64 can hold."""
-    return max(
-        float(abs(mp.mpf(float(value)) / exact - 1))
-        for value, exact in zip(values, [q, p], strict=True)
-        if abs(exact) > SMALLEST
-    )
-
-
-@pytest.mark.skipif(not REFERENCE.exists(), reason="the reference points are not at hand")
-def test_both_tails_agree_with_thirty_digit_reference_points():
-    with REFERENCE.open() as lines, mp.workdps(40):
-        rows = list(csv.DictReader(lines))
-        found = marcum_q1([float(r["a"]) for r in rows], [float(r["b"]) for r in rows])
-        for i, row in enumerate(rows):
-            exact = mp.mpf(row["Q"]), mp.mpf(row["one_minus_Q"])
-            assert worst_error([v[i] for v in found], *exact) < ACCURACY, (row["a"], row["b"])
-
-
-@pytest.mark.parametrize(("a", "b"), HARD_POINTS)
-def test_both_tails_agree_with_the_integral_of_the_rice_density(a, b):
-    # The density holds exp(-ab) I0(ab), which takes as many further digits as ab has.
-    with mp.workdps(25 if a * b < 1e5 else 42):
-        assert worst_error(marcum_q1_pair(a, b), *rice_tails(a, b)) < ACCURACY
-
-
-@given(st.floats(0.0, 38.0))
-@without_deadline
-def test_without_signal_the_crossing_probability_is_that_of_rayleigh_noise(b):
-    q, p = marcum_q1_pair(0.0, b)
-    with mp.workdps(30):
-        half = mp.mpf(b) ** 2 / 2
-        for value, exact in ((q, mp.exp(-half)), (p, -mp.expm1(-half))):
-            assert abs(value - exact) <= ACCURACY * abs(exact) + SMALLEST_STEP
 
 
 @given(amplitudes, amplitudes)
@@ -200,25 +113,6 @@ def test_signal_in_gaussian_noise_crosses_as_often_as_stated(a, b):
     assert abs(count - number * q) < 5 * math.sqrt(number * q * (1 - q))
 
 
-@pytest.mark.parametrize(("a", "b"), EXCESS_POINTS)
-def test_excess_crossing_is_the_integral_of_the_slope_over_the_signal(a, b):
-    # dQ1/da = b exp(-(a^2+b^2)/2) I1(ab), a route with neither a difference nor that series.
-    with mp.workdps(25):
-        threshold = mp.mpf(b)
-
-        def slope(s):
-            decay = mp.exp(-((s - threshold) ** 2) / 2 - s * threshold)
-            return threshold * decay * mp.besseli(1, s * threshold)
-
-        # Over the largest slope, since the quadrature stops at an absolute error.
-        end, peak = mp.mpf(a), slope(mp.mpf(min(a, b)))
-        nearest = [mp.mpf(b + offset) / end for offset in (-8, -4, 0, 4, 8) if 0 < b + offset < a]
-        exact = peak * end * gauss(lambda t: slope(end * t) / peak, [0, *nearest, 1])
-        assert exact > 0
-        error = abs(mp.mpf(excess_crossing(a, b)) - exact)
-        assert error < ACCURACY * exact + SMALLEST_STEP
-
-
 def test_excess_crossing_of_a_faint_signal_is_its_power_times_the_noise_density():
     # exp(-b^2/2) a^2 b^2 / 4 for a -> 0: power, not amplitude.
     for b in (0.5, 6.55, 20.0):
@@ -234,41 +128,6 @@ def test_excess_and_noise_crossing_add_up_to_the_crossing(a, b):
 
 
 # At least one among many
-
-
-def exact_log(p, n):
-    """ln(1 - (1-p)^n), naively but with 400 digits, and the condition number of (1-p)^n in p."""
-    none = (1 - p) ** mp.mpf(n)
-    return mp.log(1 - none), n * p / (1 - p)
-
-
-@given(st.floats(1e-300, 1.0), tries)
-@without_deadline
-def test_chance_of_one_among_many_keeps_its_digits_at_any_size(p, n):
-    with mp.workdps(400):
-        exact = 1 - (1 - mp.mpf(p)) ** mp.mpf(n)
-        assert abs(at_least_one(p, n) - exact) <= CHANCES_ACCURACY * exact
-
-
-@given(st.floats(-300.0, -1e-9), tries)
-@without_deadline
-def test_logarithm_agrees_with_400_naive_digits(log_p, n):
-    with mp.workdps(400):
-        exact, condition = exact_log(mp.exp(mp.mpf(log_p)), n)
-        # Near certainty ln p itself determines the result no better than this.
-        tolerance = CHANCES_ACCURACY if condition < 1 else (2 + condition) * 5e-16
-        error = abs(log_at_least_one(log_p, n) - exact)
-        assert error <= tolerance * abs(exact) + SMALLEST_STEP
-
-
-@pytest.mark.parametrize("log_p", [-599.9, -600.1, -744.0, -750.0, -1e5, -1e9])
-@pytest.mark.parametrize("n", [1, 3, 131072, 1e15])
-def test_logarithm_of_chances_below_float64_is_right(log_p, n):
-    # mpmath's exponents have no bounds, so the same definition is good here; p n < 1e-245.
-    with mp.workdps(60):
-        p = mp.exp(mp.mpf(log_p))
-        exact = mp.log(-mp.expm1(n * mp.log1p(-p)))
-        assert abs(log_at_least_one(log_p, n) - exact) <= CHANCES_ACCURACY * abs(exact)
 
 
 @pytest.mark.parametrize("p", [1e-21, 1e-5, 0.3, 0.5, 0.8, 1 - 1e-12])

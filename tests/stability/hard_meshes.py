@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 from cases import Family
-from exact_rays import fractions, last_places, nearest, plane_distance
+from exact_rays import fractions, last_places, met, nearest
 
 from sweep.model.geometry.rays import Caster
 from sweep.scenes.meshes import clean
@@ -42,7 +42,7 @@ def worst_of(scene: Scene) -> float:
         if exact is None or math.isinf(found):
             worst = max(worst, 0.0 if exact is None and math.isinf(found) else math.inf)
         else:
-            worst = max(worst, last_places(found, exact))
+            worst = max(worst, last_places(found, exact[0]))
     return worst
 
 
@@ -236,7 +236,7 @@ def relative_ranges() -> float:
         directions = np.concatenate([centre[None], beamlets])
         origin = np.array([-10e3 * math.cos(low), 0.0, 10e3 * math.sin(low)])
         found = caster.bundle(origin[None], directions[None])
-        ranges = [plane_distance(corners, origin, d) for d in directions]
+        ranges = [met(corners, origin, d)[0] for d in directions]
         for b in range(1, 21):
             exact = ranges[b] - ranges[0]
             worst = max(worst, float(abs(Fraction(found.offset[0, b]) / exact - 1)))

@@ -10,13 +10,11 @@ from small import STUDY, small
 from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
-from sweep.tasks import progress, store
-from sweep.tasks.accuracy import flight_bench, measure, rungs, storing
-from sweep.tasks.accuracy.bench import Seen
+from sweep.tasks import flight_study, progress, store
+from sweep.tasks.accuracy import flight_bench, measure, run, rungs
+from sweep.tasks.accuracy.bench import GridBench, Seen, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
-from sweep.tasks.accuracy.grid_bench import GridBench
 from sweep.tasks.accuracy.run import measure as measured
-from sweep.tasks.accuracy.sample import by_chance, neighbours, spread
 from sweep.tasks.errors import StoreError
 from sweep.tasks.stretches import Part
 from sweep.tasks.studies import study_of
@@ -47,15 +45,6 @@ def test_a_sample_has_no_point_twice_and_all_where_there_are_few(shape, number):
     assert np.array_equal(found, spread(shape, number))
 
 
-def test_points_are_drawn_without_repetition_and_each_as_likely():
-    assert by_chance((3, 4), 50, 1).tolist() == list(range(12))
-    found = np.concatenate([by_chance((20, 5), 30, seed) for seed in range(1000)])
-    counts = np.bincount(found, minlength=100)
-    # each of 100 points has a chance of 0.3, a thousand times: 5 sigma
-    assert (abs(counts - 300) <= 5 * np.sqrt(1000 * 0.3 * 0.7)).all()
-    assert np.array_equal(by_chance((20, 5), 30, 7), by_chance((20, 5), 30, 7))
-
-
 def test_any_stretch_of_a_sample_reaches_along_every_axis():
     index = np.unravel_index(spread((1000, 90), 200), (1000, 90))
     for first, size in itertools.product((0, 50, 150), (50,)):
@@ -67,18 +56,6 @@ def test_any_stretch_of_a_sample_reaches_along_every_axis():
 
 def test_a_longer_sample_begins_with_the_shorter():
     assert np.array_equal(spread((500, 60, 7), 300)[:100], spread((500, 60, 7), 100))
-
-
-def test_neighbours_stay_in_their_box_and_begin_with_the_point():
-    box, shape = (slice(4, 8), slice(6, 9)), (10, 12)
-    numbers = neighbours((7, 8), box, shape, 30, (0, 1))
-    assert numbers[0] == 7 * 12 + 8
-    inside = {i * 12 + j for i in range(4, 8) for j in range(6, 9)}
-    assert set(numbers.tolist()) == inside
-    assert np.array_equal(numbers[:12], numbers[12:24])
-    assert list(neighbours((), (), (), 2, ())) == [0, 0]
-    along_the_first = neighbours((5, 7), box, shape, 4, (1, 0))
-    assert along_the_first.tolist() == [5 * 12 + 7, 6 * 12 + 7, 7 * 12 + 7, 4 * 12 + 8]
 
 
 # Ladder
@@ -214,20 +191,19 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     assert np.array_equal(whole.ravel()[numbers], seen.pd[:, 3])
 
 
-def test_what_is_timed_lies_in_the_points_own_block_at_other_powers_and_ranges_first():
+def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
     bench = GridBench(small(footprint=COHERENT, storage={"block_points": 24}), 8)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     grid = bench._calling_of(rung).tiles.grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
     for number in bench._numbers:
-        first = np.unravel_index(number, grid.shape)
-        beside = bench._stretches(rung, np.array([number]), 24)
+        beside = bench._beside(rung, number, 30)
         places = np.array(np.unravel_index(beside, grid.shape))
         blocks = places // np.array(grid.block_shape)[:, None]
         assert beside[0] == number and len(set(beside)) == 24 and (blocks == blocks[:, :1]).all()
-        left = 8 - 2 * (first[1] % 4) - first[0]  # of its own grazing angle
-        assert (places[2, :left] == first[2]).all() and places[2, left] != first[2]
-        assert len(set(map(tuple, places[:2, :left].T))) == left
+        assert np.array_equal(beside[24:], beside[:6])
+        changed = (np.diff(places[1:], axis=1) != 0).any(axis=0)
+        assert changed.sum() == 14 + places[0, 0]  # powers run fastest, over one geometry
 
 
 def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
@@ -305,11 +281,12 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
 
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
     """What is computed beside a part takes part in its time, and changes nothing it sees."""
-    monkeypatch.setattr(flight_bench, "TILE_SHOTS", 32)
+    for module in (flight_bench, flight_study):
+        monkeypatch.setattr(module, "TILE_SHOTS", 32)
     bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)
     parts = bench.parts(64)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
-    stretches = [bench._of(int(part[0])) for part in parts]
+    stretches = [next(t for t in bench._tiles[::-1] if t.start <= part[0]) for part in parts]
     first = [stretch.start for stretch in stretches[: bench.least_parts]]
     assert len(set(first)) == bench.least_parts == 4 and len(parts) > 4
     tiles = [
@@ -345,7 +322,7 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     part = bench.parts(1)[0]
     seen = bench.try_on(rung, part, 1).seen
-    tiles = bench._of(0)
+    tiles, _ = bench._around(part, 1)
     study = bench._study(rung)
     caster = next(e for e in study.eyepoint_studies() if e.scanner == tiles.part.scanner)
     from sweep.scenes.eyepoint_arrays import from_arrays
@@ -414,8 +391,8 @@ def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
         return write(self, block, results)
 
     monkeypatch.setattr(store.Arrays, "write", noted)
-    monkeypatch.setattr(storing, "process_time", lambda: float(next(ticks)))
-    assert storing.storing(study) == 1.0 + study.n_blocks
+    monkeypatch.setattr(run, "process_time", lambda: float(next(ticks)))
+    assert run.storing(study) == 1.0 + study.n_blocks
     assert {block for block, _ in written} == {study.n_blocks // 2}
     # Whole chunks of all the block's arrays: anything else would have been refused.
     assert written[0][1].keys() == study.chunks(study.n_blocks // 2).keys() >= {name}

@@ -49,7 +49,7 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
             for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot")}  # fmt: skip
     for row in accuracy_table(store):
         assert row.missed == pytest.approx(float(over[row.name].max()), rel=1e-12)
-        assert row.tolerance == 0 and row.needed == math.inf and row.draws == 400
+        assert row.tolerance == 0 and row.needed == math.inf and row.number == 400
         assert row.met == int((over[row.name] <= 0).sum()) and row.points == 18
         assert names_the_place(row.where, dataset, over[row.name])
 
@@ -66,11 +66,11 @@ def test_draws_that_are_said_to_do_about_do(tmp_path):
     axes, accuracy = {"target.range": ["2 km"]}, {"tolerance": 0.02}
     few = small(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
     rows = accuracy_table(quiet(few, tmp_path / "few.zarr").store)
-    assert [row.met for row in rows] == [0, 0, 0, 0] and {row.draws for row in rows} == {300}
+    assert [row.met for row in rows] == [0, 0, 0, 0] and {row.number for row in rows} == {300}
     needed = int(max(row.needed for row in rows))
     enough = small(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
     for row in accuracy_table(quiet(enough, tmp_path / "enough.zarr").store):
-        assert row.half_width < 0.022
+        assert row.error < 0.022
 
 
 def test_blocks_that_are_not_computed_are_not_told(tmp_path):
@@ -104,7 +104,7 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     )
     store = quiet(spec, tmp_path / "wide.zarr").store
     (row,) = rays_table(store)
-    assert (row.shots, row.met, row.most, row.error) == (3, 2, 4096, 1.0)
+    assert (row.points, row.met, row.most, row.error) == (3, 2, 4096, 1.0)
     assert row.where == "grazing_angle 0.5 deg"
     said = CliRunner().invoke(main, ["status", str(store)]).output
     assert "What more beamlets may change" in said and "2 of 3" in said

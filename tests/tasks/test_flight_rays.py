@@ -144,14 +144,14 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     store = quiet(spec, tmp_path / "most.zarr").store
     (row,) = rays_table(store)
     told, rays = shots(store).beamlets_error, shots(store).beamlets
-    assert (row.scanner, row.most, row.tolerance) == ("three", 37, 1e-3)
-    assert row.rays == pytest.approx(float(rays.mean())) == 37
-    assert row.shots == told.size and row.met == (told <= 1e-3).sum() < row.shots
+    assert (row.name, row.most, row.tolerance) == ("three", 37, 1e-3)
+    assert row.mean == pytest.approx(float(rays.mean())) == 37
+    assert row.points == told.size and row.met == (told <= 1e-3).sum() < row.points
     assert row.error == told.max() and row.missed == pytest.approx(row.error - 1e-3)
     shot = int(told.values[0].argmax())
     assert row.where == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
     said = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "What more rays may change" in said and f"{row.met} of {row.shots}" in said
+    assert "What more rays may change" in said and f"{row.met} of {row.points}" in said
     spec_file = tmp_path / "most.yaml"
     spec_file.write_text(json.dumps(spec.to_yaml_mapping()))
     said = CliRunner().invoke(main, ["plan", str(spec_file)]).output

@@ -39,6 +39,17 @@ def drawn(table_4_1, number=12, **changes):
     return shots
 
 
+def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
+    """Bins around a point's lines, and |X| there, without noise."""
+    (cells,) = thesis_grid.grid_sizes(shots)[[i]].tolist()
+    low, magnitude = thesis_grid.magnitudes(
+        shots, shots.point_table(), np.array([i]), segment, cells, (degree, real, folded)
+    )
+    bins = low[0] + np.arange(magnitude.shape[1])
+    within = (bins >= 0) & (bins <= shots.fft_size // 2)
+    return bins[within], magnitude[0, within]
+
+
 def error(shots, degree):
     """Largest difference near the lines over the peak of all of them in phase.
 
@@ -52,7 +63,7 @@ def error(shots, degree):
         peak *= np.broadcast_to(shots.beat_scale, shots.size)[i] * shots.window.sum / 2 * gain
         for segment in range(3):
             _, exact = segments.spectrum(shots, i, segment)
-            bins, found = thesis_grid.spectrum(shots, i, segment, degree=degree)
+            bins, found = spectrum(shots, i, segment, degree=degree)
             inner = slice(bins.size // 4, -bins.size // 4)
             apart = np.abs(found**order - exact[bins] ** order) / peak**order
             worst = max(worst, apart[inner].max())
@@ -85,7 +96,7 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
         ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
         for i in range(2):
             _, exact = segments.spectrum(shots, i, 1)
-            bins, found = thesis_grid.spectrum(shots, i, 1, degree=9)
+            bins, found = spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
             without = segments.spectrum(replace(shots, image=False), i, 1)[1]
@@ -96,10 +107,10 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
 def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1):
     shots = drawn(table_4_1, 12, phases=phases)
     for i, segment in itertools.product(range(shots.size), range(3)):
-        _, whole = thesis_grid.spectrum(shots, i, segment)
-        _, real = thesis_grid.spectrum(shots, i, segment, real=True)
-        _, folded = thesis_grid.spectrum(shots, i, segment, folded=True)
-        _, both = thesis_grid.spectrum(shots, i, segment, real=True, folded=True)
+        _, whole = spectrum(shots, i, segment)
+        _, real = spectrum(shots, i, segment, real=True)
+        _, folded = spectrum(shots, i, segment, folded=True)
+        _, both = spectrum(shots, i, segment, real=True, folded=True)
         order = 2 if shots.incoherent else 1  # a root of rounding is much
         for other in (real, folded, both):
             assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
@@ -123,7 +134,7 @@ def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
     ((_, shots),) = wide
     assert list(thesis_grid.grid_sizes(shots)) == [2**13, 2**12]
     assert list(thesis_grid.grid_sizes(shots, 2**11)) == [2**13, 2**11]
-    bins, found = thesis_grid.spectrum(shots, 0, 0, degree=9)
+    bins, found = spectrum(shots, 0, 0, degree=9)
     _, exact = segments.spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
 

@@ -1,18 +1,27 @@
-"""What a rung is tried on: a sample of points, by the machinery that computes all of them."""
+"""A sample of points that rungs are tried on, by the machinery of a run."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from time import thread_time
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.stats import qmc
 
-from sweep.tasks.accuracy.rungs import COUNTS, Rung
+from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
+from sweep.tasks.accuracy.rungs import WRITTEN, Rung
+from sweep.tasks.calling import Called, Calling
+from sweep.tasks.evaluate import evaluate_points
+from sweep.tasks.grid import Grid
 
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
+    from sweep.spec import Axis, Spec
     from sweep.tasks.accuracy.rungs import Declared
 
     Look = Callable[[Shots], np.ndarray]
@@ -24,6 +33,12 @@ NOT_IN_TRUTH = frozenset({"acceleration", "chirp_nonlinearity", "line_width", "l
 
 AFTER_THE_LINES = frozenset({"record", "detection", "draws"})
 """Stages of effects that the thesis's way leaves out."""
+
+PLACES, MOST_TIMES = 12, 8192
+"""Places of a part of a grid's sample at which stretches of a block are timed, and their length at
+the most."""
+
+AS_WRITTEN = Rung(name="as written", kind=WRITTEN)
 
 
 class Seen(NamedTuple):
@@ -56,79 +71,111 @@ class Trial:
     """A point."""
 
 
-class Bench(Protocol):
+class Bench(ABC):
     """A sample of a study's points."""
 
-    unit: str
+    unit = "points"
+    spec: Declared
+    size: int
+    """Points of the sample."""
+    whole: int
+    """Points of the study, each computed once: draws of a flight are none of their own."""
+    least_parts: int
+    """Parts of a sample, at the least: whole ones are kept where it is broken off."""
+    most_times: int
+    """Points of the longest stretch that may be timed."""
 
-    @property
-    def most_times(self) -> int:
-        """Points of the longest stretch that may be timed."""
-
-    @property
-    def spec(self) -> Declared:
-        """The study, as rungs are put onto it."""
-
-    @property
-    def size(self) -> int:
-        """Points of the sample."""
-
-    @property
-    def least_parts(self) -> int:
-        """Parts of a sample, at the least: whole ones are kept where it is broken off."""
-
-    @property
-    def whole(self) -> int:
-        """Points of the study, each computed once: draws of a flight are none of their own."""
-
-    def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many points: places in it."""
+    def __init__(self) -> None:
+        self._names: dict[str, frozenset[str]] = {}
 
     def effects(self, rung: Rung) -> frozenset[str]:
         """Effects that a rung calls for anywhere in the sample."""
+        if rung.name not in self._names:
+            flags = np.unique(self._flags(rung)).tolist()
+            self._names[rung.name] = frozenset(name for flag in flags for name in names_of(flag))
+        return self._names[rung.name]
 
+    def of_lines(self) -> tuple[str, ...]:
+        """Effects of the study that the thesis's way can have."""
+        own = self.effects(AS_WRITTEN)
+        return tuple(e.name for e in EFFECTS if e.name in own and e.stage not in AFTER_THE_LINES)
+
+    @abstractmethod
+    def parts(self, points: int) -> list[np.ndarray]:
+        """The sample in parts of about so many points: places in it."""
+
+    @abstractmethod
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """A rung on a part of the sample, timed on stretches of so many points, if it can be."""
 
-    def forget(self) -> None:
-        """Drop what trials of one part share; its time counts for each of them."""
-
+    @abstractmethod
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
         """A point in the time domain, and as the rung has it without what the truth lacks."""
 
+    @abstractmethod
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
         """Where the sample's points are: values and attributes by name."""
+
+    @abstractmethod
+    def _flags(self, rung: Rung) -> np.ndarray:
+        """Effects that a rung calls for at each point of the sample."""
+
+    def forget(self) -> None:  # noqa: B027
+        """Drop what trials of one part share; its time counts for each of them."""
+
+
+def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
+    """Numbers of points of a grid, in C order over it, spread evenly along every axis.
+
+    Any stretch from the first is spread as well, so that a part of the sample stands for all. They
+    follow Halton's sequence, without repetition; all are taken where there are fewer.
+    """
+    total = math.prod(shape)
+    if not shape or total <= 1:
+        return np.zeros(min(total, number), np.int64)
+    sequence = qmc.Halton(len(shape), scramble=False)
+    sequence.fast_forward(1)  # the first point is the grid's corner
+    found: dict[int, None] = {}
+    for _ in range(64):
+        index = np.floor(sequence.random(2 * number) * shape).astype(np.int64)
+        found |= dict.fromkeys(np.ravel_multi_index(tuple(index.T), shape).tolist())
+        if len(found) >= min(number, total):
+            break
+    else:  # some points of small grids are never met
+        found |= dict.fromkeys(range(min(total, 2 * number)))
+    return np.fromiter(found, np.int64)[:number]
 
 
 def look_of(rung: Rung) -> Look:
     """What finds a rung's peaks in the spectra."""
-    from sweep.model import shot
+    from sweep.model.shot import find
     from sweep.tasks.accuracy import thesis_grid
 
-    if not rung.cells:
-        return shot.find
-    return partial(
-        thesis_grid.find, degree=rung.degree, size=rung.cells, real=rung.real, folded=rung.folded
-    )
+    return partial(thesis_grid.find, **rung.thesis) if rung.thesis else find
 
 
-def of_lines(names: frozenset[str]) -> tuple[str, ...]:
-    """Those of the effects that the thesis's way can have."""
-    from sweep.model.effects.catalogue import EFFECTS
+def along_axes(
+    axes: tuple[Axis, ...], index: tuple[np.ndarray, ...]
+) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+    """Coordinates of points, by their places along each axis."""
+    return {
+        member.name: (
+            np.asarray(member.display)[along],
+            {"units": member.units, "path": member.path},
+        )
+        for axis, along in zip(axes, index, strict=True)
+        for member in axis.members
+    }
 
-    return tuple(e.name for e in EFFECTS if e.name in names and e.stage not in AFTER_THE_LINES)
 
-
-def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> Seen:
-    """What counts of the outputs of points of a grid."""
+def seen_in(outputs: Mapping[str, np.ndarray], counted: int = 0) -> Seen:
+    """What counts of the outputs of points; ``counted``: in so many draws, 0 for means of them."""
     names = [f"pd_{name}" for name in (*SEGMENTS, "shot")]
-    if estimate == COUNTS:
+    if counted:
         counts = [outputs[f"n_detected_{name}"].sum(axis=1) for name in (*SEGMENTS, "shot")]
-        pd = np.stack(counts, axis=1) / draws
-        nothing = np.full((len(pd), 3), np.nan)
-        error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / draws)
-        unknown = nothing[:, :2], nothing[:, :2], nothing
-        return Seen(pd, *unknown, error.max(axis=1), *nothing[:, :2].T)
+        pd = np.stack(counts, axis=1) / counted
+        error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / counted)
+        return nothing(len(pd))._replace(pd=pd, standard_error=error.max(axis=1))
     pd = np.stack([outputs[name] for name in names], axis=1)
     alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
     magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]
@@ -142,3 +189,138 @@ def seen_in(outputs: Mapping[str, np.ndarray], estimate: str, draws: int) -> See
         np.sqrt(outputs["noise_variance"] / 2),
         outputs["beamlets"],
     )
+
+
+def nothing(points: int) -> Seen:
+    """Points of which nothing is known."""
+    sizes = ((points, 4), (points, 2), (points, 2), (points, 3), points, points, points)
+    return Seen(*(np.full(size, np.nan) for size in sizes))
+
+
+class GridBench(Bench):
+    """A sample of the points of a grid, spread evenly, or of these numbers."""
+
+    least_parts = 2
+
+    def __init__(self, spec: Spec, points: int, numbers: np.ndarray | None = None) -> None:
+        super().__init__()
+        self.spec = spec
+        self._grid = Grid(spec)
+        self._numbers = spread(self._grid.shape, points) if numbers is None else numbers
+        self._calling: dict[str, Calling] = {}
+        self._block_points = math.prod(self._grid.block_shape)
+        self.size, self.whole = len(self._numbers), self._grid.points
+        self.most_times = min(MOST_TIMES, self._block_points)
+
+    def parts(self, points: int) -> list[np.ndarray]:
+        """The sample in parts of about so many points."""
+        return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
+
+    def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
+        """A rung on a part of the sample; timed on stretches of so many points, or on the part.
+
+        What a point costs depends on those beside it, as they share what is worked out for them:
+        a stretch is what the point's block computes next to it.
+        """
+        numbers = self._numbers[part]
+        outputs, spent, planning = self._run(rung, numbers)
+        timed = len(part)
+        if times > 1:
+            some = numbers[:: -(-len(part) // PLACES)].tolist()
+            stretches = np.concatenate([self._beside(rung, number, times) for number in some])
+            # As many points together as a block has: what a call costs is shared by these alone.
+            together = np.array_split(stretches, -(-stretches.size // self._block_points))
+            runs = [self._run(rung, each)[1:] for each in together]
+            spent, planning = (sum(each) for each in zip(*runs, strict=True))
+            timed, planning = stretches.size, planning / len(runs)
+        planning = planning if rung.plans else 0.0
+        draws = int(self._calling_of(rung).tiles.grid.spec.draws.number)
+        seen = seen_in(outputs, draws if rung.counts else 0)
+        return Trial(seen, spent / timed + planning, planning)
+
+    def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
+        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        from sweep.model import shot, truth
+
+        lacking = NOT_IN_TRUTH | {effect.name for effect in EFFECTS if effect.is_random}
+        number = self._numbers[[place]]
+        flags, _ = self._planned(rung, number)
+        effects = [n for n in names_of(int(flags[0])) if n not in lacking]
+        parameters = self._calling_of(rung).tiles.grid.parameters_at(number)
+        # Records walk by themselves, whatever effects are named.
+        in_time = shot.evaluate(parameters, effects, look=truth.find)
+        return seen_in(in_time), seen_in(shot.evaluate(parameters, effects))
+
+    def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+        """Number of each point in C order, and its place along each axis."""
+        found = {"number": (self._numbers, {"long_name": "number of the point of the study"})}
+        index = np.unravel_index(self._numbers, self._grid.shape) if self._grid.shape else ()
+        return found | along_axes(self.spec.axes, index)
+
+    def _flags(self, rung: Rung) -> np.ndarray:
+        return self._planned(rung, self._numbers)[0]
+
+    def _calling_of(self, rung: Rung) -> Calling:
+        if rung.name not in self._calling:
+            spec = rung.of(self.spec)
+            self._calling[rung.name] = Calling(spec, Grid(spec))  # type: ignore[arg-type]
+        return self._calling[rung.name]
+
+    def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
+        """Outputs of points, the time they take together, and that of planning one of them."""
+        from sweep.model.shot import evaluate
+
+        grid = self._calling_of(rung).tiles.grid
+        flags, planning = self._planned(rung, numbers)
+        called = Called(flags, np.zeros(flags.size)).groups()
+        outputs: dict[str, np.ndarray] = {}
+        spent = 0.0
+        for members, effects in (
+            [(np.arange(len(flags)), self.of_lines())] if rung.of_lines else called
+        ):
+            parameters = grid.parameters_at(numbers[members])
+            begun = thread_time()
+            if rung.thesis:
+                found = evaluate(parameters, effects, look=look_of(rung))
+            else:
+                found = evaluate_points(grid.spec, parameters, len(members), effects)
+            spent += thread_time() - begun
+            for name, values in found.items():
+                room = (len(numbers), *values.shape[1:])
+                outputs.setdefault(name, np.empty(room, values.dtype))[members] = values
+        return outputs, spent, planning
+
+    def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
+        """A point and those that its block computes after it, round the block's end."""
+        grid = self._calling_of(rung).tiles.grid
+        if not grid.shape:
+            return np.zeros(times, np.int64)
+        point = np.unravel_index(number, grid.shape)
+        along = [int(p) // side for p, side in zip(point, grid.block_shape, strict=True)]
+        block = int(np.ravel_multi_index(along, grid.blocks_along))
+        order, slices = grid.geometry_order(block), grid.block(block)
+        own = [int(p) - s.start for p, s in zip(point, slices, strict=True)]
+        first = np.flatnonzero(order == np.ravel_multi_index(own, grid.extent(block)))
+        within = np.unravel_index(
+            order.take(first + np.arange(times), mode="wrap"), grid.extent(block)
+        )
+        places = [i + s.start for i, s in zip(within, slices, strict=True)]
+        return np.asarray(np.ravel_multi_index(places, grid.shape))
+
+    def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+        """Flags of points (n,), and the time that planning takes one.
+
+        A plan serves a whole tile, so that a point takes its share.
+        """
+        tiles = self._calling_of(rung).tiles
+        index = np.unravel_index(numbers, tiles.grid.shape) if tiles.grid.shape else ()
+        along = [i // side for i, side in zip(index, tiles.shape, strict=True)]
+        own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(numbers), int)
+        met, where = np.unique(own, return_inverse=True)
+        flags = np.empty(len(met), np.uint32)
+        begun = thread_time()
+        for chosen, plan in self._calling_of(rung).plans(met):
+            flags[chosen] = flags_of(plan.kept)
+        spent = thread_time() - begun
+        served = sum(math.prod(s.stop - s.start for s in tiles.points(int(tile))) for tile in met)
+        return flags[where], spent / served

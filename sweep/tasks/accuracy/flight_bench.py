@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
-from sweep.model.effects.catalogue import flags_of, names_of
+from sweep.model.effects.catalogue import NAMES, flags_of, names_of
 from sweep.tasks.accuracy.bench import (
+    AS_WRITTEN,
     NOT_IN_TRUTH,
+    Bench,
     Seen,
     Trial,
+    along_axes,
     look_of,
-    of_lines,
+    nothing,
     seen_in,
+    spread,
 )
-from sweep.tasks.accuracy.rungs import MEAN, WRITTEN, Rung
-from sweep.tasks.accuracy.sample import spread
+from sweep.tasks.accuracy.rungs import Rung
 from sweep.tasks.calling import TILE_SHOTS, Called
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.finer_rays import FinerRays, refine
@@ -72,12 +75,7 @@ class Tiles:
         own = np.unique(self.tile[rows])
         order = np.roll(np.arange(tiles.size), -int(np.searchsorted(tiles, own[0])))
         enough = int(np.searchsorted(np.cumsum(counts[order]), number)) + 1
-        chosen = np.union1d(own, tiles[order[:enough]])
-        return np.flatnonzero(np.isin(self.tile, chosen))
-
-    def some(self, rows: np.ndarray) -> Tiles:
-        """Some of the shots."""
-        return Tiles(self.part, self.index[rows], self.start)
+        return np.flatnonzero(np.isin(self.tile, [*own, *tiles[order[:enough]]]))
 
 
 class Cast(NamedTuple):
@@ -88,7 +86,7 @@ class Cast(NamedTuple):
 
 
 class _Caster(EyepointStudy):
-    """Eyepoints of a geometry in a world that others share, as building one can take seconds."""
+    """Eyepoints in a world that others share, as building one can take seconds."""
 
     def __init__(
         self, spec: SceneSpec, scanner: str, world: World, beamlets: int | None = None
@@ -102,55 +100,30 @@ class _Caster(EyepointStudy):
         return self._world
 
 
-class FlightBench:
-    """A sample of the shots of a flight.
+class FlightBench(Bench):
+    """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
     What counts is rays, plans, spectra and probabilities; draws, points and navigation cost the
     same whatever the accuracy, and are left out.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    points
-        Shots of the sample, rounded up to whole tiles.
     """
 
     unit = "shots"
 
     def __init__(self, spec: SceneSpec, points: int) -> None:
+        super().__init__()
         self.spec = spec
         self._studies: dict[str, FlightStudy] = {}
-        self._cast: dict[tuple[str, int, bytes], Cast] = {}
-        self._geometry: dict[tuple[int, str], str] = {}
         self._casters: dict[str, _Caster] = {}
-        self._finer: dict[int, FinerRays] = {}
-        self._names: dict[str, frozenset[str]] = {}
+        self._cast: dict[tuple[str, int, bytes], Cast] = {}
+        self._finer: dict[str, FinerRays] = {}
+        self._geometries: dict[tuple[str, str], str] = {}
+        # What costs the same for any number of shots, as planning mostly does, a block shares.
+        self.most_times = max(int(spec.storage.block_shots), TILE_SHOTS)
         self._tiles = self._sample(points)
-
-    @property
-    def size(self) -> int:
-        """Shots of the sample."""
-        return sum(len(tiles.index) for tiles in self._tiles)
-
-    @property
-    def whole(self) -> int:
-        """Shots of the flight, times places along the axes."""
-        stretches = self._study(Rung(name="as written", kind=WRITTEN)).scanners.values()
-        return sum(s.total_cycles * s.shots_a_cycle * math.prod(s.axes) for s in stretches)
-
-    @property
-    def least_parts(self) -> int:
-        """One for each scanner and place along the axes."""
-        return len(self._tiles)
-
-    @property
-    def most_times(self) -> int:
-        """Shots of a block of the study, where the flight has as many.
-
-        What costs the same for any number of shots, as planning mostly does, is shared by these.
-        """
-        return max(int(self.spec.storage.block_shots), TILE_SHOTS)
+        self.least_parts = len(self._tiles)  # one for each scanner and place along the axes
+        self.size = sum(len(tiles.index) for tiles in self._tiles)
+        stretches = self._study(AS_WRITTEN).scanners.values()
+        self.whole = sum(s.total_cycles * s.shots_a_cycle * math.prod(s.axes) for s in stretches)
 
     def parts(self, points: int) -> list[np.ndarray]:
         """The sample in parts of about so many shots, from all scanners and places in turn."""
@@ -158,30 +131,16 @@ class FlightBench:
         turns = zip_longest(*(tiles.parts(number) for tiles in self._tiles))
         return [part for turn in turns for part in turn if part is not None]
 
-    def effects(self, rung: Rung) -> frozenset[str]:
-        """Effects that a rung calls for anywhere in the sample."""
-        if rung.name not in self._names:
-            study, found = self._study(rung), set()
-            for tiles in self._tiles:
-                called = _called(study, tiles, self._seen(study, tiles).eyepoints)
-                found |= {name for flag in np.unique(called.flags) for name in names_of(int(flag))}
-            self._names[rung.name] = frozenset(found)
-        return self._names[rung.name]
-
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """A rung on a part of the sample, timed with its rays and the tiles beside it."""
-        study, stretch = self._study(rung), self._of(int(part[0]))
-        own = part - stretch.start
-        rows = stretch.around(own, times)
-        tiles = stretch.some(rows)
-        cast = self._seen(study, tiles)
-        called, planning = self._planned(rung, study, tiles, cast)
+        tiles, own = self._around(part, times)
+        cast = self._see(rung, tiles)
+        called, planning = self._called(rung, tiles, cast.eyepoints)
         begun = thread_time()
-        seen = self._looked(rung, study, tiles, cast.eyepoints, called)
+        seen = self._look(rung, tiles, cast.eyepoints, called)
         spent = thread_time() - begun + cast.seconds + planning
-        chosen = np.searchsorted(rows, own)
-        of_part = Seen(*(values[chosen] for values in seen))
-        return Trial(of_part, spent / len(rows), planning / len(rows))
+        number = len(tiles.index)
+        return Trial(Seen(*(values[own] for values in seen)), spent / number, planning / number)
 
     def forget(self) -> None:
         """Drop the rays that rungs of the same geometry share."""
@@ -191,20 +150,17 @@ class FlightBench:
         """A shot in the time domain, and as the rung has it without what the truth lacks."""
         from sweep.model import shot, truth
 
-        study, stretch = self._study(rung), self._of(place)
-        row = np.array([place - stretch.start])
-        rows = stretch.around(row, 1)
-        tiles = stretch.some(rows)
-        cast = self._seen(study, tiles)
-        called, _ = self._planned(rung, study, tiles, cast)
-        one = np.searchsorted(rows, row)
+        tiles, one = self._around(np.array([place]), 1)
+        cast = self._see(rung, tiles)
+        called, _ = self._called(rung, tiles, cast.eyepoints)
         eyepoints = cast.eyepoints.some(one)
         if not eyepoints.seen.all():
-            return _nothing(1), _nothing(1)
+            return nothing(1), nothing(1)
         every = names_of(int(called.flags[one[0]]))
         names = tuple(name for name in every if name not in NOT_IN_TRUTH)
+        study = self._study(rung)
         in_time, ordinary = (
-            _look(study, tiles, names, look, False, eyepoints)[0]
+            _statistics(study, tiles.part, names, look, eyepoints)[0]
             for look in (truth.find, shot.find)
         )
         return in_time, ordinary
@@ -214,36 +170,38 @@ class FlightBench:
         counts = [len(tiles.index) for tiles in self._tiles]
         scanners = np.repeat(np.array([t.part.scanner for t in self._tiles], object), counts)
         numbers = np.concatenate([tiles.index for tiles in self._tiles])
-        found: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+        index = [
+            np.repeat([tiles.part.axes[k] for tiles in self._tiles], counts)
+            for k in range(len(self.spec.axes))
+        ]
+        return {
             "scanner": (scanners, {"long_name": "scanner"}),
             "shot": (numbers, {"long_name": "number of the shot"}),
+            **along_axes(self.spec.axes, tuple(index)),
         }
-        for k, axis in enumerate(self.spec.axes):
-            along = np.repeat([tiles.part.axes[k] for tiles in self._tiles], counts)
-            for member in axis.members:
-                attributes = {"units": member.units, "path": member.path}
-                found[member.name] = (np.asarray(member.display)[along], attributes)
-        return found
 
     def _sample(self, points: int) -> list[Tiles]:
         """Tiles spread over scanners, axes and flight."""
-        study = self._study(Rung(name="as written", kind=WRITTEN))
         found: list[Tiles] = []
-        start, together = 0, self.most_times // TILE_SHOTS
-        for name, stretches in study.scanners.items():
+        start, scanners = 0, self._study(AS_WRITTEN).scanners
+        for name, stretches in scanners.items():
             axes = stretches.axes
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
-            wanted = points / TILE_SHOTS / len(study.scanners) / len(places)
+            wanted = math.ceil(points / TILE_SHOTS / len(scanners) / len(places))
             for place in places:
-                index = _spread_shots(stretches, max(together, math.ceil(wanted)))
+                index = _spread_shots(stretches, max(self.most_times // TILE_SHOTS, wanted))
                 part = Part(name, tuple(int(i) for i in place), 0, 0)
                 found.append(Tiles(part, index, start))
                 start += len(index)
         return found
 
-    def _of(self, place: int) -> Tiles:
-        """The stretch that a place of the sample is in."""
-        return next(tiles for tiles in reversed(self._tiles) if tiles.start <= place)
+    def _around(self, part: np.ndarray, times: int) -> tuple[Tiles, np.ndarray]:
+        """Whole tiles with a part of the sample, of so many shots, and where it is among them."""
+        stretch = next(tiles for tiles in reversed(self._tiles) if tiles.start <= part[0])
+        own = part - stretch.start
+        rows = stretch.around(own, times)
+        tiles = Tiles(stretch.part, stretch.index[rows], stretch.start)
+        return tiles, np.searchsorted(rows, own)
 
     def _study(self, rung: Rung) -> FlightStudy:
         if rung.name not in self._studies:
@@ -251,14 +209,16 @@ class FlightBench:
             self._studies[rung.name] = FlightStudy(spec, Path("nowhere.zarr"))  # type: ignore[arg-type]
         return self._studies[rung.name]
 
-    def _seen(self, study: FlightStudy, tiles: Tiles) -> Cast:
+    def _see(self, rung: Rung, tiles: Tiles) -> Cast:
         """What shots see: rays are cast once for all rungs of the same geometry."""
         from sweep.scenes.eyepoint_arrays import from_arrays
 
-        scanner = tiles.part.scanner
-        geometry = self._geometry_of(study, scanner)
+        spec, scanner = self._study(rung).spec, tiles.part.scanner
+        if (rung.name, scanner) not in self._geometries:
+            self._geometries[rung.name, scanner] = spec.geometry_id(scanner)
+        geometry = self._geometries[rung.name, scanner]
         if geometry not in self._casters:
-            self._casters[geometry] = _Caster(study.spec, scanner, world_of(self.spec))
+            self._casters[geometry] = _Caster(spec, scanner, world_of(self.spec))
         which_shots = geometry, tiles.start, tiles.index.tobytes()
         if which_shots not in self._cast:
             caster = self._casters[geometry]
@@ -267,64 +227,49 @@ class FlightBench:
             self._cast[which_shots] = Cast(eyepoints, thread_time() - begun)
         return self._cast[which_shots]
 
-    def _geometry_of(self, study: FlightStudy, scanner: str) -> str:
-        if (id(study), scanner) not in self._geometry:
-            self._geometry[id(study), scanner] = study.spec.geometry_id(scanner)
-        return self._geometry[id(study), scanner]
+    def _flags(self, rung: Rung) -> np.ndarray:
+        called = [
+            self._called(rung, tiles, self._see(rung, tiles).eyepoints) for tiles in self._tiles
+        ]
+        return np.concatenate([each.flags for each, _ in called])
 
-    def _planned(
-        self, rung: Rung, study: FlightStudy, tiles: Tiles, cast: Cast
-    ) -> tuple[Called, float]:
-        """What is simulated of shots, and the time [s] that it took to say."""
+    def _called(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints) -> tuple[Called, float]:
+        """What is simulated of shots, planned in their tiles, and the time [s] that it took."""
         if rung.of_lines:
-            names = of_lines(self.effects(Rung(name="as written", kind=WRITTEN)))
-            return _everywhere(frozenset(names), cast.eyepoints), 0.0
+            flag = flags_of(np.array([[name in self.of_lines()] for name in NAMES]))[0]
+            flags = np.where(eyepoints.seen, flag, 0).astype(np.uint32)
+            return Called(flags, np.zeros(flags.size)), 0.0
         begun = thread_time()
-        called = _called(study, tiles, cast.eyepoints)
+        called = self._study(rung).call(tiles.part, eyepoints, tiles.index)
         return called, thread_time() - begun if rung.plans else 0.0
 
-    def _looked(
-        self, rung: Rung, study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints, called: Called
-    ) -> Seen:
+    def _look(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints, called: Called) -> Seen:
         """Statistics of shots, of those that see anything; more rays are cast where they must."""
-        whole = _nothing(len(called.flags))
-        accuracy, rays = study.rays_accuracy, eyepoints.weight.size
+        whole, study = nothing(len(called.flags)), self._study(rung)
+        accuracy = study.rays_accuracy
         if rung.rays_error:
             accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
         seen = np.flatnonzero(eyepoints.seen)
         for among, names, flags in called.some(seen).together():
-            index = seen[among]
-            look = partial(_look, study, tiles, names, look_of(rung), accuracy is not None)
-            error = _put(whole, index, look(eyepoints.some(index), flags))
+            look = partial(_statistics, study, tiles.part, names, look_of(rung))
+            group = _Group(
+                whole=whole,
+                index=seen[among],
+                numbers=tiles.index[seen[among]],
+                flags=flags,
+                look=partial(look, estimates=accuracy is not None),
+                cast=partial(self._finer_rays(rung).see, tiles.part.scanner),
+            )
+            error = group.put(np.arange(among.size), eyepoints.some(group.index))
             if accuracy is not None:
-                found = whole, index, flags, error
-                self._refine(study, tiles, rays, found, accuracy, look)
+                refine(eyepoints.weight.size, error, accuracy, group.cast_again)
         return whole
 
-    def _refine(
-        self,
-        study: FlightStudy,
-        tiles: Tiles,
-        rays: int,
-        found: tuple[Seen, np.ndarray, np.ndarray, np.ndarray],
-        accuracy: Accuracy,
-        look: Callable[[Eyepoints, np.ndarray], tuple[Seen, np.ndarray]],
-    ) -> None:
-        """As the study does where the tolerance says how many rays there are."""
-        whole, index, flags, error = found
-        if id(study) not in self._finer:
+    def _finer_rays(self, rung: Rung) -> FinerRays:
+        if rung.name not in self._finer:
             make = partial(_Caster, world=world_of(self.spec))
-            self._finer[id(study)] = FinerRays(study.spec, make)
-
-        def again(places: np.ndarray, more: int) -> np.ndarray:
-            some = index[places]
-            seen = self._finer[id(study)].see(tiles.part.scanner, tiles.index[some], more)
-            there, error = np.flatnonzero(seen.seen), np.zeros(len(some))
-            own = flags[places][there]
-            error[there] = _put(whole, some[there], look(seen.some(there), own))
-            return error
-
-        refine(rays, error, accuracy, again)
+            self._finer[rung.name] = FinerRays(self._study(rung).spec, make)
+        return self._finer[rung.name]
 
 
 def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
@@ -337,39 +282,14 @@ def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
     return np.asarray((cycles[:, None] * cycle + np.arange(cycle)).ravel())
 
 
-def _called(study: FlightStudy, tiles: Tiles, eyepoints: Eyepoints) -> Called:
-    """What is simulated of shots, planned in their tiles."""
-    number = len(tiles.index)
-    planned = study.planned(tiles.part, eyepoints, tiles.tile)
-    nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
-    return nothing if planned is None else planned.called(number)
-
-
-def _everywhere(names: frozenset[str], eyepoints: Eyepoints) -> Called:
-    """The same effects of every shot that sees anything."""
-    from sweep.model.effects.catalogue import NAMES
-
-    flag = flags_of(np.array([[name in names] for name in NAMES]))[0]
-    seen = eyepoints.seen
-    return Called(np.where(seen, flag, 0).astype(np.uint32), np.zeros(len(seen)))
-
-
-def _put(whole: Seen, index: np.ndarray, found: tuple[Seen, np.ndarray]) -> np.ndarray:
-    """Put statistics of some shots into those of all; what their rays leave."""
-    seen, error = found
-    for values, some in zip(whole, seen, strict=True):
-        values[index] = some
-    return error
-
-
-def _look(
+def _statistics(
     study: FlightStudy,
-    tiles: Tiles,
+    part: Part,
     names: tuple[str, ...],
     look: Look,
-    estimates: bool,
     eyepoints: Eyepoints,
     flags: np.ndarray | None = None,
+    estimates: bool = False,
 ) -> tuple[Seen, np.ndarray]:
     """Statistics of shots that see something, from a way to look at their spectra.
 
@@ -379,18 +299,40 @@ def _look(
     from sweep.model.ray_error import ray_error
     from sweep.model.shot import prepare_cast, statistics
 
-    given, ground = seen_ground(eyepoints, study.parameters_at(tiles.part), study.surfaces)
+    given, ground = seen_ground(eyepoints, study.parameters_at(part), study.surfaces)
     shots = prepare_cast(given, ground, names, flags)
     found = look(shots)
     rays = np.full(shots.size, float(eyepoints.weight.size))
-    seen = seen_in(statistics(shots, found), MEAN, 0)._replace(beamlets=rays)
-    error = np.zeros(shots.size)
-    if estimates:
-        bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
-        error = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
-    return seen, error
+    seen = seen_in(statistics(shots, found))._replace(beamlets=rays)
+    if not estimates:
+        return seen, np.zeros(shots.size)
+    bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+    return seen, ray_error(shots, ground.beamlets, bins, found[:, 2].T)
 
 
-def _nothing(shots: int) -> Seen:
-    sizes = ((shots, 4), (shots, 2), (shots, 2), (shots, 3), shots, shots, shots)
-    return Seen(*(np.full(size, np.nan) for size in sizes))
+@dataclass(frozen=True, kw_only=True)
+class _Group:
+    """Shots that are computed together, and where their statistics go."""
+
+    whole: Seen
+    """Statistics of all shots."""
+    index: np.ndarray
+    """Places of the group among them."""
+    numbers: np.ndarray
+    flags: np.ndarray
+    look: Callable[[Eyepoints, np.ndarray], tuple[Seen, np.ndarray]]
+    cast: Callable[[np.ndarray, int], Eyepoints]
+
+    def put(self, places: np.ndarray, eyepoints: Eyepoints) -> np.ndarray:
+        """Put statistics of some of the group into those of all; what their rays leave."""
+        seen, error = self.look(eyepoints, self.flags[places])
+        for values, some in zip(self.whole, seen, strict=True):
+            values[self.index[places]] = some
+        return error
+
+    def cast_again(self, places: np.ndarray, rays: int) -> np.ndarray:
+        """The same with more rays, of those that then see anything."""
+        eyepoints = self.cast(self.numbers[places], rays)
+        there, error = np.flatnonzero(eyepoints.seen), np.zeros(len(places))
+        error[there] = self.put(places[there], eyepoints.some(there))
+        return error

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.tasks.accuracy.bench import Bench, Seen, Trial
-from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, DRAWN, Ladder, Rung, ladder
-from sweep.tasks.accuracy.sample import spread
+from sweep.tasks.accuracy.bench import Bench, Seen, Trial, spread
+from sweep.tasks.accuracy.rungs import ADAPTIVE, ALL_ON, DRAWN, Ladder, ladder
 from sweep.tasks.progress import working
 
 if TYPE_CHECKING:
-    from sweep.tasks.accuracy.rungs import Declared
     from sweep.tasks.interrupt import Interrupts
     from sweep.tasks.progress import Progress
 
@@ -88,16 +86,7 @@ class Measurement:
     """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
 
     Each round takes them in an order of its own: a short trial takes longer after a long one, which
-    leaves nothing of it at hand.
-
-    Parameters
-    ----------
-    bench
-        The sample.
-    time_limit
-        Time that all may take [s], about.
-    told, interrupts
-        Where to say how far it is; what breaks it off.
+    leaves nothing of it at hand. All may take `time_limit` [s], about.
     """
 
     def __init__(
@@ -160,7 +149,7 @@ class Measurement:
             if rung.kind == ADAPTIVE
         }
         if not any(rung.kind == ALL_ON for rung in rungs.rungs):
-            return rungs
+            return rungs  # of draws
         sets = {t: self._bench.effects(at[t]) for t in FIXED_AS_AT if t in at}
         self._bench.forget()
         return rungs.with_fixed(sets)
@@ -226,11 +215,7 @@ class Measurement:
         return min(runs, key=lambda trial: trial.seconds)
 
     def _round(
-        self,
-        parts: list[np.ndarray],
-        *,
-        until: float,
-        first: list[list[Trial]] | None = None,
+        self, parts: list[np.ndarray], *, until: float, first: list[list[Trial]] | None = None
     ) -> list[list[Trial]]:
         """Every rung on every part that there is time for; the first at least, if uninterrupted.
 
@@ -273,9 +258,11 @@ class Measurement:
 
     def _add_truth(self, measured: Measured) -> None:
         """Points of the sample in the time domain, as many as there is time for."""
-        rung = self._in_time_domain()
-        if rung is not self._ladder.reference:
+        rung, beamlets = self._ladder.reference, "footprint.beamlets"
+        if beamlets in rung.overrides:
             measured.truth_beamlets = TRUTH_BEAMLETS
+            overrides = {**rung.overrides, beamlets: TRUTH_BEAMLETS}
+            rung = replace(rung, name="in time", overrides=overrides)
         for place in measured.done[spread(measured.done.shape, TRUTH_POINTS)].tolist():
             late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
             if self._interrupts.stopping or (late and len(measured.truth) >= LEAST_IN_TRUTH):
@@ -285,37 +272,16 @@ class Measurement:
                 measured.truth[place] = in_time, reference
         self._bench.forget()
 
-    def _in_time_domain(self) -> Rung:
-        """The reference, with no more beamlets than there is time for."""
-        reference = self._ladder.reference
-        if "footprint.beamlets" not in reference.overrides:
-            return reference
-        fewer: dict[str, Any] = {"footprint.beamlets": TRUTH_BEAMLETS}
-        return replace(reference, name="in time", overrides={**reference.overrides, **fewer})
-
-
-def bench_of(spec: Declared, points: int) -> Bench:
-    """A sample of a study's points."""
-    from sweep.spec import SceneSpec
-    from sweep.tasks.accuracy.flight_bench import FlightBench
-    from sweep.tasks.accuracy.grid_bench import GridBench
-
-    if isinstance(spec, SceneSpec):
-        return FlightBench(spec, points)
-    return GridBench(spec, points)
-
-
-def differences(measured: Measured) -> Iterator[tuple[str, np.ndarray]]:
-    """Errors of all rungs against the reference, (rungs, points) each, by name."""
-    reference = measured.seen[-1]
-    found = [apart(seen, reference) for seen in measured.seen]
-    for name, values in zip(ERRORS, zip(*found, strict=True), strict=True):
-        yield name, np.array(values)
-
 
 ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error", "leakage_error")
 PROMISED = 3
 """The first of these, which a tolerance promises to bound."""
+
+
+def differences(measured: Measured) -> dict[str, np.ndarray]:
+    """Errors of all rungs against the reference, (rungs, points) each, by name."""
+    found = [apart(seen, measured.seen[-1]) for seen in measured.seen]
+    return {name: np.array(v) for name, v in zip(ERRORS, zip(*found, strict=True), strict=True)}
 
 
 def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
@@ -323,16 +289,13 @@ def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
 
     Magnitudes in relation to the other, or to sigma where it is below that.
     """
-    pd, leakage = (
-        _chances_apart(one, two)
-        for one, two in ((seen.pd, other.pd), (seen.leakage, other.leakage))
-    )
     with np.errstate(divide="ignore", invalid="ignore"):
         pfa = np.abs(seen.log10_pfa - other.log10_pfa)
         least = np.maximum(other.magnitude, other.sigma[:, None])
         magnitude = np.abs(seen.magnitude - other.magnitude) / least
-    same = seen.log10_pfa == other.log10_pfa
-    pfa = np.where(same, 0.0, pfa)
+    pfa = np.where(seen.log10_pfa == other.log10_pfa, 0.0, pfa)
+    pd = _chances_apart(seen.pd, other.pd)
+    leakage = _chances_apart(seen.leakage, other.leakage)
     return tuple(np.fmax.reduce(values, axis=1) for values in (pd, pfa, magnitude, leakage))
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import process_time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,38 +14,42 @@ from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks import identity, store, versions
-from sweep.tasks.accuracy.bench import Bench
+from sweep.tasks.accuracy.bench import Bench, GridBench
+from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.measure import (
     POINTS,
     TIME_LIMIT,
     Measured,
     Measurement,
+    Nothing,
     apart,
-    bench_of,
     differences,
 )
 from sweep.tasks.accuracy.rungs import REFERENCE, THESIS, Rung
-from sweep.tasks.accuracy.storing import storing
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.interrupt import Interrupts
 from sweep.tasks.progress import Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
-from sweep.tasks.study import ArrayLayout
+from sweep.tasks.study import ArrayLayout, Study
 
 if TYPE_CHECKING:
+    from sweep.spec import SceneSpec, Spec
     from sweep.tasks.accuracy.rungs import Declared
 
+#: Of each part of storing; the first may import and open what the others find.
+TRIALS = 3
+
 _ABOUT = {
-    "pd_error": ("1", "largest error of a probability of detection, of segments and shot"),
-    "log10_pfa_error": ("1", "error of log10 of a probability of false alarm"),
-    "leakage_error": ("1", "error of a probability of leakage, of the two chirps"),
-    "magnitude_error": ("1", "error of the magnitude of the peak bins, over it or sigma if larger"),
-    "standard_error": ("1", "standard error that the setting itself tells, where it draws"),
+    "pd_error": "largest error of a probability of detection, of segments and shot",
+    "log10_pfa_error": "error of log10 of a probability of false alarm",
+    "leakage_error": "error of a probability of leakage, of the two chirps",
+    "magnitude_error": "error of the magnitude of the peak bins, over it or sigma if larger",
+    "standard_error": "standard error that the setting itself tells, where it draws",
 }
 
 
 def measure(
-    spec: Declared,
+    spec: Spec | SceneSpec,
     *,
     store_path: Location,
     points: int = POINTS,
@@ -53,12 +61,10 @@ def measure(
 
     Parameters
     ----------
-    spec
-        The study.
+    spec, points
+        The study; points of the sample.
     store_path
         Path of the store to make; it is there whole, or not at all.
-    points
-        Points of the sample.
     time_limit
         Time that trying may take [s], about.
     overwrite
@@ -78,8 +84,6 @@ def measure(
     SceneError
         Where a file of a scene is missing, changed or unfit.
     """
-    from sweep.tasks.accuracy.measure import Nothing
-
     if getattr(spec.draws, "whole_spectra", False):
         raise TaskError(
             "this study draws whole spectra, which have no settings to try: "
@@ -90,17 +94,24 @@ def measure(
     told = chosen(progress)
     with Interrupts() as interrupts:
         with working("choosing points", told):
-            bench = bench_of(spec, points)
+            bench = _bench_of(spec, points)
         try:
-            measured = Measurement(
+            measurement = Measurement(
                 bench, time_limit=time_limit, told=told, interrupts=interrupts
-            ).run()
+            )  # fmt: skip
+            measured = measurement.run()
         except Nothing:
             return False
-    stored = storing(study_of(spec, store_path))  # type: ignore[arg-type]
+    stored = storing(study_of(spec, store_path))
     _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
     store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
     return True
+
+
+def _bench_of(spec: Spec | SceneSpec, points: int) -> Bench:
+    from sweep.spec import SceneSpec
+
+    return FlightBench(spec, points) if isinstance(spec, SceneSpec) else GridBench(spec, points)
 
 
 def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
@@ -113,16 +124,44 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
     identity.refuse_to_replace(path)
 
 
-class Content:
-    """What the store holds: errors by rung and point, seconds by rung and round.
+def storing(study: Study) -> float:
+    """Processor time that making a study's store and writing all of its blocks takes [s].
 
-    Parameters
-    ----------
-    spec, bench, measured
-        The study, the sample of its points, and what rungs came to on it.
-    stored
-        Time that storing all of it takes [s].
+    Of blocks of zeros, which pack faster than results do: it is no more than what results take.
     """
+    block = study.n_blocks // 2
+    layouts = {layout.name: layout for layout in study.arrays()}
+    results = {}
+    for name, position in study.chunks(block).items():
+        layout = layouts[name]
+        sizes = zip(layout.shape, layout.chunks, position, strict=True)
+        extent = [min(cut, n - cut * place) for n, cut, place in sizes]
+        results[name] = np.zeros(extent, layout.dtype)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "study.zarr"
+
+        def make() -> None:
+            if path.exists():
+                store.remove(path)
+            store.create(path, study)
+
+        made = _least(make)
+        arrays = store.Arrays(path, study)
+        return made + study.n_blocks * _least(lambda: arrays.write(block, results))
+
+
+def _least(work: Callable[[], object]) -> float:
+    """Least processor time of a work in some trials [s]."""
+    spent = []
+    for _ in range(TRIALS):
+        begun = process_time()
+        work()
+        spent.append(process_time() - begun)
+    return min(spent)
+
+
+class Content:
+    """Content of the store: errors by rung and point, seconds by rung and round."""
 
     def __init__(self, spec: Declared, bench: Bench, measured: Measured, stored: float) -> None:
         self._spec, self._bench, self._measured, self._stored = spec, bench, measured, stored
@@ -135,7 +174,7 @@ class Content:
     def attributes(self) -> dict[str, Any]:
         """The spec, what the errors are taken against, and what was measured on."""
         measured = self._measured
-        found = {
+        return {
             "kind": ACCURACY,
             "title": self._spec.title,
             "question": "What does accuracy cost in time?",
@@ -143,15 +182,15 @@ class Content:
             "reference": measured.ladder.about,
             "environment": {"processor": versions.processor(), **versions.software()},
             "unit": self._bench.unit,
-            "points": len(self._measured.done),
+            "points": len(measured.done),
             "study_points": self._bench.whole,
             "storing_seconds": self._stored,
             "notes": list(measured.ladder.notes),
             "thesis_beamlets": self._thesis_beamlets(),
             "stopped": measured.stopped,
             "coordinates": " ".join(["kind", *self._bench.coordinates()]),
+            **self._truth(),
         }
-        return found | self._truth()
 
     def _truth(self) -> dict[str, Any]:
         """How far the reference is from the time domain, at the most; at how many points."""
@@ -178,40 +217,42 @@ class Content:
 
     def arrays(self) -> list[ArrayLayout]:
         """Coordinates, errors, seconds."""
+        return list(self._arrays())
+
+    def _arrays(self) -> Iterator[ArrayLayout]:
         measured, rungs = self._measured, self._measured.ladder.rungs
-        found = [
-            _array("rung", ("rung",), _texts(rung.name for rung in rungs)),
-            _array("kind", ("rung",), _texts(rung.kind for rung in rungs)),
-            _array("tolerance", ("rung",), np.array([_tolerance(r) for r in rungs]), "1",
-                   "tolerance of an adaptive setting"),
-            _array("times", ("rung",), measured.times, "1", "points of each stretch that is timed"),
-            _array("seconds", ("rung", "round"), measured.seconds, "s",
-                   "time a point on one core, planning included"),
-            _array("planning", ("rung", "round"), measured.planning, "s",
-                   "planning's share of it"),
-        ]  # fmt: skip
-        errors = dict(differences(measured))
+        yield _array("rung", ("rung",), _texts([rung.name for rung in rungs]))
+        yield _array("kind", ("rung",), _texts([rung.kind for rung in rungs]))
+        yield _array(
+            "tolerance", ("rung",), np.array([_tolerance(rung) for rung in rungs]),
+            units="1", long_name="tolerance of an adaptive setting",
+        )  # fmt: skip
+        yield _array(
+            "times", ("rung",), measured.times,
+            units="1", long_name="points of each stretch that is timed",
+        )  # fmt: skip
+        yield _array(
+            "seconds", ("rung", "round"), measured.seconds,
+            units="s", long_name="time a point on one core, planning included",
+        )  # fmt: skip
+        yield _array(
+            "planning", ("rung", "round"), measured.planning,
+            units="s", long_name="planning's share of it",
+        )  # fmt: skip
+        errors = differences(measured)
         errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
         for name, values in errors.items():
-            found.append(_array(name, ("rung", "point"), values, *_ABOUT[name]))
-        found.append(self._truth_array())
-        for name, (values, attributes) in self._bench.coordinates().items():
-            chosen_ = np.asarray(values)[measured.done]
-            layout = _array(
-                name, ("point",), _texts(chosen_) if chosen_.dtype == object else chosen_
-            )
-            layout.attributes.update(attributes)  # type: ignore[attr-defined]
-            found.append(layout)
-        return found
-
-    def _truth_array(self) -> ArrayLayout:
-        """Differences of pd between reference and time domain; nan where it was not looked at."""
-        measured = self._measured
-        values = np.full(len(measured.done), np.nan)
+            yield _array(name, ("rung", "point"), values, units="1", long_name=_ABOUT[name])
+        truth = np.full(len(measured.done), np.nan)
         for place, (in_time, reference) in measured.truth.items():
-            values[np.flatnonzero(measured.done == place)] = apart(in_time, reference)[0]
-        long_name = "difference of a probability of detection from the time domain's"
-        return _array("truth_pd_difference", ("point",), values, "1", long_name)
+            truth[np.flatnonzero(measured.done == place)] = apart(in_time, reference)[0]
+        about = "difference of a probability of detection from the time domain's"
+        yield _array("truth_pd_difference", ("point",), truth, units="1", long_name=about)
+        for name, (values, attributes) in self._bench.coordinates().items():
+            some = np.asarray(values)[measured.done]
+            yield _array(
+                name, ("point",), _texts(some) if some.dtype == object else some, **attributes
+            )  # fmt: skip
 
 
 def _tolerance(rung: Rung) -> float:
@@ -223,17 +264,13 @@ def _texts(values: Any) -> np.ndarray:
     return np.array(list(values), object)
 
 
-def _array(
-    name: str, dims: tuple[str, ...], values: np.ndarray, units: str = "", long_name: str = ""
-) -> ArrayLayout:
-    attributes = {"units": units, "long_name": long_name} if long_name else {}
-    text = values.dtype == object
+def _array(name: str, dims: tuple[str, ...], values: np.ndarray, **attributes: Any) -> ArrayLayout:
     return ArrayLayout(
         name=name,
         shape=values.shape,
         chunks=tuple(max(1, n) for n in values.shape),
         dims=dims,
-        dtype="string" if text else str(values.dtype),
+        dtype="string" if values.dtype == object else str(values.dtype),
         attributes=attributes,
         values=values,
     )

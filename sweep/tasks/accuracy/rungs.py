@@ -55,20 +55,14 @@ LONG_RUN = 10
 DRAWN_TOLERANCES = (1e-1, 3e-2, 1e-2)
 """Tolerances until which points are drawn."""
 
-MEAN, COUNTS = "mean", "counts"
-"""What is read off draws: the mean of each draw's probability, or how many were detected."""
-
-_TOLERANCE = "accuracy.tolerance"
-_BEAMLETS, _PATTERN = "footprint.beamlets", "footprint.pattern"
-_LINE = "line"
-_EXACTLY = dict.fromkeys(
-    ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), FINEST_TOLERANCE
-)
-
 DRAWN = "draws.number"
 """Field that holds the number of draws."""
 
-_LIMIT = "draws.limit"
+_TOLERANCE, _LIMIT = "accuracy.tolerance", "draws.limit"
+_BEAMLETS, _PATTERN, _LINE = "footprint.beamlets", "footprint.pattern", "line"
+_EXACTLY = dict.fromkeys(
+    ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), FINEST_TOLERANCE
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,17 +75,8 @@ class Rung:
         What it is called; one of the kinds above.
     overrides
         Values of fields of the spec by dotted path, as one would write them.
-    plans
-        Whether effects are planned, and the time that this takes counts.
-    of_lines
-        Whether only what the thesis's way can have is simulated: no effects within a record, no
-        leakage.
-    cells, degree, real, folded
-        Of the thesis's way, where the rung is that: cells of the grid, degree of the deposit,
-        whether powers are transformed as real numbers, and whether it goes back to the bins alone
-        (:mod:`sweep.tasks.accuracy.thesis_grid`); else 0.
-    estimate
-        What is read off draws.
+    thesis
+        Options of :func:`sweep.tasks.accuracy.thesis_grid.find`, where it finds the peaks.
     rays_error
         What the rays of a flight's shots may leave before they are cast with more; 0 where the
         spec says that.
@@ -100,14 +85,23 @@ class Rung:
     name: str
     kind: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    plans: bool = True
-    of_lines: bool = False
-    cells: int = 0
-    degree: int = 0
-    real: bool = False
-    folded: bool = False
-    estimate: str = MEAN
+    thesis: Mapping[str, Any] = field(default_factory=dict)
     rays_error: float = 0.0
+
+    @property
+    def of_lines(self) -> bool:
+        """Whether only what the thesis's way can have is simulated: nothing within a record."""
+        return self.kind in (CLOSED_FORM, THESIS, IMPROVED)
+
+    @property
+    def plans(self) -> bool:
+        """Whether effects are planned, and the time that this takes counts."""
+        return not self.of_lines and self.kind not in (FIXED, ALL_ON, REFERENCE)
+
+    @property
+    def counts(self) -> bool:
+        """Whether pd is how many draws were detected, not the mean of each one's probability."""
+        return self.kind in (COUNTED, IN_NOISE)
 
     def of(self, spec: Declared) -> Declared:
         """The spec with the overrides put onto it.
@@ -150,32 +144,34 @@ class Ladder:
     ) -> Ladder:
         """The ladder with rungs that simulate the same effects at every point.
 
-        Each of them to several tolerances, which say how exactly lines and leakage are computed.
-
         Parameters
         ----------
         sets
             Effects that a tolerance calls for anywhere.
         tolerances
-            For lines and leakage; those of the effects by default.
+            For lines and leakage, each tried with each set; those of the effects by default.
         """
-        from sweep.model.effects.catalogue import EFFECTS
-
         as_at: dict[frozenset[str], float] = {}
         for tolerance, names in sets.items():
             as_at.setdefault(names, tolerance)
-        further = []
-        for names, first in as_at.items():
-            modes = {
-                f"effects.{effect.name}": "on" if effect.name in names else "off"
-                for effect in EFFECTS
-            }
-            for tolerance in tolerances or sets:
-                name = f"{len(names)} effects as at {first:g}, to {tolerance:g}"
-                overrides = modes | self.fixed(tolerance) | {_TOLERANCE: tolerance}
-                further.append(Rung(name=name, kind=FIXED, overrides=overrides, plans=False))
+        further = [
+            Rung(
+                name=f"{len(names)} effects as at {first:g}, to {tolerance:g}",
+                kind=FIXED,
+                overrides=_modes(names) | self.fixed(tolerance) | {_TOLERANCE: tolerance},
+            )
+            for names, first in as_at.items()
+            for tolerance in tolerances or sets
+        ]
         place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
         return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
+
+
+def _modes(on: frozenset[str]) -> dict[str, str]:
+    """Some effects forced on, all others off."""
+    from sweep.model.effects.catalogue import NAMES
+
+    return {f"effects.{name}": "on" if name in on else "off" for name in NAMES}
 
 
 def ladder(spec: Declared) -> Ladder:
@@ -196,7 +192,7 @@ def ladder(spec: Declared) -> Ladder:
             for t in TOLERANCES
         ]
     every = _every_effect(spec)
-    rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every, plans=False))
+    rungs.append(Rung(name="all effects on", kind=ALL_ON, overrides=every))
     finest, about, rays_error = every | _EXACTLY, "all effects on", 0.0
     if why:
         notes.append(f"the number of beamlets is left alone: {why}")
@@ -206,13 +202,10 @@ def ladder(spec: Declared) -> Ladder:
     else:
         finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
-    rungs += _numbers(spec) if not why else ()
+    rungs += () if why else _numbers(_is_flight(spec))
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS}, powers_add(spec.parameters()))
-    reference = Rung(
-        name="reference", kind=REFERENCE, overrides=finest, plans=False, rays_error=rays_error
-    )
-    fixed = partial(_fixed_beamlets, spec, bool(why))
-    return Ladder((*rungs, reference), about, tuple(notes), fixed)
+    rungs.append(Rung(name="reference", kind=REFERENCE, overrides=finest, rays_error=rays_error))
+    return Ladder(tuple(rungs), about, tuple(notes), partial(_fixed_beamlets, spec, bool(why)))
 
 
 def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, Any]:
@@ -225,9 +218,8 @@ def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, 
     return {_BEAMLETS: min(next((n for n in NUMBERS if n >= least), MOST_RAYS), MOST_RAYS)}
 
 
-def _numbers(spec: Declared) -> Iterator[Rung]:
+def _numbers(flight: bool) -> Iterator[Rung]:
     """Fixed numbers of beamlets: in a lattice, and in a line where the ground is a plane."""
-    flight = _is_flight(spec)
     for n in NUMBERS:
         if not flight or n <= MOST_RAYS:
             yield Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
@@ -242,19 +234,16 @@ def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
     Before them the same beamlets with the same effects in closed form, like for like. ``powers``:
     whether beamlets add as such, which then are transformed as real numbers.
     """
-    like: dict[str, Any] = {"overrides": overrides, "plans": False, "of_lines": True}
-    yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, **like)
-    for power in (11, 12):
-        yield Rung(name=f"thesis 2^{power}", kind=THESIS, cells=1 << power, **like)
-    improved = like | {"kind": IMPROVED, "real": powers}
-    for power in (11, 12) if powers else ():
-        yield Rung(name=f"thesis 2^{power}, real", cells=1 << power, **improved)
-    for power, degree in ((11, 0), (12, 0), (12, 9)):
-        how = f"folded, degree {degree}" if degree else "folded"
-        yield Rung(
-            name=f"thesis 2^{power}, {how}", cells=1 << power, degree=degree, folded=True,
-            **improved,
-        )  # fmt: skip
+    yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, overrides=overrides)
+    forms: list[tuple[str, str, int, dict[str, Any]]] = [
+        *((THESIS, "", power, {}) for power in (11, 12)),
+        *((IMPROVED, ", real", power, {"real": True}) for power in (11, 12) if powers),
+        *((IMPROVED, ", folded", power, {"folded": True, "real": powers}) for power in (11, 12)),
+        (IMPROVED, ", folded, degree 9", 12, {"folded": True, "real": powers, "degree": 9}),
+    ]
+    for kind, how, power, options in forms:
+        thesis = {"size": 1 << power} | options
+        yield Rung(name=f"thesis 2^{power}{how}", kind=kind, overrides=overrides, thesis=thesis)
 
 
 def _drawn_ladder(spec: Declared) -> Ladder:
@@ -267,45 +256,30 @@ def _drawn_ladder(spec: Declared) -> Ladder:
             own = {path: longest}
             notes.append(f"with {longest} of the {written} draws that are written")
     rungs = [Rung(name="as written", kind=WRITTEN, overrides=own)]
-    may_stop = _may_stop(spec)
-    if may_stop:
-        rungs += [
-            Rung(
-                name=f"auto at {t:g}", kind=ADAPTIVE,
-                overrides={DRAWN: 0, _LIMIT: longest, _TOLERANCE: t},
-            )
-            for t in DRAWN_TOLERANCES
-        ]  # fmt: skip
-    noise, to_the_end = {"draws.method": "noise"}, {_LIMIT: 0} if may_stop else {}
+    may_stop = "limit" in type(spec.draws).model_fields  # draws until a tolerance is met
+    for t in DRAWN_TOLERANCES if may_stop else ():
+        until = {DRAWN: 0, _LIMIT: longest, _TOLERANCE: t}
+        rungs.append(Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=until))
+    to_the_end = {_LIMIT: 0} if may_stop else {}
     for number in DRAW_NUMBERS:
         each = {DRAWN: number} | to_the_end
+        noise = each | {"draws.method": "noise"}
         rungs += [
             Rung(name=f"{number} draws, mean", kind=MEANS, overrides=each),
-            Rung(name=f"{number} draws, counts", kind=COUNTED, overrides=each, estimate=COUNTS),
-            Rung(
-                name=f"{number} draws, noise", kind=IN_NOISE, overrides=each | noise,
-                estimate=COUNTS,
-            ),
-        ]  # fmt: skip
+            Rung(name=f"{number} draws, counts", kind=COUNTED, overrides=each),
+            Rung(name=f"{number} draws, noise", kind=IN_NOISE, overrides=noise),
+        ]
     other = {DRAWN: longest, "seed": int(spec.seed) ^ 1} | to_the_end
-    reference = Rung(
-        name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other, plans=False
-    )
-    about = f"{longest} other draws, all effects on"
-    return Ladder((*rungs, reference), about, tuple(notes))
-
-
-def _may_stop(spec: Declared) -> bool:
-    """Whether points can be drawn until their tolerance is met."""
-    return "limit" in type(spec.draws).model_fields
+    rungs.append(Rung(name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other))
+    return Ladder(tuple(rungs), f"{longest} other draws, all effects on", tuple(notes))
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
     """All effects on, each with the scene's own parameters."""
     from sweep.model.effects.catalogue import EFFECTS
 
-    may = {e.name for e in EFFECTS if not e.is_random or (_draws(spec) and not _is_flight(spec))}
-    return {f"effects.{effect.name}": "on" for effect in EFFECTS if effect.name in may}
+    random = _draws(spec)
+    return {f"effects.{e.name}": "on" for e in EFFECTS if random or not e.is_random}
 
 
 def _is_flight(spec: Declared) -> bool:
@@ -316,9 +290,7 @@ def _is_flight(spec: Declared) -> bool:
 
 def _draws(spec: Declared) -> bool:
     """Whether probabilities are means over draws: of a flight they are not."""
-    if _is_flight(spec):
-        return False
-    return spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0
+    return not _is_flight(spec) and (spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0)
 
 
 def _on_axis(spec: Declared, path: str) -> bool:
@@ -327,8 +299,7 @@ def _on_axis(spec: Declared, path: str) -> bool:
 
 def _beamlets_fixed(spec: Declared) -> str:
     """Why the number of beamlets is the scene's and not accuracy's; empty where it is."""
-    phases = spec.parameters()["footprint.phases"]
-    if phases == "coherent":
+    if spec.parameters()["footprint.phases"] == "coherent":
         return "with coherent phases it is part of the scene, as the thesis has it"
     if spec.instrument.receiver.architecture == "direct":
         return "in direct detection beamlets add as amplitudes, and are part of the scene"

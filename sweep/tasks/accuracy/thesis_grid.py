@@ -16,7 +16,6 @@ It is here to be compared with (`sweep accuracy`), and is as fast as it can fair
 befalls lines within a record (range walk, line width) it leaves out, and leakage beyond the grid.
 """
 
-from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -45,7 +44,7 @@ _ROWS = 32
 def find(
     shots: Shots, *, degree: int = 0, size: int = SIZE, real: bool = False, folded: bool = False
 ) -> np.ndarray:
-    """What each segment's spectrum holds, as :func:`sweep.model.shot.find`; no leakage.
+    """Largest bins of each segment's spectrum, as :func:`sweep.model.shot.find`; no leakage.
 
     Parameters
     ----------
@@ -69,8 +68,9 @@ def find(
     table, sizes = shots.point_table(), grid_sizes(shots, size)
     for cells in np.unique(sizes):
         for segment in np.flatnonzero(shots.segments):
-            for index in _batches(np.flatnonzero(sizes == cells)):
-                low, magnitude = _magnitudes(
+            members = np.flatnonzero(sizes == cells)
+            for index in np.split(members, range(_ROWS, members.size, _ROWS)):
+                low, magnitude = magnitudes(
                     shots, table, index, int(segment), int(cells), (degree, real, folded)
                 )
                 out = np.empty((6, index.size))
@@ -80,23 +80,6 @@ def find(
                 out[3] *= table[6, index]
                 found[segment][:, index] = out
     return found
-
-
-def spectrum(
-    shots: Shots, i: int, segment: int, *, degree: int = 0, size: int = SIZE, real: bool = False,
-    folded: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Bins around a point's lines, and |X| there, without noise, both (m,).
-
-    Parameters as of :func:`find`; ``i``, ``segment``: point; 0 up, 1 Doppler, 2 down.
-    """
-    cells = int(grid_sizes(shots, size)[i])
-    low, magnitude = _magnitudes(
-        shots, shots.point_table(), np.array([i]), segment, cells, (degree, real, folded)
-    )
-    bins = low[0] + np.arange(magnitude.shape[1])
-    within = (bins >= 0) & (bins <= shots.fft_size // 2)
-    return bins[within], magnitude[0, within]
 
 
 def grid_sizes(shots: Shots, least: int = SIZE) -> np.ndarray:
@@ -111,11 +94,7 @@ def grid_sizes(shots: Shots, least: int = SIZE) -> np.ndarray:
     return np.maximum(least, 2 ** needed.astype(np.int64))
 
 
-def _batches(index: np.ndarray) -> Iterator[np.ndarray]:
-    return (index[first : first + _ROWS] for first in range(0, index.size, _ROWS))
-
-
-def _magnitudes(
+def magnitudes(
     shots: Shots,
     table: np.ndarray,
     index: np.ndarray,

@@ -14,10 +14,9 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator
 from matplotlib.transforms import Bbox
 
+from sweep.analysis import accuracy as of
 from sweep.analysis import canvas, labels
-from sweep.analysis.accuracy import settings as of
-from sweep.analysis.accuracy import text
-from sweep.analysis.accuracy.settings import Setting, settings_in
+from sweep.analysis.accuracy import Setting, settings_in
 from sweep.analysis.opening import ACCURACY, read_attributes
 from sweep.storage.locations import Location, beside, zarr_store
 from sweep.storage.opening import CHECKED
@@ -62,16 +61,20 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
     """The figure of a store that `sweep accuracy` made."""
     drawn = of.candidates(settings)
     sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
-    _front(axes, of.front(drawn))
+    axes.step(
+        *zip(*map(_place, of.front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
+        linestyle="--", zorder=1, label="front of the best",
+    )  # fmt: skip
     names: list[Annotation] = []
     for kind, (marker, colour, words) in MARKS.items():
         some = of.of_kinds(drawn, kind)
         for i, setting in enumerate(some):
             _mark(axes, setting, marker, colour, words if i == 0 else "")
-        if kind in JOINED:
-            _join(axes, some, colour)
+        if kind in JOINED and some:
+            line = zip(*map(_place, some), strict=True)
+            axes.plot(*line, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
         names += _names(axes, some, above=kind not in BY_NUMBER)
-    _finish(axes, min(_shown(setting.quantile(0.5)) for setting in drawn))
+    _finish(axes, min(setting.quantile(0.5) for setting in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
     sheet.draw_without_rendering()
@@ -81,8 +84,8 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
 
 def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
     """A mark at the error that counts, a line down to pd's of 90 %, a dot at its median."""
-    time = 1e6 * setting.seconds
-    worst, most, half = map(_shown, (setting.error, setting.quantile(0.9), setting.quantile(0.5)))
+    time, worst = _place(setting)
+    most, half = (max(setting.quantile(share), FLOOR) for share in (0.9, 0.5))
     if most > FLOOR:
         axes.plot([time, time], [most, worst], color=colour, linewidth=1.0, alpha=0.6, zorder=2)
         axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
@@ -95,15 +98,9 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
     )  # fmt: skip
 
 
-def _join(axes: Axes, settings: Sequence[Setting], colour: str) -> None:
-    """A faint line through the settings of one method."""
-    times = [1e6 * setting.seconds for setting in settings]
-    errors = [_place(setting) for setting in settings]
-    axes.plot(times, errors, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
-
-
-def _place(setting: Setting) -> float:
-    return _shown(setting.error)
+def _place(setting: Setting) -> tuple[float, float]:
+    """Time [us] and error at which a setting is drawn."""
+    return 1e6 * setting.seconds, max(setting.error, FLOOR)
 
 
 def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotation]:
@@ -116,9 +113,8 @@ def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotat
             words = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             beside = together[-1] if above else together[0]
             name = axes.annotate(
-                words, (1e6 * beside.seconds, _place(beside)), xytext=PLACES[0],
-                textcoords="offset points", fontsize=7.5, color=MARKS[beside.kind][1],
-                path_effects=HALO, zorder=3,
+                words, _place(beside), xytext=PLACES[0], textcoords="offset points", fontsize=7.5,
+                color=MARKS[beside.kind][1], path_effects=HALO, zorder=3,
             )  # fmt: skip
             _put(name, PLACES[0 if above else 1])
             found.append(name)
@@ -133,7 +129,7 @@ def _put(name: Annotation, place: tuple[float, float]) -> None:
 
 def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Setting]) -> None:
     """Move names off marks and off each other, where another place beside their marks is free."""
-    marks = [axes.transData.transform((1e6 * s.seconds, _place(s))) for s in settings]
+    marks = [axes.transData.transform(_place(setting)) for setting in settings]
     half = MARK_SIZE / 2 * canvas.DPI / 72
     taken = [Bbox([mark - half, mark + half]) for mark in marks]
     for name in names:
@@ -161,8 +157,8 @@ def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
 
 def _alike(one: Setting, other: Setting) -> bool:
     """Tell whether two marks are too close for a name each."""
-    apart = np.log(one.seconds / other.seconds), np.log(_place(one) / _place(other))
-    return abs(apart[0]) < 0.25 and abs(apart[1]) < 1.2
+    apart = np.abs(np.log(_place(one)) - np.log(_place(other)))
+    return bool((apart < (0.25, 1.2)).all())
 
 
 def _short(setting: Setting) -> str:
@@ -174,20 +170,6 @@ def _short(setting: Setting) -> str:
     if setting.kind in BY_NUMBER:
         return setting.name.split()[0]
     return ""
-
-
-def _front(axes: Axes, best: Sequence[Setting]) -> None:
-    """The front as steps: what can be had for a time."""
-    times = [1e6 * setting.seconds for setting in best]
-    errors = [_shown(setting.error) for setting in best]
-    axes.step(
-        times, errors, where="post", color="0.35", linewidth=1.2, linestyle="--", zorder=1,
-        label="front of the best",
-    )  # fmt: skip
-
-
-def _shown(error: float) -> float:
-    return max(error, FLOOR)
 
 
 def _finish(axes: Axes, least: float) -> None:
@@ -218,7 +200,7 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
         f"reference: {attributes['reference']}",
     ]
     if attributes["truth_points"]:
-        difference = text.error(attributes["truth_pd_difference"])
+        difference = of.error(attributes["truth_pd_difference"])
         parts.append(
             f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
             f"{difference} of it"
@@ -248,5 +230,5 @@ def draw(store: Location, directory: Path | None = None, form: str = "png") -> l
     place = beside(store) if directory is None else directory
     file = place / f"{stem}.txt"
     drawn = canvas.save(sheet(dataset, settings), place / f"{stem}.{form}")
-    file.write_text(text.page(dataset, settings).text(), encoding="utf-8")
+    file.write_text(of.page(dataset, settings).text(), encoding="utf-8")
     return [drawn, file]

@@ -4,16 +4,15 @@ from fractions import Fraction
 
 import numpy as np
 
-Vector = tuple[Fraction, Fraction, Fraction]
+Vector = list[Fraction]
 
 
 def fractions(values: np.ndarray) -> Vector:
-    x, y, z = (Fraction(float(v)) for v in values)
-    return x, y, z
+    return [v if isinstance(v, Fraction) else Fraction(float(v)) for v in values]
 
 
 def less(a: Vector, b: Vector) -> Vector:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return [x - y for x, y in zip(a, b, strict=True)]
 
 
 def volume(a: Vector, b: Vector, c: Vector) -> Fraction:
@@ -25,31 +24,36 @@ def volume(a: Vector, b: Vector, c: Vector) -> Fraction:
     )
 
 
-def plane_distance(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> Fraction | None:
-    """Where a triangle's plane is met, in lengths of d; None if the ray lies along it."""
+def met(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> tuple[Fraction, bool] | None:
+    """Distance to a triangle's plane in lengths of d, and whether the ray meets the triangle.
+
+    By the volumes that the ray spans with the edges; rims are inside. None where it runs along the
+    plane.
+    """
     start, along = fractions(o), fractions(d)
     a, b, c = (less(fractions(v), start) for v in corners)
-    total = volume(along, b, c) + volume(along, c, a) + volume(along, a, b)
-    return volume(a, b, c) / total if total else None
+    parts = volume(along, b, c), volume(along, c, a), volume(along, a, b)
+    if not sum(parts):
+        return None
+    t = volume(a, b, c) / sum(parts)
+    return t, t > 0 and (min(parts) >= 0 or max(parts) <= 0)
 
 
 def nearest(
     vertices: np.ndarray, faces: np.ndarray, o: np.ndarray, d: np.ndarray
-) -> Fraction | None:
-    """Distance to the nearest triangle, rims included; None where the ray meets none."""
+) -> tuple[Fraction, int] | None:
+    """Distance to the nearest triangle and its number; None where the ray meets none."""
     corners = vertices[faces]
     centre = corners.mean(axis=1)
     radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
     away = centre - o
     aside = np.einsum("ij,ij->i", away, away) - (away @ d) ** 2
     close = aside <= (1.001 * radius + 1e-6 * np.linalg.norm(away, axis=1)) ** 2
-    start, along, best = fractions(o), fractions(d), None
-    for triangle in corners[close]:
-        a, b, c = (less(fractions(v), start) for v in triangle)
-        parts = volume(along, b, c), volume(along, c, a), volume(along, a, b)
-        if sum(parts) and (min(parts) >= 0 or max(parts) <= 0):
-            t = volume(a, b, c) / sum(parts)
-            best = t if t > 0 and (best is None or t < best) else best
+    best = None
+    for face in np.flatnonzero(close):
+        found = met(corners[face], o, d)
+        if found and found[1] and (best is None or found[0] < best[0]):
+            best = found[0], int(face)
     return best
 
 

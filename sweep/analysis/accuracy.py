@@ -1,0 +1,392 @@
+"""Settings that `sweep accuracy` tried: errors and times, who beats whom, in tables and words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.tabular import Block, Page
+
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+EXACT = 1e-9
+"""Error below which settings are alike: that of the reference itself."""
+
+WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
+CLOSED_FORM, IMPROVED = "closed form", "thesis improved"
+BEAMLETS, IN_A_LINE = "beamlets", "in a line"
+MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
+FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COUNTED, IN_NOISE)
+"""Kinds of settings that are the same at every point."""
+
+AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0
+"""What adaptive settings are held to: against the best fixed one, against the thesis's way."""
+
+OF_THESIS = 109
+"""Beamlets of the thesis's way."""
+
+FEW_ROUNDS = 3
+"""Rounds of which fewer have no median that one slow trial would not move."""
+
+LIKELY = 0.95
+"""Share of the points whose error counts where errors are random; else all of them do."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A rung, in numbers."""
+
+    name: str
+    kind: str
+    tolerance: float
+    rounds: np.ndarray
+    """Seconds a point by round."""
+    planning: float
+    """Seconds a point in the best round."""
+    pd_error: np.ndarray
+    """By point."""
+    log10_pfa_error: float
+    """Largest over the points; nan where it has none, as the next two."""
+    magnitude_error: float
+    leakage_error: float
+    """No part of what is promised: it jumps where a bin comes to the threshold."""
+    likely: float
+    """Share of the points that :attr:`error` is of."""
+
+    @property
+    def seconds(self) -> float:
+        """A point, in the best of the rounds."""
+        return float(np.min(self.rounds))
+
+    @property
+    def error(self) -> float:
+        """That which counts: the largest over the points, of all that a tolerance promises.
+
+        Where it is random, that of pd at most of the points.
+        """
+        if self.likely < 1.0:
+            return self.quantile(self.likely)
+        promised = self.quantile(1.0), self.log10_pfa_error, self.magnitude_error
+        return float(np.fmax.reduce(promised))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it simulates all that the study asks for: the thesis's effects have no leakage.
+
+        They do where leaving it out is no larger an error than those promised.
+        """
+        return self.kind != CLOSED_FORM or self.leakage_error <= max(self.error, EXACT)
+
+    def quantile(self, share: float) -> float:
+        """Error of pd that this share of the points stays below."""
+        return float(np.nanquantile(self.pd_error, share))
+
+    def times_faster(self, other: Setting, besides: float = 0.0) -> float:
+        """Time of another over that of this, round by round, in the median; of few, at best.
+
+        Both with what a point takes besides [s].
+        """
+        if self.rounds.size < FEW_ROUNDS:
+            return (other.seconds + besides) / (self.seconds + besides)
+        return float(np.median((other.rounds + besides) / (self.rounds + besides)))
+
+
+def settings_in(dataset: xr.Dataset) -> list[Setting]:
+    """The settings of a store that `sweep accuracy` made, in its order."""
+    found = []
+    likely = LIKELY if np.isfinite(dataset.standard_error.values).any() else 1.0
+    for i in range(dataset.sizes["rung"]):
+        rung = dataset.isel(rung=i)
+        rounds = rung.seconds.values
+        largest = {
+            name: float(np.fmax.reduce(rung[name].values))
+            for name in ("log10_pfa_error", "magnitude_error", "leakage_error")
+        }
+        found.append(
+            Setting(
+                name=str(rung.rung.values),
+                kind=str(rung.kind.values),
+                tolerance=float(rung.tolerance),
+                rounds=rounds,
+                planning=float(rung.planning.values[np.argmin(rounds)]),
+                pd_error=rung.pd_error.values,
+                likely=likely,
+                **largest,
+            )
+        )
+    return found
+
+
+def of_kinds(settings: Iterable[Setting], *kinds: str) -> list[Setting]:
+    """Settings of some kinds."""
+    return [setting for setting in settings if setting.kind in kinds]
+
+
+def candidates(settings: Iterable[Setting]) -> list[Setting]:
+    """All but the reference, which has no error of its own."""
+    return [setting for setting in settings if setting.kind != REFERENCE]
+
+
+def front(settings: Sequence[Setting]) -> list[Setting]:
+    """Settings that no other is both as fast and as accurate as, the fastest first."""
+    best: list[Setting] = []
+    for setting in sorted(settings, key=lambda s: (s.seconds, s.error)):
+        if not best or max(setting.error, EXACT) < max(best[-1].error, EXACT):
+            best.append(setting)
+    return best
+
+
+def cheapest(settings: Sequence[Setting], error: float) -> Setting | None:
+    """The fastest setting whose error is no larger."""
+    allowed = max(error, EXACT)
+    fitting = [setting for setting in settings if setting.error <= allowed]
+    return min(fitting, key=lambda s: s.seconds, default=None)
+
+
+@dataclass(frozen=True)
+class Duel:
+    """An adaptive setting against another, both with no more than an error; None where none is."""
+
+    adaptive: Setting
+    other: Setting | None
+
+    @property
+    def times_faster(self) -> float:
+        """How many times faster the adaptive one is; inf against nothing."""
+        return self.with_besides(0.0)
+
+    def with_besides(self, seconds: float) -> float:
+        """The same, with what both take besides [s], a point."""
+        return self.adaptive.times_faster(self.other, seconds) if self.other else float("inf")
+
+
+def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
+    """For each error that adaptive settings have: the fastest of them, the fastest fixed one.
+
+    What leaves leakage out, where there is some, does less than they do, and is none of these.
+    """
+    adaptive = of_kinds(settings, ADAPTIVE)
+    fixed = [setting for setting in of_kinds(settings, *FIXED) if setting.is_whole]
+    errors = sorted({max(setting.error, EXACT) for setting in adaptive}, reverse=True)
+    best = ((cheapest(adaptive, error), error) for error in errors)
+    return [Duel(own, cheapest(fixed, error)) for own, error in best if own is not None]
+
+
+def against_thesis(settings: Sequence[Setting], kind: str = THESIS) -> list[Duel]:
+    """The fastest adaptive setting that is as accurate as the thesis's way, for each form of it.
+
+    `kind`: as it is described, or improved.
+    """
+    adaptive = of_kinds(settings, ADAPTIVE)
+    best = ((cheapest(adaptive, each.error), each) for each in of_kinds(settings, kind))
+    return [Duel(own, thesis) for own, thesis in best if own is not None]
+
+
+COLUMNS = ("setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
+           "magnitude", "leakage", "front")  # fmt: skip
+"""Time, its share of planning, and errors: three quantiles of pd's, the largest of the others."""
+
+
+SHORT = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
+"""The same in few columns."""
+
+CHEAPEST = ("error allowed", "cheapest setting", "us a point", "its error")
+
+STORING = "storing_seconds"
+"""Attribute that stores of earlier versions lack."""
+
+
+def rows(settings: Sequence[Setting]) -> list[list[str]]:
+    """A row for each setting, by COLUMNS."""
+    best = front(candidates(settings))
+    return [
+        [
+            s.name,
+            microseconds(s.seconds),
+            microseconds(s.planning) if s.planning else "-",
+            *(error(s.quantile(share)) for share in (0.5, 0.9, 1.0)),
+            *map(error, (s.log10_pfa_error, s.magnitude_error, s.leakage_error)),
+            "*" if s in best else "",
+        ]
+        for s in settings
+    ]
+
+
+def short_rows(settings: Sequence[Setting]) -> list[list[str]]:
+    """The same by SHORT: those on the front have a star before their names."""
+    return [
+        [f"{star or ' '} {name}", f"{time} us", *errors]
+        for name, time, _, _, *errors, star in rows(settings)
+    ]
+
+
+def cheapest_rows(settings: Sequence[Setting]) -> list[list[str]]:
+    """The cheapest setting for each tolerance: tolerance, setting, its time, its error."""
+    found = []
+    for tolerance in TOLERANCES:
+        best = cheapest(candidates(settings), tolerance)
+        told = best and [best.name, microseconds(best.seconds), error(best.error)]
+        found.append([f"{tolerance:g}", *(told or ["none", "", ""])])
+    return found
+
+
+def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
+    """What it comes to, in words."""
+    attributes = dataset.attrs
+    found = [_written(dataset, settings)]
+    found += _fixed(against_fixed(settings), attributes)
+    found += _thesis(settings, attributes["thesis_beamlets"]) + _like_for_like(settings)
+    found.append(_reference(attributes))
+    found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
+    found += [_partial(attributes)] if attributes["stopped"] else []
+    return found
+
+
+def page(dataset: xr.Dataset, settings: Sequence[Setting]) -> Page:
+    """Tables and sentences under the study's title."""
+    blocks = [
+        Block("Settings", COLUMNS, rows(settings)),
+        Block("Cheapest setting for each error", CHEAPEST, cheapest_rows(settings)),
+    ]
+    return Page(f"{dataset.attrs['title']}: accuracy", blocks, sentences(dataset, settings), [])
+
+
+def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
+    (written,) = of_kinds(settings, WRITTEN)
+    number, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
+    best = cheapest(candidates(settings), written.error)
+    whole = f"all {number:,} {unit} take" if number > 1 else "that is"
+    text = (
+        f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
+        f"{whole} {_time(number * written.seconds)} on one core"
+    )
+    if (stored := dataset.attrs.get(STORING)) is not None:
+        text += f", and at least {_time(stored)} to be stored, whatever the setting"
+    if best is None or best is written or best.times_faster(written) < 1.05:
+        return text + ". Nothing tried is faster and as accurate."
+    return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
+
+
+def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
+    """Statement on adaptive against fixed settings."""
+    if not duels:
+        return []
+    worst = min(duels, key=lambda duel: duel.times_faster)
+    if worst.other is None:
+        return ["At equal error: no fixed setting is as accurate as any adaptive one."]
+    kept = "kept" if worst.times_faster >= AS_FAST else _lost(worst, duels, attributes)
+    several = [duel.times_faster for duel in duels if duel.other]
+    return [
+        f"At equal error, adaptive against the best single fixed setting: {_span(several)} times "
+        f"as fast; least {worst.adaptive.name} against {worst.other.name}. "
+        f"Never slower by more than 10 %: {kept}."
+    ]
+
+
+def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
+    """By how much an adaptive setting is slower, and what that is of all that the study takes.
+
+    However few points a study has, its store is to be made, which is most of what it takes then.
+    """
+    points = attributes["study_points"]
+    slower = worst.adaptive.seconds * (1 - worst.times_faster)
+    lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
+    told = f"NOT kept, by {lost} in all; planning takes {planning}"
+    if (stored := attributes.get(STORING)) is None:
+        return told
+    whole = min(duel.with_besides(stored / points) for duel in duels)
+    return f"{told}; with the study's store it is {whole:.2g} times as fast"
+
+
+def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
+    """Statement on adaptive settings against the thesis's way, as described and improved.
+
+    What they are held to is against its own number of beamlets.
+    """
+    duels = against_thesis(settings)
+    if not duels:
+        return []
+    kept = " and ".join(
+        f"{'kept' if duel.times_faster >= TIMES_FASTER else 'NOT kept'} against {_name(duel)}"
+        for duel in duels
+    )
+    least = f"At least {TIMES_FASTER:g} times as fast: {kept}."
+    if beamlets != OF_THESIS:
+        least = f"With this scene's {beamlets} beamlets, that is, where the thesis has {OF_THESIS}."
+    told = [f"Against the thesis's way at the error that it has: {_told(duels)}. {least}"]
+    if improved := against_thesis(settings, IMPROVED):
+        told.append(f"Against what it can be improved to: {_told(improved)}.")
+    return told
+
+
+def _told(duels: Sequence[Duel]) -> str:
+    return "; ".join(
+        f"{duel.adaptive.name} is {duel.times_faster:.2g} times as fast as {_name(duel)} "
+        f"(error {error(duel.other.error)})"
+        for duel in duels
+        if duel.other
+    )
+
+
+def _name(duel: Duel) -> str:
+    return duel.other.name if duel.other else ""
+
+
+def _like_for_like(settings: Sequence[Setting]) -> list[str]:
+    """The same beamlets with the same effects: the closed form against the thesis's way."""
+    told = [
+        f"{closed.times_faster(thesis):.2g} times as fast as {thesis.name}"
+        for closed in of_kinds(settings, CLOSED_FORM)
+        for thesis in of_kinds(settings, THESIS, IMPROVED)
+    ]
+    if not told:
+        return []
+    return [
+        "Like for like, the same beamlets and effects (none within a record, as range walk, and no "
+        f"leakage), the closed form is {', '.join(told)}."
+    ]
+
+
+def _reference(attributes: dict) -> str:
+    text = f"Reference: {attributes['reference']}"
+    if not attributes["truth_points"]:
+        return text + ", not held against the time domain."
+    fewer = f", with {n} beamlets in both," if (n := attributes["truth_beamlets"]) else ""
+    return text + (
+        f"; at {attributes['truth_points']} {attributes['unit']}{fewer} it is within "
+        f"{error(attributes['truth_pd_difference'])} of the time domain's pd, within "
+        f"{error(attributes['truth_magnitude_difference'])} of its magnitudes."
+    )
+
+
+def _partial(attributes: dict) -> str:
+    reason = attributes["stopped"]
+    return f"Not the whole sample ({reason}): {attributes['points']} {attributes['unit']} of it."
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
+
+
+def _time(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:,.0f} min" if seconds < 6000 else f"{seconds / 3600:,.0f} h"
+
+
+def microseconds(seconds: float) -> str:
+    """A time in microseconds, in three digits."""
+    value = 1e6 * seconds
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def error(value: float) -> str:
+    """An error in two digits; 0 below what counts, nothing for nan."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.1e}" if value >= EXACT else f"<{EXACT:.0e}".replace("e-0", "e-")

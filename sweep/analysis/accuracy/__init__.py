@@ -1,1 +1,0 @@
-"""What accuracy costs in time, read from the store of `sweep accuracy`."""
