@@ -31,7 +31,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 53_705, "modules": 281, "lines of the model": 17_386, "modules of the model": 67,
+    "lines": 53_321, "modules": 276, "lines of the model": 17_386, "modules of the model": 67,
     "compiled functions": 125, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
