@@ -19,9 +19,12 @@ MAY_IMPORT = {
     "tasks": {"tasks", "extras", "storage", "spec", "scenes", "model", "units"},
     "analysis": {"analysis", "storage", "spec", "scenes", "model", "units"},
     "report": {"report", "analysis", "storage", "spec", "scenes", "model", "units"},
-    "cli": {"cli", "extras", "tasks", "report", "analysis", "storage", "spec", "scenes", "model", "units"},
+    "cli": {
+        "cli", "extras", "tasks", "report", "analysis", "storage", "spec", "scenes", "model",
+        "units",
+    },
     "__init__": {"tasks", "analysis", "spec"},
-}
+}  # fmt: skip
 """Imports run one way; analysis and report read stores, however they were computed."""
 
 NOT_IN_THE_MODEL = {
