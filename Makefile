@@ -1,24 +1,32 @@
 # `make demo` and `make test` set up everything they need; the rest builds on the same environment.
 PYTHON ?= python3
 BIN := .venv/bin
+CORE := .venv/.core
 READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
-$(READY): pyproject.toml requirements.lock
+# What grids and figures need; the demo needs no more.
+$(CORE): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
+	$(TIMED) "core" $(MAKE) --no-print-directory install-core
+	touch $@
+
+install-core:
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --constraint requirements.lock --editable .
+
+$(READY): $(CORE)
 	$(TIMED) "install" $(MAKE) --no-print-directory install
 	touch $@
 
 install:
-	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --requirement requirements.lock
-	$(BIN)/pip install --quiet --no-deps --editable .
 
-demo: $(READY)
+demo: $(CORE)
 	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
 	$(BIN)/sweep figures results/quickstart.zarr
 

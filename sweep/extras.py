@@ -4,7 +4,7 @@ EXTRAS = {
     "laspy": "scenes", "rasterio": "scenes", "trimesh": "scenes",
     "itables": "report", "jinja2": "report", "plotly": "report",
     "obstore": "cloud",
-    "asyncssh": "clusters", "cryptography": "clusters", "dask_jobqueue": "clusters",
+    "asyncssh": "clusters", "dask_jobqueue": "clusters",
     "dask_kubernetes": "kubernetes", "httpx": "kubernetes", "kr8s": "kubernetes",
 }  # fmt: skip
 """Extra of `pyproject.toml` that installs a module."""
