@@ -361,7 +361,7 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
 
 def warn_of_beam(study: Spec | SceneSpec) -> None:
     """Say where a beam is narrower than its aperture makes it."""
-    from sweep.spec.beam_check import too_narrow
+    from sweep.spec.grid_rules import too_narrow
 
     if told := too_narrow(study.parameters_off_axes(), study.axes):
         click.echo(f"warning: {told}", err=True)

@@ -2,7 +2,6 @@
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.clusters import AnyCluster, cluster_of, load_cluster
-from sweep.spec.experiment import Spec
 from sweep.spec.figures import (
     FalseAlarmTable,
     Figure,
@@ -27,6 +26,7 @@ from sweep.spec.sections import (
     Storage,
     Target,
 )
+from sweep.spec.study import Spec
 
 __all__ = [
     "Accuracy",

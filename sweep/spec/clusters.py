@@ -6,75 +6,151 @@ bytes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from pydantic import PrivateAttr, ValidationError
 
-import sweep.spec.cluster_fields as of
-from sweep.spec.cluster_fields import Bounds, Texts, Variables, WorkerNumber, word
-from sweep.spec.instrument import Part
-from sweep.spec.list_rules import File
+import sweep.spec.declaring as of
 from sweep.spec.mistakes import ABSENT, Finding, SpecError, near_miss
-from sweep.spec.quantities import count
-from sweep.spec.reading import Document, plain, read_document
-from sweep.spec.rules import Text
-from sweep.spec.translation import findings_of
+from sweep.spec.parts import Part
+from sweep.spec.reading import Document, findings_of, plain, read_document
+from sweep.spec.rules import Numeric, Rule, Special, Text
+from sweep.units import QuantityError
 
 LOOPBACK = "127.0.0.1"
+_COUNT = Numeric(about="Workers", example="8", at_least="1", at_most="100000", whole=True)
+_BOUNDS = "write e.g. {least: 2, most: 40}"
+
+
+class Bounds(NamedTuple):
+    """Workers at least and at most; the same where their number is fixed."""
+
+    least: int
+    most: int
+
+
+def _read_number(written: object) -> Bounds:
+    """A number of workers, or bounds that it is kept within."""
+    if not isinstance(written, Mapping):
+        try:
+            return Bounds(_COUNT.read(written), _COUNT.read(written))
+        except QuantityError as error:
+            raise QuantityError(error.rule, "write e.g. 8 or {least: 2, most: 40}") from None
+    if written.keys() != {"least", "most"}:
+        raise QuantityError("must have a least and a most", _BOUNDS)
+    ends = {}
+    for name in ("least", "most"):
+        try:
+            ends[name] = _COUNT.read(written[name])
+        except QuantityError as error:
+            raise QuantityError(f"has a {name} that {error.rule}", _BOUNDS) from None
+    if ends["least"] > ends["most"]:
+        raise QuantityError("has a least above its most", "write the smaller number as least")
+    return Bounds(**ends)
+
+
+def _read_variables(written: object) -> dict[str, str]:
+    """Environment variables by name."""
+    example = "write e.g. {TMPDIR: /scratch}"
+    if not isinstance(written, Mapping):
+        raise QuantityError("must be a mapping of names to values", example)
+    for name, value in written.items():
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", str(name)):
+            raise QuantityError(f"holds '{name}', which is no name of a variable", example)
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise QuantityError(f"holds no text for {name}", example)
+        if re.search(r"[\n\r\0']", str(value)):
+            raise QuantityError(f"holds a quote or more than a line for {name}", example)
+    return {str(name): str(value) for name, value in written.items()}
+
+
+def _number(about: str, default: Any = ...) -> Any:
+    return of.field(Special(about=about, reader=_read_number), default)
+
+
+def _one_word(about: str, example: str) -> Text:
+    """Rule of one word on a command line: no blanks, no quotes, nothing that a shell reads."""
+    remedy = f"write one word, such as '{example}'"
+    pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
+    return Text(about=about, example=example, pattern=pattern, remedy=remedy)
+
+
+def _word(about: str, example: str, default: Any = ...) -> Any:
+    return of.field(_one_word(about, example), default)
+
+
+def _texts(about: str, rule: Rule, least: int = 0, default: Any = ...) -> Any:
+    return of.several(rule, least, 100_000, default, about=about, noun="texts")
+
+
+def _lines(about: str, example: str) -> Any:
+    line = Text(
+        about="One line", example=example, pattern=r"[^\n\r\0]{1,2000}", remedy="write one line"
+    )
+    return _texts(about, line, default=())
+
+
+def _memory(about: str, default: Any = ...) -> Any:
+    """An amount of memory [byte]."""
+    return of.quantity(about, "byte", "4 GB", "64 MB", "100 TB", default=default)
 
 
 class Security(Part):
     """Certificates with which all parts know each other, in PEM: traffic is TLS throughout."""
 
-    ca: Annotated[str, File(about="Certificate of the authority that signed the others")]
-    certificate: Annotated[str, File(about="Certificate of scheduler, workers and client")]
-    key: Annotated[str, File(about="Its private key")]
+    ca: str = of.file("Certificate of the authority that signed the others")
+    certificate: str = of.file("Certificate of scheduler, workers and client")
+    key: str = of.file("Its private key")
+
+
+def _threads() -> Any:
+    return of.count("Threads, each with a block of its own", "1", at_most="1000", default=1)
 
 
 class Worker(Part):
     """One worker process."""
 
-    threads: Annotated[int, count("Threads, each with a block of its own", "1", at_most="1000")] = 1
-    memory: Annotated[float, of.memory("Memory that it may take")]
+    threads: int = _threads()
+    memory: float = _memory("Memory that it may take")
 
 
 class LocalWorker(Part):
     """One worker process of this machine."""
 
-    threads: Annotated[int, count("Threads, each with a block of its own", "1", at_most="1000")] = 1
-    memory: Annotated[
-        float | None, of.memory("Memory that it may take; without one, its share of 90 % of it")
-    ] = None
+    threads: int = _threads()
+    memory: float | None = _memory(
+        "Memory that it may take; without one, its share of 90 % of it", None
+    )
 
 
 class Scheduler(Part):
     """Where the scheduler listens: to this machine alone unless told otherwise."""
 
-    host: Annotated[str, word("Address that workers reach it by", "10.0.0.5")] = ""
-    interface: Annotated[str, word("Or the network interface that it has", "ib0")] = ""
-    port: Annotated[int, count("Port; 0 for any", "8786", at_least="0", at_most="65535")] = 0
-    dashboard: Annotated[
-        str, word("Address of the dashboard; port 0 for any", f"{LOOPBACK}:8787")
-    ] = f"{LOOPBACK}:8787"
+    host: str = _word("Address that workers reach it by", "10.0.0.5", "")
+    interface: str = _word("Or the network interface that it has", "ib0", "")
+    port: int = of.count("Port; 0 for any", "8786", "0", "65535", default=0)
+    dashboard: str = _word(
+        "Address of the dashboard; port 0 for any", f"{LOOPBACK}:8787", f"{LOOPBACK}:8787"
+    )
 
 
 class Job(Part):
     """One job of a batch system, with one worker or several."""
 
-    workers: Annotated[int, count("Workers of one job", "8", at_most="1000")] = 1
-    walltime: Annotated[float, of.walltime("Time that a job may take; workers leave before it")]
-    queue: Annotated[str, word("Queue or partition", "normal")] = ""
-    account: Annotated[str, word("Account that is charged", "lidar")] = ""
-    directives: Annotated[
-        tuple[str, ...], Texts(about="Further options of the job", example="--exclusive")
-    ] = ()
-    prologue: Annotated[
-        tuple[str, ...],
-        Texts(about="Shell lines before the worker starts", example="module load python/3.12"),
-    ] = ()
-    logs: Annotated[str, word("Directory for what jobs print", "logs")] = "logs"
+    workers: int = of.count("Workers of one job", "8", at_most="1000", default=1)
+    walltime: float = of.duration(
+        "Time that a job may take; workers leave before it", "2 h", "1 min", "365 d"
+    )
+    queue: str = _word("Queue or partition", "normal", "")
+    account: str = _word("Account that is charged", "lidar", "")
+    directives: tuple[str, ...] = _lines("Further options of the job", "--exclusive")
+    prologue: tuple[str, ...] = _lines(
+        "Shell lines before the worker starts", "module load python/3.12"
+    )
+    logs: str = _word("Directory for what jobs print", "logs", "logs")
 
 
 class Cluster(Part):
@@ -100,16 +176,16 @@ class Cluster(Part):
 class Started(Cluster):
     """What clusters have whose workers are started here."""
 
-    environment: Annotated[dict[str, str], Variables(about="Environment variables of workers")] = {}  # noqa: RUF012
+    environment: dict[str, str] = of.field(
+        Special(about="Environment variables of workers", reader=_read_variables), {}
+    )
 
 
 class Local(Started):
     """Processes of this machine."""
 
     kind: Literal["local"]
-    workers: Annotated[
-        Bounds | None, WorkerNumber(about="Workers; without a number, one a core")
-    ] = None
+    workers: Bounds | None = _number("Workers; without a number, one a core", None)
     worker: LocalWorker = LocalWorker()
     scheduler: Scheduler = Scheduler()
 
@@ -118,46 +194,36 @@ class Address(Cluster):
     """A Dask scheduler that runs already."""
 
     kind: Literal["scheduler"]
-    address: Annotated[
-        str,
-        Text(
-            about="Address of the scheduler",
-            pattern=r"(tcp|tls|ucx)://\S+:\d+",
-            remedy="write e.g. 'tcp://10.0.0.5:8786', or tls:// with a security section",
-        ),
-    ]
+    address: str = of.text(
+        "Address of the scheduler",
+        pattern=r"(tcp|tls|ucx)://\S+:\d+",
+        remedy="write e.g. 'tcp://10.0.0.5:8786', or tls:// with a security section",
+    )
 
 
 class SSH(Started):
     """Machines that are reached by SSH."""
 
     kind: Literal["ssh"]
-    hosts: Annotated[
-        tuple[str, ...],
-        Texts(about="Machines", example="node1, node2", of=word("A host", "node1"), least=1),
-    ]
-    workers: Annotated[Bounds, WorkerNumber(about="Workers, dealt out over the machines")]
+    hosts: tuple[str, ...] = _texts("Machines", _one_word("A host", "node1"), 1)
+    workers: Bounds = _number("Workers, dealt out over the machines")
     worker: Worker
     scheduler: Scheduler
-    user: Annotated[str, word("User there; without one, as here", "lidar")] = ""
-    port: Annotated[int, count("Port of SSH", "22", at_most="65535")] = 22
-    identity: Annotated[str, File(about="Private key to log in with; without one, as ssh does")] = (
-        ""
-    )
-    known_hosts: Annotated[str, File(about="Keys of known machines; without one, as ssh does")] = ""
-    python: Annotated[str, word("Python there; without one, the path of this one", "python")] = ""
+    user: str = _word("User there; without one, as here", "lidar", "")
+    port: int = of.count("Port of SSH", "22", at_most="65535", default=22)
+    identity: str = of.file("Private key to log in with; without one, as ssh does", "")
+    known_hosts: str = of.file("Keys of known machines; without one, as ssh does", "")
+    python: str = _word("Python there; without one, the path of this one", "python", "")
 
 
 class Batch(Started):
     """Jobs of a batch system."""
 
-    workers: Annotated[Bounds, WorkerNumber(about="Workers, in whole jobs")]
+    workers: Bounds = _number("Workers, in whole jobs")
     worker: Worker
     job: Job
     scheduler: Scheduler
-    python: Annotated[
-        str, word("Python of the jobs; without one, the path of this one", "python")
-    ] = ""
+    python: str = _word("Python of the jobs; without one, the path of this one", "python", "")
 
 
 class Slurm(Batch):
@@ -175,31 +241,28 @@ class PBS(Batch):
 class Volume(Part):
     """A persistent volume that all pods and this machine see, for stores and scenes."""
 
-    claim: Annotated[str, word("Its claim", "studies")]
-    path: Annotated[str, word("Where it is mounted, the same as here", "/data")]
+    claim: str = _word("Its claim", "studies")
+    path: str = _word("Where it is mounted, the same as here", "/data")
 
 
 class Kubernetes(Started):
     """Pods that the Dask operator of a Kubernetes cluster starts."""
 
     kind: Literal["kubernetes"]
-    workers: Annotated[Bounds, WorkerNumber(about="Workers, a pod each")]
+    workers: Bounds = _number("Workers, a pod each")
     worker: Worker
-    image: Annotated[str, word("Image with sweep in it", "registry.example.org/sweep:0.1.0")]
-    name: Annotated[
-        str,
-        Text(
-            about="Name of the cluster",
-            pattern=r"[a-z]([a-z0-9-]{0,50}[a-z0-9])?",
-            remedy="take small letters, digits and '-', such as 'sweep'",
-        ),
-    ] = "sweep"
-    namespace: Annotated[str, word("Namespace", "lidar")] = "default"
+    image: str = _word("Image with sweep in it", "registry.example.org/sweep:0.1.0")
+    name: str = of.text(
+        "Name of the cluster",
+        "sweep",
+        pattern=r"[a-z]([a-z0-9-]{0,50}[a-z0-9])?",
+        remedy="take small letters, digits and '-', such as 'sweep'",
+    )
+    namespace: str = _word("Namespace", "lidar", "default")
     volume: Volume | None = None
-    secret: Annotated[
-        str,
-        word("Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls"),
-    ] = ""
+    secret: str = _word(
+        "Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls", ""
+    )
 
 
 AnyCluster = Local | Address | SSH | Slurm | PBS | Kubernetes
@@ -210,31 +273,12 @@ KINDS: dict[str, type[Cluster]] = {
 
 
 def load_cluster(path: str | Path) -> AnyCluster:
-    """Cluster that a YAML file describes.
-
-    Raises
-    ------
-    SpecError
-        With every mistake in it, each with its path, its line and a remedy.
-    """
+    """Cluster that a YAML file describes, or a `SpecError` with every mistake in it."""
     return _cluster(read_document(Path(path)), Path(path).absolute().parent)
 
 
 def cluster_of(mapping: Mapping[str, Any], *, base: Path | str = ".") -> AnyCluster:
-    """Cluster from plain data, written as in a file.
-
-    Parameters
-    ----------
-    mapping : mapping
-        What a cluster's file holds.
-    base : path
-        Folder that the files which it names are relative to.
-
-    Raises
-    ------
-    SpecError
-        With every mistake in it.
-    """
+    """Cluster from plain data, written as in a file whose folder is `base`."""
     return _cluster(Document(plain(mapping)), Path(base).absolute())
 
 
@@ -243,7 +287,7 @@ def _cluster(document: Document, base: Path) -> AnyCluster:
     model = KINDS.get(kind) if isinstance(kind, str) else None
     findings = document.findings
     if model is None:
-        raise SpecError([document.mistake(f) for f in (*findings, _no_kind(kind))])
+        raise SpecError(document.mistakes([*findings, _no_kind(kind)]))
     cluster: Any = None
     try:
         cluster = model.model_validate(document.value)
@@ -253,8 +297,7 @@ def _cluster(document: Document, base: Path) -> AnyCluster:
         cluster._base = base
         findings += _together(cluster)
     if findings:
-        mistakes = dict.fromkeys(document.mistake(finding) for finding in findings)
-        raise SpecError(sorted(mistakes, key=lambda mistake: mistake.line or 0))
+        raise SpecError(document.mistakes(findings))
     found: AnyCluster = cluster
     return found
 
@@ -262,7 +305,7 @@ def _cluster(document: Document, base: Path) -> AnyCluster:
 def _no_kind(kind: object) -> Finding:
     names = ", ".join(KINDS)
     if kind is ABSENT:
-        return Finding(("kind",), "is missing", f"write 'kind:' and one of {names}", ABSENT)
+        return Finding(("kind",), "is missing", f"write 'kind:' and one of {names}")
     return Finding(("kind",), f"must be one of {names}", near_miss(str(kind), KINDS), kind)
 
 
@@ -275,10 +318,10 @@ def _together(cluster: AnyCluster) -> list[Finding]:
         findings += _address_findings(cluster)
     if isinstance(cluster, SSH) and cluster.workers.least < cluster.workers.most:
         rule = "must be a number: machines reached by SSH are there or not"
-        findings.append(Finding(("workers",), rule, f"write {cluster.workers.most}", ABSENT))
+        findings.append(Finding(("workers",), rule, f"write {cluster.workers.most}"))
     if isinstance(cluster, Kubernetes) and bool(cluster.secret) != bool(cluster.security):
         rule = "goes with the security section: pods have their certificates from it"
-        findings.append(Finding(("secret",), rule, "give both, or none", ABSENT))
+        findings.append(Finding(("secret",), rule, "give both, or none"))
     return findings
 
 
@@ -290,7 +333,7 @@ def _scheduler_findings(scheduler: Scheduler, *, far: bool) -> list[Finding]:
         remedy = "write e.g. 'interface: ib0' or 'host: 10.0.0.5'"
     else:
         return []
-    return [Finding(("scheduler",), rule, remedy, ABSENT)]
+    return [Finding(("scheduler",), rule, remedy)]
 
 
 def _address_findings(cluster: Address) -> list[Finding]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from types import MappingProxyType
 from typing import Any
@@ -11,7 +11,8 @@ from pydantic import BaseModel
 
 from sweep.spec.instrument import Instrument
 from sweep.spec.mistakes import near_miss
-from sweep.spec.rules import Rule, Text
+from sweep.spec.parts import rules_of
+from sweep.spec.rules import Rule
 from sweep.spec.sections import Accuracy, Atmosphere, Footprint, Target
 
 SECTIONS: dict[str, type[BaseModel]] = {
@@ -32,24 +33,6 @@ def parameter_rules() -> MappingProxyType[str, Rule]:
     return MappingProxyType(rules)
 
 
-def rules_of(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
-    """Rules of a model's fields and of its sections' fields, by dotted path."""
-    rules: dict[str, Rule] = {}
-    for name, field in model.model_fields.items():
-        path = f"{prefix}.{name}" if prefix else name
-        rule = rule_of(field)
-        if rule is not None:
-            rules[path] = rule
-        elif isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            rules |= rules_of(field.annotation, path)
-    return rules
-
-
-def rule_of(field: Any) -> Rule | None:
-    """The rule in a field's annotation, if it has one."""
-    return next((item for item in field.metadata if isinstance(item, Rule)), None)
-
-
 def default_of(path: str) -> Any:
     """Default of a parameter, SI; None where it has none."""
     section, *rest = path.split(".")
@@ -58,54 +41,6 @@ def default_of(path: str) -> Any:
         model = model.model_fields[name].annotation
     field = model.model_fields[rest[-1]]
     return None if field.is_required() else field.default
-
-
-def values_of(part: BaseModel, prefix: str) -> dict[str, Any]:
-    """Values of a model's fields and of its sections' fields, by dotted path."""
-    values: dict[str, Any] = {}
-    for name in type(part).model_fields:
-        value = getattr(part, name)
-        path = f"{prefix}.{name}" if prefix else name
-        values |= values_of(value, path) if isinstance(value, BaseModel) else {path: value}
-    return values
-
-
-def written_name(name: str, field: Any) -> str:
-    """Name of a field as users write it: `from` is a word of Python's own."""
-    return str(field.alias or name)
-
-
-UNSTORED = ("question", "execution", "axes", "figures")
-"""Sections of a study of which no default is written out."""
-
-Key = tuple[str, ...]
-
-KIND = Text(about="Which of several a part is")
-
-
-def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
-    """Every value of a part and of the parts in it that is there: its path, rule and SI value."""
-    for name, field in type(part).model_fields.items():
-        value, key = getattr(part, name), (*path, written_name(name, field))
-        rule = KIND if name == "kind" else rule_of(field)
-        if rule is not None and value is not None:
-            yield key, rule, value
-        elif isinstance(value, BaseModel):
-            yield from leaves(value, key)
-        elif isinstance(value, dict):
-            for inner, below in value.items():
-                yield from leaves(below, (*key, inner))
-
-
-def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
-    """Whether the mapping lacked the path, where the value then is put."""
-    for name in path[:-1]:
-        mapping = mapping.setdefault(name, {})
-        if not isinstance(mapping, dict):
-            return False
-    lacking = path[-1] not in mapping
-    mapping.setdefault(path[-1], value)
-    return lacking
 
 
 def short_name(path: str) -> str:

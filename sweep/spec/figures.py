@@ -1,4 +1,4 @@
-"""The figures and tables that a study makes of its results."""
+"""The figures and tables that a study makes of its results, over a grid or of a scene."""
 
 from __future__ import annotations
 
@@ -6,59 +6,27 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from sweep.spec.instrument import Part
-from sweep.spec.rules import Numeric, Rule, Text
+import sweep.spec.declaring as of
+from sweep.model.outputs import POINTS, SHOTS, STATISTICS, XYZ
+from sweep.spec.parts import Part
+from sweep.spec.rules import Choice, Special
 from sweep.units import QuantityError, read_number
 
 Selection = str | int | float | tuple[str | int | float, ...]
 Printed = tuple[Any, ...]
-
-STEM = Text(
-    about="Stem of the picture's file name",
-    pattern=r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}",
-    remedy="take letters, digits, '_', '-' and '.'",
-)
-_COORDINATE = Text(
-    about="Name of a coordinate: the last part of an axis's path",
-    pattern=r"[A-Za-z_][A-Za-z0-9_]{0,99}",
-    remedy="take the last part of an axis's path, such as 'range'",
-)
-_VARIABLE = Text(
-    about="Name of a stored quantity, such as pd_shot",
-    pattern=r"[A-Za-z_][A-Za-z0-9_]{0,99}",
-    remedy="take a stored quantity, such as 'pd_shot'",
-)
-TITLE = Text(about="Title of the figure")
+Crop = tuple[float, ...]
 
 
-class _Where(Rule):
-    """Values of coordinates that a figure is confined to."""
-
-    def read(self, written: object) -> dict[str, Selection]:
-        """Coordinates with one value or several each, as written."""
-        if not isinstance(written, dict):
-            raise QuantityError(
-                "must be a mapping of coordinates to values", "write e.g. {grazing_angle: 15 deg}"
-            )
-        return {str(name): _selection(value) for name, value in written.items()}
-
-    def schema(self) -> dict[str, Any]:
-        """JSON Schema: coordinates, each with a value or a list of values."""
-        value = {"type": ["string", "number"]}
-        several = {"type": "array", "items": value, "minItems": 1}
-        return {
-            "description": self.about,
-            "type": "object",
-            "additionalProperties": {"anyOf": [value, several]},
-            "examples": [{"grazing_angle": "15 deg"}],
-        }
-
-
-def _selection(written: object) -> Selection:
-    """One value or several, as written."""
-    if isinstance(written, list | tuple) and written:
-        return tuple(_single(value) for value in written)
-    return _single(written)
+def _read_where(written: object) -> dict[str, Selection]:
+    """Coordinates with one value or several each, as written."""
+    if not isinstance(written, dict):
+        rule = "must be a mapping of coordinates to values"
+        raise QuantityError(rule, "write e.g. {grazing_angle: 15 deg}")
+    return {
+        str(name): tuple(map(_single, value)) if value and isinstance(value, list | tuple)
+        else _single(value)
+        for name, value in written.items()
+    }  # fmt: skip
 
 
 def _single(written: object) -> str | int | float:
@@ -68,20 +36,11 @@ def _single(written: object) -> str | int | float:
     return written
 
 
-class _PrintedNumbers(Rule):
-    """Numbers that a publication prints, in rows."""
-
-    def read(self, written: object) -> Printed:
-        """Numbers, nested as written."""
-        if not isinstance(written, list | tuple):
-            raise QuantityError("must be a list of numbers or of rows of numbers")
-        return tuple(self.read(v) if isinstance(v, list | tuple) else _number(v) for v in written)
-
-    def schema(self) -> dict[str, Any]:
-        """JSON Schema: numbers, or rows of them."""
-        number = {"type": ["number", "string"]}
-        row = {"type": "array", "items": number}
-        return {"description": self.about, "type": "array", "items": {"anyOf": [number, row]}}
+def _read_printed(written: object) -> Printed:
+    """Numbers, nested as written."""
+    if not isinstance(written, list | tuple):
+        raise QuantityError("must be a list of numbers or of rows of numbers")
+    return tuple(_read_printed(v) if isinstance(v, list | tuple) else _number(v) for v in written)
 
 
 def _number(written: object) -> float:
@@ -89,92 +48,312 @@ def _number(written: object) -> float:
     return unit.to_si(value)
 
 
-WHERE = _Where(about="Values of coordinates that the figure is confined to")
-_PRINTED = _PrintedNumbers(about="The numbers as published, row by row, to stand beside ours")
+_VALUE = {"type": ["string", "number"]}
+_VALUES = {"type": "array", "items": _VALUE, "minItems": 1}
+_WHERE = Special(
+    about="Values of coordinates that the figure is confined to",
+    reader=_read_where,
+    json={
+        "type": "object",
+        "additionalProperties": {"anyOf": [_VALUE, _VALUES]},
+        "examples": [{"grazing_angle": "15 deg"}],
+    },
+)
+_NUMBER = {"type": ["number", "string"]}
+_PRINTED = Special(
+    about="The numbers as published, row by row, to stand beside ours",
+    reader=_read_printed,
+    json={"type": "array", "items": {"anyOf": [_NUMBER, {"type": "array", "items": _NUMBER}]}},
+)
 
 
-class _Drawing(Part):
+def _where() -> Any:
+    return of.field(_WHERE, {})
+
+
+def _word(about: str, example: str, default: Any = ...) -> Any:
+    """Name of something in a store."""
+    pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
+    return of.text(f"Name of {about}", default, pattern=pattern, remedy=f"take {example}")
+
+
+def _coordinate(default: Any = ...) -> Any:
+    example = "the last part of an axis's path, such as 'range'"
+    return _word("a coordinate: the last part of an axis's path", example, default)
+
+
+def _variable() -> Any:
+    return _word("a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'")
+
+
+class Drawing(Part):
     """What all figures have."""
 
-    name: Annotated[str, STEM] = ""
-    title: Annotated[str, TITLE] = ""
+    name: str = of.text(
+        "Stem of the picture's file name",
+        "",
+        pattern=r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}",
+        remedy="take letters, digits, '_', '-' and '.'",
+    )
+    title: str = of.text("Title of the figure", "")
 
     @property
     def stem(self) -> str:
         """Stem of the picture's file name."""
-        return self.name or f"{getattr(self, 'variable', self.kind)}_{self.kind}"  # type: ignore[attr-defined]
+        return self.name or "_".join([*filter(None, self._shown), self.kind])  # type: ignore[attr-defined]
+
+    @property
+    def _shown(self) -> tuple[str | None, ...]:
+        """What the figure shows, as parts of its file's name."""
+        return (getattr(self, "variable", self.kind),)  # type: ignore[attr-defined]
+
+
+# Figures of grids
+
+
+class GridDrawing(Drawing):
+    """What all figures of grids have."""
 
     @property
     def coordinates(self) -> dict[str, str]:
         """Coordinates named, by the field that names them."""
-        named = {key: getattr(self, key, "") for key in ("x", "y", "by", "rows")}
+        named = {key: getattr(self, key, "") for key in ("x", "y", "by", "rows", "columns")}
         where = {f"where.{name}": name for name in getattr(self, "where", {})}
-        columns = getattr(self, "columns", "")
-        named["columns"] = columns if isinstance(columns, str) else ""
         return {key: name for key, name in (named | where).items() if name}
 
 
-class Surface(_Drawing):
+class Surface(GridDrawing):
     """A quantity over two coordinates, seen from above."""
 
     kind: Literal["surface"]
-    variable: Annotated[str, _VARIABLE]
-    x: Annotated[str, _COORDINATE]
-    y: Annotated[str, _COORDINATE]
-    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
+    variable: str = _variable()
+    x: str = _coordinate()
+    y: str = _coordinate()
+    where: dict[str, Selection] = _where()
 
 
-class Slices(_Drawing):
+class Slices(GridDrawing):
     """A quantity along one coordinate, a line for each value of another."""
 
     kind: Literal["slices"]
-    variable: Annotated[str, _VARIABLE]
-    x: Annotated[str, _COORDINATE]
-    by: Annotated[str, _COORDINATE] = ""
-    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
+    variable: str = _variable()
+    x: str = _coordinate()
+    by: str = _coordinate("")
+    where: dict[str, Selection] = _where()
 
 
-class Table(_Drawing):
+class Table(GridDrawing):
     """A quantity averaged over all but rows and columns."""
 
     kind: Literal["table"]
-    variable: Annotated[str, _VARIABLE]
-    rows: Annotated[str, _COORDINATE]
-    columns: Annotated[str, _COORDINATE] = ""
-    where: Annotated[dict[str, Selection], WHERE] = Field(default_factory=dict)
-    minimum_range: Annotated[
-        float,
-        Numeric(
-            about="Nearer ranges are left out",
-            si_unit="m",
-            example="5 m",
-            at_least="0 m",
-            at_most="1e15 m",
-        ),
-    ] = 0.0
-    printed: Annotated[Printed, _PRINTED] = ()
+    variable: str = _variable()
+    rows: str = _coordinate()
+    columns: str = _coordinate("")
+    where: dict[str, Selection] = _where()
+    minimum_range: float = of.length(
+        "Nearer ranges are left out", "5 m", "0 m", "1e15 m", default=0.0
+    )
+    printed: Printed = of.field(_PRINTED, ())
 
 
-class FalseAlarmTable(_Drawing):
+class FalseAlarmTable(GridDrawing):
     """False alarms of a shot over the three cuts of Tables 4.3 to 4.5, a row for each value.
 
     Columns are 15 deg, 85 deg and 3500 m; ranges up to 5 m are left out.
     """
 
     kind: Literal["false_alarm_table"]
-    by: Annotated[str, _COORDINATE]
-    printed: Annotated[Printed, _PRINTED] = ()
+    by: str = _coordinate()
+    printed: Printed = of.field(_PRINTED, ())
 
 
-class ThresholdTable(_Drawing):
+class ThresholdTable(GridDrawing):
     """False alarms of a bin for each threshold, as in Table 4.2."""
 
     kind: Literal["threshold_table"]
-    by: Annotated[str, _COORDINATE] = "tnr"
-    printed: Annotated[Printed, _PRINTED] = ()
+    by: str = _coordinate("tnr")
+    printed: Printed = of.field(_PRINTED, ())
 
 
 Figure = Annotated[
     Surface | Slices | Table | FalseAlarmTable | ThresholdTable, Field(discriminator="kind")
 ]
 FIGURE_KINDS = ("surface", "slices", "table", "false_alarm_table", "threshold_table")
+
+# Figures of scenes
+
+QUANTITIES = (
+    *(name for table in (SHOTS, STATISTICS, POINTS) for name, output in table.items()
+      if XYZ not in output.dims),
+    "altitude", "x", "y", "z", "shot",
+)  # fmt: skip
+"""What a figure can show of shots and of points."""
+
+SEVERAL_SURFACES = "several_surfaces"
+_VIEW = Choice(about="Where from", options=("oblique", "above", "side", "front"))
+_EYE = {
+    "azimuth": of.measure("Of the eye, from x towards y", "rad", "-60 deg"),
+    "elevation": of.measure("Above the horizon", "rad", "30 deg", "-90 deg", "90 deg"),
+}
+
+
+def _read_view(written: object) -> str | dict[str, float]:
+    """A word, or azimuth and elevation of the eye [rad]."""
+    if not isinstance(written, dict):
+        return _VIEW.read(written)
+    if set(written) != set(_EYE):
+        rule = "must be a word or have an azimuth and an elevation"
+        raise QuantityError(rule, "write e.g. {azimuth: -60 deg, elevation: 30 deg}")
+    return {name: rule.read(written[name]) for name, rule in _EYE.items()}
+
+
+_FROM = Special(
+    about=_VIEW.about,
+    reader=_read_view,
+    json={
+        "anyOf": [
+            {"type": "string", "enum": list(_VIEW.options)},
+            {
+                "type": "object",
+                "properties": {name: rule.schema() for name, rule in _EYE.items()},
+                "required": list(_EYE),
+                "additionalProperties": False,
+            },
+        ]
+    },
+)
+
+
+def _quantity(about: str, default: Any = ...) -> Any:
+    """A quantity of shots or points."""
+    usual = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
+    rule = "is no quantity of shots or points"
+    return of.field(Choice(about=about, options=QUANTITIES, rule=rule, remedy=usual), default)
+
+
+def _scanner() -> Any:
+    return of.name("Scanner; the first by default", None)
+
+
+def _ranges() -> Any:
+    about = "By whole bins, or interpolated between them"
+    return of.choice(about, ("quantised", "interpolated"), "quantised")
+
+
+def _draw() -> Any:
+    return of.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
+
+
+def _part(along: str) -> Any:
+    """Part of the scene along an axis."""
+    rule = of.measure("Coordinate", "m", "100 m")
+    return of.several(rule, 2, 2, None, about=f"Part along {along}", rising=True)
+
+
+def _time() -> Any:
+    rule = of.measure("Time", "s", "10 s", "0 s", "1e8 s")
+    return of.several(rule, 2, 2, None, about="Part of the flight's time", rising=True)
+
+
+class SceneDrawing(Drawing):
+    """What all figures of scenes have."""
+
+    where: dict[str, Selection] = _where()
+
+    @property
+    def named_scanners(self) -> dict[tuple[str | int, ...], str]:
+        """Scanners named, by where in the figure."""
+        scanner = getattr(self, "scanner", None)
+        listed = getattr(self, "scanners", None) or ()
+        named: dict[tuple[str | int, ...], str] = {("scanner",): scanner} if scanner else {}
+        return named | {("scanners", i): name for i, name in enumerate(listed)}
+
+
+class CloudFigure(SceneDrawing):
+    """A point cloud."""
+
+    kind: Literal["cloud"]
+    scanner: str | None = _scanner()
+    colour: str = _quantity("What colours the points", "range")
+    ranges: str = _ranges()
+    view: str | dict[str, float] = of.field(_FROM, "oblique")
+    x: Crop | None = _part("x")
+    y: Crop | None = _part("y")
+    z: Crop | None = _part("z")
+    time: Crop | None = _time()
+    terrain: bool = of.flag("Whether to draw the ground", default=True)
+    path: bool = of.flag("Whether to draw the flight path", default=False)
+    dropouts: bool = of.flag("Whether to mark shots without a point", default=False)
+    draw: int = _draw()
+
+    @property
+    def _shown(self) -> tuple[str | None, ...]:
+        return self.scanner, self.colour
+
+
+class Scatter(SceneDrawing):
+    """A quantity of shots or points over another."""
+
+    kind: Literal["scatter"]
+    scanner: str | None = _scanner()
+    x: str = _quantity("Quantity along x", "time")
+    y: str = _quantity("Quantity along y")
+    colour: str = _quantity("What colours the points", "beam")
+    ranges: str = _ranges()
+    time: Crop | None = _time()
+    draw: int = _draw()
+
+    @property
+    def _shown(self) -> tuple[str | None, ...]:
+        return self.scanner, f"{self.y}_over_{self.x}"
+
+
+class ShotSpectra(SceneDrawing):
+    """The three spectra of one shot, with threshold, noise and detections."""
+
+    kind: Literal["shot_spectra"]
+    scanner: str | None = _scanner()
+    shot: int | str = of.count(
+        "Number of the shot, from 0, or the first whose footprint has several surfaces",
+        "0", "0", "1e15", word=SEVERAL_SURFACES, default=SEVERAL_SURFACES,
+    )  # fmt: skip
+    draw: int = _draw()
+
+    @property
+    def _shown(self) -> tuple[str | None, ...]:
+        return self.scanner, str(self.shot)
+
+
+class _OfNavigation(SceneDrawing):
+    """What navigation is shown."""
+
+    scanners: tuple[str, ...] | None = of.several(
+        of.named("Scanner", "three"), 1, 10_000, None,
+        about="Scanners; all by default", noun="names", distinct=True,
+    )  # fmt: skip
+    quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"), "velocity")
+    show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"), "all")
+    bins: int = of.count("Bins of altitude", "12", "1", "1000", default=12)
+
+    @property
+    def _shown(self) -> tuple[str | None, ...]:
+        return (f"{self.quantity}_{self.show}",)
+
+
+class NavigationFigure(_OfNavigation):
+    """Statistics of navigation over altitude, a line a scanner."""
+
+    kind: Literal["navigation"]
+
+
+class NavigationTable(_OfNavigation):
+    """The same as a table."""
+
+    kind: Literal["navigation_table"]
+
+
+SceneFigure = Annotated[
+    CloudFigure | Scatter | ShotSpectra | NavigationFigure | NavigationTable,
+    Field(discriminator="kind"),
+]
+SCENE_FIGURE_KINDS = ("cloud", "scatter", "shot_spectra", "navigation", "navigation_table")

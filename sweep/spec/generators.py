@@ -1,43 +1,109 @@
-"""Written axis values as arrays: single values and linear, log or step generators."""
+"""Written values along an axis as arrays: single values and linear, log or step generators.
+
+Regular values stay exact until the one rounding of each, so that a value that a generator makes is
+the float that the same value written out gives.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
-from sweep.spec.mistakes import ABSENT, Finding, Location, near_miss
-from sweep.spec.progressions import Progression, rounded, si_values, values_in
+from sweep.spec.mistakes import Findings, Location, near_miss, rejected
 from sweep.spec.rules import Numeric, Rule
 from sweep.units import QuantityError, Unit
 
 MOST_VALUES = 20_000_000
-GENERATORS = ("linear", "log", "step")
-
 _FORMS = {
     "linear": "{linear: [first, last], number: 10}",
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
+_NUMBER = Numeric(about="", example="10", at_least="2", at_most=str(MOST_VALUES), whole=True)
 
 
-class Rejected(Exception):
-    """Written values that cannot be read.
+# Regular values, exactly
 
-    Parameters
-    ----------
-    findings : list of Finding
-        Everything wrong with them.
+
+@dataclass(frozen=True)
+class Progression:
+    """The regular values ``start + increment * i`` for ``i = 0 .. number - 1``, exactly."""
+
+    start: Fraction
+    increment: Fraction = Fraction(0)
+    number: int = 1
+
+    def mapped(self, factor: Fraction, offset: Fraction) -> Progression:
+        """The progression of ``factor * value + offset``."""
+        return Progression(self.start * factor + offset, self.increment * factor, self.number)
+
+    def values(self) -> np.ndarray:
+        """Floats (number,), each the nearest to its exact value.
+
+        Both terms are whole multiples of their greatest common divisor, so that the values are
+        whole numbers times one exact ratio, which a two-part product rounds once.
+        """
+        common = _common_divisor(self.start, self.increment)
+        first, step = int(self.start / common), int(self.increment / common)
+        if max(abs(first), abs(first + step * (self.number - 1))) < 2**53:
+            multiples = np.arange(self.number, dtype=np.int64) * step + first
+            return _times(multiples.astype(np.float64), common)
+        start, increment = float(self.start), float(self.increment)
+        return start + increment * np.arange(self.number, dtype=np.float64)
+
+
+def _common_divisor(a: Fraction, b: Fraction) -> Fraction:
+    """Largest fraction of which both are whole multiples; 1 for two zeros."""
+    divisor = math.gcd(a.numerator * b.denominator, b.numerator * a.denominator)
+    return Fraction(divisor, a.denominator * b.denominator) if divisor else Fraction(1)
+
+
+def _times(values: np.ndarray, ratio: Fraction) -> np.ndarray:
+    """Product of floats (n,) with an exact ratio, rounded once (Dekker's two-part product)."""
+    if ratio.numerator == 1 and ratio.denominator < 2**53:
+        return values / ratio.denominator
+    high = float(ratio)
+    low = float(ratio - Fraction(high))
+    product = values * high
+    if low == 0.0 or abs(high) > 1e200 or not np.all(np.abs(values) < 1e100):
+        return product
+    splitter = 134217729.0  # 2**27 + 1 halves a 53-bit significand
+    a = values * splitter
+    a_high = a - (a - values)
+    a_low = values - a_high
+    b_high = high * splitter - (high * splitter - high)
+    b_low = high - b_high
+    error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+    return product + (error + values * low)
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """Values (n,) to 15 significant digits.
+
+    Powers and logarithms may differ in the last bit from one machine to the next; 15 digits are
+    the same everywhere.
     """
+    magnitude = np.abs(values)
+    np.floor(np.log10(magnitude, where=magnitude > 0, out=np.zeros(values.shape)), out=magnitude)
+    exponent = 14 - magnitude.astype(np.int64)
+    inside = np.abs(exponent) <= 22  # powers of ten that are exact floats
+    scale = 10.0 ** np.where(inside, np.abs(exponent), 0)
+    up, down = np.rint(values * scale) / scale, np.rint(values / scale) * scale
+    return np.where(inside, np.where(exponent >= 0, up, down), values)
 
-    def __init__(self, *findings: Finding) -> None:
-        super().__init__(*findings)
-        self.findings = list(findings)
+
+def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
+    """SI values (n,) in the given unit, to 15 significant digits."""
+    if unit.decibel:
+        return _rounded(10.0 * np.log10(si))
+    return _rounded(_times(si - float(unit.offset) if unit.offset else si, 1 / unit.factor))
+
+
+# Written values
 
 
 @dataclass(frozen=True)
@@ -64,20 +130,8 @@ class Values:
             return values_in(unit, self.si)
         if unit == self.unit:
             return self.progression.values()
-        factor = self.unit.factor / unit.factor
-        return self.progression.mapped(
-            factor, (self.unit.offset - unit.offset) / unit.factor
-        ).values()
-
-
-@contextmanager
-def reported(location: Location, written: object) -> Iterator[None]:
-    """Context in which a broken rule becomes a finding at the given location."""
-    try:
-        yield
-    except QuantityError as error:
-        finding = Finding(location, error.rule, error.suggestion, written)
-        raise Rejected(finding) from None
+        offset = (self.unit.offset - unit.offset) / unit.factor
+        return self.progression.mapped(self.unit.factor / unit.factor, offset).values()
 
 
 def read_pieces(written: object, rule: Rule, location: Location) -> list[Values] | list[str]:
@@ -89,91 +143,65 @@ def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]
         With every mistake in it.
     """
     if isinstance(written, dict):
-        return [read_generator(written, rule, location)]
+        return [_read_generator(written, rule, location)]
     if not isinstance(written, list):
-        raise Rejected(
-            Finding(
-                location,
-                "must be a list or a generator",
-                f"write e.g. [{written}] or {_FORMS['linear']}",
-                written,
-            )
-        )
+        remedy = f"write e.g. [{written}] or {_FORMS['linear']}"
+        raise rejected(location, "must be a list or a generator", remedy, written)
     if not written:
-        raise Rejected(Finding(location, "holds no value", "list at least one", ABSENT))
+        raise rejected(location, "holds no value", "list at least one")
     pieces: list[Any] = []
-    findings: list[Finding] = []
+    findings = Findings()
     for i, piece in enumerate(written):
-        try:
-            if isinstance(piece, dict):
-                pieces.append(read_generator(piece, rule, (*location, i)))
-            else:
-                pieces.append(read_single(piece, rule, (*location, i)))
-        except Rejected as rejected:
-            findings += rejected.findings
-    if findings:
-        raise Rejected(*findings)
+        read = _read_generator if isinstance(piece, dict) else read_single
+        with findings.of():
+            pieces.append(read(piece, rule, (*location, i)))
+    findings.refuse_any()
     return pieces
 
 
 def read_single(written: object, rule: Rule, location: Location) -> Values | str:
     """One value: of numeric fields with its unit, of others the word."""
-    with reported(location, written):
+    try:
         value = rule.read(written)
         if not isinstance(rule, Numeric):
             return str(value)
         number, unit = rule.exact(written)
-        kind = np.int64 if rule.whole else np.float64
-        return Values(np.array([value], dtype=kind), unit, Progression(number))
+    except QuantityError as error:
+        raise rejected(location, error.rule, error.suggestion, written) from None
+    kind = np.int64 if rule.whole else np.float64
+    return Values(np.array([value], dtype=kind), unit, Progression(number))
 
 
-def read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> Values:
+def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> Values:
     """Values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``, within the field's bounds."""
-    kinds = [key for key in written if key in GENERATORS]
+    kinds = [key for key in written if key in _FORMS]
     if len(kinds) != 1:
-        suggestion = near_miss(str(next(iter(written), "")), GENERATORS)
-        raise Rejected(
-            Finding(
-                location,
-                "must have exactly one of linear, log and step",
-                suggestion or f"write e.g. {_FORMS['linear']}",
-                ABSENT,
-            )
-        )
-    kind = kinds[0]
+        remedy = near_miss(str(next(iter(written), "")), _FORMS)
+        remedy = remedy or f"write e.g. {_FORMS['linear']}"
+        raise rejected(location, "must have exactly one of linear, log and step", remedy)
     if not isinstance(rule, Numeric):
-        raise Rejected(Finding(location, "takes words, which have no steps", "list them", ABSENT))
+        raise rejected(location, "takes words, which have no steps", "list them")
+    kind, findings = kinds[0], Findings()
     allowed = {kind} if kind == "step" else {kind, "number"}
-    findings = [
-        Finding((*location, str(key)), f"is no part of '{kind}'", f"write {_FORMS[kind]}", value)
-        for key, value in written.items()
-        if key not in allowed
-    ]
-    try:
-        values = _generated(kind, written, rule, location)
-        _hold_to_rule(values, rule, location)
-    except Rejected as rejected:
-        raise Rejected(*findings, *rejected.findings) from None
-    if findings:
-        raise Rejected(*findings)
-    return values
-
-
-def _generated(kind: str, written: dict[Any, Any], rule: Numeric, location: Location) -> Values:
-    """Values of a generator whose kind is known."""
-    findings: list[Finding] = []
-    number = 2  # stands in for one that cannot be read, so that the bounds are looked at too
+    for key, value in written.items():
+        if key not in allowed:
+            with findings.of():
+                where = (*location, str(key))
+                raise rejected(where, f"is no part of '{kind}'", f"write {_FORMS[kind]}", value)
+    number = 0
     if kind != "step":
-        try:
-            number = _read_number_of_values(written, location, kind)
-        except Rejected as rejected:
-            findings += rejected.findings
-    try:
-        values = _spaced(kind, written[kind], number, rule, (*location, kind))
-    except Rejected as rejected:
-        raise Rejected(*findings, *rejected.findings) from None
-    if findings:
-        raise Rejected(*findings)
+        with findings.of((*location, "number"), written.get("number")):
+            if "number" not in written:
+                raise rejected(location, "lacks the number of values", f"write {_FORMS[kind]}")
+            number = int(_NUMBER.read(written["number"]))
+    values: Values | None = None
+    with findings.of():
+        # Bounds are looked at even if the number of values cannot be read.
+        values = _spaced(kind, written[kind], number or 2, rule, (*location, kind))
+        if number or kind == "step":
+            _hold_to_rule(values, rule, location)
+    findings.refuse_any()
+    assert values is not None
     return values
 
 
@@ -181,10 +209,9 @@ def _spaced(kind: str, written: object, number: int, rule: Numeric, location: Lo
     """Values between written bounds."""
     bounds, unit = _read_bounds(kind, written, rule, location)
     if kind == "step":
-        return _stepped(bounds, unit, rule, location)
+        return _regular(_stepped(bounds, location), unit, rule, location)
     if bounds[0] == bounds[1]:
-        rule_broken = "begins and ends with the same value"
-        raise Rejected(Finding(location, rule_broken, "write it as a list of one", ABSENT))
+        raise rejected(location, "begins and ends with the same value", "write it as a list of one")
     if kind == "log":
         return _geometric(bounds, unit, number, rule, location)
     progression = Progression(bounds[0], (bounds[1] - bounds[0]) / (number - 1), number)
@@ -197,83 +224,53 @@ def _read_bounds(
     """First, last and (for a step) increment as exact numbers in the first one's unit."""
     count = 3 if kind == "step" else 2
     if not isinstance(written, list) or len(written) != count:
-        raise Rejected(
-            Finding(location, f"must be a list of {count} values", f"write {_FORMS[kind]}", written)
+        raise rejected(
+            location, f"must be a list of {count} values", f"write {_FORMS[kind]}", written
         )
-    numbers: list[Fraction] = []
-    units: list[Unit] = []
-    findings: list[Finding] = []
+    exact: list[tuple[Fraction, Unit]] = []
+    findings = Findings()
     for i, text in enumerate(written):
-        try:
-            with reported((*location, i), text):
-                number, unit = rule.exact(text)
-                if i < 2:
-                    rule.read(text)
-                numbers.append(number)
-                units.append(unit)
-        except Rejected as rejected:
-            findings += rejected.findings
-    if findings:
-        raise Rejected(*findings)
-    first = units[0]
-    if any(unit.decibel != first.decibel for unit in units):
-        rule_broken = "mixes decibels with a plain unit"
-        raise Rejected(Finding(location, rule_broken, "take one of them", ABSENT))
-    pairs = zip(numbers, units, strict=True)
-    return [_in_unit(n, u, first, i) for i, (n, u) in enumerate(pairs)], first
+        with findings.of((*location, i), text):
+            exact.append(rule.exact(text))
+            if i < 2:
+                rule.read(text)
+    findings.refuse_any()
+    first = exact[0][1]
+    if any(unit.decibel != first.decibel for _, unit in exact):
+        raise rejected(location, "mixes decibels with a plain unit", "take one of them")
+    # An increment feels no offset.
+    offsets = [exact[0][1].offset - first.offset, exact[1][1].offset - first.offset, Fraction(0)]
+    return [
+        (number * unit.factor + offset) / first.factor
+        for (number, unit), offset in zip(exact, offsets, strict=False)
+    ], first
 
 
-def _in_unit(number: Fraction, unit: Unit, wanted: Unit, position: int) -> Fraction:
-    """Number in another unit; an increment (position 2) feels no offset."""
-    offset = Fraction(0) if position == 2 else unit.offset - wanted.offset
-    return (number * unit.factor + offset) / wanted.factor
-
-
-def _read_number_of_values(written: dict[Any, Any], location: Location, kind: str) -> int:
-    """Number of values of a linear or log generator."""
-    rule = Numeric(about="", example="10", at_least="2", at_most=str(MOST_VALUES), whole=True)
-    if "number" not in written:
-        raise Rejected(
-            Finding(location, "lacks the number of values", f"write {_FORMS[kind]}", ABSENT)
-        )
-    with reported((*location, "number"), written["number"]):
-        return int(rule.read(written["number"]))
-
-
-def _stepped(bounds: list[Fraction], unit: Unit, rule: Numeric, location: Location) -> Values:
+def _stepped(bounds: list[Fraction], location: Location) -> Progression:
     """Values from first to last, last included where a step lands on it."""
     first, last, step = bounds
     if step == 0:
-        raise Rejected(Finding(location, "has a step of zero", "list the values", ABSENT))
+        raise rejected(location, "has a step of zero", "list the values")
     if (last - first) / step < 0:
-        raise Rejected(
-            Finding(
-                location,
-                "has a step that leads away from its end",
-                "turn its sign, or swap first and last",
-                ABSENT,
-            )
-        )
+        remedy = "turn its sign, or swap first and last"
+        raise rejected(location, "has a step that leads away from its end", remedy)
     number = math.floor((last - first) / step) + 1
     if number > MOST_VALUES:
-        raise Rejected(
-            Finding(
-                location,
-                f"gives {number} values, and an axis has at most {MOST_VALUES}",
-                "take a larger step",
-                ABSENT,
-            )
-        )
-    return _regular(Progression(first, step, number), unit, rule, location)
+        rule = f"gives {number} values, and an axis has at most {MOST_VALUES}"
+        raise rejected(location, rule, "take a larger step")
+    return Progression(first, step, number)
 
 
 def _regular(progression: Progression, unit: Unit, rule: Numeric, location: Location) -> Values:
     """Values of a regular progression, whole ones where the field asks for them."""
-    if not rule.whole:
-        return Values(si_values(progression, unit), unit, progression)
+    if unit.decibel:
+        si = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
+        return Values(si, unit, progression)
     exact = progression.mapped(unit.factor, unit.offset)
+    if not rule.whole:
+        return Values(exact.values(), unit, progression)
     if exact.start.denominator != 1 or exact.increment.denominator != 1:
-        raise Rejected(Finding(location, "gives values that are not whole", "list them", ABSENT))
+        raise rejected(location, "gives values that are not whole", "list them")
     steps = np.arange(progression.number, dtype=np.int64)
     return Values(int(exact.start) + int(exact.increment) * steps, unit, progression)
 
@@ -283,24 +280,18 @@ def _geometric(
 ) -> Values:
     """Values with a constant ratio, spaced in SI so that the unit of the ends doesn't matter."""
     if unit.decibel:
-        raise Rejected(
-            Finding(
-                location,
-                "steps in decibels, which are logarithms already",
-                f"write {_FORMS['linear']}",
-                ABSENT,
-            )
-        )
+        remedy = f"write {_FORMS['linear']}"
+        raise rejected(location, "steps in decibels, which are logarithms already", remedy)
     first, last = (unit.to_si(bound) for bound in bounds)
     if first <= 0 or last <= 0:
-        raise Rejected(Finding(location, "must begin and end above zero", "", ABSENT))
-    si = rounded(np.geomspace(first, last, number))
+        raise rejected(location, "must begin and end above zero")
+    si = _rounded(np.geomspace(first, last, number))
     si[0], si[-1] = first, last
     if not rule.whole:
         return Values(si, unit)
     whole = np.rint(si)
     if np.any(np.abs(si - whole) > 1e-9 * whole):
-        raise Rejected(Finding(location, "gives values that are not whole", "list them", ABSENT))
+        raise rejected(location, "gives values that are not whole", "list them")
     return Values(whole.astype(np.int64), unit)
 
 
@@ -309,13 +300,5 @@ def _hold_to_rule(values: Values, rule: Numeric, location: Location) -> None:
     broken = rule.first_outside(values.si)
     if broken is not None:
         index, words = broken
-        value = values.displayed(values.unit)[index]
-        raise Rejected(
-            Finding(
-                location,
-                f"{words}, and value {index + 1} of the generator is "
-                f"{value:.12g} {values.unit.text}".rstrip(),
-                "",
-                ABSENT,
-            )
-        )
+        value = f"{values.displayed(values.unit)[index]:.12g} {values.unit.text}".rstrip()
+        raise rejected(location, f"{words}, and value {index + 1} of the generator is {value}")

@@ -1,57 +1,57 @@
-"""Ground of a scene: real terrain, heights from files, and what is drawn at random."""
+"""Ground of a scene: real terrain, heights from files, planes, and what is drawn at random."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-import sweep.spec.quantities as of
+import sweep.spec.declaring as of
 from sweep.model.ground import LAWS
 from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
-from sweep.spec.instrument import Part
-from sweep.spec.list_rules import File, Several
-from sweep.spec.rules import Choice, Numeric, Text
-from sweep.spec.streams import generator
+from sweep.spec.parts import Files, Part
+from sweep.spec.sections import share_scattered
 
 if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
-    from sweep.spec.files import Files
+
+MOST_STEPS = 7000
+"""Grid steps along one side of a square."""
+_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
+
+Vector = tuple[float, ...]
+
+
+def generator(use: str, seed: int) -> np.random.Generator:
+    """Random numbers of one use: the same seed gives craters and boulders unlike places."""
+    key = (_STREAMS.index(use),)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
 
 class Material(Part):
     """Optical properties of a surface."""
 
-    reflectance: Annotated[
-        float,
-        Numeric(about="Fraction of light scattered back", example="0.1", at_least="0", at_most="1"),
-    ]
-    reflectance_law: Annotated[str, Choice(about="How it scatters", options=LAWS)] = "lambert"
+    reflectance: float = share_scattered()
+    reflectance_law: str = of.choice("How it scatters", LAWS, "lambert")
 
 
 OPTICAL = tuple(Material.model_fields)
 """Fields that rays know nothing of."""
 
-_SCALE = of.number("Metres to a unit of the file's heights", "0.5", at_least="1e-9", at_most="1e9")
-
-_RELIEF_SLOPE = of.number(
-    "Standard deviation of height differences over the baseline, divided by it",
-    "0.1",
-    at_least="0",
-    at_most="10",
-)
-
 
 class Relief(Part):
     """Fractal relief, for what a survey is too coarse to show."""
 
-    hurst: Annotated[float, of.number("Hurst exponent", "0.9", at_least="1e-3", at_most="0.999")]
-    rms_slope: Annotated[float, _RELIEF_SLOPE]
-    baseline: Annotated[float, of.size("Distance at which the slope is stated", "10 m")]
-    seed: Annotated[int, of.seed()] = 0
+    hurst: float = of.number("Hurst exponent", "0.9", "1e-3", "0.999")
+    rms_slope: float = of.number(
+        "Standard deviation of height differences over the baseline, divided by it",
+        "0.1", "0", "10",
+    )  # fmt: skip
+    baseline: float = of.size("Distance at which the slope is stated", "10 m")
+    seed: int = of.seed()
 
     def heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
         """Heights on a grid [m], of mean 0."""
@@ -71,17 +71,16 @@ class Relief(Part):
 class Craters(Part):
     """Simple craters by the lunar size-frequency law."""
 
-    smallest: Annotated[float, of.size("Smallest diameter, three grid steps or more", "20 m")]
-    largest: Annotated[float, of.size("Largest diameter", "300 m")]
-    least_fresh: Annotated[
-        float,
-        of.number("Freshness of the most worn, against 1", "0.1", at_least="0", at_most="1"),
-    ] = 0.1
-    equilibrium_diameter: Annotated[
-        float | None,
-        of.size("Diameter up to which craters have worn each other down; all by default", "100 m"),
-    ] = None
-    seed: Annotated[int, of.seed()] = 0
+    smallest: float = of.size("Smallest diameter, three grid steps or more", "20 m")
+    largest: float = of.size("Largest diameter", "300 m")
+    least_fresh: float = of.number(
+        "Freshness of the most worn, against 1", "0.1", "0", "1", default=0.1
+    )
+    equilibrium_diameter: float | None = of.size(
+        "Diameter up to which craters have worn each other down; all by default", "100 m",
+        default=None,
+    )  # fmt: skip
+    seed: int = of.seed()
 
     def carved(self, terrain: Terrain) -> Terrain:
         """Terrain with the craters in it."""
@@ -102,18 +101,13 @@ class Craters(Part):
 class Ground(Material, ABC):
     """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
 
-    owns_coordinates: ClassVar[bool] = False
-    """Whether its coordinates are its own, and not relative to the scene's origin."""
-
-    smoothing: Annotated[
-        float,
-        of.length(
-            "Standard deviation of a Gaussian that the heights are blurred by", at_least="0 m"
-        ),
-    ] = 0.0
-    factor: Annotated[
-        int, of.count("New grid steps to each old one, by a cubic spline", "8", at_most="1000")
-    ] = 1
+    smoothing: float = of.length(
+        "Standard deviation of a Gaussian that the heights are blurred by", "10 m", "0 m",
+        default=0.0,
+    )  # fmt: skip
+    factor: int = of.count(
+        "New grid steps to each old one, by a cubic spline", "8", "1", "1000", default=1
+    )
     relief: Relief | None = None
     craters: Craters | None = None
 
@@ -146,13 +140,7 @@ class Ground(Material, ABC):
         """The ground before anything is done to it."""
 
     def check(self) -> None:
-        """Looks at what can be seen without making the ground.
-
-        Raises
-        ------
-        ValueError
-            For a grid that can not be.
-        """
+        """Raise a ValueError for a grid that, by its fields alone, can not be."""
 
     def step(self) -> float | None:
         """Grid step [m], the larger one; None where only a file knows it."""
@@ -162,10 +150,9 @@ class Ground(Material, ABC):
 class PlacedGround(Ground):
     """Ground without coordinates of its own."""
 
-    position: Annotated[
-        tuple[float, ...],
-        of.position("Where the middle of its grid lies, its heights above that"),
-    ] = (0.0, 0.0, 0.0)
+    position: Vector = of.position(
+        "Where the middle of its grid lies, its heights above that", default=(0.0, 0.0, 0.0)
+    )
 
     def survey(self, files: Files) -> Terrain:
         """The ground before anything is done to it."""
@@ -181,6 +168,9 @@ class PlacedGround(Ground):
         """Heights, wherever they are."""
 
 
+# Ground of surveys and files
+
+
 class Jacksboro(PlacedGround):
     """The Jacksboro fault, Tennessee: real terrain that is always there, at posts of 74 m x 92 m.
 
@@ -188,14 +178,13 @@ class Jacksboro(PlacedGround):
     """
 
     kind: Literal["jacksboro"]
-    size: Annotated[
-        float | None,
-        of.length("Side of the square cut from it; all of it by default", "3 km", at_least="1 km"),
-    ] = None
-    middle: Annotated[
-        tuple[float, ...],
-        of.position("Middle of that square, eastwards and northwards from that of the survey", 2),
-    ] = (0.0, 0.0)
+    size: float | None = of.length(
+        "Side of the square cut from it; all of it by default", "3 km", "1 km", default=None
+    )
+    middle: Vector = of.position(
+        "Middle of that square, eastwards and northwards from that of the survey",
+        of=2, default=(0.0, 0.0),
+    )  # fmt: skip
 
     def grid(self, files: Files | None) -> Terrain:
         """Heights of the survey."""
@@ -203,12 +192,10 @@ class Jacksboro(PlacedGround):
         from sweep.scenes.terrain import piece
 
         survey = jacksboro()
-        if self.size is None:
-            return survey
-        return piece(survey, centre=self.middle, size=self.size)
+        return survey if self.size is None else piece(survey, centre=self.middle, size=self.size)  # type: ignore[arg-type]
 
     def check(self) -> None:
-        """Looks for ground where the piece is cut."""
+        """Look for ground where the piece is cut."""
         self.grid(None)
 
     def step(self) -> float | None:
@@ -216,36 +203,28 @@ class Jacksboro(PlacedGround):
         return max(abs(step) for step in self.grid(None).spacing) / self.factor
 
 
+def _scale() -> Any:
+    return of.number("Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0)
+
+
 class RasterGround(Ground):
     """Heights of a georeferenced raster, such as a GeoTIFF, in its own coordinates."""
 
-    owns_coordinates = True
-
     kind: Literal["raster"]
-    file: Annotated[str, File(about="The raster, whatever rasterio reads", digest=raster_digest)]
-    band: Annotated[int, of.count("Band that holds the heights", "1")] = 1
-    scale: Annotated[float, _SCALE] = 1.0
-    window: Annotated[
-        tuple[float, ...] | None,
-        Several(
-            about="West, south, east and north of the part to read, in the raster's coordinates",
-            of=of.number("Coordinate", "500000"),
-            least=4,
-            most=4,
-        ),
-    ] = None
-    metres_per_degree: Annotated[
-        tuple[float, ...] | None,
-        Several(
-            about="Metres of a degree eastwards and northwards, of a raster in degrees",
-            of=of.number("Metres", "110900", at_least="1e-6"),
-            least=2,
-            most=2,
-        ),
-    ] = None
-    pixel: Annotated[
-        float | None, of.size("Size of a pixel, of a raster that states no scale", "1 m")
-    ] = None
+    file: str = of.file("The raster, whatever rasterio reads", digest=raster_digest)
+    band: int = of.count("Band that holds the heights", "1", default=1)
+    scale: float = _scale()
+    window: Vector | None = of.several(
+        of.measure("Coordinate", "", "500000"), 4, 4, None,
+        about="West, south, east and north of the part to read, in the raster's coordinates",
+    )  # fmt: skip
+    metres_per_degree: Vector | None = of.several(
+        of.measure("Metres", "", "110900", "1e-6"), 2, 2, None,
+        about="Metres of a degree eastwards and northwards, of a raster in degrees",
+    )  # fmt: skip
+    pixel: float | None = of.size(
+        "Size of a pixel, of a raster that states no scale", "1 m", default=None
+    )
 
     def survey(self, files: Files) -> Terrain:
         """Heights of the raster."""
@@ -263,20 +242,15 @@ class ArrayGround(PlacedGround):
     """Heights of a NumPy file."""
 
     kind: Literal["array"]
-    file: Annotated[str, File(about="The file, .npy or .npz")]
-    spacing: Annotated[
-        tuple[float, ...],
-        of.vector(
-            "Step from column to column and from row to row; the second is below 0 where row 0 "
-            "is the northern one",
-            "m",
-            "5 m",
-            2,
-        ),
-    ]
-    name: Annotated[str | None, Text(about="Array of an .npz that holds the heights")] = None
-    no_data: Annotated[float | None, of.number("Value for a missing height", "-9999")] = None
-    scale: Annotated[float, _SCALE] = 1.0
+    file: str = of.file("The file, .npy or .npz")
+    spacing: Vector = of.vector(
+        "Step from column to column and from row to row; the second is below 0 where row 0 "
+        "is the northern one",
+        "m", "5 m", of=2,
+    )  # fmt: skip
+    name: str | None = of.text("Array of an .npz that holds the heights", None)
+    no_data: float | None = of.number("Value for a missing height", "-9999", default=None)
+    scale: float = _scale()
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the file."""
@@ -292,10 +266,10 @@ class ImageGround(PlacedGround):
     """Heights of a grey image: row 0 is the northern one."""
 
     kind: Literal["image"]
-    file: Annotated[str, File(about="The image, of 8 or 16 bits")]
-    pixel: Annotated[float, of.size("Size of a pixel", "2 m")]
-    white: Annotated[float, of.length("Height of full white", "49 m")]
-    black: Annotated[float, of.length("Height of black", "0 m")] = 0.0
+    file: str = of.file("The image, of 8 or 16 bits")
+    pixel: float = of.size("Size of a pixel", "2 m")
+    white: float = of.length("Height of full white", "49 m")
+    black: float = of.length("Height of black", "0 m", default=0.0)
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the image."""
@@ -303,3 +277,111 @@ class ImageGround(PlacedGround):
 
         path = files.path(self.file)
         return read_image(path, pixel=self.pixel, black=self.black, white=self.white)
+
+
+# Ground that no file holds
+
+
+def _nodes(side: float, step: float) -> int:
+    """Nodes of a grid of at least a side's length."""
+    return math.ceil(side / step * (1 - 1e-12)) + 1
+
+
+class SquareGround(PlacedGround):
+    """A square of ground on a grid that is stated."""
+
+    size: float = of.size("Side of the square", "3 km")
+
+    def own_step(self) -> float:
+        """Grid step before refining [m]."""
+        return float(self.spacing)  # type: ignore[attr-defined]
+
+    def flat(self) -> Terrain:
+        """The grid, of heights 0."""
+        from sweep.scenes.terrain import Terrain
+
+        self.check()
+        step, number = self.own_step(), _nodes(self.size, self.own_step())
+        return Terrain(np.zeros((number, number)), (step, step), np.zeros(3))
+
+    def check(self) -> None:
+        """Look at the number of grid steps."""
+        steps = _nodes(self.size, self.own_step()) - 1
+        if not 1 <= steps <= MOST_STEPS:
+            raise ValueError(
+                f"a side of {self.size:g} m has {steps} steps of {self.own_step():g} m, "
+                f"and takes {MOST_STEPS} at most"
+            )
+
+    def step(self) -> float | None:
+        """Grid step [m]."""
+        return self.own_step() / self.factor
+
+
+class Plane(SquareGround):
+    """A square plane."""
+
+    kind: Literal["plane"]
+    height: float = of.length("Height of its middle", "0 m", default=0.0)
+    slope: float = of.angle("Angle from the level", "10 deg", "0 deg", "80 deg", default=0.0)
+    uphill: float = of.angle("Heading in which it rises", "90 deg", default=0.0)
+    spacing: float | None = of.size(
+        "Grid step, for relief and craters; one cell by default", "5 m", default=None
+    )
+
+    def own_step(self) -> float:
+        """Grid step before refining [m]."""
+        return self.size if self.spacing is None else self.spacing
+
+    def grid(self, files: Files) -> Terrain:
+        """The plane."""
+        grid = self.flat()
+        rise, steps = math.tan(self.slope), np.arange(len(grid.heights))
+        along = (steps - steps.mean()) * grid.spacing[0] * rise
+        tilt = math.cos(self.uphill) * along + math.sin(self.uphill) * along[:, None]
+        return replace(grid, heights=tilt + self.height)
+
+
+class ReliefGround(Relief, SquareGround):
+    """Fractal ground, of mean height 0."""
+
+    kind: Literal["relief"]
+    spacing: float = of.size("Grid step", "5 m")
+
+    def grid(self, files: Files) -> Terrain:
+        """The ground as drawn."""
+        grid = self.flat()
+        shape = len(grid.heights), len(grid.heights)
+        return replace(grid, heights=self.heights(shape, grid.spacing))
+
+
+class Hills(SquareGround):
+    """Smooth rolling ground, of mean height 0."""
+
+    kind: Literal["hills"]
+    spacing: float = of.size("Grid step", "1 m")
+    rms_height: float = of.length("Standard deviation of the height", "10 m", "0 m")
+    correlation_length: float = of.size(
+        "Distance at which the correlation of heights is 1/e", "80 m"
+    )
+    seed: int = of.seed()
+
+    def check(self) -> None:
+        """Look at the number of grid steps, and at their size."""
+        super().check()
+        if not self.correlation_length > 3 * self.spacing:
+            raise ValueError("hills need a correlation length over three grid steps")
+
+    def grid(self, files: Files) -> Terrain:
+        """The ground as drawn."""
+        from sweep.scenes.terrain import hills
+
+        grid = self.flat()
+        heights = hills(
+            generator("hills", self.seed),
+            shape=(len(grid.heights), len(grid.heights)),
+            spacing=grid.spacing,
+            rms_height=self.rms_height,
+            correlation_length=self.correlation_length,
+        )
+        return replace(grid, heights=heights)

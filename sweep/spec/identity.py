@@ -5,15 +5,27 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cache
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.fields import parameter_rules
-from sweep.spec.scene_units import scene_units
+from sweep.spec.grounds import OPTICAL
+from sweep.spec.motion import Platform
+from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
+from sweep.spec.rules import File
+from sweep.spec.scanners import AnyScanner
+from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
 
 LISTED_VALUES = 64
+MOST_TOLD = 8
+"""Values of an axis that are told one by one."""
+ROOTS: Models = (Scene, Platform, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner))
+"""Sections that studies of scenes alone have."""
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
@@ -54,6 +66,48 @@ def digest(identity: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
+def leaf_values(part: BaseModel, digests: Mapping[str, str]) -> dict[str, Any]:
+    """SI values of a part by dotted path; of files, their digests."""
+    return {
+        ".".join(path): digests.get(value, value) if isinstance(rule, File) else value
+        for path, rule, value in leaves(part)
+    }
+
+
+def geometry_of(
+    scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
+) -> dict[str, Any]:
+    """What a flight over a scene sees through one scanner: all but the beams' own shape.
+
+    Objects count by their place in the scene, which is where their surfaces' numbers come from,
+    and not by name.
+    """
+    places = {name: place for place, name in enumerate(scene.objects)}
+    return {
+        "objects": [
+            _object_geometry(leaf_values(thing, digests), places)
+            for thing in scene.objects.values()
+        ],
+        "origin": places.get(scene.origin, -1),
+        "platform": leaf_values(platform, digests),
+        "scanner": leaf_values(scanner, digests),
+    }
+
+
+def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> dict[str, Any]:
+    """What rays meet of an object: no reflectance, and the ground that it stands on by place."""
+    kept = {path: v for path, v in values.items() if path.rsplit(".", 1)[-1] not in OPTICAL}
+    return kept | ({"on": places[kept["on"]]} if "on" in kept else {})
+
+
+@cache
+def scene_units() -> MappingProxyType[str, str]:
+    """SI unit of every field of a scene by its name: one name has one unit wherever it stands."""
+    fields = [item for model in all_parts(*ROOTS) for item in fields_of(model).items()]
+    rules = {name: rule for name, field in fields if (rule := rule_of(field))}
+    return MappingProxyType({name: rule.units for name, rule in rules.items()})
+
+
 class Identified(Protocol):
     """Something with an identity: a spec."""
 
@@ -62,18 +116,8 @@ class Identified(Protocol):
         ...
 
 
-MOST_TOLD = 8
-"""Values of an axis that are told one by one."""
-
-
 def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, Any]) -> list[str]:
-    """Lines ``path: value -> value`` for all that differs between two studies.
-
-    Parameters
-    ----------
-    a, b : Spec or mapping
-        Specs or their identities, as `Spec.identity` gives them or as they come back from JSON.
-    """
+    """Lines ``path: value -> value`` for all that differs between two specs or their identities."""
     left, right = (
         _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)
     )
@@ -87,18 +131,15 @@ def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, A
 
 def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
     """Leaves of an identity by dotted path; the values of an axis count as one leaf."""
-    flat: dict[str, Any] = {}
-    flat |= identity.get("parameters", {})
+    flat: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():
-        if key == "parameters":
-            continue
         if key == "axes":
             flat["axes"] = [axis["name"] for axis in value]
             for axis in value:
                 flat |= {f"axes.{axis['name']}.{path}": m for path, m in axis["members"].items()}
-        elif isinstance(value, Mapping):
+        elif isinstance(value, Mapping) and key != "parameters":
             flat |= {f"{key}.{inner}": leaf for inner, leaf in value.items()}
-        else:
+        elif key != "parameters":
             flat[key] = value
     return flat
 

@@ -3,479 +3,220 @@
 Values are SI inside; what users write carries units.
 """
 
-from typing import Annotated, Self
+from typing import Self
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
+import sweep.spec.declaring as of
 from sweep.model.beam import COUPLINGS, SINGLE_MODE
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.threshold import PROCESSING, WAYS
-from sweep.spec.effect_fields import with_parameters
-from sweep.spec.method_rule import Method
-from sweep.spec.rules import BROKEN_RULE, Choice, Numeric
-from sweep.spec.window_rule import Window
+from sweep.spec.parts import Part, with_parameters
+from sweep.spec.rules import BROKEN_RULE, Method, Window
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-
-
-class Part(BaseModel):
-    """A section of a spec: frozen, and with no field but its own."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+_WATTS = ("1e-18 W", "1e9 W")
+_HERTZ = ("1 mHz", "1e15 Hz")
+_OHMS = ("1 uohm", "1e12 ohm")
+_WAIST = ("5 mm", "100 nm", "1 km")
 
 
 @with_parameters("instrument.laser")
 class Laser(Part):
     """Transmitter: wavelength, power and beam."""
 
-    wavelength: Annotated[
-        float,
-        Numeric(
-            about="Optical wavelength",
-            si_unit="m",
-            example="1550 nm",
-            at_least="1 nm",
-            at_most="100 m",
-        ),
-    ]
-    power: Annotated[
-        float,
-        Numeric(
-            about="Transmitted optical power",
-            si_unit="W",
-            example="1 W",
-            at_least="1e-18 W",
-            at_most="1e9 W",
-        ),
-    ]
-    beam_divergence: Annotated[
-        float,
-        Numeric(
-            about="Full angle of the beam, for a Gaussian beam between its 1/e^2 points; or give "
-            "beam_waist",
-            si_unit="rad",
-            example="50 urad",
-            at_least="1e-12 rad",
-            at_most="90 deg",
-            words=(("none", 0),),
-        ),
-    ] = 0.0
-    beam_waist: Annotated[
-        float,
-        Numeric(
-            about="1/e^2 radius of the beam as it leaves the telescope; or give beam_divergence",
-            si_unit="m",
-            example="5 mm",
-            at_least="100 nm",
-            at_most="1 km",
-            words=(("none", 0),),
-        ),
-    ] = 0.0
-    beam_quality: Annotated[
-        float,
-        Numeric(
-            about="M^2 of the sent beam; 1 for a beam at the limit of diffraction",
-            example="1.2",
-            at_least="1",
-            at_most="1e6",
-        ),
-    ] = 1.0
-    focus: Annotated[
-        float,
-        Numeric(
-            about="Distance at which the telescope is focused; none: at infinity",
-            si_unit="m",
-            example="20 m",
-            at_least="1 mm",
-            at_most="1e15 m",
-            words=(("none", 0),),
-        ),
-    ] = 0.0
+    wavelength: float = of.length("Optical wavelength", "1550 nm", "1 nm", "100 m")
+    power: float = of.quantity("Transmitted optical power", "W", "1 W", *_WATTS)
+    beam_divergence: float = of.angle(
+        "Full angle of the beam, for a Gaussian beam between its 1/e^2 points; or give beam_waist",
+        "50 urad", "1e-12 rad", "90 deg", default=0.0, word="none",
+    )  # fmt: skip
+    beam_waist: float = of.length(
+        "1/e^2 radius of the beam as it leaves the telescope; or give beam_divergence",
+        *_WAIST, default=0.0, word="none",
+    )  # fmt: skip
+    beam_quality: float = of.number(
+        "M^2 of the sent beam; 1 for a beam at the limit of diffraction",
+        "1.2", "1", "1e6", default=1.0,
+    )  # fmt: skip
+    focus: float = of.length(
+        "Distance at which the telescope is focused; none: at infinity",
+        "20 m", "1 mm", "1e15 m", default=0.0, word="none",
+    )  # fmt: skip
 
 
 @with_parameters("instrument.chirp")
 class Chirp(Part):
     """Linear frequency sweep of one segment."""
 
-    bandwidth: Annotated[
-        float,
-        Numeric(
-            about="Frequency swept in one chirp",
-            si_unit="Hz",
-            example="1 GHz",
-            at_least="1 mHz",
-            at_most="1e15 Hz",
-        ),
-    ]
-    start_frequency: Annotated[
-        float,
-        Numeric(
-            about="Frequency at which the chirp starts",
-            si_unit="Hz",
-            example="5.5 GHz",
-            at_least="0 Hz",
-            at_most="1e15 Hz",
-        ),
-    ]
-    duration: Annotated[
-        float,
-        Numeric(
-            about="Length of one segment",
-            si_unit="s",
-            example="500 us",
-            at_least="1 ps",
-            at_most="1e6 s",
-        ),
-    ]
+    bandwidth: float = of.quantity("Frequency swept in one chirp", "Hz", "1 GHz", *_HERTZ)
+    start_frequency: float = of.quantity(
+        "Frequency at which the chirp starts", "Hz", "5.5 GHz", "0 Hz", "1e15 Hz"
+    )
+    duration: float = of.duration("Length of one segment", "500 us", "1 ps", "1e6 s")
 
 
 @with_parameters("instrument.telescope")
 class Telescope(Part):
     """Receiving optics."""
 
-    aperture: Annotated[
-        float,
-        Numeric(
-            about="Diameter of the aperture",
-            si_unit="m",
-            example="25 mm",
-            at_least="1 um",
-            at_most="1 km",
-        ),
-    ]
-    optical_efficiency: Annotated[
-        float,
-        Numeric(
-            about="Fraction of the collected light that reaches the detector",
-            example="0.8",
-            at_least="0",
-            at_most="1",
-        ),
-    ] = 1.0
-    coupling: Annotated[
-        str,
-        Choice(
-            about="Light that mixes with the local oscillator: that of a single mode, or all in "
-            "the aperture, as the thesis has it; direct detection always has all",
-            options=COUPLINGS,
-        ),
-    ] = SINGLE_MODE
+    aperture: float = of.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
+    optical_efficiency: float = of.number(
+        "Fraction of the collected light that reaches the detector", "0.8", "0", "1", default=1.0
+    )
+    coupling: str = of.choice(
+        "Light that mixes with the local oscillator: that of a single mode, or all in "
+        "the aperture, as the thesis has it; direct detection always has all",
+        COUPLINGS,
+        SINGLE_MODE,
+    )
 
 
 @with_parameters("instrument.receiver")
 class Receiver(Part):
     """Detector, local oscillator and amplifiers."""
 
-    responsivity: Annotated[
-        float,
-        Numeric(
-            about="Responsivity at unit gain",
-            si_unit="A/W",
-            example="1.1 A/W",
-            at_least="1e-9 A/W",
-            at_most="1e3 A/W",
-        ),
-    ]
-    detector_bandwidth: Annotated[
-        float,
-        Numeric(
-            about="Electrical bandwidth of the detector",
-            si_unit="Hz",
-            example="400 MHz",
-            at_least="1 mHz",
-            at_most="1e15 Hz",
-        ),
-    ]
-    optical_passband: Annotated[
-        float,
-        Numeric(
-            about="Width of the optical filter",
-            si_unit="m",
-            example="25 nm",
-            at_least="0 m",
-            at_most="100 m",
-        ),
-    ]
-    noise_equivalent_power: Annotated[
-        float,
-        Numeric(
-            about="Noise-equivalent power density of the detector",
-            si_unit="W/Hz^0.5",
-            example="5 pW/rtHz",
-            at_least="0 W/Hz^0.5",
-            at_most="100 W/Hz^0.5",
-        ),
-    ]
-    transimpedance: Annotated[
-        float,
-        Numeric(
-            about="Gain of the transimpedance amplifier",
-            si_unit="ohm",
-            example="7 kohm",
-            at_least="1 uohm",
-            at_most="1e12 ohm",
-        ),
-    ]
-    amplifier_bandwidth: Annotated[
-        float,
-        Numeric(
-            about="Electrical bandwidth of the amplifier",
-            si_unit="Hz",
-            example="400 MHz",
-            at_least="1 mHz",
-            at_most="1e15 Hz",
-        ),
-    ]
-    amplifier_noise_current: Annotated[
-        float,
-        Numeric(
-            about="Input-referred noise current of the amplifier, rms over its bandwidth",
-            si_unit="A",
-            example="25 nA",
-            at_least="0 A",
-            at_most="1 kA",
-        ),
-    ]
-    noise_shape: Annotated[
-        str,
-        Choice(
-            about="Density of the receiver's noise: shaped by its bandwidths as signals are, or "
-            "white over the record",
-            options=("receiver", "white"),
-        ),
-    ] = "receiver"
-    architecture: Annotated[
-        str, Choice(about="How the echo is detected", options=ARCHITECTURES)
-    ] = "homodyne"
-    local_oscillator_power: Annotated[
-        float,
-        Numeric(
-            about="Power of the local oscillator; direct detection has none",
-            si_unit="W",
-            example="1 mW",
-            at_least="1e-18 W",
-            at_most="1e9 W",
-        ),
-    ] = 1e-3
-    local_oscillator_waist: Annotated[
-        float,
-        Numeric(
-            about="1/e^2 radius at the telescope of the beam that the local oscillator would make; "
-            "none: the sent beam's. single_mode only",
-            si_unit="m",
-            example="5 mm",
-            at_least="100 nm",
-            at_most="1 km",
-            words=(("none", 0),),
-        ),
-    ] = 0.0
-    mixing_efficiency: Annotated[
-        float,
-        Numeric(
-            about="Heterodyne efficiency: share of the echo's power that mixes with the local "
-            "oscillator, as which it counts in the SNR",
-            example="0.7",
-            at_least="1e-9",
-            at_most="1",
-        ),
-    ] = 1.0
-    apd_gain: Annotated[
-        float,
-        Numeric(
-            about="Avalanche gain; 1 for a PIN diode", example="10", at_least="1", at_most="1e9"
-        ),
-    ] = 1.0
-    excess_noise_factor: Annotated[
-        float,
-        Numeric(
-            about="Excess noise factor of the avalanche", example="2.5", at_least="1", at_most="1e9"
-        ),
-    ] = 1.0
-    noise_figure: Annotated[
-        float,
-        Numeric(
-            about="Noise figure of the radio-frequency stages; heterodyne only",
-            si_unit="dB",
-            example="3 dB",
-            at_least="0 dB",
-            at_most="300 dB",
-        ),
-    ] = 1.0
-    modulation_index: Annotated[
-        float,
-        Numeric(
-            about="Depth of the intensity modulation; direct only",
-            example="0.9",
-            at_least="1e-9",
-            at_most="1",
-        ),
-    ] = 1.0
-    load_resistance: Annotated[
-        float,
-        Numeric(
-            about="Load whose thermal noise limits direct detection; direct only",
-            si_unit="ohm",
-            example="50 ohm",
-            at_least="1 uohm",
-            at_most="1e12 ohm",
-        ),
-    ] = 50.0
-    temperature: Annotated[
-        float,
-        Numeric(
-            about="Temperature of the load; direct only",
-            si_unit="K",
-            example="290 K",
-            at_least="1 nK",
-            at_most="1e9 K",
-        ),
-    ] = 290.0
+    responsivity: float = of.quantity(
+        "Responsivity at unit gain", "A/W", "1.1 A/W", "1e-9 A/W", "1e3 A/W"
+    )
+    detector_bandwidth: float = of.quantity(
+        "Electrical bandwidth of the detector", "Hz", "400 MHz", *_HERTZ
+    )
+    optical_passband: float = of.length("Width of the optical filter", "25 nm", "0 m", "100 m")
+    noise_equivalent_power: float = of.quantity(
+        "Noise-equivalent power density of the detector",
+        "W/Hz^0.5", "5 pW/rtHz", "0 W/Hz^0.5", "100 W/Hz^0.5",
+    )  # fmt: skip
+    transimpedance: float = of.quantity(
+        "Gain of the transimpedance amplifier", "ohm", "7 kohm", *_OHMS
+    )
+    amplifier_bandwidth: float = of.quantity(
+        "Electrical bandwidth of the amplifier", "Hz", "400 MHz", *_HERTZ
+    )
+    amplifier_noise_current: float = of.quantity(
+        "Input-referred noise current of the amplifier, rms over its bandwidth",
+        "A", "25 nA", "0 A", "1 kA",
+    )  # fmt: skip
+    noise_shape: str = of.choice(
+        "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
+        "white over the record",
+        ("receiver", "white"),
+        "receiver",
+    )
+    architecture: str = of.choice("How the echo is detected", ARCHITECTURES, "homodyne")
+    local_oscillator_power: float = of.quantity(
+        "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
+        default=1e-3,
+    )  # fmt: skip
+    local_oscillator_waist: float = of.length(
+        "1/e^2 radius at the telescope of the beam that the local oscillator would make; "
+        "none: the sent beam's. single_mode only",
+        *_WAIST, default=0.0, word="none",
+    )  # fmt: skip
+    mixing_efficiency: float = of.number(
+        "Heterodyne efficiency: share of the echo's power that mixes with the local "
+        "oscillator, as which it counts in the SNR",
+        "0.7", "1e-9", "1", default=1.0,
+    )  # fmt: skip
+    apd_gain: float = of.number("Avalanche gain; 1 for a PIN diode", "10", "1", "1e9", default=1.0)
+    excess_noise_factor: float = of.number(
+        "Excess noise factor of the avalanche", "2.5", "1", "1e9", default=1.0
+    )
+    noise_figure: float = of.quantity(
+        "Noise figure of the radio-frequency stages; heterodyne only",
+        "dB", "3 dB", "0 dB", "300 dB", default=1.0,
+    )  # fmt: skip
+    modulation_index: float = of.number(
+        "Depth of the intensity modulation; direct only", "0.9", "1e-9", "1", default=1.0
+    )
+    load_resistance: float = of.quantity(
+        "Load whose thermal noise limits direct detection; direct only",
+        "ohm", "50 ohm", *_OHMS, default=50.0,
+    )  # fmt: skip
+    temperature: float = of.quantity(
+        "Temperature of the load; direct only", "K", "290 K", "1 nK", "1e9 K", default=290.0
+    )
 
 
 class Detector(Part):
     """What flags bins of a spectrum, where whole spectra are drawn."""
 
-    kind: Annotated[
-        str, Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS))
-    ] = FIXED
-    training: Annotated[
-        int,
-        Numeric(
-            about="Training cells of a CFAR detector, half of them on either side; even",
-            example="32",
-            at_least="2",
-            at_most="100000",
-            whole=True,
-        ),
-    ] = 32
-    guard: Annotated[
-        int,
-        Numeric(
-            about="Guard cells on either side of the bin, which train nothing",
-            example="4",
-            at_least="0",
-            at_most="100000",
-            whole=True,
-        ),
-    ] = 4
-    rank: Annotated[
-        int,
-        Numeric(
-            about="Rank of OS-CFAR's training cell, 1 for the least; auto: three quarters of them",
-            example="24",
-            at_least="1",
-            at_most="100000",
-            whole=True,
-            words=(("auto", 0),),
-        ),
-    ] = 0
-    pfa: Annotated[
-        float,
-        Numeric(
-            about="Design probability of a false alarm in a bin of noise, of CFAR detectors",
-            example="1e-6",
-            at_least="1e-30",
-            at_most="0.5",
-        ),
-    ] = 1e-6
+    kind: str = of.field(
+        Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)), FIXED
+    )
+    training: int = of.count(
+        "Training cells of a CFAR detector, half of them on either side; even",
+        "32", "2", "100000", default=32,
+    )  # fmt: skip
+    guard: int = of.count(
+        "Guard cells on either side of the bin, which train nothing", "4", "0", "100000", default=4
+    )
+    rank: int = of.count(
+        "Rank of OS-CFAR's training cell, 1 for the least; auto: three quarters of them",
+        "24", "1", "100000", default=0, word="auto",
+    )  # fmt: skip
+    pfa: float = of.number(
+        "Design probability of a false alarm in a bin of noise, of CFAR detectors",
+        "1e-6", "1e-30", "0.5", default=1e-6,
+    )  # fmt: skip
 
 
 class Estimator(Part):
     """What places a detected peak between bins, where whole spectra are drawn."""
 
-    kind: Annotated[
-        str, Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS))
-    ] = PEAK_BIN
-
-
-def _design_pfa(where: str) -> Numeric:
-    """Rule of a probability of a false alarm that the threshold is set by."""
-    return Numeric(
-        about=f"Instead of tnr: probability that noise alone raises a false alarm in {where}",
-        example="1e-6",
-        at_least="1e-300",
-        at_most="0.99",
+    kind: str = of.field(
+        Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS)), PEAK_BIN
     )
+
+
+def _design_pfa(where: str) -> float | None:
+    """Field of a probability of a false alarm that the threshold is set by."""
+    about = f"Instead of tnr: probability that noise alone raises a false alarm in {where}"
+    rule: float | None = of.number(about, "1e-6", "1e-300", "0.99", default=None)
+    return rule
 
 
 @with_parameters("instrument.processing")
 class Processing(Part):
     """Sampling, transform and threshold."""
 
-    sample_rate: Annotated[
-        float,
-        Numeric(
-            about="Rate of the ADC",
-            si_unit="Hz",
-            example="600 MHz",
-            at_least="1 mHz",
-            at_most="1e15 Hz",
-        ),
-    ]
-    fft_size: Annotated[
-        int,
-        Numeric(
-            about="Points of the FFT", example="2^17", at_least="2", at_most="2^30", whole=True
-        ),
-    ]
-    tnr: Annotated[
-        float | None,
-        Numeric(
-            about="Threshold over the standard deviation of a noise-only bin's magnitude",
-            example="10",
-            at_least="1e-6",
-            at_most="1e6",
-        ),
-    ] = None
-    threshold_to_mean: Annotated[
-        float | None,
-        Numeric(
-            about="Instead of tnr: threshold over the mean of a noise-only bin's magnitude",
-            example="4",
-            at_least="1e-6",
-            at_most="1e6",
-        ),
-    ] = None
-    design_pfa_bin: Annotated[float | None, _design_pfa("a bin")] = None
-    design_pfa_segment: Annotated[float | None, _design_pfa("any bin of a segment")] = None
-    design_pfa_shot: Annotated[float | None, _design_pfa("any segment of a shot")] = None
-    window: Annotated[
-        str, Window(about="Window function, by scipy.signal's name, with its parameters")
-    ] = "hamming"
-    acquisition_delay: Annotated[
-        float,
-        Numeric(
-            about="Time from the start of a segment to its first sample",
-            si_unit="s",
-            example="70 us",
-            at_least="0 s",
-            at_most="1e6 s",
-        ),
-    ] = 0.0
-    bins_counted: Annotated[
-        str,
-        Choice(
-            about="Bins that may raise a false alarm: half the FFT, as a real record has, or all",
-            options=("half", "all"),
-        ),
-    ] = "half"
-    detection: Annotated[
-        str,
-        Choice(
-            about="Bins by which an echo is detected: any that it occupies, or the largest alone",
-            options=("any_bin", "peak_bin"),
-        ),
-    ] = "any_bin"
-    noise_bins: Annotated[
-        str,
-        Choice(
-            about="Noise of bins: correlated as window and padding make it, and real at DC and "
-            "Nyquist; or independent and circular, as the thesis takes it",
-            options=("correlated", "independent"),
-        ),
-    ] = "correlated"
+    sample_rate: float = of.quantity("Rate of the ADC", "Hz", "600 MHz", *_HERTZ)
+    fft_size: int = of.count("Points of the FFT", "2^17", "2", "2^30")
+    tnr: float | None = of.number(
+        "Threshold over the standard deviation of a noise-only bin's magnitude",
+        "10", "1e-6", "1e6", default=None,
+    )  # fmt: skip
+    threshold_to_mean: float | None = of.number(
+        "Instead of tnr: threshold over the mean of a noise-only bin's magnitude",
+        "4", "1e-6", "1e6", default=None,
+    )  # fmt: skip
+    design_pfa_bin: float | None = _design_pfa("a bin")
+    design_pfa_segment: float | None = _design_pfa("any bin of a segment")
+    design_pfa_shot: float | None = _design_pfa("any segment of a shot")
+    window: str = of.field(
+        Window(about="Window function, by scipy.signal's name, with its parameters"), "hamming"
+    )
+    acquisition_delay: float = of.duration(
+        "Time from the start of a segment to its first sample", "70 us", "0 s", "1e6 s", default=0.0
+    )
+    bins_counted: str = of.choice(
+        "Bins that may raise a false alarm: half the FFT, as a real record has, or all",
+        ("half", "all"),
+        "half",
+    )
+    detection: str = of.choice(
+        "Bins by which an echo is detected: any that it occupies, or the largest alone",
+        ("any_bin", "peak_bin"),
+        "any_bin",
+    )
+    noise_bins: str = of.choice(
+        "Noise of bins: correlated as window and padding make it, and real at DC and "
+        "Nyquist; or independent and circular, as the thesis takes it",
+        ("correlated", "independent"),
+        "correlated",
+    )
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sweep.spec.experiment import Spec
 from sweep.spec.mistakes import SpecError
 from sweep.spec.reading import parsed, read_document
 from sweep.spec.scene_spec import SceneSpec
+from sweep.spec.study import Spec
 
 
 def load(path: str | Path) -> Spec | SceneSpec:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+from sweep.units import QuantityError
+
 Location = tuple[str | int, ...]
 
+ABSENT = object()
+"""Stands for a value where none is written."""
 _LONGEST_VALUE = 60
 
 
@@ -47,13 +52,7 @@ class Mistake:
 
 
 class SpecError(Exception):
-    """Everything that is wrong with a spec, at once.
-
-    Parameters
-    ----------
-    mistakes : iterable of Mistake
-        The mistakes, in the order in which to show them.
-    """
+    """Everything that is wrong with a spec, at once, in the order in which to show it."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list(mistakes)
@@ -77,16 +76,47 @@ class Finding:
     rule, suggestion : str
         As in `Mistake`.
     written : object
-        The value as read from the file; ``ABSENT`` where there is none to show.
+        The value as read from the file, if it is to be shown.
     """
 
     location: Location
     rule: str
     suggestion: str = ""
-    written: object = None
+    written: object = ABSENT
 
 
-ABSENT = object()
+class Rejected(Exception):
+    """A part of a spec that cannot be read, with everything that is wrong with it."""
+
+    def __init__(self, *findings: Finding) -> None:
+        super().__init__(*findings)
+        self.findings = list(findings)
+
+
+def rejected(
+    location: Location, rule: str, suggestion: str = "", written: object = ABSENT
+) -> Rejected:
+    """Refusal for a single reason, to be raised."""
+    return Rejected(Finding(location, rule, suggestion, written))
+
+
+class Findings(list[Finding]):
+    """Findings of several parts, which are read one after the other whatever is wrong with one."""
+
+    @contextmanager
+    def of(self, location: Location = (), written: object = ABSENT) -> Iterator[None]:
+        """Context that keeps what is wrong with a part, or with the value at a location."""
+        try:
+            yield
+        except Rejected as error:
+            self.extend(error.findings)
+        except QuantityError as error:
+            self.append(Finding(location, error.rule, error.suggestion, written))
+
+    def refuse_any(self) -> None:
+        """Raise all findings, if there are any."""
+        if self:
+            raise Rejected(*self)
 
 
 def dotted(location: Location) -> str:

@@ -1,16 +1,23 @@
-"""YAML files as plain mappings, with the line of every value and every mistake in the YAML."""
+"""A spec as written: YAML with the line of every value, and every mistake in plain words.
+
+YAML becomes a `Document`, a plain mapping with the line of every value; what pydantic then finds
+wrong with it becomes findings, which the document gives their lines.
+"""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel, ValidationError
 
+from sweep.spec.fields import parameter_rules
+from sweep.spec.figures import FIGURE_KINDS, SCENE_FIGURE_KINDS
 from sweep.spec.mistakes import (
     ABSENT,
     Finding,
@@ -21,6 +28,8 @@ from sweep.spec.mistakes import (
     near_miss,
     shown,
 )
+from sweep.spec.parts import Models, Place, fields_of, kind_of, place_of, rule_of, rules_of
+from sweep.spec.rules import BROKEN_RULE, Numeric
 
 LARGEST_FILE = 1_000_000
 DEEPEST = 30
@@ -39,24 +48,15 @@ _PLAIN_TAGS = frozenset(
 
 @dataclass
 class Document:
-    """A spec as written: values, their places and what is already known to be wrong.
-
-    Parameters
-    ----------
-    value : dict
-        The mapping.
-    places : dict
-        File and line of each location.
-    findings : list of Finding
-        Mistakes found on reading.
-    file : str
-        The file read; empty where there is none.
-    """
+    """A spec as written: values, their places and what is already known to be wrong."""
 
     value: dict[str, Any]
     places: dict[Location, tuple[str, int]] = field(default_factory=dict)
+    """File and line of each location."""
     findings: list[Finding] = field(default_factory=list)
+    """Mistakes found on reading."""
     file: str = ""
+    """The file read; empty where there is none."""
 
     def mistake(self, finding: Finding) -> Mistake:
         """A finding with its file and line; those of the nearest place around it that has any."""
@@ -64,35 +64,28 @@ class Document:
         while location and location not in self.places:
             location = location[:-1]
         file, line = self.places.get(location, (self.file, None))
-        return Mistake(
-            dotted(finding.location),
-            finding.rule,
-            shown(finding.written),
-            finding.suggestion,
-            line,
-            file,
-        )
+        path, value = dotted(finding.location), shown(finding.written)
+        return Mistake(path, finding.rule, value, finding.suggestion, line, file)
+
+    def mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
+        """Findings as they stand in the file, each once; those in other files come last."""
+        mistakes = dict.fromkeys(self.mistake(finding) for finding in findings)
+        return sorted(mistakes, key=lambda m: (m.file != self.file, m.file, m.line or 0))
 
 
 def read_document(path: Path) -> Document:
-    """Mapping in a YAML file.
+    """Mapping in a YAML file; lesser mistakes in it are left in the document.
 
     Raises
     ------
     SpecError
-        Where the file is no readable YAML mapping. Lesser mistakes are left in the document.
+        Where the file is no readable YAML mapping.
     """
     return parsed(_read_text(path), path)
 
 
 def parsed(text: str, path: Path) -> Document:
-    """Mapping in YAML text, mistakes in which are told as those of a file.
-
-    Raises
-    ------
-    SpecError
-        As of :func:`read_document`.
-    """
+    """Mapping in YAML text, mistakes in which are told as those of a file."""
     try:
         root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -119,13 +112,11 @@ def _read_text(path: Path) -> str:
     except IsADirectoryError:
         raise _file_error(path, "is a directory", "name a YAML file") from None
     except (OSError, ValueError) as error:
-        raise _file_error(
-            path, f"cannot be read: {getattr(error, 'strerror', '') or error}", _NO_FILE
-        ) from None
+        rule = f"cannot be read: {getattr(error, 'strerror', '') or error}"
+        raise _file_error(path, rule, _NO_FILE) from None
     if len(content) > LARGEST_FILE:
-        raise _file_error(
-            path, f"is larger than {LARGEST_FILE} bytes", "give long axes as generators"
-        )
+        rule = f"is larger than {LARGEST_FILE} bytes"
+        raise _file_error(path, rule, "give long axes as generators")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -173,22 +164,13 @@ class _Walk:
         self.nodes += 1
         line = node.start_mark.line + 1
         if self.nodes > MOST_NODES or len(location) > DEEPEST:
-            raise SpecError(
-                [
-                    Mistake(
-                        dotted(location)[:200],
-                        "holds too many values",
-                        "",
-                        "repeat less with aliases",
-                        line,
-                        self.document.file,
-                    )
-                ]
-            )
+            path, rule = dotted(location)[:200], "holds too many values"
+            file, remedy = self.document.file, "repeat less with aliases"
+            raise SpecError([Mistake(path, rule, "", remedy, line, file)])
         self.document.places.setdefault(location, (self.document.file, line))
         if node.tag not in _PLAIN_TAGS:
             rule = f"has the tag {node.tag}, and tags are not read"
-            self.finding(location, rule, "leave it out", ABSENT)
+            self.finding(location, rule, "leave it out")
         if isinstance(node, yaml.MappingNode):
             return self.mapping(node, location)
         if isinstance(node, yaml.SequenceNode):
@@ -200,18 +182,14 @@ class _Walk:
         values: dict[str, Any] = {}
         for key_node, child in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
-                self.finding(location, "has a key that is no word", "begin it with a word", ABSENT)
+                self.finding(location, "has a key that is no word", "begin it with a word")
                 continue
             key = key_node.value
             line = key_node.start_mark.line + 1
             if key in values:
                 first = self.document.places[(*location, key)][1]
-                self.finding(
-                    (*location, f"{key}"),
-                    f"is given twice, on lines {first} and {line}",
-                    "keep one",
-                    ABSENT,
-                )
+                rule = f"is given twice, on lines {first} and {line}"
+                self.finding((*location, f"{key}"), rule, "keep one")
                 continue
             self.document.places[(*location, key)] = (self.document.file, line)
             values[key] = self.value(child, (*location, key))
@@ -229,19 +207,13 @@ class _Walk:
             return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
         return node.value
 
-    def finding(self, location: Location, rule: str, suggestion: str, written: object) -> None:
+    def finding(self, location: Location, rule: str, suggestion: str) -> None:
         """A mistake to be reported with all the others."""
-        self.document.findings.append(Finding(location, rule, suggestion, written))
+        self.document.findings.append(Finding(location, rule, suggestion))
 
 
 def resolve_instrument(document: Document, base: Path) -> bool:
-    """A document whose instrument is no reference to a file any more, changed in place.
-
-    Returns
-    -------
-    bool
-        Whether the instrument is there: False where its file could not be read.
-    """
+    """Put an instrument's file in the place of its path; False where it can't be read."""
     written = document.value.get("instrument")
     reference: object = written
     overrides: dict[str, Any] = {}
@@ -252,9 +224,8 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     elif not isinstance(written, str):
         return True
     if not isinstance(reference, str):
-        document.findings.append(
-            Finding(location, "must be the path of a YAML file", "", reference)
-        )
+        rule = "must be the path of a YAML file"
+        document.findings.append(Finding(location, rule, "", reference))
         return False
     try:
         read = read_document(base / os.path.expanduser(reference))
@@ -273,13 +244,7 @@ def resolve_instrument(document: Document, base: Path) -> bool:
 
 
 def plain(data: Any, location: Location = ()) -> Any:
-    """A copy of plain data as YAML would give it: dicts with text keys, and lists.
-
-    Raises
-    ------
-    SpecError
-        Where it is nested too deeply, or a number is too long to be read.
-    """
+    """A copy of plain data as YAML would give it: dicts with text keys, and lists."""
     if len(location) > DEEPEST:
         raise SpecError([Mistake(dotted(location), "is nested too deeply")])
     if isinstance(data, int) and data.bit_length() > _MOST_DIGITS:
@@ -309,3 +274,99 @@ def _is_leaf(value: Any, location: Location) -> bool:
         except (KeyError, IndexError, TypeError):
             return True
     return not isinstance(value, dict)
+
+
+# Pydantic's errors in plain words
+
+_PLAIN = {
+    "model_type": "must be a mapping of fields to values",
+    "model_attributes_type": "must be a mapping of fields to values",
+    "dict_type": "must be a mapping",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "invalid_key": "must be a word",
+}
+_FLIES = "it is for studies with a scene, in place of a target"
+_OTHER_STUDYS = {
+    **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
+    **dict.fromkeys(("platform", "scanners", "navigation"), _FLIES),
+}
+"""Remedy for a section that only the other kind of study has."""
+
+_DRAWN_BY = dict.fromkeys(FIGURE_KINDS, "a target") | dict.fromkeys(SCENE_FIGURE_KINDS, "a scene")
+
+
+def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:
+    """Everything pydantic found wrong with a mapping read as `root`."""
+    return [_finding(dict(detail), root) for detail in error.errors(include_url=False)]
+
+
+def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
+    """One error of pydantic's."""
+    kind, written = detail["type"], detail["input"]
+    place = place_of(detail["loc"], root)
+    location = place.location
+    if kind == BROKEN_RULE:
+        context, path = detail["ctx"], dotted(location)
+        if isinstance(written, list) and path in parameter_rules():
+            remedy = f"put several under axes: '{path}: [...]'"
+            return Finding(location, "takes one value", remedy, written)
+        shown = ABSENT if isinstance(written, dict) else written
+        return Finding(location, context["rule"], context["suggestion"], shown)
+    if kind == "missing":
+        return Finding(location, "is missing", _remedy(place))
+    if kind == "extra_forbidden":
+        return Finding(location, "is no field", _sibling(place, root))
+    if kind == "union_tag_invalid":
+        tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
+        rule = f"must be one of {', '.join(kinds)}"
+        return Finding((*location, "kind"), rule, _other_kind(str(tag), kinds), tag)
+    if kind == "union_tag_not_found":
+        return Finding(location, "lacks its kind", f"write {_with_kind(place.models)}", written)
+    rule = _PLAIN.get(kind, "has a value that cannot stand here")
+    return Finding(location, rule, "", written)
+
+
+def _with_kind(models: Models) -> str:
+    """What a part of several kinds is written with."""
+    return f"kind: and one of {', '.join(kind_of(model) for model in models)}"
+
+
+def _other_kind(tag: str, kinds: list[str]) -> str:
+    """Suggestion for a kind that is none of those here."""
+    if tag in _DRAWN_BY and kinds[0] in _DRAWN_BY:
+        return f"{tag} is for studies of {_DRAWN_BY[tag]}"
+    return near_miss(tag, kinds)
+
+
+def _remedy(place: Place) -> str:
+    """What to write for a missing field or section."""
+    name = place.location[-1]
+    field = fields_of(place.parents[0]).get(str(name)) if place.parents else None
+    rule = rule_of(field) if field is not None else None
+    example = rule.example if rule is not None else ""
+    if example:
+        varies = isinstance(rule, Numeric) and dotted(place.location) in parameter_rules()
+        return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if varies else "")
+    if len(place.models) > 1:
+        return f"write '{name}:' with {_with_kind(place.models)}"
+    if place.models:
+        return f"write '{name}:' with {', '.join(fields_of(place.models[0]))}"
+    return f"write '{name}: ...'"
+
+
+def _sibling(place: Place, root: type[BaseModel]) -> str:
+    """Field that an unknown one resembles: beside it, else anywhere."""
+    name = str(place.location[-1])
+    beside = [field for model in place.parents for field in fields_of(model)]
+    if name in _OTHER_STUDYS and place.parents == (root,):
+        return _OTHER_STUDYS[name]
+    suggestion = near_miss(name, beside)
+    if suggestion:
+        return suggestion
+    elsewhere = [
+        p for p in (*parameter_rules(), *rules_of(root, "")) if p.rsplit(".", 1)[-1] == name
+    ]
+    if elsewhere:
+        return f"did you mean '{elsewhere[0]}'?"
+    return f"the fields here are {', '.join(beside)}" if beside else ""

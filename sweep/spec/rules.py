@@ -1,26 +1,35 @@
 """What a single field of a spec may hold: reads what the user wrote and says what is wrong.
 
-A rule sits in a field's annotation. Pydantic reads the field with it, an axis over the field
-holds every one of its values to it, and the JSON Schema describes it.
+A rule sits in a field's metadata. Pydantic reads the field with it, an axis over the field holds
+every one of its values to it, and the JSON Schema describes it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from sweep.model.window import ALIASES, COSINE_SUMS
+from sweep.scenes.files import file_digest
 from sweep.spec.mistakes import near_miss
 from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
 
 BROKEN_RULE = "broken_rule"
+
+Json = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +43,11 @@ class Rule:
     """
 
     about: str
+
+    @property
+    def example(self) -> str:
+        """A good value; empty where none need be shown."""
+        return ""
 
     @property
     def units(self) -> str:
@@ -52,18 +66,16 @@ class Rule:
 
     def written(self, value: Any) -> Any:
         """What a user writes to have exactly `value`."""
-        return str(value)
+        return value
 
-    def schema(self) -> dict[str, Any]:
+    def schema(self) -> Json:
         """JSON Schema of what a user may write."""
         return {"description": self.about}
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self._validated)
 
-    def __get_pydantic_json_schema__(
-        self, _: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, _: CoreSchema, handler: GetJsonSchemaHandler) -> Json:
         return self.schema()
 
     def _validated(self, written: object) -> Any:
@@ -76,6 +88,39 @@ class Rule:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Special(Rule):
+    """What one kind of field alone holds.
+
+    Parameters
+    ----------
+    reader
+        Reads what the user wrote, or raises a `QuantityError`.
+    json : dict
+        JSON Schema of it.
+    """
+
+    reader: Callable[[Any], Any]
+    json: Json = dataclasses.field(default_factory=dict, compare=False)
+
+    def read(self, written: object) -> Any:
+        """Value of what the user wrote."""
+        return self.reader(written)
+
+    def schema(self) -> Json:
+        """JSON Schema of what a user may write."""
+        return super().schema() | self.json
+
+
+_BOUNDS = {
+    "above": ("greater than", np.less_equal, "exclusiveMinimum"),
+    "at_least": ("at least", np.less, "minimum"),
+    "below": ("less than", np.greater_equal, "exclusiveMaximum"),
+    "at_most": ("at most", np.greater, "maximum"),
+}
+"""Bounds of numbers: in words, what breaks them, and in JSON Schema's words."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Numeric(Rule):
     """A number within bounds, with a unit where `si_unit` names one.
 
@@ -84,59 +129,65 @@ class Numeric(Rule):
     si_unit : str
         Unit of the value inside; ``"dB"`` for a power ratio that is written in decibels; empty
         for a pure number.
-    example : str
-        A good value.
     above, at_least, below, at_most : str, optional
         Bounds, as a user would write them.
     whole : bool
         Whether only whole numbers will do.
-    words : tuple of (str, int)
-        Words that stand for numbers, whatever the bounds; not along axes.
+    word : str
+        A word that may stand in place of a number, not along axes; empty for none.
+    means : int or float or str
+        Value that the word stands for, whatever the bounds.
     """
 
     si_unit: str = ""
-    example: str
+    example: str = ""
     above: str | None = None
     at_least: str | None = None
     below: str | None = None
     at_most: str | None = None
     whole: bool = False
-    words: tuple[tuple[str, int], ...] = ()
+    word: str = ""
+    means: float | str = 0
 
     @property
     def units(self) -> str:
         """SI unit of the value read; a power ratio has none."""
         return "" if self.si_unit == DECIBEL else self.si_unit
 
+    @property
+    def bounds(self) -> dict[str, str]:
+        """Bounds that there are, as written."""
+        written = {name: getattr(self, name) for name in _BOUNDS}
+        return {name: bound for name, bound in written.items() if bound is not None}
+
     def exact(self, written: object) -> tuple[Fraction, Unit]:
         """Exact number and unit of what the user wrote, bounds apart."""
         if self.si_unit:
             return read_quantity(written, si_unit=self.si_unit, example=self.example)
-        if isinstance(written, str) and written in dict(self.words):
-            raise QuantityError(
-                "is one value for a whole study, no point of an axis", "leave it out"
-            )
+        if self.word and written == self.word:
+            rule = "is one value for a whole study, no point of an axis"
+            raise QuantityError(rule, "leave it out")
         try:
             return read_number(written)
         except QuantityError as error:
-            if not self.words:
+            if not self.word:
                 raise
-            words = " or ".join(word for word, _ in self.words)
-            raise QuantityError(f"must be a number or {words}", error.suggestion) from None
+            raise QuantityError(f"must be a number or {self.word}", error.suggestion) from None
 
-    def read(self, written: object) -> float | int:
-        """SI value of what the user wrote, within the bounds."""
-        known = dict(self.words)
-        if isinstance(written, str) and written in known:
-            return known[written]
+    def read(self, written: object) -> Any:
+        """SI value of what the user wrote, within the bounds; or what its word means."""
+        if self.word and written == self.word:
+            return self.means
         try:
-            return self._read(written)
+            return self._number(written)
         except QuantityError as error:
-            words = "".join(f" or '{word}'" for word in known)
-            remedy = error.suggestion or f"write e.g. '{self.example}'{words}"
+            remedy = error.suggestion or f"write e.g. '{self.example}'"
+            if self.word and not error.suggestion:
+                text = written if isinstance(written, str) else ""
+                remedy = near_miss(text, [self.word], otherwise=f"{remedy} or '{self.word}'")
             raise QuantityError(error.rule, remedy) from None
 
-    def _read(self, written: object) -> float | int:
+    def _number(self, written: object) -> float | int:
         number, unit = self.exact(written)
         if self.whole and number.denominator != 1:
             raise QuantityError("must be a whole number")
@@ -148,59 +199,38 @@ class Numeric(Rule):
 
     def first_outside(self, values: np.ndarray) -> tuple[int, str] | None:
         """Index of the first of the SI values (n,) that breaks a bound, and that bound in words."""
-        for written, words, is_outside in (
-            (self.above, "must be greater than", np.less_equal),
-            (self.at_least, "must be at least", np.less),
-            (self.below, "must be less than", np.greater_equal),
-            (self.at_most, "must be at most", np.greater),
-        ):
-            if written is None:
-                continue
+        for name, written in self.bounds.items():
+            words, is_outside, _ = _BOUNDS[name]
             outside = is_outside(values, _bound(self, written))
             if outside.any():
-                return int(np.argmax(outside)), f"{words} {written}"
+                return int(np.argmax(outside)), f"must be {words} {written}"
         return None
 
     def written(self, value: Any) -> str | int | float:
         """Text that reads back as exactly `value`: ``0.001 W``; of decibels, to 15 digits."""
-        for word, stands_for in self.words:
-            if value == stands_for:
-                return word
+        if self.word and value == self.means:
+            return self.word
         if self.si_unit:
             number = 10.0 * math.log10(value) if self.si_unit == DECIBEL else float(value)
             return f"{repr(number).removesuffix('.0')} {self.si_unit}"
         return int(value) if self.whole else float(value)
 
-    def schema(self) -> dict[str, Any]:
+    def schema(self) -> Json:
         """JSON Schema: text with a unit, or a number."""
-        bounds = [f"greater than {self.above}"] if self.above is not None else []
-        bounds += [f"at least {self.at_least}"] if self.at_least is not None else []
-        bounds += [f"less than {self.below}"] if self.below is not None else []
-        bounds += [f"at most {self.at_most}"] if self.at_most is not None else []
-        description = f"{self.about}; {', '.join(bounds)}" if bounds else self.about
-        common: dict[str, Any] = {"description": description, "examples": [self.example]}
+        bounds = [f"{_BOUNDS[name][0]} {written}" for name, written in self.bounds.items()]
+        about = "; ".join([self.about, *([", ".join(bounds)] if bounds else [])])
+        common: Json = {"description": about, "examples": [self.example]}
         if self.si_unit:
-            words = (rf"^{word}$" for word, _ in self.words)
-            pattern = "|".join([r"^\s*[-+−.0-9].*[^\s0-9.]\S*\s*$", *words])
+            pattern = r"^\s*[-+−.0-9].*[^\s0-9.]\S*\s*$"
+            pattern += rf"|^{self.word}$" if self.word else ""
             return common | {"type": "string", "pattern": pattern}
-        kinds: list[dict[str, Any]] = [
-            {"type": "integer" if self.whole else "number"} | self._numeric_bounds(),
+        numbers = {_BOUNDS[name][2]: _bound(self, text) for name, text in self.bounds.items()}
+        kinds: list[Json] = [
+            {"type": "integer" if self.whole else "number"} | numbers,
             {"type": "string", "pattern": r"^\s*[-+.0-9][-+.0-9eE^*_ ]*%?\s*$"},
         ]
-        kinds += (
-            [{"type": "string", "enum": [word for word, _ in self.words]}] if self.words else []
-        )
+        kinds += [{"type": "string", "enum": [self.word]}] if self.word else []
         return common | {"anyOf": kinds}
-
-    def _numeric_bounds(self) -> dict[str, float]:
-        """Bounds of a pure number in JSON Schema's words."""
-        words = {
-            "exclusiveMinimum": self.above,
-            "minimum": self.at_least,
-            "exclusiveMaximum": self.below,
-            "maximum": self.at_most,
-        }
-        return {word: _bound(self, text) for word, text in words.items() if text is not None}
 
 
 @lru_cache(maxsize=1024)
@@ -208,6 +238,9 @@ def _bound(rule: Numeric, written: str) -> float:
     """SI value of a rule's bound."""
     number, unit = rule.exact(written)
     return unit.to_si(number)
+
+
+_FUNCTION = r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*:[A-Za-z_][A-Za-z0-9_]*"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,20 +251,75 @@ class Choice(Rule):
     ----------
     options : tuple of str
         The words.
+    rule, remedy : str
+        What is wrong with others, by default that they are none of the options.
     """
 
     options: tuple[str, ...]
+    rule: str = ""
+    remedy: str = ""
 
     def read(self, written: object) -> str:
         """The word written."""
         if written in self.options and isinstance(written, str):
             return written
-        options = ", ".join(self.options)
-        raise QuantityError(f"must be one of {options}", near_miss(str(written), self.options))
+        rule = self.rule or f"must be one of {', '.join(self.options)}"
+        raise QuantityError(rule, near_miss(str(written), self.options, otherwise=self.remedy))
 
-    def schema(self) -> dict[str, Any]:
+    def schema(self) -> Json:
         """JSON Schema: the words."""
         return {"description": self.about, "type": "string", "enum": list(self.options)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method(Choice):
+    """One of several words, or ``module:function``, which reading does not import."""
+
+    def read(self, written: object) -> str:
+        """The word or the function's name."""
+        if isinstance(written, str) and re.fullmatch(_FUNCTION, written):
+            return written
+        try:
+            return super().read(written)
+        except QuantityError as error:
+            rule = f"{error.rule}, or a function as module:function"
+            raise QuantityError(rule, error.suggestion) from None
+
+    def schema(self) -> Json:
+        """JSON Schema: the words, or a function's name."""
+        words = {"type": "string", "enum": list(self.options)}
+        function = {"type": "string", "pattern": f"^{_FUNCTION}$"}
+        return {"description": self.about, "anyOf": [words, function]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode(Choice):
+    """One of several words, two of which YAML makes truth values of: a bare `on` or `off`."""
+
+    def read(self, written: object) -> str:
+        """The word."""
+        if isinstance(written, bool):
+            return "on" if written else "off"
+        return super().read(written)
+
+    def schema(self) -> Json:
+        """JSON Schema: the words, and what YAML makes of two of them."""
+        return {"description": self.about, "enum": [*self.options, True, False]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flag(Rule):
+    """Whether or not."""
+
+    def read(self, written: object) -> bool:
+        """True or False."""
+        if not isinstance(written, bool):
+            raise QuantityError("must be true or false", "write 'true' or 'false'")
+        return written
+
+    def schema(self) -> Json:
+        """JSON Schema: true or false."""
+        return {"description": self.about, "type": "boolean"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,6 +334,7 @@ class Text(Rule):
         What to write where it doesn't.
     """
 
+    example: str = ""
     pattern: str = r"[^\x00-\x08\x0b-\x1f\x7f-\x9f]{0,5000}"
     remedy: str = "write at most 5000 characters that can be printed"
 
@@ -257,6 +346,207 @@ class Text(Rule):
             raise QuantityError("is no text that can stand here", self.remedy)
         return str(written)
 
-    def schema(self) -> dict[str, Any]:
+    def schema(self) -> Json:
         """JSON Schema: text."""
         return {"description": self.about, "type": "string", "pattern": f"^{self.pattern}$"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class File(Rule):
+    """Path of a file, relative to the one that names it.
+
+    Parameters
+    ----------
+    digest
+        Digest of what is read from the file.
+    """
+
+    digest: Callable[[Path], str] = file_digest
+
+    def read(self, written: object) -> str:
+        """The path, as written."""
+        if not isinstance(written, str) or not 0 < len(written.strip()) <= 4096:
+            raise QuantityError("must be the path of a file", "write it relative to this file")
+        if "\0" in written:
+            raise QuantityError("holds a character that no path has")
+        return written
+
+    def schema(self) -> Json:
+        """JSON Schema: text."""
+        return {"description": self.about, "type": "string", "minLength": 1}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Several(Rule):
+    """A list of values, each held to the same rule.
+
+    Parameters
+    ----------
+    of : Rule
+        What each value may be.
+    least, most : int
+        Number of values.
+    noun : str
+        What they are together.
+    rising : bool
+        Whether each must exceed the one before.
+    distinct : bool
+        Whether none may be there twice.
+    """
+
+    of: Rule
+    least: int = 3
+    most: int = 3
+    noun: str = "values"
+    rising: bool = False
+    distinct: bool = False
+
+    @property
+    def units(self) -> str:
+        """SI unit of the values read; empty where there is none."""
+        return self.of.units
+
+    @property
+    def example(self) -> str:
+        """A good list."""
+        return f"[{', '.join([self.of.example] * max(self.least, 1))}]"
+
+    def read(self, written: object) -> tuple[Any, ...]:
+        """SI values of what the user wrote."""
+        remedy = f"write e.g. {self.example}"
+        if not isinstance(written, list | tuple) or not self.least <= len(written) <= self.most:
+            number = f"{self.least} " if self.least == self.most else ""
+            number = number or (f"at least {self.least} " if self.noun == "values" else "")
+            raise QuantityError(f"must be a list of {number}{self.noun}", remedy)
+        values = tuple(_read_element(self.of, i, value) for i, value in enumerate(written))
+        if self.rising and any(b <= a for a, b in pairwise(values)):
+            raise QuantityError("must begin below its end", "put the lower value first")
+        if self.distinct and len(set(values)) < len(values):
+            raise QuantityError("holds a name more than once", "list it once")
+        return values
+
+    def written(self, value: Any) -> Any:
+        """List that reads back as exactly `value`."""
+        return [self.of.written(element) for element in value]
+
+    def schema(self) -> Json:
+        """JSON Schema: a list."""
+        number = {"minItems": self.least, "maxItems": self.most}
+        distinct = {"uniqueItems": True} if self.distinct else {}
+        items = {"type": "array", "items": self.of.schema()}
+        return {"description": self.about} | items | number | distinct
+
+
+def _read_element(rule: Rule, index: int, written: object) -> Any:
+    """One value of a list, or what is wrong with it."""
+    try:
+        return rule.read(written)
+    except QuantityError as error:
+        value = written if isinstance(written, str | int | float) else type(written).__name__
+        told = f"holds {value!r:.60} as value {index}, which {error.rule}"
+        raise QuantityError(told, error.suggestion or f"write e.g. {rule.example}") from None
+
+
+_FROM_NADIR = Numeric(
+    about="Angle from nadir", si_unit="rad", example="22.5 deg", at_least="-89 deg",
+    at_most="89 deg",
+)  # fmt: skip
+_COMPONENT = Numeric(about="Component", example="-1", at_least="-1e9", at_most="1e9")
+STEERED = Several(
+    about="Angles of a beam towards forward and towards the left", of=_FROM_NADIR, least=2, most=2
+)
+_POINTED = Several(about="Direction of a beam in the body frame", of=_COMPONENT)
+MOST_BEAMS = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beams(Rule):
+    """Directions of beams: angles towards forward and left, or vectors in the body frame."""
+
+    def read(self, written: object) -> tuple[tuple[float, ...], ...]:
+        """Angles [rad] (two of them) or components (three) of each beam."""
+        example = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
+        if not isinstance(written, list | tuple) or not 0 < len(written) <= MOST_BEAMS:
+            raise QuantityError(f"must be a list of 1 to {MOST_BEAMS} beams", example)
+        return tuple(_read_element(_rule_of_beam(b), i, b) for i, b in enumerate(written))
+
+    def written(self, value: Any) -> Any:
+        """Lists that read back as exactly `value`."""
+        return [_rule_of_beam(beam).written(beam) for beam in value]
+
+    def schema(self) -> Json:
+        """JSON Schema: a list of lists."""
+        beam = {"anyOf": [STEERED.schema(), _POINTED.schema()]}
+        number = {"minItems": 1, "maxItems": MOST_BEAMS}
+        return {"description": self.about, "type": "array", "items": beam} | number
+
+
+def _rule_of_beam(beam: object) -> Several:
+    """Rule of a beam, by how many numbers it has."""
+    return _POINTED if isinstance(beam, list | tuple) and len(beam) == 3 else STEERED
+
+
+WINDOWS = tuple(COSINE_SUMS)
+"""Windows that need no look at scipy, which is slow to import; all others are put to it."""
+SCIPY_WINDOWS = (
+    "barthann", "bartlett", "bohman", "chebwin", "cosine", "dpss", "exponential", "gaussian",
+    "general_gaussian", "general_hamming", "kaiser", "lanczos", "parzen", "taylor", "triang",
+    "tukey",
+)  # fmt: skip
+_WINDOW = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?")
+_KAISER = "write e.g. 'kaiser(8.6)'"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window(Rule):
+    """Name of a window function, with its parameters: ``hamming``, ``kaiser(8.6)``."""
+
+    def read(self, written: object) -> str:
+        """Window in one spelling."""
+        match = _WINDOW.fullmatch(written.strip().lower()) if isinstance(written, str) else None
+        if match is None:
+            remedy = "write e.g. 'hamming' or 'kaiser(8.6)'"
+            raise QuantityError("must be the name of a window", remedy)
+        name = ALIASES.get(match["name"], match["name"])
+        inside = match["parameters"]
+        if name in WINDOWS and inside is None:
+            return name
+        try:
+            parameters = [float(text) for text in inside.split(",")] if inside else []
+        except ValueError:
+            raise QuantityError("has parameters that are no numbers", _KAISER) from None
+        _try_window(name, tuple(parameters))
+        return f"{name}({','.join(map(repr, parameters))})" if parameters else name
+
+    def schema(self) -> Json:
+        """JSON Schema: a word, parameters in brackets."""
+        return {
+            "description": self.about,
+            "type": "string",
+            "pattern": r"^\s*[A-Za-z_]+\s*(\([-+.,eE0-9\s]*\))?\s*$",
+            "examples": ["hamming", "hann", "rectangular", "kaiser(8.6)"],
+        }
+
+
+@lru_cache(maxsize=256)
+def _try_window(name: str, parameters: tuple[float, ...]) -> None:
+    """Make the window with scipy; a QuantityError where it knows none or refuses parameters."""
+    from scipy.signal import get_window  # slow to import, and seldom needed
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            values = get_window((name, *parameters) if parameters else name, 16)
+    except UserWarning:
+        rule = "has parameters that make it unsuitable for spectral analysis"
+        raise QuantityError(rule, "take others, for chebwin 45 or more") from None
+    except RuntimeWarning:  # samples beyond what a number can be
+        raise QuantityError("has parameters that make no usable window") from None
+    except (ValueError, TypeError, ArithmeticError, MemoryError):
+        if name in WINDOWS + SCIPY_WINDOWS:
+            rule = "has parameters that this window does not take"
+            raise QuantityError(rule, _KAISER) from None
+        remedy = near_miss(name, WINDOWS + SCIPY_WINDOWS, otherwise="write e.g. 'hamming'")
+        raise QuantityError("is no periodic window that scipy.signal makes", remedy) from None
+    if not np.all(np.isfinite(values)) or not np.sum(values) > 0:
+        raise QuantityError("has parameters that make no usable window")

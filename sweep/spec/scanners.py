@@ -2,133 +2,124 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-import sweep.spec.quantities as of
-from sweep.model.geometry.scanner import (
-    BeamCycle,
-    LineScan,
-    Scanner,
-    cone,
-    corners,
-    fixed,
-    raster,
-    squares,
-    steered,
-)
-from sweep.spec.instrument import Part
-from sweep.spec.list_rules import Beams, Flag, Several
-from sweep.spec.rules import Choice, Numeric
+import sweep.spec.declaring as of
+from sweep.model.geometry import scanner as patterns
+from sweep.model.geometry.scanner import Scanner
+from sweep.spec.parts import Part
+from sweep.spec.rules import Beams
 
 Numbers = tuple[float, ...]
 
 MOST_BEAMS = "10000"
-_RATE = of.frequency("Measurement cycles a second")
-_REACH = {"at_least": "0 deg", "at_most": "89 deg"}
+_REACH = ("0 deg", "89 deg")
 
 
-def _interval(default: str) -> Numeric:
+def _rate() -> Any:
+    return of.frequency("Measurement cycles a second")
+
+
+def _interval(default: str, value: float | None) -> Any:
+    """Field of the time from beam to beam."""
     about = f"Time from one beam of a cycle to the next; {default} by default"
-    return of.duration(about, "10 ms")
+    return of.duration(about, "10 ms", default=value)
 
 
-_TOGETHER = _interval("0, all at once,")
-_SPREAD = _interval("spread evenly over the cycle")
+def _together() -> Any:
+    return _interval("0, all at once,", 0.0)
+
+
+def _spread() -> Any:
+    return _interval("spread evenly over the cycle", None)
+
+
+def _angles(about: str, example: str, *bounds: str, number: tuple[int, int], **more: Any) -> Any:
+    """Field of several angles."""
+    return of.several(of.measure("Angle", "rad", example, *bounds), *number, about=about, **more)
 
 
 class Cone(Part):
     """Beams evenly round nadir, all of them in every cycle."""
 
     kind: Literal["cone"]
-    beams: Annotated[int, of.count("Beams", "3", at_most=MOST_BEAMS)]
-    half_angle: Annotated[float, of.angle("From nadir", "22.5 deg", **_REACH)]
-    azimuth: Annotated[float, of.angle("Of the first beam, from forward to the left")] = 0.0
-    rate: Annotated[float, _RATE]
-    interval: Annotated[float, _TOGETHER] = 0.0
+    beams: int = of.count("Beams", "3", at_most=MOST_BEAMS)
+    half_angle: float = of.angle("From nadir", "22.5 deg", *_REACH)
+    azimuth: float = of.angle("Of the first beam, from forward to the left", default=0.0)
+    rate: float = _rate()
+    interval: float = _together()
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
-        pointed = cone(self.beams, half_angle=self.half_angle, azimuth=self.azimuth)
-        return fixed(pointed, rate=self.rate, interval=self.interval)
+        pointed = patterns.cone(self.beams, half_angle=self.half_angle, azimuth=self.azimuth)
+        return patterns.fixed(pointed, rate=self.rate, interval=self.interval)
 
 
 class FixedBeams(Part):
     """Beams at stated directions, all of them in every cycle."""
 
     kind: Literal["fixed"]
-    beams: Annotated[
-        tuple[Numbers, ...],
-        Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam"),
-    ]
-    rate: Annotated[float, _RATE]
-    interval: Annotated[float, _TOGETHER] = 0.0
+    beams: tuple[Numbers, ...] = of.field(
+        Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam")
+    )
+    rate: float = _rate()
+    interval: float = _together()
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
-        pointed = [steered(*b) if len(b) == 2 else np.array(b) for b in self.beams]  # type: ignore[arg-type]
-        return fixed(np.array(pointed), rate=self.rate, interval=self.interval)
+        pointed = [patterns.steered(*b) if len(b) == 2 else np.array(b) for b in self.beams]  # type: ignore[arg-type]
+        return patterns.fixed(np.array(pointed), rate=self.rate, interval=self.interval)
 
 
 class Corners(Part):
     """One steered beam that visits the corners of a square."""
 
     kind: Literal["corners"]
-    angle: Annotated[float, of.angle("Of both axes from nadir", "22.5 deg", **_REACH)]
-    rate: Annotated[float, _RATE]
-    interval: Annotated[float | None, _SPREAD] = None
+    angle: float = of.angle("Of both axes from nadir", "22.5 deg", *_REACH)
+    rate: float = _rate()
+    interval: float | None = _spread()
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
-        return fixed(corners(self.angle), rate=self.rate, interval=self.interval)
+        return patterns.fixed(patterns.corners(self.angle), rate=self.rate, interval=self.interval)
 
 
 class Squares(Part):
     """One beam steered by stacked elements, square after square; a cycle is a square."""
 
     kind: Literal["squares"]
-    elements: Annotated[
-        Numbers,
-        Several(
-            about="Angle by which each element of an axis throws the beam to either side",
-            of=of.angle("Angle", "15 deg", at_least="1e-6 deg", at_most="45 deg"),
-            least=1,
-            most=5,
-        ),
-    ]
-    rate: Annotated[float, _RATE]
-    interval: Annotated[float | None, _SPREAD] = None
+    elements: Numbers = _angles(
+        "Angle by which each element of an axis throws the beam to either side",
+        "15 deg", "1e-6 deg", "45 deg", number=(1, 5),
+    )  # fmt: skip
+    rate: float = _rate()
+    interval: float | None = _spread()
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
-        directions, patterns = squares(self.elements)
-        return BeamCycle(directions, patterns, self.rate, self.interval)
+        directions, visited = patterns.squares(self.elements)
+        return patterns.BeamCycle(directions, visited, self.rate, self.interval)
 
 
 class RasterScan(Part):
     """One steered beam that visits a grid of directions; a cycle is a frame."""
 
     kind: Literal["raster"]
-    columns: Annotated[int, of.count("Directions across", "32", at_most=MOST_BEAMS)]
-    rows: Annotated[int, of.count("Directions along", "32", at_most=MOST_BEAMS)]
-    half_angles: Annotated[
-        Numbers,
-        Several(
-            about="Reach to each side of nadir, across and along",
-            of=of.angle("Angle", "10 deg", **_REACH),
-            least=2,
-            most=2,
-        ),
-    ]
-    rate: Annotated[float, _RATE]
-    both_ways: Annotated[bool, Flag(about="Every other row runs backwards")] = True
+    columns: int = of.count("Directions across", "32", at_most=MOST_BEAMS)
+    rows: int = of.count("Directions along", "32", at_most=MOST_BEAMS)
+    half_angles: Numbers = _angles(
+        "Reach to each side of nadir, across and along", "10 deg", *_REACH, number=(2, 2)
+    )
+    rate: float = _rate()
+    both_ways: bool = of.flag("Every other row runs backwards", default=True)
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
         across, along = self.half_angles
-        return raster(
+        return patterns.raster(
             columns=self.columns,
             rows=self.rows,
             half_angles=(across, along),
@@ -141,33 +132,19 @@ class Line(Part):
     """Beams swept together from side to side; a cycle is one measurement of each."""
 
     kind: Literal["line"]
-    half_angle: Annotated[float, of.angle("Reach of the sweep to each side", "5 deg", **_REACH)]
-    line_rate: Annotated[float, of.frequency("Lines a second; a sweep one way is a line")]
-    rate: Annotated[float, _RATE]
-    along: Annotated[
-        Numbers,
-        Several(
-            about="Angle of each beam from nadir towards forward",
-            of=of.angle("Angle", "250 urad", at_least="-89 deg", at_most="89 deg"),
-            least=1,
-            most=1000,
-        ),
-    ] = (0.0,)
-    wave: Annotated[
-        str, Choice(about="Constant rate or resonant mirror", options=("triangle", "sine"))
-    ] = "triangle"
-    interval: Annotated[float, _TOGETHER] = 0.0
+    half_angle: float = of.angle("Reach of the sweep to each side", "5 deg", *_REACH)
+    line_rate: float = of.frequency("Lines a second; a sweep one way is a line")
+    rate: float = _rate()
+    along: Numbers = _angles(
+        "Angle of each beam from nadir towards forward",
+        "250 urad", "-89 deg", "89 deg", number=(1, 1000), default=(0.0,),
+    )  # fmt: skip
+    wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"), "triangle")
+    interval: float = _together()
 
     def pattern(self) -> Scanner:
         """The scan pattern."""
-        return LineScan(
-            half_angle=self.half_angle,
-            line_rate=self.line_rate,
-            rate=self.rate,
-            along=self.along,
-            wave=self.wave,
-            interval=self.interval,
-        )
+        return patterns.LineScan(**self.model_dump(exclude={"kind"}))
 
 
 AnyScanner = Annotated[
@@ -177,4 +154,6 @@ AnyScanner = Annotated[
 
 def shots_a_cycle(pattern: Scanner) -> int:
     """Shots of one measurement cycle."""
-    return pattern.beams_per_cycle if isinstance(pattern, BeamCycle) else pattern.beams
+    if isinstance(pattern, patterns.BeamCycle):
+        return pattern.beams_per_cycle
+    return pattern.beams

@@ -1,77 +1,60 @@
-"""What is wrong with a scene study beyond its single fields: names, references, files, flights."""
+"""What is wrong with a study of a scene beyond its single fields.
+
+Names and references, objects, files, the flight, and axes that would move the rays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-import sweep.spec.quantities as of
-from sweep.spec.files import Files, named_files
-from sweep.spec.flight_check import flight_findings
-from sweep.spec.grounds import Ground
-from sweep.spec.mistakes import ABSENT, Finding, Location, near_miss
-from sweep.spec.motion import Platform
-from sweep.spec.object_check import object_findings
-from sweep.spec.objects import AnyObject
-from sweep.spec.scanners import AnyScanner
-from sweep.spec.scene_sections import WORLD
-from sweep.units import QuantityError
+import sweep.spec.declaring as of
+from sweep.model import beam
+from sweep.model.ground import pattern as pattern_of
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.resolution import PATTERN
+from sweep.scenes.files import SceneError
+from sweep.spec.axes import Axis
+from sweep.spec.grid_rules import at as written_at
+from sweep.spec.grounds import Craters, Ground, Jacksboro
+from sweep.spec.mistakes import Finding, Location, near_miss
+from sweep.spec.motion import Motion, Platform, Span, Tracked, WaypointPath
+from sweep.spec.parts import Files, named_files
+from sweep.spec.scanners import AnyScanner, shots_a_cycle
+from sweep.spec.scene import WORLD, AnyObject, Boulders, Box, MeshObject, Solid, Sphere, Trees
+from sweep.units import QuantityError, read_unit
 
 RESERVED = ("map_height", "map_x", "map_y")
 """Names that arrays of a store have beside its scanners."""
-
 OBJECTS: Location = ("scene", "objects")
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Parts of a scene study, as far as they can be read."""
-
-    objects: dict[str, Any] = field(default_factory=dict)
-    scanners: dict[str, Any] = field(default_factory=dict)
-    platform: Platform | None = None
-
-    @classmethod
-    def of(cls, written: Mapping[str, Any]) -> Parts:
-        """Parts of a spec as written; those that cannot be read are passed over."""
-        platform: Platform | None = None
-        with suppress(ValidationError):
-            platform = Platform.model_validate(written.get("platform"))
-        return cls(
-            dict(_read(_section(written, *OBJECTS), _objects())),
-            dict(_read(_section(written, "scanners"), _scanners())),
-            platform,
-        )
+_LOOKS = 257
+"""Times at which an attitude is tried."""
 
 
 @cache
-def _objects() -> TypeAdapter[Any]:
-    return TypeAdapter(AnyObject)
-
-
-@cache
-def _scanners() -> TypeAdapter[Any]:
-    return TypeAdapter(AnyScanner)
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
 
 
 def _section(written: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
     """A mapping in a spec; empty where there is none."""
-    found: Any = written
-    for name in path:
-        found = found.get(name) if isinstance(found, Mapping) else None
+    found = written_at(written, ".".join(map(str, path)))
     return dict(found) if isinstance(found, Mapping) else {}
 
 
-def _read(section: Mapping[str, Any], adapter: TypeAdapter[Any]) -> Iterator[tuple[str, Any]]:
+def _readable(section: Mapping[str, Any], kind: Any) -> dict[str, Any]:
+    """Parts of a kind in a section that can be read, by name."""
+    found = {}
     for name, value in section.items():
         with suppress(ValidationError):
-            yield name, adapter.validate_python(value)
+            found[name] = _adapter(kind).validate_python(value)
+    return found
 
 
 def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Finding]:
@@ -84,18 +67,23 @@ def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Findin
     base : Path or None
         Folder that files are relative to; None leaves them alone.
     """
-    parts = Parts.of(written)
+    objects = _readable(_section(written, *OBJECTS), AnyObject)
+    scanners = _readable(_section(written, "scanners"), AnyScanner)
+    platform = _readable({"platform": written.get("platform")}, Platform).get("platform")
     findings = [
         *_name_findings(written, OBJECTS, lambda name: name == WORLD, "scene"),
         *_name_findings(written, ("scanners",), lambda name: name in RESERVED, "store"),
-        *_reference_findings(written, parts),
+        *_reference_findings(written, objects),
     ]
-    for name, thing in parts.objects.items():
-        findings += object_findings(thing, (*OBJECTS, name))
-    files = [] if base is None else list(_file_findings(parts, base))
-    flights = flight_findings(parts.platform, parts.scanners, parts.objects, base)
+    for name, thing in objects.items():
+        findings += _object_findings(thing, (*OBJECTS, name))
+    files = [] if base is None else list(_file_findings(objects, platform, base))
     known = {finding.location for finding in files}
+    flights = _flight_findings(platform, scanners, objects, base)
     return findings + files + [f for f in flights if f.location not in known]
+
+
+# Names, references, files
 
 
 def _name_findings(
@@ -103,73 +91,56 @@ def _name_findings(
 ) -> Iterator[Finding]:
     """Names of objects or scanners that can't be, and a section without any."""
     named = _section(written, *section)
-    rule = of.name("Name")
     for name in named:
         try:
-            rule.read(name)
+            of.named("Name").read(name)
         except QuantityError as error:
-            yield Finding((*section, name), "is no name", error.suggestion, ABSENT)
+            yield Finding((*section, name), "is no name", error.suggestion)
         if taken(name):
-            yield Finding((*section, name), f"is a name that the {by} has taken", "", ABSENT)
-    if not named and isinstance(_parent(written, section), Mapping):
-        yield Finding(section, "holds nothing", "name at least one", ABSENT)
+            yield Finding((*section, name), f"is a name that the {by} has taken")
+    if not named and isinstance(written_at(written, ".".join(map(str, section))), Mapping):
+        yield Finding(section, "holds nothing", "name at least one")
 
 
-def _parent(written: Mapping[str, Any], section: Location) -> object:
-    """The section itself where it is written; None where pydantic tells that it is missing."""
-    found: Any = written
-    for name in section:
-        found = found.get(name) if isinstance(found, Mapping) else None
-    return found
-
-
-def _reference_findings(written: Mapping[str, Any], parts: Parts) -> Iterator[Finding]:
-    """References to objects that are not there, or no ground."""
+def _reference_findings(
+    written: Mapping[str, Any], objects: Mapping[str, Any]
+) -> Iterator[Finding]:
+    """References to objects that are not there, or no ground; a position of the origin."""
     named = _section(written, *OBJECTS)
     if not named:
         return
     origin = _section(written, "scene").get("origin", WORLD)
     if isinstance(origin, str) and origin != WORLD:
-        yield from _reference(origin, ("scene", "origin"), named, parts, "or 'world'")
-        yield from _placed_origin(origin, parts)
+        yield from _reference(origin, ("scene", "origin"), named, objects, ", or 'world'")
+        if any(getattr(objects.get(origin), "position", None) or ()):
+            rule, remedy = "places the scene's origin, which lies at zero", "leave it out, or "
+            yield Finding((*OBJECTS, origin, "position"), rule, f"{remedy}take another origin")
     for name, thing in named.items():
         on = thing.get("on") if isinstance(thing, Mapping) else None
         if isinstance(on, str):
-            yield from _reference(on, (*OBJECTS, name, "on"), named, parts, "")
+            yield from _reference(on, (*OBJECTS, name, "on"), named, objects, "")
 
 
 def _reference(
-    name: str, location: Location, named: Mapping[str, Any], parts: Parts, otherwise: str
+    name: str, at: Location, named: Mapping[str, Any], objects: Mapping[str, Any], otherwise: str
 ) -> Iterator[Finding]:
     """One reference to a ground."""
-    grounds = [key for key, thing in parts.objects.items() if isinstance(thing, Ground)]
+    grounds = [key for key, thing in objects.items() if isinstance(thing, Ground)]
     remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
-    remedy += f", {otherwise}" if otherwise else ""
+    remedy += otherwise
     if name not in named:
         rule = "is no object of the scene"
-        yield Finding(location, rule, near_miss(name, named, otherwise=remedy), name)
-    elif name in parts.objects and name not in grounds:
-        yield Finding(location, "is no ground", remedy, name)
+        yield Finding(at, rule, near_miss(name, named, otherwise=remedy), name)
+    elif name in objects and name not in grounds:
+        yield Finding(at, "is no ground", remedy, name)
 
 
-def _placed_origin(name: str, parts: Parts) -> Iterator[Finding]:
-    """A position of the object that all positions are relative to."""
-    if any(getattr(parts.objects.get(name), "position", None) or ()):
-        yield Finding(
-            (*OBJECTS, name, "position"),
-            "places the scene's origin, which lies at zero",
-            "leave it out, or take another origin",
-            ABSENT,
-        )
-
-
-def _file_findings(parts: Parts, base: Path) -> Iterator[Finding]:
+def _file_findings(
+    objects: Mapping[str, Any], platform: Platform | None, base: Path
+) -> Iterator[Finding]:
     """Files that are missing or can not be read."""
-    from sweep.scenes.files import SceneError
-
-    things = [((*OBJECTS, name), thing) for name, thing in parts.objects.items()]
-    if parts.platform is not None:
-        things.append((("platform",), parts.platform))
+    things: list[tuple[Location, Any]] = [((*OBJECTS, n), thing) for n, thing in objects.items()]
+    things += [] if platform is None else [(("platform",), platform)]
     for location, thing in things:
         for key, rule, file in named_files(thing):
             try:
@@ -177,3 +148,234 @@ def _file_findings(parts: Parts, base: Path) -> Iterator[Finding]:
             except SceneError as error:
                 broken = f"names a file that {error.rule}"
                 yield Finding((*location, *key), broken, error.remedy, file)
+
+
+# Objects
+
+
+def _refused(make: Callable[[], object], location: Location) -> list[Finding]:
+    """What the model says against a part that it is asked to make."""
+    try:
+        make()
+    except (ValueError, ArithmeticError) as error:
+        return [Finding(location, f"can not be made: {error}")]
+    return []
+
+
+def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
+    """What is wrong with an object at a location, its references and files apart."""
+    if isinstance(thing, Ground):
+        yield from _ground_findings(thing, location)
+    if isinstance(thing, Solid):
+        yield from _solid_findings(thing, location)
+    if isinstance(thing, Boulders):
+        yield from _size_findings(thing, location)
+    if isinstance(thing, Trees) and not thing.tree.crown_base < thing.tree.height:
+        rule = f"must lie below the top, {thing.tree.height:g} m"
+        base = f"{thing.tree.crown_base:g} m"
+        yield Finding((*location, "tree", "crown_base"), rule, "lower it", base)
+
+
+def _size_findings(thing: Boulders | Craters, location: Location) -> Iterator[Finding]:
+    """Diameters without a range."""
+    if not thing.smallest < thing.largest:
+        rule = f"must exceed the smallest diameter, {thing.smallest:g} m"
+        yield Finding((*location, "largest"), rule, "", f"{thing.largest:g} m")
+
+
+def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
+    """A grid that can not be, or that can not hold its craters."""
+    section = "middle" if isinstance(ground, Jacksboro) else "spacing"
+    unfit = _refused(ground.check, (*location, section))
+    yield from unfit
+    if ground.craters is None:
+        return
+    yield from _size_findings(ground.craters, (*location, "craters"))
+    step, smallest = None if unfit else ground.step(), ground.craters.smallest
+    if step is not None and smallest < 3 * step:
+        rule, remedy = f"must be three grid steps of {step:.3g} m or more", "raise it, or make the "
+        at = (*location, "craters", "smallest")
+        yield Finding(at, rule, f"{remedy}grid finer", f"{smallest:g} m")
+
+
+def _solid_findings(thing: Solid, location: Location) -> Iterator[Finding]:
+    """A solid that is placed twice or nowhere, or whose lengths have no unit."""
+    place = (*location, "position")
+    if thing.motion is not None and thing.position is not None:
+        rule = "stands beside a motion, whose path places the object"
+        yield Finding(place, rule, "leave one of them out")
+    if isinstance(thing, Sphere | Box) and thing.motion is None and thing.position is None:
+        yield Finding(place, "is missing", "write e.g. 'position: [0 m, 0 m, 10 m]'")
+    yield from _refused(thing.rotation.turn, (*location, "rotation"))
+    if isinstance(thing, MeshObject) and thing.unit is not None:
+        try:
+            read_unit(thing.unit, si_unit="m", example="mm")
+        except QuantityError as error:
+            yield Finding((*location, "unit"), error.rule, error.suggestion, thing.unit)
+
+
+# The flight: paths, attitudes, scan patterns, and targets that move
+
+
+def _flight_findings(
+    platform: Platform | None,
+    scanners: Mapping[str, Any],
+    objects: Mapping[str, Any],
+    base: Path | None,
+) -> list[Finding]:
+    """What is wrong with platform, scanners and moving objects, of those that can be read."""
+    span: Span | None = None
+    findings: list[Finding] = []
+    files = Files(base or Path())
+    if platform is not None and (base is not None or not _on_files(platform)):
+        findings += _motion_findings(platform, ("platform",), files, None)
+        if not findings:
+            path = platform.path.path(files)
+            span = path.start, path.stop
+    for name, scanner in scanners.items():
+        findings += _pattern_findings(scanner, ("scanners", name), span)
+    for name, thing in objects.items():
+        motion = getattr(thing, "motion", None)
+        if motion is not None and span is not None and (base or not _on_files(motion)):
+            findings += _motion_findings(motion, (*OBJECTS, name, "motion"), files, span)
+    return findings
+
+
+def _on_files(motion: Motion) -> bool:
+    """Whether a movement is that of a table."""
+    return isinstance(motion.path, WaypointPath) or isinstance(motion.attitude, Tracked)
+
+
+def _motion_findings(
+    motion: Motion, location: Location, files: Files, span: Span | None
+) -> Iterator[Finding]:
+    """A path or an attitude that can not be, or a target's path that is shorter than the flight."""
+    section = "path"
+    try:
+        path = motion.path.path(files, span)
+        section = "attitude"
+        motion.law(files, path)
+        section = "mounting"
+        flight = motion.flight(files, span)
+        section = "attitude"
+        flight.state(np.linspace(path.start, path.stop, _LOOKS))
+    except SceneError as error:
+        yield Finding((*location, section, "file"), f"names a file that {error.rule}", error.remedy)
+        return
+    except (ValueError, ArithmeticError) as error:
+        yield Finding((*location, section), f"can not be made: {error}")
+        return
+    if span is not None and not (path.start <= span[0] and path.stop >= span[1]):
+        rule = (
+            f"lasts from {path.start:g} to {path.stop:g} s, and the flight from {span[0]:g} to "
+            f"{span[1]:g} s"
+        )
+        yield Finding((*location, "path"), rule, "make it last throughout the flight")
+
+
+def _pattern_findings(scanner: Any, location: Location, span: Span | None) -> Iterator[Finding]:
+    """A scan pattern that can not be, or that makes no whole cycle in the flight."""
+    unfit = _refused(scanner.pattern, location)
+    yield from unfit
+    if unfit or span is None:
+        return
+    pattern = scanner.pattern()
+    each = shots_a_cycle(pattern)
+    if pattern.number(span[1] - span[0]) < each:
+        rule = f"makes no whole cycle of {each} shots in a flight of {span[1] - span[0]:.6g} s"
+        yield Finding((*location, "rate"), rule, "raise it, or lengthen the flight")
+
+
+# Axes: what may vary while the light falls where it fell
+
+STORED = frozenset(
+    name
+    for table in (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
+    for stored, output in table.items()
+    for name in (stored, *output.dims)
+)
+"""Names of a store's arrays and dimensions."""
+
+_OTHER = "make another study of it"
+_SPECTRA = ("looks at whole spectra, which flights do not draw", "study a flat target")
+_BEAMS = (beam.DIVERGENCE, beam.WAIST, beam.QUALITY, beam.FOCUS, beam.RECEIVED_WAIST, beam.COUPLING)
+_MOVES = ("moves the beamlets, and a study casts its rays once", _OTHER)
+_REASONS = {
+    "footprint.speckle": ("", ""),  # which moves no beamlet
+    "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
+    **dict.fromkeys((*_BEAMS, "footprint."), _MOVES),
+    "instrument.processing.detector.": _SPECTRA,
+    "instrument.processing.estimator.": _SPECTRA,
+    "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER),
+}
+
+
+def why_not(path: str) -> tuple[str, str]:
+    """Why an axis can't set a parameter, and a remedy; empty where it can."""
+    return next((why for start, why in _REASONS.items() if path.startswith(start)), ("", ""))
+
+
+class Arrangement(NamedTuple):
+    """Words that say where beamlets go."""
+
+    pattern: str
+    phases: str
+    architecture: str
+    thesis: bool
+    """True where they go as far as divergence times range, whatever the wavelength."""
+
+    @property
+    def beamlets(self) -> str:
+        """Arrangement of the beamlets, as :func:`sweep.model.ground.pattern` has it."""
+        words = {PATTERN: self.pattern, "footprint.phases": self.phases}
+        return pattern_of(words | {beam.ARCHITECTURE: self.architecture})
+
+
+def parameter_findings(
+    arrangement: Arrangement, path: str, values: Iterable[Any], location: Location
+) -> list[Finding]:
+    """What is wrong with a parameter taking several values, which stand at a location."""
+    rule, remedy = why_not(path)
+    if rule:
+        return [Finding(location, rule, remedy)]
+    if path == beam.WAVELENGTH and not arrangement.thesis:
+        rule = "moves the beamlets, as the beam's radius follows from it, and rays are cast once"
+        return [Finding(location, rule, f"{_OTHER}, or take coupling: aperture")]
+    if path != beam.ARCHITECTURE:
+        return []
+    each = [arrangement, *(arrangement._replace(architecture=str(v)) for v in values)]
+    modes = {one.architecture == "direct" for one in each}
+    if len({one.beamlets for one in each}) > 1 or (len(modes) > 1 and not arrangement.thesis):
+        rule = "moves the beamlets between direct detection and the others"
+        remedy = f"{_OTHER}, or take coherent phases and coupling: aperture"
+        return [Finding(location, rule, remedy)]
+    return []
+
+
+def axis_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Iterator[Finding]:
+    """Axes of what can not vary on one geometry."""
+
+    def word(path: str, otherwise: str) -> str:
+        found = written_at(written, path, None)
+        return str(otherwise if found is None else found)
+
+    chosen = word(PATTERN, "auto")
+    thesis = word(beam.COUPLING, beam.SINGLE_MODE) == beam.APERTURE and {
+        word(path, "none") for path in (beam.WAIST, beam.FOCUS)
+    } == {"none"}
+    arrangement = Arrangement(
+        chosen,
+        word("footprint.phases", "incoherent"),
+        word(beam.ARCHITECTURE, "homodyne"),
+        thesis,
+    )
+    if chosen in ("line", "square"):
+        rule = "stands for a plane alone, and the ground of a scene is none"
+        yield Finding(("footprint", "pattern"), rule, "take hexagonal", chosen)
+    for axis in axes:
+        for member in axis.members:
+            at: Location = ("axes", axis.name if axis.zipped else member.path)
+            yield from parameter_findings(arrangement, member.path, member.values, at)
+        if axis.zipped and axis.name in STORED:
+            rule = "bears the name of something stored"
+            yield Finding(("axes", axis.name), rule, "take a word such as 'cut'")

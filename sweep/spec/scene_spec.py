@@ -14,28 +14,23 @@ from pydantic import Field, PrivateAttr
 from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
-from sweep.spec.axes import Axis
-from sweep.spec.content import geometry_of, leaf_values
-from sweep.spec.detector_check import is_method, not_on_flights
-from sweep.spec.effect_check import not_in_flights, written_modes
-from sweep.spec.fields import values_of
-from sweep.spec.files import Files, named_files
-from sweep.spec.identity import axis_identity, digest
-from sweep.spec.limits import readable
+from sweep.spec.figure_check import scene_figure_findings
+from sweep.spec.figures import SceneFigure
+from sweep.spec.grid_rules import Grid, is_method, not_in_flights
+from sweep.spec.identity import axis_identity, digest, geometry_of, leaf_values
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
 from sweep.spec.motion import Platform
+from sweep.spec.parts import Files, named_files, values_of
 from sweep.spec.reading import Document, plain
 from sweep.spec.scanners import AnyScanner, shots_a_cycle
-from sweep.spec.scene_axes import (
+from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.scene_check import (
     Arrangement,
     axis_findings,
     parameter_findings,
+    scene_findings,
     why_not,
 )
-from sweep.spec.scene_check import scene_findings
-from sweep.spec.scene_figure_check import scene_figure_findings
-from sweep.spec.scene_figures import SceneFigure
-from sweep.spec.scene_sections import Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.study import Study
 
 if TYPE_CHECKING:
@@ -82,12 +77,7 @@ class SceneSpec(Study):
     def from_stored(cls, text: str, base: Path | str | None = None) -> Self:
         """Spec from the JSON that `to_json` gave, the same again but for its execution.
 
-        Parameters
-        ----------
-        text : str
-            The JSON.
-        base : path, optional
-            Folder that its files are relative to; they are not looked at before they are needed.
+        Files, relative to `base`, are not looked at before they are needed.
         """
         written = plain(json.loads(text))
         if not isinstance(written, dict):
@@ -99,18 +89,15 @@ class SceneSpec(Study):
 
     @classmethod
     def further_findings(
-        cls,
-        written: Mapping[str, Any],
-        axes: tuple[Axis, ...],
-        base: Path | None,
-        axes_are_whole: bool,
+        cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
         """What is wrong with scene, flight, files, random effects and figures."""
-        findings = scene_findings(written, base) + axis_findings(written, axes)
-        values = readable(written, axes)
-        findings += not_in_flights(values, axes, written_modes(written))
-        findings += not_on_flights(values, axes)
-        return findings + scene_figure_findings(written, axes if axes_are_whole else None)
+        return [
+            *scene_findings(written, base),
+            *axis_findings(written, grid.axes),
+            *not_in_flights(grid),
+            *scene_figure_findings(written, grid.axes if axes_are_whole else None),
+        ]
 
     @classmethod
     def may_vary(cls, path: str) -> bool:

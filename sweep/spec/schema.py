@@ -8,11 +8,11 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from sweep.spec.experiment import Spec
-from sweep.spec.fields import parameter_rules, rule_of, written_name
+from sweep.spec.fields import parameter_rules
+from sweep.spec.parts import all_parts, fields_of, rule_of
 from sweep.spec.rules import Numeric, Rule
 from sweep.spec.scene_spec import SceneSpec
-from sweep.spec.structure import all_parts
+from sweep.spec.study import Spec
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -71,9 +71,9 @@ def _complete(study: dict[str, Any], rules: Mapping[str, Rule], required: tuple[
 
 def _show_written_defaults(properties: dict[str, Any], model: type[BaseModel]) -> None:
     """Defaults as a user would write them, in place of SI values; of single fields only."""
-    for name, field in model.model_fields.items():
-        described, rule = properties[written_name(name, field)], rule_of(field)
-        if rule is not None and described.get("default") not in (None, ""):
+    for name, field in fields_of(model).items():
+        described, rule = properties[name], rule_of(field)
+        if rule is not None and described.get("default") not in (None, "", [], {}):
             described["default"] = rule.written(field.default)
         else:
             described.pop("default", None)

@@ -1,56 +1,52 @@
-"""What every study has, however it is declared: reading, identity, and text for a store."""
+"""A study of a flat target over a grid, and what every study has, however it is declared."""
 
 from __future__ import annotations
 
 import copy
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import ConfigDict, PrivateAttr, ValidationError
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
+import sweep.spec.declaring as of
+from sweep.model import VERSION
 from sweep.model.threshold import WAYS
-from sweep.spec.axes import Axis, Member
-from sweep.spec.axis_reading import paths_on_axes, read_axes
-from sweep.spec.beam_check import beam_findings
-from sweep.spec.effect_check import effect_findings, written_modes
-from sweep.spec.fields import (
-    UNSTORED,
-    fill,
-    leaves,
-    parameter_rules,
-    parameter_suggestion,
-    short_name,
-    values_of,
+from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
+from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
+from sweep.spec.figure_check import figure_findings
+from sweep.spec.figures import Figure
+from sweep.spec.generators import values_in
+from sweep.spec.grid_rules import Grid, grid_findings, is_method, spectra_findings, without_draws
+from sweep.spec.identity import axis_identity, digest
+from sweep.spec.instrument import Instrument
+from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
+from sweep.spec.parts import Part, fill, leaves, values_of
+from sweep.spec.reading import Document, findings_of, plain, resolve_instrument
+from sweep.spec.rules import Numeric, Rule, Special
+from sweep.spec.sections import (
+    Accuracy,
+    Atmosphere,
+    Draws,
+    Effects,
+    Execution,
+    Footprint,
+    Storage,
+    Target,
 )
-from sweep.spec.identity import digest
-from sweep.spec.instrument import Instrument, Part
-from sweep.spec.limits import grid_findings, readable
-from sweep.spec.mistakes import ABSENT, Finding, Location, Mistake, SpecError, dotted, shown
-from sweep.spec.progressions import values_in
-from sweep.spec.reading import Document, plain, resolve_instrument
-from sweep.spec.rules import Numeric, Rule, Text
-from sweep.spec.sections import Accuracy, Atmosphere, Effects, Execution, Footprint
-from sweep.spec.translation import findings_of
 from sweep.units import QuantityError
 
 LARGEST_GRID = 10**15
-
-_SEED = Numeric(
-    about="Seed of all random draws", example="1", at_least="0", at_most="2^63", whole=True
-)
-
-
-class _ReadAxes(Rule):
-    """Axes, which `read_axes` has read before pydantic sees them."""
-
-    def read(self, written: object) -> object:
-        """The axes as they are."""
-        return written
+_UNSTORED = ("question", "execution", "axes", "figures")
+"""Sections of a study of which no default is written out."""
+_READ_AXES = Special(about="What varies", reader=lambda axes: axes)
+"""Rule of axes, which `read_axes` has read before pydantic sees them."""
 
 
 class Study(Part, ABC):
@@ -61,16 +57,16 @@ class Study(Part, ABC):
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
 
-    title: Annotated[str, Text(about="What the study is called")]
-    question: Annotated[str, Text(about="The question that the study answers")] = ""
+    title: str = of.text("What the study is called")
+    question: str = of.text("The question that the study answers", "")
     instrument: Instrument
     atmosphere: Atmosphere = Atmosphere()
     footprint: Footprint = Footprint()
     effects: Effects = Effects()
     accuracy: Accuracy = Accuracy()
-    seed: Annotated[int, _SEED] = 0
+    seed: int = of.seed("Seed of all random draws")
     execution: Execution = Execution()
-    axes: Annotated[tuple[Axis, ...], _ReadAxes(about="What varies")] = ()
+    axes: tuple[Axis, ...] = of.field(_READ_AXES, ())
 
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
 
@@ -96,20 +92,7 @@ class Study(Part, ABC):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Spec from a document, which is changed, or all of its mistakes at once.
-
-        Parameters
-        ----------
-        document : Document
-            The spec as written.
-        base : Path or None
-            Folder that the files which it names are relative to; None leaves them alone.
-
-        Raises
-        ------
-        SpecError
-            With every mistake in it.
-        """
+        """Spec from a document, which is changed; files are left alone without a base."""
         has_instrument = resolve_instrument(document, base or Path())
         written = document.value
         filled = [
@@ -124,12 +107,10 @@ class Study(Part, ABC):
             spec = cls.model_validate({**written, "axes": axes})
         except ValidationError as error:
             findings += findings_of(error, cls)
-        values = readable(written, axes)
-        findings += grid_findings(values, axes)
-        findings += beam_findings(values, axes)
-        findings += effect_findings(values, axes, written_modes(written))
-        findings += _size_finding(axes)
-        findings += cls.further_findings(written, axes, base, axes_are_whole)
+        grid = Grid.of(written, axes)
+        findings += grid_findings(grid)
+        findings += _size_findings(axes)
+        findings += cls.further_findings(written, grid, base, axes_are_whole)
         # What is wrong with an axis or an instrument's file is told there, and there alone.
         findings = [
             finding
@@ -139,7 +120,7 @@ class Study(Part, ABC):
         ]
         findings = document.findings + findings
         if findings or spec is None:
-            raise SpecError(_in_order(document, findings))
+            raise SpecError(document.mistakes(findings))
         spec._written = spec._completed(written)
         return spec
 
@@ -150,24 +131,11 @@ class Study(Part, ABC):
 
     @classmethod
     def further_findings(
-        cls,
-        written: Mapping[str, Any],
-        axes: tuple[Axis, ...],
-        base: Path | None,
-        axes_are_whole: bool,
+        cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
-        """What is wrong with a spec beyond its single fields.
+        """What is wrong with a spec as written beyond its single fields and its grid.
 
-        Parameters
-        ----------
-        written : mapping
-            The spec as written.
-        axes : tuple of Axis
-            The axes that could be read.
-        base : Path or None
-            Folder that the files which it names are relative to; None leaves them alone.
-        axes_are_whole : bool
-            Whether all of the axes could be read.
+        Files are left alone without a base. Not all axes may have been read.
         """
         return []
 
@@ -198,7 +166,7 @@ class Study(Part, ABC):
             path, rule = _parameter(name, parameters | dict.fromkeys(WAYS))
             if rule is None:
                 suggestion = parameter_suggestion(name, parameters)
-                findings.append(Finding((name,), "is no parameter", suggestion, ABSENT))
+                findings.append(Finding((name,), "is no parameter", suggestion))
                 continue
             try:
                 if path in WAYS:  # one takes another's place
@@ -208,9 +176,7 @@ class Study(Part, ABC):
                 findings.append(Finding((name,), error.rule, error.suggestion, written))
             findings += self.unvaried(path, parameters[path], (name,))
         if not findings:
-            findings = grid_findings(parameters, ())
-            findings += beam_findings(parameters, ())
-            findings += effect_findings(parameters, (), self.modes())
+            findings = grid_findings(Grid(parameters, modes=self.modes()))
         if findings:
             raise SpecError(Document({}).mistake(finding) for finding in findings)
         return parameters
@@ -283,7 +249,7 @@ class Study(Part, ABC):
         """The spec as written, with its defaults written out and its execution left out."""
         mapping = {key: value for key, value in written.items() if key != "execution"}
         for path, rule, value in leaves(self):
-            if path[0] not in UNSTORED:
+            if path[0] not in _UNSTORED:
                 fill(mapping, list(path), rule.written(value))
         return mapping
 
@@ -299,24 +265,85 @@ def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
-def _size_finding(axes: tuple[Axis, ...]) -> list[Finding]:
+def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:
     """A grid too large to count."""
-    points = 1
-    for axis in axes:
-        points *= axis.size
+    points = math.prod(axis.size for axis in axes)
     if points <= LARGEST_GRID:
         return []
-    return [
-        Finding(
-            ("axes",),
-            f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}",
-            "take fewer values",
-            ABSENT,
-        )
-    ]
+    rule = f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}"
+    return [Finding(("axes",), rule, "take fewer values")]
 
 
-def _in_order(document: Document, findings: list[Finding]) -> list[Mistake]:
-    """Mistakes as they stand in the file, each once."""
-    mistakes = dict.fromkeys(document.mistake(finding) for finding in findings)
-    return sorted(mistakes, key=lambda m: (m.file != document.file, m.file, m.line or 0))
+class Spec(Study):
+    """A study of a flat target over a grid of parameters, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    target: Target
+    draws: Draws = Draws()
+    storage: Storage = Storage()
+    figures: tuple[Figure, ...] = Field(default=(), description="Figures and tables of the results")
+
+    @classmethod
+    def from_stored(cls, text: str) -> Self:
+        """Spec from the JSON that `to_json` gave, the same again but for its execution."""
+        return cls.from_mapping(json.loads(text))
+
+    @classmethod
+    def further_findings(
+        cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
+    ) -> list[Finding]:
+        """Figures of what the study lacks, random effects without draws, draws without an end."""
+        findings = list(figure_findings(written, grid.axes)) if axes_are_whole else []
+        with suppress(ValidationError):
+            draws = Draws.model_validate(written.get("draws", {}))
+            findings += spectra_findings(draws, grid)
+            if not draws.any:
+                findings += without_draws(grid)
+            if draws.number and draws.adaptive:
+                findings.append(_two_numbers(draws))
+        return findings
+
+    def parameters(self) -> dict[str, float | int | str]:
+        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        return {
+            path: value
+            for section in SECTIONS
+            for path, value in values_of(getattr(self, section), section).items()
+            if value is not None
+        }
+
+    @cached_property
+    def has_random_effects(self) -> bool:
+        """Whether anything but noise may be random at any point."""
+        return any(without_draws(Grid(self.parameters(), self.axes, self.modes())))
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Title, question, figures and execution are no part of it, nor are values that an axis
+        overrides, nor is what looks at whole spectra where none are drawn. The order of the axes
+        is: it lays out the arrays.
+        """
+        looked_at = self.draws.whole_spectra
+        return {
+            "model": VERSION,
+            "parameters": {
+                path: value
+                for path, value in self.parameters_off_axes().items()
+                if looked_at or not is_method(path)
+            },
+            "axes": [axis_identity(axis) for axis in self.axes],
+            "draws": values_of(self.draws, ""),
+            "effects": self.modes(),
+            "seed": self.seed,
+            "storage": values_of(self.storage, ""),
+        }
+
+
+def _two_numbers(draws: Draws) -> Finding:
+    """A fixed number of draws beside a limit."""
+    rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to draw"
+    remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many times"
+    return Finding(("draws", "limit"), rule, remedy, draws.limit)

@@ -14,11 +14,10 @@ from sweep.model.geometry.rays import Caster
 from sweep.scenes.files import SceneError
 from sweep.scenes.meshes import Facets
 from sweep.scenes.terrain import Terrain
-from sweep.spec.files import Files
 from sweep.spec.grounds import Ground, PlacedGround
 from sweep.spec.motion import Span
-from sweep.spec.objects import Boulders, Solid, Trees, materials
-from sweep.spec.scene_sections import Scene
+from sweep.spec.parts import Files
+from sweep.spec.scene import Boulders, Scene, Solid, Trees, materials
 
 
 class World(NamedTuple):

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sweep.extras import remedy
-from sweep.spec.cluster_fields import Bounds
 from sweep.spec.clusters import (
     SSH,
     Address,
     AnyCluster,
     Batch,
+    Bounds,
     Cluster,
     Kubernetes,
     Local,

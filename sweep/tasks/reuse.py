@@ -15,7 +15,7 @@ import numpy as np
 
 from sweep.model.resolution import by_tolerance
 from sweep.spec import Spec
-from sweep.spec.detector_check import is_method
+from sweep.spec.grid_rules import is_method
 from sweep.storage import opening
 from sweep.storage.locations import Location
 from sweep.tasks import identity

@@ -13,7 +13,7 @@ from sweep.analysis.scenes.quantities import KINDS, QUANTITIES, kinds, shown
 from sweep.analysis.scenes.recording import Interval, Thinned, confined
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import SpecError
-from sweep.spec.scene_figures import QUANTITIES as OF_SPECS
+from sweep.spec.figures import QUANTITIES as OF_SPECS
 
 
 @pytest.fixture(scope="module")

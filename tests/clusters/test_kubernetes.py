@@ -15,7 +15,7 @@ import yaml
 from small import quiet, small, tree
 
 from sweep.spec import cluster_of, load_cluster
-from sweep.spec.cluster_fields import Bounds
+from sweep.spec.clusters import Bounds
 from sweep.tasks.clusters import certificates, kubernetes
 from sweep.tasks.errors import ClusterError
 

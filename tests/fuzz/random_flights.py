@@ -11,12 +11,11 @@ from random_parts import SPREADS, Parts
 from random_studies import CHEAP, TIMING, axes_of, drop, plain_paths, rules
 
 from sweep.spec import SceneSpec, SpecError
-from sweep.spec.files import Files
 from sweep.spec.grounds import Ground
 from sweep.spec.instrument import Instrument
 from sweep.spec.motion import Platform
-from sweep.spec.objects import AnyObject
-from sweep.spec.structure import kind_of, models_at
+from sweep.spec.parts import Files, kind_of, models_at
+from sweep.spec.scene import AnyObject
 
 GROUND_KINDS = frozenset(kind_of(m) for m in models_at(AnyObject) if issubclass(m, Ground))
 FILES = {

@@ -11,9 +11,8 @@ from pydantic import BaseModel
 from written_values import STYLES, Style, cheaper, values
 
 from sweep.model.threshold import WAYS
-from sweep.spec.fields import rule_of, written_name
-from sweep.spec.list_rules import File
-from sweep.spec.structure import kind_of, models_at
+from sweep.spec.parts import kind_of, models_at, rule_of, written_name
+from sweep.spec.rules import File
 
 THRESHOLDS = tuple(way.rsplit(".", 1)[-1] for way in WAYS)
 """Fields of which a spec has one."""

@@ -13,7 +13,7 @@ from written_values import STYLES, Style, cheaper, inside, numbers, spelled, uni
 from sweep.model import beam
 from sweep.spec import Spec, SpecError
 from sweep.spec.fields import default_of, parameter_rules
-from sweep.spec.limits import DELAY, DURATION, RANGE, SAMPLE_RATE
+from sweep.spec.grid_rules import DELAY, DURATION, RANGE, SAMPLE_RATE
 from sweep.spec.rules import Numeric, Rule
 from sweep.units import QuantityError
 

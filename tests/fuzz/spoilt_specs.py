@@ -9,9 +9,9 @@ import yaml
 from hypothesis import strategies as st
 
 from sweep.spec import SceneSpec, Spec
-from sweep.spec.fields import parameter_rules, rule_of, written_name
+from sweep.spec.fields import parameter_rules
+from sweep.spec.parts import all_parts, rule_of, written_name
 from sweep.spec.rules import Choice, Numeric
-from sweep.spec.structure import all_parts
 
 
 class Spoilt(NamedTuple):

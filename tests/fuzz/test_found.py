@@ -160,7 +160,7 @@ def test_the_ends_of_the_bounds_are_computed_without_a_warning(name, tmp_path):
 
 
 def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
-    from sweep.spec.files import Files
+    from sweep.spec.parts import Files
 
     rocks = {
         "kind": "boulders", "on": "ground", "law": {"kind": "power", "density": "0.1 m^-2",
@@ -183,8 +183,8 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
 
 def test_boulders_beside_the_ground_are_refused():
     from sweep.scenes.terrain import square
-    from sweep.spec.drawn_grounds import Plane
-    from sweep.spec.files import Files
+    from sweep.spec.grounds import Plane
+    from sweep.spec.parts import Files
 
     ground = Plane(kind="plane", size="100 m", reflectance=0.1).terrain(Files("."))
     assert square(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)

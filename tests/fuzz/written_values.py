@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from sweep.spec import list_rules, window_rule
-from sweep.spec.method_rule import Method
-from sweep.spec.rules import Choice, Numeric, Rule, Text
+from sweep.spec import rules
+from sweep.spec.rules import Choice, Method, Numeric, Rule, Text
 from sweep.units import _PREFIXED, QuantityError, Unit
 
 MOST_SIGNIFICANT = 17
@@ -216,9 +215,9 @@ def quantities(rule: Numeric, decades: float) -> st.SearchStrategy[Any]:
 
 
 @cache
-def windows(rule: window_rule.Window) -> st.SearchStrategy[str]:
+def windows(rule: rules.Window) -> st.SearchStrategy[str]:
     """Any window of scipy's that the rule takes, with parameters where it wants some."""
-    names = (*window_rule._WINDOWS, *window_rule._WINDOW_ALIASES, *window_rule._SCIPY_WINDOWS)
+    names = (*rules.WINDOWS, *rules.ALIASES, *rules.SCIPY_WINDOWS)
     inside = ("", "(0.5)", "(2.5)", "(8.6)", "(60)", "(1.5, 7)")
     every = [name + parameters for name in names for parameters in inside]
     return st.sampled_from([window for window in every if _reads(rule, window)])
@@ -235,16 +234,16 @@ def texts(draw: st.DrawFn, rule: Text) -> str:
     return draw(st.from_regex(rule.pattern, fullmatch=True).map(lambda text: text[:20]))
 
 
-def several(rule: list_rules.Several, decades: float) -> st.SearchStrategy[list[Any]]:
+def several(rule: rules.Several, decades: float) -> st.SearchStrategy[list[Any]]:
     """A list as a rule takes it, of few values."""
     most = min(rule.most, rule.least + 2)
     listed = st.lists(values(rule.of, decades), min_size=rule.least, max_size=most)
     return listed.filter(lambda written: _reads(rule, written))
 
 
-def _beams(rule: list_rules.Beams, decades: float) -> st.SearchStrategy[list[Any]]:
+def _beams(rule: rules.Beams, decades: float) -> st.SearchStrategy[list[Any]]:
     """A few beams, by angles or by vectors."""
-    steered = several(list_rules._STEERED, min(decades, 0.3))
+    steered = several(rules.STEERED, min(decades, 0.3))
     pointed = st.lists(st.sampled_from(["-1", 0.25, "−0.5", 0]), min_size=2, max_size=2)
     return st.lists(st.one_of(steered, pointed.map(lambda two: [*two, -1])), min_size=1, max_size=4)
 
@@ -261,31 +260,25 @@ def _reads(rule: Rule, written: object) -> bool:
 def values(rule: Rule, decades: float) -> st.SearchStrategy[Any]:
     """All that a rule takes, as written; numbers about its example, so many decades away."""
     if isinstance(rule, Numeric):
-        return quantities(rule, decades)
-    if isinstance(rule, window_rule.Window):
+        number = quantities(rule, decades)
+        return st.one_of(st.just(rule.word), number) if isinstance(rule.means, str) else number
+    if isinstance(rule, rules.Window):
         return windows(rule)
-    if isinstance(rule, Choice):
-        words = rule.schema()["enum"]
-        return st.sampled_from(words)
     if isinstance(rule, Method):  # a function of the user's would have to be there
         return st.sampled_from(rule.options)
+    if isinstance(rule, Choice):
+        return st.sampled_from(rule.schema()["enum"])
     if isinstance(rule, Text):
         return texts(rule)
-    if isinstance(rule, list_rules.Flag):
+    if isinstance(rule, rules.Flag):
         return st.booleans()
-    if isinstance(rule, list_rules.Either):
-        return st.one_of(st.sampled_from(rule.words), values(rule.of, decades))
-    if isinstance(rule, list_rules.Beams):
+    if isinstance(rule, rules.Beams):
         return _beams(rule, decades)
-    if isinstance(rule, list_rules.Several):
+    if isinstance(rule, rules.Several):
         return several(rule, decades)
-    if isinstance(rule, list_rules.Names):
-        return st.lists(values(rule.of, decades), min_size=1, max_size=3, unique_by=str)
     raise TypeError(f"no strategy for what {type(rule).__name__} takes: add one in written_values")
 
 
 def cheaper(rule: Rule, bounds: dict[str, str]) -> Rule:
     """A rule with tighter bounds, so that what keeps it is soon computed."""
-    if isinstance(rule, list_rules.Either):
-        return replace(rule, of=cheaper(rule.of, bounds))
     return replace(rule, **bounds)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corner
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, solve
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
-from sweep.spec.scene_sections import Navigation
+from sweep.spec.scene import Navigation
 
 DRAWS = 20_000
 """A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of

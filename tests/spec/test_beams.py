@@ -5,7 +5,7 @@ from written_specs import written
 
 from sweep.cli.telling import warn_of_beam
 from sweep.spec import Spec, SpecError
-from sweep.spec.beam_check import too_narrow
+from sweep.spec.grid_rules import too_narrow
 
 MODE = {"instrument.telescope.coupling": "single_mode"}
 WAIST = {"instrument.laser.beam_divergence": ...}

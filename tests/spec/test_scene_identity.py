@@ -12,10 +12,9 @@ from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
-from sweep.spec.fields import leaves
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.scene_units import ROOTS, scene_units, units_by_name
-from sweep.spec.structure import all_parts
+from sweep.spec.identity import ROOTS, scene_units
+from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
 
 
 def spec_of(mapping, base="."):
@@ -310,13 +309,15 @@ def test_differences_are_told_with_units():
 
 
 def test_a_name_has_one_unit_wherever_it_stands():
-    for name, units in units_by_name():
-        assert scene_units()[name] == units, name
+    for model in all_parts(*ROOTS):
+        for name, field in fields_of(model).items():
+            rule = rule_of(field)
+            assert rule is None or scene_units()[name] == rule.units, name
     assert scene_units()["half_angle"] == "rad" and len(all_parts(*ROOTS)) > 30
 
 
 def test_random_things_of_one_seed_share_no_numbers():
-    from sweep.spec.streams import generator
+    from sweep.spec.grounds import generator
 
     first = {use: generator(use, 7).random(4) for use in ("relief", "hills", "craters", "trees")}
     values = np.array(list(first.values()))

@@ -10,9 +10,8 @@ from written_specs import written as grid
 
 from sweep.model.ground import LAWS
 from sweep.spec import SceneSpec, json_schema, load
-from sweep.spec.fields import rule_of, written_name
+from sweep.spec.parts import all_parts, rule_of, written_name
 from sweep.spec.reading import read_document
-from sweep.spec.structure import all_parts
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SCENES = [
@@ -97,9 +96,8 @@ def test_every_field_is_described_and_its_default_reads_back():
             if "default" in described:
                 assert rule.read(described["default"]) == field.default, (model, name)
                 looked_at += 1
-            example = getattr(rule, "example", None)
-            if isinstance(example, str) and not example.startswith("["):
-                rule.read(example)
+            if rule.example and not rule.example.startswith("["):
+                rule.read(rule.example)
     assert looked_at > 40
 
 

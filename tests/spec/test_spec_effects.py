@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from written_scenes import written as flight
 from written_specs import written
 
-import sweep.spec.effect_fields
+import sweep.spec.parts
 from sweep.model.effects.catalogue import EFFECTS, NAMES, PARAMETERS
 from sweep.model.effects.effect import Parameter
 from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored, json_schema
-from sweep.spec.axis_reading import read_axes
-from sweep.spec.effect_fields import with_modes, with_parameters
-from sweep.spec.fields import parameter_rules, rule_of
-from sweep.spec.instrument import Laser, Part
-from sweep.spec.limits import has_point
+from sweep.spec.axes import read_axes
+from sweep.spec.fields import parameter_rules
+from sweep.spec.grid_rules import Grid
+from sweep.spec.instrument import Laser
+from sweep.spec.parts import Part, rule_of, with_modes, with_parameters
 from sweep.spec.reading import read_document
 from sweep.spec.rules import Numeric
 from sweep.spec.sections import Effects
@@ -122,8 +122,8 @@ def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
     """Both decorators read the catalogue: what is added there is in the sections."""
     new = Parameter(path="instrument.laser.colours", about="Colours", default=2.0,
                     example="3", limits=("1", None))  # fmt: skip
-    monkeypatch.setattr(sweep.spec.effect_fields, "PARAMETERS", (new,))
-    monkeypatch.setattr(sweep.spec.effect_fields, "EFFECTS", EFFECTS[:1])
+    monkeypatch.setattr(sweep.spec.parts, "PARAMETERS", (new,))
+    monkeypatch.setattr(sweep.spec.parts, "EFFECTS", EFFECTS[:1])
 
     class Bare(Part):
         """A section."""
@@ -316,9 +316,9 @@ def test_a_grid_has_a_point_just_when_one_of_its_points_meets_all_conditions(a, 
     conditions = {one: lambda v: v > x, two: lambda v: v < y, three: lambda v: v == 1}
     points = zip(a, b, strict=True) if zipped else [(i, j) for i in a for j in b]
     expected = any(i > x and j < y for i, j in points)
-    assert has_point(conditions, {three: 1.0}, axes) == expected
-    assert not has_point(conditions, {three: 2.0}, axes)
-    assert not has_point(conditions, {}, axes)
+    assert Grid({three: 1.0}, axes).has_point(conditions) == expected
+    assert not Grid({three: 2.0}, axes).has_point(conditions)
+    assert not Grid({}, axes).has_point(conditions)
 
 
 # Decibels beside a plain unit

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from written_specs import written
 
-import sweep.spec.experiment
+import sweep.spec.study
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
 from sweep.spec import Spec, difference
-from sweep.spec.detector_check import is_method
 from sweep.spec.fields import SECTIONS, default_of, parameter_rules
+from sweep.spec.grid_rules import is_method
 from sweep.spec.rules import Choice
 
 AXES = {
@@ -193,7 +193,7 @@ def test_draws_seed_and_blocks_are_part_of_the_id(changes):
 
 def test_the_models_version_is_part_of_the_id(monkeypatch):
     before, id_before = spec().identity(), spec().id
-    monkeypatch.setattr(sweep.spec.experiment, "VERSION", "another")
+    monkeypatch.setattr(sweep.spec.study, "VERSION", "another")
     assert spec().id != id_before
     (line,) = difference(before, spec())
     assert line.startswith("model: ") and line.endswith("-> another")

@@ -30,7 +30,7 @@ from sweep.analysis.scenes.terrain import Ground
 from sweep.analysis.tabular import Block, Cell, Page
 from sweep.model.effects.catalogue import names_of
 from sweep.spec import SceneSpec
-from sweep.spec.scene_figures import (
+from sweep.spec.figures import (
     CloudFigure,
     NavigationFigure,
     NavigationTable,

@@ -15,8 +15,7 @@ from dask_jobqueue.pbs import PBSJob
 from dask_jobqueue.slurm import SLURMJob
 from distributed.core import Status
 
-from sweep.spec.cluster_fields import Bounds
-from sweep.spec.clusters import Batch, Slurm
+from sweep.spec.clusters import Batch, Bounds, Slurm
 from sweep.tasks.clusters import common
 
 #: Seconds until a running cluster submits again what was not taken.

@@ -13,8 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from sweep.extras import remedy
-from sweep.spec.cluster_fields import Bounds
-from sweep.spec.clusters import Kubernetes
+from sweep.spec.clusters import Bounds, Kubernetes
 from sweep.tasks.clusters import common
 from sweep.tasks.errors import ClusterError
 

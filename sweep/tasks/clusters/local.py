@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sweep.spec.cluster_fields import Bounds
-from sweep.spec.clusters import Local
+from sweep.spec.clusters import Bounds, Local
 from sweep.tasks.clusters import common
 
 LEAST_MEMORY = 1 << 30

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sweep.spec.cluster_fields import Bounds
-from sweep.spec.clusters import SSH
+from sweep.spec.clusters import SSH, Bounds
 from sweep.tasks.clusters import common
 
 

@@ -1,4 +1,4 @@
-"""Objects of a scene: meshes and solids, and what stands on its ground."""
+"""A scene: meshes and solids, what stands on its ground, and all that a study has beside it."""
 
 from __future__ import annotations
 
@@ -7,22 +7,31 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-import sweep.spec.quantities as of
-from sweep.spec.drawn_grounds import Hills, Plane, ReliefGround
-from sweep.spec.grounds import ArrayGround, ImageGround, Jacksboro, Material, RasterGround
-from sweep.spec.instrument import Part
-from sweep.spec.list_rules import File
+import sweep.spec.declaring as of
+from sweep.spec.grounds import (
+    ArrayGround,
+    Hills,
+    ImageGround,
+    Jacksboro,
+    Material,
+    Plane,
+    RasterGround,
+    ReliefGround,
+    generator,
+)
 from sweep.spec.motion import Motion, Turn
-from sweep.spec.rules import Choice, Numeric, Text
-from sweep.spec.streams import generator
+from sweep.spec.parts import Files, Part
+from sweep.spec.sections import sunlight
 
 if TYPE_CHECKING:
     from sweep.scenes.meshes import Facets
     from sweep.scenes.scattered import Law
     from sweep.scenes.terrain import Terrain
-    from sweep.spec.files import Files
 
 Vector = tuple[float, ...]
+
+WORLD = "world"
+"""The origin of a scene whose coordinates are as they are."""
 
 
 class Solid(Material, ABC):
@@ -31,9 +40,9 @@ class Solid(Material, ABC):
     One that moves is placed by its path; its rotation is that in the moving body's frame.
     """
 
-    position: Annotated[
-        Vector | None, of.position("Where its own zero lies; its coordinates as they are")
-    ] = None
+    position: Vector | None = of.position(
+        "Where its own zero lies; its coordinates as they are", default=None
+    )
     rotation: Turn = Turn()
     motion: Motion | None = None
 
@@ -56,14 +65,10 @@ class MeshObject(Solid):
     """A mesh from a file."""
 
     kind: Literal["mesh"]
-    file: Annotated[str, File(about="The mesh: STL, OBJ, PLY, glTF and whatever trimesh loads")]
-    unit: Annotated[str | None, Text(about="Unit of its lengths; the file's own, or m")] = None
-    up: Annotated[
-        str | None, Choice(about="Its vertical axis; y for glTF, else z", options=("y", "z"))
-    ] = None
-    scale: Annotated[
-        float, of.number("Factor on all lengths", "2", at_least="1e-9", at_most="1e9")
-    ] = 1.0
+    file: str = of.file("The mesh: STL, OBJ, PLY, glTF and whatever trimesh loads")
+    unit: str | None = of.text("Unit of its lengths; the file's own, or m", None)
+    up: str | None = of.choice("Its vertical axis; y for glTF, else z", ("y", "z"), None)
+    scale: float = of.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
 
     def shape(self, files: Files) -> Facets:
         """Its facets before they are turned."""
@@ -76,10 +81,10 @@ class Sphere(Solid):
     """A sphere of triangles whose corners lie on it."""
 
     kind: Literal["sphere"]
-    radius: Annotated[float, of.size("Radius", "1 m")]
-    subdivisions: Annotated[
-        int, of.count("Times that an icosahedron's faces are cut in four", "4", "0", "8")
-    ] = 4
+    radius: float = of.size("Radius", "1 m")
+    subdivisions: int = of.count(
+        "Times that an icosahedron's faces are cut in four", "4", "0", "8", default=4
+    )
 
     def shape(self, files: Files) -> Facets:
         """Its facets about its centre."""
@@ -92,7 +97,7 @@ class Box(Solid):
     """A box."""
 
     kind: Literal["box"]
-    size: Annotated[Vector, of.vector("Length along x, y and z", "m", "2 m")]
+    size: Vector = of.vector("Length along x, y and z", "m", "2 m")
 
     def shape(self, files: Files) -> Facets:
         """Its facets about its middle."""
@@ -105,10 +110,7 @@ class MartianRocks(Part):
     """Rocks of the Martian plains (Golombek and Rapp 1997)."""
 
     kind: Literal["martian_rocks"]
-    abundance: Annotated[
-        float,
-        of.number("Fraction of the ground under rocks", "5 %", at_least="1e-9", at_most="0.9"),
-    ]
+    abundance: float = of.number("Fraction of the ground under rocks", "5 %", "1e-9", "0.9")
 
     def law(self) -> Law:
         """Size-frequency law."""
@@ -121,12 +123,10 @@ class PowerLaw(Part):
     """A number per area that falls with a power of the diameter."""
 
     kind: Literal["power"]
-    density: Annotated[
-        float,
-        Numeric(about="Number per area of 1 m or larger", si_unit="m^-2", example="0.01 m^-2",
-                at_least="1e-12 m^-2", at_most="1e6 m^-2"),
-    ]  # fmt: skip
-    exponent: Annotated[float, of.number("Exponent", "2.5", at_least="1e-3", at_most="20")]
+    density: float = of.quantity(
+        "Number per area of 1 m or larger", "m^-2", "0.01 m^-2", "1e-12 m^-2", "1e6 m^-2"
+    )
+    exponent: float = of.number("Exponent", "2.5", "1e-3", "20")
 
     def law(self) -> Law:
         """Size-frequency law."""
@@ -139,24 +139,20 @@ class Boulders(Material):
     """Half-ellipsoids on a ground."""
 
     kind: Literal["boulders"]
-    on: Annotated[str, of.name("Ground that they lie on")]
+    on: str = of.name("Ground that they lie on")
     law: Annotated[MartianRocks | PowerLaw, Field(discriminator="kind")]
-    smallest: Annotated[float, of.size("Smallest diameter", "0.5 m")]
-    largest: Annotated[float, of.size("Largest diameter", "3 m")]
-    centre: Annotated[
-        Vector, of.position("Middle of the square that they lie in", 2)
-    ] = (0.0, 0.0)  # fmt: skip
-    within: Annotated[
-        float | None, of.size("Side of that square; all of the ground by default", "200 m")
-    ] = None
-    height_ratio: Annotated[
-        float, of.number("Height over diameter", "0.5", at_least="1e-6", at_most="10")
-    ] = 0.5
-    elongation: Annotated[
-        float, of.number("Largest ratio of long to short axis", "1.5", at_least="1", at_most="10")
-    ] = 1.5
-    subdivisions: Annotated[int, of.count("Refinement of their shape", "2", "0", "4")] = 2
-    seed: Annotated[int, of.seed()] = 0
+    smallest: float = of.size("Smallest diameter", "0.5 m")
+    largest: float = of.size("Largest diameter", "3 m")
+    centre: Vector = of.position("Middle of the square that they lie in", of=2, default=(0.0, 0.0))
+    within: float | None = of.size(
+        "Side of that square; all of the ground by default", "200 m", default=None
+    )
+    height_ratio: float = of.number("Height over diameter", "0.5", "1e-6", "10", default=0.5)
+    elongation: float = of.number(
+        "Largest ratio of long to short axis", "1.5", "1", "10", default=1.5
+    )
+    subdivisions: int = of.count("Refinement of their shape", "2", "0", "4", default=2)
+    seed: int = of.seed()
 
     def facets(self, ground: Terrain) -> Facets:
         """Their facets on a ground in the scene's frame.
@@ -188,34 +184,32 @@ class Boulders(Material):
 class TreeMeasures(Part):
     """Mean measures of the trees of a clump."""
 
-    height: Annotated[float, of.size("From the ground to the top", "12 m")] = 12.0
-    crown_diameter: Annotated[float, of.size("Across", "7 m")] = 7.0
-    crown_base: Annotated[float, of.length("Height of its lower end", "3 m", at_least="0 m")] = 3.0
-    trunk_diameter: Annotated[float, of.size("At the ground", "40 cm")] = 0.4
-    leaf_length: Annotated[float, of.size("Long diagonal of a leaf", "30 cm")] = 0.30
-    leaf_width: Annotated[float, of.size("Short diagonal of a leaf", "20 cm")] = 0.20
-    leaf_area_index: Annotated[
-        float,
-        of.number("One-sided leaf area over that of the outline", "2", at_least="0", at_most="20"),
-    ] = 2.0
-    variation: Annotated[
-        float,
-        of.number("Share by which sizes vary to each side", "0.25", at_least="0", at_most="0.99"),
-    ] = 0.25
+    height: float = of.size("From the ground to the top", "12 m", default=12.0)
+    crown_diameter: float = of.size("Across", "7 m", default=7.0)
+    crown_base: float = of.length("Height of its lower end", "3 m", "0 m", default=3.0)
+    trunk_diameter: float = of.size("At the ground", "40 cm", default=0.4)
+    leaf_length: float = of.size("Long diagonal of a leaf", "30 cm", default=0.30)
+    leaf_width: float = of.size("Short diagonal of a leaf", "20 cm", default=0.20)
+    leaf_area_index: float = of.number(
+        "One-sided leaf area over that of the outline", "2", "0", "20", default=2.0
+    )
+    variation: float = of.number(
+        "Share by which sizes vary to each side", "0.25", "0", "0.99", default=0.25
+    )
 
 
 class Trees(Part):
     """A clump of broad-leaved trees on a ground, of two materials."""
 
     kind: Literal["trees"]
-    on: Annotated[str, of.name("Ground that they grow on")]
-    centre: Annotated[Vector, of.position("Middle of the clump", 2)] = (0.0, 0.0)
-    radius: Annotated[float, of.size("Trunks stand within it", "15 m")]
-    number: Annotated[int, of.count("Trees", "7", at_most="10000")]
+    on: str = of.name("Ground that they grow on")
+    centre: Vector = of.position("Middle of the clump", of=2, default=(0.0, 0.0))
+    radius: float = of.size("Trunks stand within it", "15 m")
+    number: int = of.count("Trees", "7", at_most="10000")
     tree: TreeMeasures = TreeMeasures()
     leaf: Material
     trunk: Material
-    seed: Annotated[int, of.seed()] = 0
+    seed: int = of.seed()
 
     def facets(self, ground: Terrain) -> Facets:
         """Leaves (surface 0) and trunks (1) on a ground in the scene's frame.
@@ -233,7 +227,7 @@ class Trees(Part):
             centre=(self.centre[0], self.centre[1]),
             radius=self.radius,
             number=self.number,
-            tree=Tree(**{name: getattr(self.tree, name) for name in TreeMeasures.model_fields}),
+            tree=Tree(**self.tree.model_dump()),
         )
 
 
@@ -260,3 +254,47 @@ def materials(name: str, thing: Part) -> list[tuple[str, Material]]:
         return [(f"{name}.leaf", thing.leaf), (f"{name}.trunk", thing.trunk)]
     assert isinstance(thing, Material)
     return [(name, thing)]
+
+
+class Scene(Part):
+    """What the instrument flies over."""
+
+    origin: str = of.name("Ground whose middle is the zero of all positions, or 'world'", WORLD)
+    objects: dict[str, AnyObject] = Field(description="What there is, by name")
+    solar_irradiance: float = sunlight("scene")
+
+
+class SceneDraws(Part):
+    """Random realisations of the flight's radiometry."""
+
+    number: int = of.count("Draws", "1000", at_most="1e9", default=1)
+    method: str = of.choice(
+        "Draw against the probabilities, or add noise to the bins",
+        ("probabilities", "noise"),
+        "probabilities",
+    )
+    returns: int = of.count("Points kept of a shot at most", "4", at_most="64", default=4)
+
+
+class Navigation(Part):
+    """Velocity and altitude from each measurement cycle."""
+
+    test_level: float = of.number(
+        "Chance that a test for faulty beams rejects a good cycle; 0 leaves it out",
+        "0.001", "0", "0.5", default=0.0,
+    )  # fmt: skip
+    ground_slope: float = of.number(
+        "Standard deviation of the ground's slope, as far as it is known beforehand; 10 leaves "
+        "the slope to the points, 0 says that the ground is level",
+        "0.1", "0", "10", default=10.0,
+    )  # fmt: skip
+    relief: float = of.length(
+        "Standard deviation of the ground's height", "1 m", "0 m", default=0.0
+    )
+
+
+class SceneStorage(Part):
+    """How results are cut up in the store; part of a study's identity."""
+
+    block_shots: int = of.count("Shots that one block holds at most", "4096", default=4096)
+    block_draws: int = of.count("Draws that one block holds at most", "64", default=64)

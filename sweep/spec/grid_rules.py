@@ -1,0 +1,520 @@
+"""Rules that join several fields, held against the whole grid of a study by its extremes.
+
+A chirp longer than its echo's delay, samples to transform, no more electrons than photons; beams
+that an aperture can make; effects with what they need; detectors that fit their spectra.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import beam
+from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.effect import Effect, Parameter
+from sweep.model.effects.noise_sources import SUN_RADIUS
+from sweep.model.noisy_spectra import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.spec.axes import Axis, place_on_grid
+from sweep.spec.fields import default_of, parameter_rules
+from sweep.spec.mistakes import ABSENT, Finding
+from sweep.spec.parts import OFF, ON, rules_of
+from sweep.spec.sections import SPECTRA, Draws, Effects
+from sweep.units import QuantityError
+
+RANGE = "target.range"
+DURATION = "instrument.chirp.duration"
+DELAY = "instrument.processing.acquisition_delay"
+SAMPLE_RATE = "instrument.processing.sample_rate"
+FFT_SIZE = "instrument.processing.fft_size"
+WINDOW = "instrument.processing.window"
+RESPONSIVITY = "instrument.receiver.responsivity"
+EXTINCTION = "atmosphere.extinction"
+FULL_SCALE = "instrument.processing.full_scale"
+TRAINING, GUARD, RANK = (DETECTOR + name for name in ("training", "guard", "rank"))
+
+_TRIED = 16
+"""Samples with which windows are tried as they are read: with more they can be had."""
+_FEWEST_BINS = 8
+"""Bins of a spectrum that is looked at whole."""
+
+Condition = Callable[[Any], Any]
+"""What holds or does not for each of several values."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Values of a study's parameters, as far as they can be read.
+
+    Axes vary apart, and the members of one together.
+
+    Parameters
+    ----------
+    values : mapping
+        SI values of the parameters off the axes by dotted path.
+    axes : tuple of Axis
+        The axes.
+    modes : mapping
+        Mode of each effect by its name.
+    """
+
+    values: Mapping[str, Any]
+    axes: tuple[Axis, ...] = ()
+    modes: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Grid:
+        """Grid of a spec as written."""
+        on_axes = {member.path for axis in axes for member in axis.members}
+        values: dict[str, Any] = {}
+        for path, rule in parameter_rules().items():
+            found = at(written, path)
+            if path in on_axes:
+                continue
+            with suppress(QuantityError):
+                value = default_of(path) if found is ABSENT else rule.read(found)
+                if value is not None:
+                    values[path] = value
+        modes: dict[str, str] = {}
+        for name, rule in rules_of(Effects, "").items():
+            found = at(written, f"effects.{name}")
+            with suppress(QuantityError):
+                default = Effects.model_fields[name].default
+                modes[name] = default if found is ABSENT else rule.read(found)
+        return cls(values, axes, modes)
+
+    def knows(self, *paths: str) -> bool:
+        """Whether parameters could be read."""
+        return all(self.span(path).size for path in paths)
+
+    def span(self, path: str) -> np.ndarray:
+        """Values (n,) that a parameter takes; none where it could not be read."""
+        for axis in self.axes:
+            for member in axis.members:
+                if member.path == path:
+                    return np.asarray(member.values)
+        return np.asarray([self.values[path]] if path in self.values else [])
+
+    def finding(self, path: str, rule: str, remedy: str) -> Finding:
+        """What is wrong with a parameter, told where its values stand."""
+        return Finding(place_on_grid(path, self.axes), rule, remedy)
+
+    def has_point(self, conditions: Mapping[str, Condition]) -> bool:
+        """Whether some point meets conditions on parameters by path, all of them."""
+        on_axes = {member.path for axis in self.axes for member in axis.members}
+        for path in set(conditions) - on_axes:
+            if path not in self.values or not conditions[path](np.asarray(self.values[path])):
+                return False
+        return all(_met(axis, conditions).any() for axis in self.axes)
+
+    def least(
+        self,
+        terms: Mapping[str, Callable[[Any], Any]],
+        conditions: Mapping[str, Condition] = MappingProxyType({}),
+    ) -> dict[str, float]:
+        """Parameters where the sum of a term of each is least, of points that meet conditions.
+
+        Each axis adds its own least part. Empty where no point meets the conditions, or not all
+        of the terms' parameters could be read.
+        """
+        if not self.knows(*terms) or not self.has_point(conditions):
+            return {}
+        found = {path: self.values[path] for path in terms if path in self.values}
+        for axis in self.axes:
+            own = {member.path: np.asarray(member.values) for member in axis.members}
+            size = sum((term(own[p]) for p, term in terms.items() if p in own), np.zeros(axis.size))
+            place = np.where(_met(axis, conditions), size, np.inf).argmin()
+            found |= {path: own[path][place] for path in terms if path in own}
+        return {path: float(value) for path, value in found.items()}
+
+
+def at(written: Mapping[str, Any], path: str, otherwise: object = ABSENT) -> Any:
+    """What is written at a dotted path."""
+    found: Any = written
+    for name in path.split("."):
+        found = found.get(name, ABSENT) if isinstance(found, Mapping) else ABSENT
+    return otherwise if found is ABSENT else found
+
+
+def _met(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
+    """Whether each place along an axis (n,) meets the conditions on the axis's own parameters."""
+    met = np.ones(axis.size, bool)
+    for member in axis.members:
+        if member.path in conditions:
+            met &= conditions[member.path](np.asarray(member.values))
+    return met
+
+
+def _is(word: str) -> Condition:
+    return lambda values: values == word
+
+
+def _is_not(word: str) -> Condition:
+    return lambda values: values != word
+
+
+def _given(values: np.ndarray) -> np.ndarray:
+    return values > 0
+
+
+def _missing(values: np.ndarray) -> np.ndarray:
+    return values == 0
+
+
+def grid_findings(grid: Grid) -> list[Finding]:
+    """What is wrong with the combinations of values in a study's grid."""
+    return [
+        *(list(_time_findings(grid)) or _window_findings(grid)),
+        *_photon_findings(grid),
+        *_beam_findings(grid),
+        *_nesting_findings(grid),
+        *_need_findings(grid),
+    ]
+
+
+# Times and samples
+
+
+def _spare(grid: Grid, weights: Mapping[str, float]) -> float | None:
+    """Least weighted sum of parameters over a grid; None where not all could be read."""
+    terms = {path: partial(operator.mul, weight) for path, weight in weights.items()}
+    found = grid.least(terms)
+    return sum(weights[path] * found[path] for path in weights) if found else None
+
+
+def _time_findings(grid: Grid) -> Iterator[Finding]:
+    """Chirps too short for their echo, or for two samples."""
+    spare = _spare(grid, {DURATION: 1.0, DELAY: -1.0, RANGE: -2.0 / SPEED_OF_LIGHT})
+    if spare is not None and spare <= 0:
+        rule = (
+            "must exceed the acquisition delay and the echo's delay 2R/c over the whole grid, "
+            f"and falls short by {-spare:.6g} s at its worst"
+        )
+        yield grid.finding(DURATION, rule, "shorten the range or lengthen the chirp")
+        return
+    samples = _fewest_samples(grid)
+    if samples is not None and np.floor(samples + 1e-6) < 2:
+        rule = f"must leave 2 samples after the acquisition delay, and leaves {samples:.3g}"
+        yield grid.finding(DURATION, rule, "raise the sample rate or lengthen the chirp")
+
+
+def _fewest_samples(grid: Grid) -> float | None:
+    """Fewest samples of one segment over the grid; None where it can't be told."""
+    if not grid.knows(DURATION, DELAY, SAMPLE_RATE):
+        return None
+    weights = {DURATION: 1.0, DELAY: -1.0}
+    shared: Mapping[str, Any] = {}
+    for axis in grid.axes:
+        own = {member.path: np.asarray(member.values) for member in axis.members}
+        shared = own if SAMPLE_RATE in own else shared
+    along = sum((weights[path] * shared[path] for path in weights if path in shared), 0.0)
+    rest = _spare(grid, {path: weight for path, weight in weights.items() if path not in shared})
+    return float(np.min(((rest or 0.0) + along) * shared.get(SAMPLE_RATE, grid.span(SAMPLE_RATE))))
+
+
+def _window_findings(grid: Grid) -> Iterator[Finding]:
+    """A window for the shortest record: some have none of a few samples."""
+    samples = _fewest_samples(grid)
+    if samples is None or not grid.knows(WINDOW, FFT_SIZE):
+        return
+    from sweep.model import window
+
+    length = int(min(grid.span(FFT_SIZE).min(), samples + 1e-6))
+    for name in dict.fromkeys(grid.span(WINDOW).tolist()):
+        try:
+            window.samples(name, min(length, _TRIED))
+        except ValueError:
+            rule = f"must be one that has {length} samples, as many as the shortest record, and "
+            rule += f"{name} has none of so few"
+            remedy = "write another one, or raise instrument.processing.fft_size"
+            yield grid.finding(WINDOW, rule, remedy)
+            return
+
+
+def _photon_findings(grid: Grid) -> Iterator[Finding]:
+    """More electrons than photons."""
+    per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
+    spare = _spare(grid, {beam.WAVELENGTH: per_metre, RESPONSIVITY: -1.0})
+    if spare is not None and spare < 0:
+        rule = (
+            "must not exceed that of one electron a photon, q lambda / (h c), over the whole "
+            f"grid, and does so by {-spare:.3g} A/W at its worst"
+        )
+        yield grid.finding(RESPONSIVITY, rule, "lower it; the gain of an avalanche is 'apd_gain'")
+
+
+# Beams
+
+_ONE_MODE = {beam.COUPLING: _is(beam.SINGLE_MODE), beam.ARCHITECTURE: _is_not("direct")}
+
+
+def _beam_findings(grid: Grid) -> Iterator[Finding]:
+    """Beams that are given twice or not at all, too wide for their aperture, or too narrow."""
+    if not grid.knows(beam.WAVELENGTH, beam.DIAMETER, beam.DIVERGENCE, beam.WAIST):
+        return
+    if grid.has_point({beam.DIVERGENCE: _missing, beam.WAIST: _missing}):
+        rule = "must be given, or beam_waist in its place"
+        yield grid.finding(beam.DIVERGENCE, rule, "write e.g. '50 urad'")
+    elif grid.has_point({beam.DIVERGENCE: _given, beam.WAIST: _given}):
+        rule = "stands beside beam_divergence, and each follows from the other"
+        yield grid.finding(beam.WAIST, rule, "leave one of them out")
+    else:
+        yield from _width_findings(grid)
+
+
+def _width_findings(grid: Grid) -> Iterator[Finding]:
+    """Beams that are too wide for their aperture, or too narrow for the paraxial approximation."""
+    remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
+    if told := _too_narrow(grid, _ONE_MODE):
+        narrow, limit = told
+        rule = f"must be at least {1e6 * limit:.3g} urad, 4 M^2 lambda / (pi D): no narrower beam "
+        rule += f"leaves an aperture of {1e3 * narrow[beam.DIAMETER]:.3g} mm"
+        yield grid.finding(beam.DIVERGENCE, rule, f"widen the beam or the aperture, {remedy}")
+    for path in (beam.WAIST, beam.RECEIVED_WAIST):
+        wide = _worst(grid, {path: 1.0, beam.DIAMETER: -1.0}, _ONE_MODE | {path: _given})
+        if wide and wide[path] > wide[beam.DIAMETER] / 2:
+            rule = f"must be at most {500 * wide[beam.DIAMETER]:.3g} mm, the radius of the aperture"
+            yield grid.finding(path, rule, f"take a smaller one, or a larger aperture, {remedy}")
+        powers = {beam.QUALITY: 1.0, beam.WAVELENGTH: 1.0, path: -1.0}
+        thin = _worst(grid, powers, {path: _given})
+        if thin and thin[path] < (least := _fitting(thin, beam.WIDEST)):
+            rule = (
+                f"must be at least {1e6 * least:.3g} um, for the beam to spread by 90 deg at most"
+            )
+            yield grid.finding(path, rule, "take a larger one")
+
+
+def too_narrow(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> str:
+    """Beam of a study that its aperture cannot make, in words; empty where there is none.
+
+    Only where all light in the aperture mixes: elsewhere such a beam is refused.
+    """
+    for law in ({beam.COUPLING: _is(beam.APERTURE)}, {beam.ARCHITECTURE: _is("direct")}):
+        if told := _too_narrow(Grid(values, axes), law):
+            narrow, limit = told
+            made = f"an aperture of {1e3 * narrow[beam.DIAMETER]:.3g} mm makes"
+            given = f"a beam of {1e6 * narrow[beam.DIVERGENCE]:.3g} urad is narrower than"
+            return f"{given} {made}, 4 M^2 lambda / (pi D) = {1e6 * limit:.3g} urad"
+    return ""
+
+
+def _too_narrow(grid: Grid, law: Mapping[str, Condition]) -> tuple[dict[str, float], float] | None:
+    """Parameters of the narrowest beam that no aperture under a law makes, and its limit [rad]."""
+    # The product of these powers is the waist over the aperture's radius, but for 4 / pi.
+    rising, falling = (beam.QUALITY, beam.WAVELENGTH), (beam.DIVERGENCE, beam.DIAMETER)
+    powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
+    found = _worst(grid, powers, {**law, beam.DIVERGENCE: _given})
+    if found and found[beam.DIVERGENCE] < (limit := _fitting(found, found[beam.DIAMETER] / 2)):
+        return found, limit
+    return None
+
+
+def _fitting(found: Mapping[str, float], width: float) -> float:
+    """Divergence [rad] of a beam with a waist [m], or waist of one with a divergence."""
+    return float(beam.divergence_of(width, found[beam.WAVELENGTH], found[beam.QUALITY]))
+
+
+def _worst(
+    grid: Grid, powers: Mapping[str, float], conditions: Mapping[str, Condition]
+) -> dict[str, float]:
+    """Parameters where a product of powers of them is largest; empty where there are none."""
+    terms = {path: partial(_log_power, -power) for path, power in powers.items()}
+    return grid.least(terms, conditions)
+
+
+def _log_power(power: float, values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.asarray(power * np.log(values))
+
+
+# Effects
+
+
+class Need(NamedTuple):
+    """A parameter that means nothing beside some values of another."""
+
+    path: str
+    asks: Condition
+    """Whether values of it need the other."""
+    other: str
+    """Parameter that must then have another value."""
+    lacks: Condition
+    """Whether values of that one will not do."""
+    rule: str
+    remedy: str
+    if_on: bool = False
+    """Whether the parameter's effect has the same need wherever it is forced on."""
+
+
+def _above_zero(path: str, asks: Condition, other: str) -> Need:
+    return Need(path, asks, other, _missing, f"needs {other}, which is 0", f"set {other}")
+
+
+_OF_ONE_MODE = (
+    "counts by the mode that a coherent receiver sees, and here all light in the aperture does",
+    "take a coherent receiver of coupling: single_mode",
+)
+NEEDS = (
+    *(
+        Need(path, lambda value: value != 0, other, _is(word), *_OF_ONE_MODE)
+        for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
+        for other, word in ((beam.COUPLING, beam.APERTURE), (beam.ARCHITECTURE, "direct"))
+    ),
+    _above_zero("instrument.processing.bits", _given, FULL_SCALE),
+    _above_zero(
+        "atmosphere.profile", lambda profile: np.isin(profile, ("exponential", "layer")), EXTINCTION
+    ),
+    Need(
+        "target.roughness",
+        _given,
+        beam.ARCHITECTURE,
+        _is("direct"),
+        "makes speckle, of which direct detection averages over an unknown number",
+        "take a coherent receiver",
+        if_on=True,
+    ),
+    Need(
+        "target.roughness",
+        _given,
+        "footprint.speckle",
+        _is("developed"),
+        "says how rough the target is, which developed speckle takes to be without limit",
+        "set footprint.speckle: none",
+    ),
+    Need(
+        "target.sun_distance",
+        lambda distance: (distance > 0) & (distance < SUN_RADIUS),
+        beam.WAVELENGTH,
+        _given,
+        f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
+        "set it to 1 au or so",
+    ),
+)
+
+
+def _nesting_findings(grid: Grid) -> Iterator[Finding]:
+    """Effects that are on within others that are off."""
+    within = {effect.name: effect.within for effect in EFFECTS}
+    for name, outer in within.items():
+        while outer and grid.modes.get(name) == ON:
+            if grid.modes.get(outer) == OFF:
+                rule = f"acts within {outer}, which is off"
+                yield _of_mode(name, rule, f"turn {outer} on, or leave {name} out")
+            outer = within[outer]
+
+
+def _need_findings(grid: Grid) -> Iterator[Finding]:
+    """Parameters of effects without others that they need."""
+    for need in NEEDS:
+        owner = next(e for e in EFFECTS if any(p.path == need.path for p in e.parameters))
+        mode = grid.modes.get(owner.name, OFF)
+        remedy = f"{need.remedy}, or effects.{owner.name}: off"
+        if mode != OFF and grid.has_point({need.path: need.asks, need.other: need.lacks}):
+            yield grid.finding(need.path, need.rule, remedy)
+        elif need.if_on and mode == ON and grid.has_point({need.other: need.lacks}):
+            yield _of_mode(owner.name, need.rule, remedy)
+
+
+def without_draws(grid: Grid) -> Iterator[Finding]:
+    """Random effects that a grid has and, without draws, can't simulate."""
+    rule = "is simulated by draws, and the study has none"
+    for effect in EFFECTS:
+        if effect.is_random and grid.modes.get(effect.name) == ON:
+            yield _of_mode(effect.name, rule, "set draws.limit or draws.number, or leave it out")
+    for effect, parameter in _random_and_there(grid):
+        remedy = (
+            "set draws.limit to draw until accuracy.tolerance is met, draws.number to draw so many "
+            f"times, or effects.{effect.name}: off"
+        )
+        yield grid.finding(parameter.path, rule, remedy)
+
+
+def not_in_flights(grid: Grid) -> Iterator[Finding]:
+    """Random effects and methods that are asked for in a flight, and that only grids draw."""
+    rule = "is not drawn in flights"
+    for effect in EFFECTS:
+        of_target = any(parameter.path.startswith("target.") for parameter in effect.parameters)
+        if (effect.turn or of_target) and effect.is_random and grid.modes.get(effect.name) == ON:
+            instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
+            yield _of_mode(effect.name, rule, f"leave it out{instead}")
+    for effect, parameter in _random_and_there(grid):
+        # Others are drawn, or are of a target, which a flight has not and which is told elsewhere.
+        if effect.turn is not None:
+            remedy = f"leave it out, or set effects.{effect.name}: off"
+            yield grid.finding(parameter.path, rule, remedy)
+    rule = "looks at whole spectra, which flights over scenes do not draw"
+    for path in _methods(grid):
+        if path in grid.values:
+            yield grid.finding(path, rule, "leave it out, or study a flat target")
+
+
+def _of_mode(effect: str, rule: str, remedy: str) -> Finding:
+    """What is wrong with an effect that is on."""
+    return Finding(("effects", effect), rule, remedy, ON)
+
+
+def _random_and_there(grid: Grid) -> Iterator[tuple[Effect, Parameter]]:
+    """Random effects that are not off, each with a parameter by which the scene has it."""
+    for effect in EFFECTS:
+        if effect.is_random and grid.modes.get(effect.name, OFF) != OFF:
+            for parameter in effect.parameters:
+                # One that is something by default only says how an effect acts.
+                unlike = _is_not(parameter.default)  # type: ignore[arg-type]
+                if parameter.brings and grid.has_point({parameter.path: unlike}):
+                    yield effect, parameter
+
+
+# Detectors and estimators
+
+
+def is_method(path: str) -> bool:
+    """Whether a parameter says how whole spectra are looked at."""
+    return path.startswith((DETECTOR, ESTIMATOR))
+
+
+def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
+    """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
+    if not draws.whole_spectra:
+        remedy = f"set draws: {{method: {SPECTRA}, number: 1000}}, or leave it out"
+        rule = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"
+        for path in _methods(grid):
+            yield grid.finding(path, rule, remedy)
+    elif not draws.any:
+        rule, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
+        yield Finding(("draws", "method"), rule, remedy, draws.method)
+    else:
+        yield from _misfits(grid)
+
+
+def _methods(grid: Grid) -> list[str]:
+    """Methods' parameters that are not at their defaults."""
+    on_axes = [m.path for axis in grid.axes for m in axis.members if is_method(m.path)]
+    values = grid.values
+    changed = [path for path in DEFAULTS if values.get(path, DEFAULTS[path]) != DEFAULTS[path]]
+    return [*on_axes, *(path for path in changed if path not in on_axes)]
+
+
+def _misfits(grid: Grid) -> Iterator[Finding]:
+    """CFAR windows that are odd or too wide, and ranks beyond them, by the grid's extremes."""
+    training, guard, rank = (grid.span(path) for path in (TRAINING, GUARD, RANK))
+    if (training % 2 == 1).any():
+        yield grid.finding(TRAINING, "must be even", "half of them stand on either side")
+    if training.size and rank.size and rank.max() > training.min():
+        rule = f"must be at most detector.training, {training.min():g}, over the whole grid"
+        yield grid.finding(RANK, rule, "lower it, or write 'auto'")
+    if not grid.knows(TRAINING, GUARD, FFT_SIZE):
+        return
+    bins = int(grid.span(FFT_SIZE).min()) // 2 - 1
+    needed = max(int(training.max() + 2 * guard.max()) + 1, _FEWEST_BINS)
+    if bins < needed:
+        rule = f"leaves {bins} bins between DC and Nyquist, and detectors need {needed} over the "
+        yield grid.finding(
+            FFT_SIZE, f"{rule}whole grid", "lengthen it, or take fewer training cells"
+        )

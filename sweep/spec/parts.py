@@ -1,0 +1,257 @@
+"""Sections of a spec and walks over them: their fields, their values, the files they name."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, create_model
+
+from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
+from sweep.model.effects.effect import MODES, Parameter
+from sweep.scenes.files import SceneError, file_digest
+from sweep.spec.mistakes import Location
+from sweep.spec.rules import Choice, File, Mode, Numeric, Rule, Text
+
+AUTO, ON, OFF = MODES
+Models = tuple[type[BaseModel], ...]
+Key = tuple[str, ...]
+Section = TypeVar("Section", bound=BaseModel)
+
+KIND = Text(about="Which of several a part is")
+
+
+class Part(BaseModel):
+    """A section of a spec: frozen, and with no field but its own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+# Fields that physical effects bring into sections, as the model's catalogue declares them
+
+
+def with_parameters(path: str) -> Callable[[type[Section]], type[Section]]:
+    """Decorator that gives the section at a dotted path the parameters of effects within it."""
+    fields = {
+        parameter.path.removeprefix(f"{path}."): (
+            Annotated[str if parameter.options else float, _rule_of(parameter)],
+            parameter.default,
+        )
+        for parameter in PARAMETERS
+        if parameter.path.rpartition(".")[0] == path
+    }
+    return lambda section: _completed(section, fields)
+
+
+def with_modes(section: type[Section]) -> type[Section]:
+    """The section with a mode for every effect, `auto` by default."""
+    modes = {e.name: Mode(about=e.about[0].upper() + e.about[1:], options=MODES) for e in EFFECTS}
+    return _completed(section, {n: (Annotated[str, mode], AUTO) for n, mode in modes.items()})
+
+
+def _rule_of(parameter: Parameter) -> Rule:
+    if parameter.options:
+        return Choice(about=parameter.about, options=parameter.options)
+    return Numeric(
+        about=parameter.about,
+        si_unit=parameter.unit,
+        example=parameter.example,
+        at_least=parameter.limits[0],
+        at_most=parameter.limits[1],
+    )
+
+
+def _completed(section: type[Section], fields: dict[str, Any]) -> type[Section]:
+    """The section with further fields, by the same name."""
+    if taken := sorted(set(fields) & set(section.model_fields)):
+        raise TypeError(f"{section.__name__} has {', '.join(taken)} already")
+    completed: type[Section] = create_model(
+        section.__name__,
+        __base__=section,
+        __module__=section.__module__,
+        __doc__=section.__doc__,
+        **fields,
+    )
+    return completed
+
+
+# Fields of models
+
+
+def rule_of(field: Any) -> Rule | None:
+    """The rule in a field's metadata, if it has one."""
+    return next((item for item in field.metadata if isinstance(item, Rule)), None)
+
+
+def written_name(name: str, field: Any) -> str:
+    """Name of a field as users write it: `from` is a word of Python's own."""
+    return str(field.alias or name)
+
+
+def fields_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Fields of a model by the names that users write."""
+    return {written_name(name, field): field for name, field in model.model_fields.items()}
+
+
+def rules_of(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
+    """Rules of a model's fields and of its sections' fields, by dotted path."""
+    rules: dict[str, Rule] = {}
+    for name, field in model.model_fields.items():
+        path = f"{prefix}.{name}" if prefix else name
+        rule = rule_of(field)
+        if rule is not None:
+            rules[path] = rule
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            rules |= rules_of(field.annotation, path)
+    return rules
+
+
+def models_at(annotation: Any) -> Models:
+    """Models that a value of an annotation is read as: several where its kind tells which."""
+    if get_origin(annotation) is Annotated:
+        return models_at(get_args(annotation)[0])
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return (annotation,)
+    if get_origin(annotation) in (dict, tuple, list):
+        return ()
+    return tuple(model for inner in get_args(annotation) for model in models_at(inner))
+
+
+def kind_of(model: type[BaseModel]) -> str:
+    """The word that a model goes by among others."""
+    field = model.model_fields.get("kind")
+    return str(get_args(field.annotation)[0]) if field is not None else ""
+
+
+def _element(annotation: Any) -> Any:
+    """Annotation of what a mapping or a list holds."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _element(inner[0])
+    if origin is dict:
+        return inner[1]
+    return inner[0] if origin in (tuple, list) else None
+
+
+def all_parts(*roots: type[BaseModel]) -> list[type[BaseModel]]:
+    """Every model that values of the roots may consist of, the roots too, each once."""
+    found: dict[type[BaseModel], None] = {}
+    todo = list(roots)
+    while todo:
+        model = todo.pop()
+        if model not in found:
+            found[model] = None
+            held = [field.annotation for field in model.model_fields.values()]
+            todo += [inner for at in held for inner in models_at(at) or models_at(_element(at))]
+    return list(found)
+
+
+class Place(NamedTuple):
+    """A place in a spec."""
+
+    location: Location
+    """Keys and indices that lead there, as in the file."""
+    models: Models
+    """What stands there is read as one of these; none for a single value."""
+    parents: Models
+    """What it stands in is read as one of these."""
+
+
+def place_of(location: Location, root: type[BaseModel]) -> Place:
+    """Place of one of pydantic's locations, which name the kind of a part after its key."""
+    at: Any = root
+    found: list[str | int] = []
+    parents: Models = ()
+    for part in location:
+        models = models_at(at)
+        if len(models) > 1:
+            at = next((model for model in models if kind_of(model) == part), None)
+            continue
+        parents = models
+        found.append(part)
+        if models:
+            field = fields_of(models[0]).get(str(part))
+            at = None if field is None else field.annotation
+        else:
+            at = _element(at)
+    return Place(tuple(found), models_at(at), parents)
+
+
+# Values of sections
+
+
+def values_of(part: BaseModel, prefix: str) -> dict[str, Any]:
+    """Values of a model's fields and of its sections' fields, by dotted path."""
+    values: dict[str, Any] = {}
+    for name in type(part).model_fields:
+        value = getattr(part, name)
+        path = f"{prefix}.{name}" if prefix else name
+        values |= values_of(value, path) if isinstance(value, BaseModel) else {path: value}
+    return values
+
+
+def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
+    """Every value of a part and of the parts in it that is there: its path, rule and SI value."""
+    for name, field in type(part).model_fields.items():
+        value, key = getattr(part, name), (*path, written_name(name, field))
+        rule = KIND if name == "kind" else rule_of(field)
+        if rule is not None and value is not None:
+            yield key, rule, value
+        elif isinstance(value, BaseModel):
+            yield from leaves(value, key)
+        elif isinstance(value, dict):
+            for inner, below in value.items():
+                yield from leaves(below, (*key, inner))
+
+
+def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
+    """Whether the mapping lacked the path, where the value then is put."""
+    for name in path[:-1]:
+        mapping = mapping.setdefault(name, {})
+        if not isinstance(mapping, dict):
+            return False
+    lacking = path[-1] not in mapping
+    mapping.setdefault(path[-1], value)
+    return lacking
+
+
+# Files that sections name
+
+
+@dataclass(frozen=True)
+class Files:
+    """Files named in a spec.
+
+    Parameters
+    ----------
+    base : Path
+        Folder that their paths are relative to; ~ is the user's own.
+    digests : mapping
+        Digest of each file by its path as written.
+    """
+
+    base: Path
+    digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def path(self, written: str, digest: Callable[[Path], str] = file_digest) -> Path:
+        """Where a file is; a `SceneError` where it has changed since the spec was loaded."""
+        path = self.base / os.path.expanduser(written)
+        known = self.digests.get(written)
+        if known is not None and digest(path) != known:
+            raise SceneError(
+                path,
+                "has changed since the study was declared",
+                "bring the old file back, or make another study of the new one",
+            )
+        return path
+
+
+def named_files(part: BaseModel) -> Iterator[tuple[Key, File, str]]:
+    """Places in a spec that name a file, with their rule and the path written there."""
+    for key, rule, value in leaves(part):
+        if isinstance(rule, File):
+            yield key, rule, value
