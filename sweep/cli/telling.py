@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
     from sweep.tasks.accuracy_table import Row
     from sweep.tasks.effects_table import EffectRow, EffectsTable
+    from sweep.tasks.plan import Plan
     from sweep.tasks.session import Outcome
 
 MISTAKE, INCOMPLETE = 2, 3
@@ -238,14 +240,14 @@ def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
     bound = "at most about" if study.draws.adaptive else "about"
     yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
-    yield from _question(p.points, p.bytes, p.points * p.seconds_a_point)
+    yield from _question(p)
 
 
 def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a scene will take."""
     from sweep.model.accuracy import Accuracy
     from sweep.model.resolution import BEAMLETS
-    from sweep.tasks.plan import scene_plan as planned
+    from sweep.tasks.plan import plan as planned
     from sweep.tasks.progress import duration
 
     p = planned(study, store=store, workers=workers)
@@ -261,14 +263,14 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
             else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
         )  # fmt: skip
         yield "", f"{1e6 * s.seconds_a_draw:.3g} us a shot and draw on one core"
-    yield "draws", f"{p.draws:,}, at {p.places:,} place(s) along the axes"
+    places = math.prod(int(axis.size) for axis in study.axes)
+    yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
     yield "blocks", f"{p.blocks:,}"
     yield "chunks", f"{p.chunks:,} files"
     yield "bytes", f"{in_bytes(p.bytes)} before compression"
     yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
-    shots = sum(s.shots for s in p.scanners) * p.draws * p.places
-    yield from _question(shots, p.bytes, p.seconds * p.workers)
+    yield from _question(p)
 
 
 def tell_effects(table: EffectsTable) -> None:
@@ -298,24 +300,16 @@ def ask_before(study: Spec | SceneSpec, store: Location, *, yes: bool) -> None:
 
 def _size(study: Spec | SceneSpec, store: Location) -> tuple[int, int, float]:
     """Points and bytes of a study, and its seconds on one core where it has many draws."""
-    from sweep.spec import SceneSpec
-    from sweep.tasks import plan
-    from sweep.tasks.flight_study import FlightStudy
-    from sweep.tasks.grid import Grid
-    from sweep.tasks.grid_study import output_names
+    from sweep.spec import Spec
+    from sweep.tasks.plan import plan
+    from sweep.tasks.studies import study_of
 
-    if isinstance(study, SceneSpec):
-        points = FlightStudy(study, store.absolute()).points
-        if not MEASURED < points <= MOST_POINTS:
-            return points, 0, 0.0
-        flight = plan.scene_plan(study, store=store)
-        return points, flight.bytes, flight.seconds * flight.workers
-    points = Grid(study).points
-    size = points * plan.point_bytes(study, output_names(study))
-    many = points * max(1, study.draws.number, study.draws.limit) > MEASURED
-    if not many or _excess(points, size, 0.0):
+    sized = study_of(study, store.absolute())
+    points, size = sized.points, sized.bytes
+    draws = max(1, study.draws.number, study.draws.limit) if isinstance(study, Spec) else 1
+    if points * draws <= MEASURED or _excess(points, size, 0.0):
         return points, size, 0.0
-    return points, size, points * plan.plan(study).seconds_a_point
+    return points, size, plan(study, store=store).work
 
 
 def _excess(points: int, size: int, seconds: float) -> str:
@@ -328,8 +322,8 @@ def _excess(points: int, size: int, seconds: float) -> str:
     return ", ".join(told)
 
 
-def _question(points: int, size: int, seconds: float) -> Iterator[tuple[str, str]]:
-    if why := _excess(points, size, seconds):
+def _question(plan: Plan) -> Iterator[tuple[str, str]]:
+    if why := _excess(plan.points, plan.bytes, plan.work):
         yield "question", f"sweep run asks first, or takes --yes: {why}"
 
 

@@ -1,4 +1,9 @@
-"""Which effects the points of a grid call for: planned tile by tile, told point by point."""
+"""Effects that points call for: planned tile by tile, told point by point.
+
+Tiles are boxes of neighbouring points of a grid, or shots of a flight that follow each other. They
+are fixed by the study alone, not by its blocks: what is simulated at a point does not depend on how
+a study is cut up.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +13,38 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.catalogue import FLAGS_APART, flag_attributes, flags_of, names_of
-from sweep.tasks.study import ArrayLayout
-from sweep.tasks.tiles import Alike, Tiles
+from sweep.model.effects.catalogue import FLAGS_APART, flags_of, names_of
+from sweep.tasks.grid import Grid, Value
 
 if TYPE_CHECKING:
     from sweep.model.effects.planning import Plan
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
     from sweep.spec import Spec
-    from sweep.tasks.grid import Grid
 
 #: Arrays of a store that say what was simulated.
 EFFECTS, ERROR = "effects", "effects_error"
 
 TOLERANCE = "accuracy.tolerance"
 
+#: Points of a tile at the most: few enough that they are much alike, enough that planning is cheap.
+TILE_POINTS = 1024
+
 #: Shots of a flight that are planned together.
 TILE_SHOTS = 256
 
 #: Points of a grid that are looked at together; of a tile, that are looked at first.
 POINTS_AT_ONCE, FEW_POINTS = 1 << 14, 64
+
+#: Numbers that set the length of records, or how closely all is computed.
+UNDIVIDED = (
+    "instrument.processing.fft_size",
+    "instrument.processing.sample_rate",
+    "instrument.processing.acquisition_delay",
+    "instrument.chirp.duration",
+    "footprint.beamlets",
+    TOLERANCE,
+)
 
 
 class Called(NamedTuple):
@@ -57,14 +73,115 @@ class Called(NamedTuple):
             yield index, names_of(int(np.bitwise_or.reduce(own))), own
 
 
-class Calling:
-    """Plans of a grid's tiles.
+class Alike(NamedTuple):
+    """Tiles that share every word and size."""
 
-    Parameters
-    ----------
-    spec, grid
-        The study and its grid.
-    """
+    code: int
+    """The same for all tiles of the grid that share them."""
+    tiles: np.ndarray
+    """(m,): their numbers among those asked for."""
+    parameters: dict[str, Value]
+    """By dotted path: words, numbers, and arrays that broadcast over (m, *tile): tiles that the
+    grid's edge cuts have their last points several times."""
+
+
+class Tiles:
+    """Tiles of a grid; points of one tile share every word and every size."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self._undivided = tuple(self._is_undivided(k) for k in range(len(grid.dims)))
+        self.shape = tile_shape(grid.shape, self._undivided)
+        self.along = tuple(-(-n // s) for n, s in zip(grid.shape, self.shape, strict=True))
+
+    @property
+    def number(self) -> int:
+        """Tiles of the whole grid."""
+        return math.prod(self.along)
+
+    def of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
+        """Tiles that a block meets, and where each of its points lies among them.
+
+        Returns
+        -------
+        tiles : (m,) ndarray of int
+            Numbers of tiles, in C order over the grid of tiles.
+        place : (points,) ndarray of int
+            Index into them of each point of the block, in C order over the block.
+        """
+        along = [
+            np.arange(s.start, s.stop) // side
+            for s, side in zip(self.grid.block(block), self.shape, strict=True)
+        ]
+        mesh = np.ix_(*along) if along else ()
+        numbers = np.ravel_multi_index(mesh, self.along) if along else np.zeros((), np.int64)
+        tiles, place = np.unique(numbers, return_inverse=True)
+        return tiles, place.ravel()
+
+    def alike(self, tiles: np.ndarray, every: int = 1) -> Iterator[Alike]:
+        """Parameters of the points of some tiles, those together that share words and sizes.
+
+        ``every``: of every so manieth point along each axis, and of those with the largest value
+        of each parameter.
+        """
+        positions = np.unravel_index(tiles, self.along) if self.along else ()
+        codes = np.zeros(len(tiles), np.int64)
+        for k, position in enumerate(positions):
+            if self._undivided[k]:
+                codes = codes * self.along[k] + position
+        for code in np.unique(codes) if any(self._undivided) else codes[:1]:
+            chosen = np.flatnonzero(codes == code)
+            parameters: dict[str, Value] = {**self.grid.fixed}
+            for k, position in enumerate(positions):
+                parameters |= self._along(k, position[chosen], every)
+            yield Alike(int(code), chosen, parameters)
+
+    def points(self, tile: int) -> tuple[slice, ...]:
+        """Slices of a tile along each axis, cut at the edge of the grid."""
+        position = np.unravel_index(tile, self.along) if self.along else ()
+        return tuple(
+            slice(int(p) * side, min((int(p) + 1) * side, size))
+            for p, side, size in zip(position, self.shape, self.grid.shape, strict=True)
+        )
+
+    def _is_undivided(self, axis: int) -> bool:
+        from sweep.model.shot import SHARED
+
+        return any(
+            values.dtype.kind in "UO" or path in UNDIVIDED or path in SHARED
+            for path, values in self.grid.values[axis].items()
+        )
+
+    def _along(self, axis: int, position: np.ndarray, every: int) -> dict[str, Value]:
+        members = self.grid.values[axis]
+        if self._undivided[axis]:
+            first = int(position[0])
+            return {path: values[first].item() for path, values in members.items()}
+        side, size = self.shape[axis], self.grid.shape[axis]
+        within = np.minimum(position[:, None] * side + np.arange(side), size - 1)
+        index = within[:, ::every]
+        if every > 1:  # with the largest of each, so that none is missed that is there at all
+            furthest = [np.abs(v[within].astype(float)).argmax(axis=1) for v in members.values()]
+            rows = np.arange(len(position))[:, None]
+            index = np.hstack([index, within[rows, np.transpose(furthest)]])
+        shape = [len(position), *(1,) * len(self.shape)]
+        shape[axis + 1] = index.shape[1]
+        index = index.reshape(shape)
+        return {path: values[index].astype(float) for path, values in members.items()}
+
+
+def tile_shape(sizes: tuple[int, ...], undivided: tuple[bool, ...]) -> tuple[int, ...]:
+    """Points of a tile along each axis: alike on all, but 1 where values are not to be joined."""
+    shape, room = [1] * len(sizes), TILE_POINTS
+    free = sorted((k for k in range(len(sizes)) if not undivided[k]), key=lambda k: sizes[k])
+    for done, k in enumerate(free):
+        shape[k] = min(sizes[k], max(1, int(room ** (1 / (len(free) - done)) + 1e-9)))
+        room //= shape[k]
+    return tuple(shape)
+
+
+class Calling:
+    """Plans of a grid's tiles, each made once."""
 
     def __init__(self, spec: Spec, grid: Grid) -> None:
         self._modes, self.tiles = spec.modes(), Tiles(grid)
@@ -126,22 +243,17 @@ class Calling:
         from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
         from sweep.model.effects.points import Points
+        from sweep.model.resolution import BEAMLETS, effects_tolerance
 
-        points = Points(DEFAULTS | alike.parameters)
-        tolerance = self._tolerance(alike.parameters)
-        number, along = len(alike.tiles), tuple(range(1, len(self.tiles.shape) + 1))
+        parameters, number = alike.parameters, len(alike.tiles)
+        along = tuple(range(1, len(self.tiles.shape) + 1))
 
         def tiles(values: np.ndarray) -> np.ndarray:
             most = np.max(values, axis=along) if values.ndim else values
             return np.broadcast_to(most, (number,))
 
-        return plan(points, tiles, self._modes, tolerance)
-
-    def _tolerance(self, parameters: Mapping[str, Any]) -> float:
-        """Share of the tolerance that is for effects."""
-        from sweep.model.resolution import BEAMLETS, effects_tolerance
-
-        return effects_tolerance(parameters, int(parameters[BEAMLETS]))
+        tolerance = effects_tolerance(parameters, int(parameters[BEAMLETS]))  # type: ignore[arg-type]
+        return plan(Points(DEFAULTS | parameters), tiles, self._modes, tolerance)
 
 
 class ShotsPlan(NamedTuple):
@@ -162,65 +274,50 @@ class ShotsPlan(NamedTuple):
         return called
 
 
-class ShotsCalling:
-    """Plans of a flight's shots, at one place along its axes.
+def plan_shots(
+    eyepoints: Eyepoints,
+    tiles: np.ndarray,
+    parameters: Mapping[str, Any],
+    surfaces: Sequence[Surface],
+    *,
+    modes: Mapping[str, str],
+    rotating: bool,
+    rays_by_tolerance: bool = False,
+) -> ShotsPlan | None:
+    """Plans of a flight's shots at one place along its axes; None where none sees anything.
 
     Parameters
     ----------
+    eyepoints, tiles
+        Shots, and the number of the tile of each, rising.
     parameters, surfaces
         As of :func:`sweep.model.eyepoints.seen_ground`.
-    modes
-        Mode of each effect.
-    rotating
-        Whether any body turns.
+    modes, rotating
+        Mode of each effect; whether any body turns.
     rays_by_tolerance
         Whether the tolerance is for the number of rays too.
     """
+    from sweep.model.effects.catalogue import DEFAULTS
+    from sweep.model.effects.planning import plan
+    from sweep.model.effects.points import Points
+    from sweep.model.eyepoints import seen_ground
+    from sweep.model.ground import of_rays
+    from sweep.model.resolution import effects_tolerance
 
-    def __init__(
-        self,
-        parameters: Mapping[str, Any],
-        surfaces: Sequence[Surface],
-        *,
-        modes: Mapping[str, str],
-        rotating: bool,
-        rays_by_tolerance: bool = False,
-    ) -> None:
-        self._parameters, self._surfaces, self._modes = parameters, surfaces, modes
-        self._rotating, self._rays_by_tolerance = rotating, rays_by_tolerance
+    seen = eyepoints.seen.nonzero()[0]
+    if not seen.size:
+        return None
+    some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
+    edges, tile = _stretches(tiles[seen])
+    shots, ground = seen_ground(some, DEFAULTS | dict(parameters), surfaces)
+    points = Points(shots, of_rays(ground), rotating=rotating)
 
-    def plans(self, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
-        """Plans of shots whose tiles have these numbers, rising; None where none sees anything."""
-        seen = eyepoints.seen.nonzero()[0]
-        if not seen.size:
-            return None
-        some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
-        edges, tile = _stretches(tiles[seen])
-        return ShotsPlan(seen, tile, self._plan(some, edges))
+    def of_tiles(values: np.ndarray) -> np.ndarray:
+        return np.maximum.reduceat(np.broadcast_to(values, some.time.shape), edges[:-1])
 
-    def _plan(self, eyepoints: Eyepoints, edges: np.ndarray) -> Plan:
-        """The plan of tiles of shots that all see something."""
-        from sweep.model.effects.catalogue import DEFAULTS
-        from sweep.model.effects.planning import plan
-        from sweep.model.effects.points import Points
-        from sweep.model.eyepoints import seen_ground
-        from sweep.model.ground import of_rays
-
-        shots, ground = seen_ground(eyepoints, DEFAULTS | dict(self._parameters), self._surfaces)
-        points = Points(shots, of_rays(ground), rotating=self._rotating)
-
-        def tiles(values: np.ndarray) -> np.ndarray:
-            each = np.broadcast_to(values, eyepoints.time.shape)
-            return np.maximum.reduceat(each, edges[:-1])
-
-        return plan(points, tiles, self._modes, self._tolerance(eyepoints))
-
-    def _tolerance(self, eyepoints: Eyepoints) -> float:
-        """What of the tolerance is for effects."""
-        from sweep.model.resolution import effects_tolerance
-
-        number = 0 if self._rays_by_tolerance else eyepoints.offset.shape[1]
-        return effects_tolerance(self._parameters, number)
+    rays = 0 if rays_by_tolerance else some.offset.shape[1]
+    planned = plan(points, of_tiles, modes, effects_tolerance(parameters, rays))
+    return ShotsPlan(seen, tile, planned)
 
 
 def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,27 +325,3 @@ def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     new = np.diff(tiles) != 0
     edges = np.concatenate([[0], np.flatnonzero(new) + 1, [tiles.size]])
     return edges, np.concatenate([[0], np.cumsum(new)])
-
-
-def layouts(
-    shape: tuple[int, ...], chunks: tuple[int, ...], dims: tuple[str, ...]
-) -> list[ArrayLayout]:
-    """Arrays that say what was simulated at each point."""
-    comment = (
-        "sum over the effects left out of what each may change: of pd in all three segments, of "
-        "log10 of the probability of a false alarm, or of a relative magnitude, whichever is most"
-    )
-    return [
-        ArrayLayout(
-            name=EFFECTS, shape=shape, chunks=chunks, dims=dims, dtype="uint32", fill=0,
-            attributes=flag_attributes(),
-        ),
-        ArrayLayout(
-            name=ERROR, shape=shape, chunks=chunks, dims=dims, dtype="float64", fill=float("nan"),
-            attributes={
-                "units": "1",
-                "long_name": "largest change by effects that were left out",
-                "comment": comment,
-            },
-        ),
-    ]  # fmt: skip

@@ -17,7 +17,6 @@ from sweep.tasks import identity, studies, user_code
 from sweep.tasks.casting import cast, eyepoints_are_sound
 from sweep.tasks.cluster import declared
 from sweep.tasks.errors import ClusterError, StoreError
-from sweep.tasks.extension import changed, refuse_unlike, what_is_there
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -35,6 +34,7 @@ from sweep.tasks.recipe import (
     refuse_damaged_recipe,
     write_recipe,
 )
+from sweep.tasks.reuse import changed, refuse_unlike, what_is_there
 from sweep.tasks.session import Outcome, Session, unwritable
 from sweep.tasks.store import create, remove, sync
 from sweep.tasks.study import Evaluate

@@ -11,8 +11,17 @@ import numpy as np
 
 from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
-from sweep.tasks.grid import NO_COUNT, Grid, Value, canonical_rows
-from sweep.tasks.study import NONE_FOUND, Found, Known, Results, Stop, Unfinished, together
+from sweep.tasks.grid import Grid, Value, canonical_rows
+from sweep.tasks.study import (
+    FILLS,
+    NONE_FOUND,
+    Found,
+    Known,
+    Results,
+    Stop,
+    Unfinished,
+    together,
+)
 
 if TYPE_CHECKING:
     from sweep.model.sampling import Before
@@ -81,8 +90,7 @@ def evaluate_block(
         for name, values in found.items():
             room = (size, *values.shape[1:])
             if name not in results:  # what no point has found stays unknown
-                unknown = NO_COUNT if values.dtype.kind == "i" else np.nan
-                results[name] = np.full(room, unknown, values.dtype)
+                results[name] = np.full(room, FILLS[values.dtype.kind], values.dtype)
             results[name][points] = values
     if spec.draws.whole_spectra:
         results.pop(RUNNING, None)  # of use to a block that is begun

@@ -1,23 +1,26 @@
 """Eyepoints as a study of its own: what every shot of a flight sees through one scanner.
 
 Rays are cast here and nowhere else. The store is named by its content, so that every radiometric
-study of the same geometry finds it.
+study of the same geometry finds it. It holds as many rays of each shot as most need; the few shots
+for which the tolerance asks for more are cast again as they are looked at (:func:`refine`).
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT, Output
+from sweep.model.accuracy import Accuracy
+from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
+from sweep.model.resolution import more_rays
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks.calling import TILE_SHOTS
-from sweep.tasks.grid_study import described
-from sweep.tasks.study import ArrayLayout, Results
+from sweep.tasks.study import FILLS, ArrayLayout, BlockGrid, Results, Study, described
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
@@ -43,15 +46,13 @@ def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
     return real(study_path).parent / EYEPOINTS / f"{geometry_id}.zarr"
 
 
-class EyepointStudy:
+class EyepointStudy(Study):
     """What the shots of a flight see through one scanner.
 
     Parameters
     ----------
-    spec
-        A study of the scene.
-    scanner
-        Name of the scanner.
+    spec, scanner
+        A study of the scene, and the name of the scanner.
     beamlets
         Rays of each shot; those of the spec by default.
     """
@@ -64,17 +65,20 @@ class EyepointStudy:
         self.shots_a_cycle = spec.shots_a_cycle(scanner)
         self.beamlets = beamlets or int(spec.parameters()["footprint.beamlets"])
         most = max(1, min(BLOCK_SHOTS, BLOCK_BEAMLETS // self.beamlets))
-        self.block_cycles = min(self.cycles, max(1, most // self.shots_a_cycle))
+        block_cycles = min(self.cycles, max(1, most // self.shots_a_cycle))
+        self._grid = BlockGrid(
+            ("cycle",), (self.cycles,), (block_cycles,), finer="shot", each=self.shots_a_cycle
+        )
+
+    @property
+    def grids(self) -> tuple[BlockGrid]:
+        """Its cycles."""
+        return (self._grid,)
 
     @cached_property
     def id(self) -> str:
         """Hash of the geometry."""
         return self.spec.geometry_id(self.scanner)
-
-    @property
-    def points(self) -> int:
-        """Number of shots."""
-        return self.cycles * self.shots_a_cycle
 
     @property
     def rays(self) -> int:
@@ -85,22 +89,6 @@ class EyepointStudy:
         """Rays that are cast for a number of shots in whole cycles."""
         return shots * self.beamlets + shots // self.shots_a_cycle
 
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-        return -(-self.cycles // self.block_cycles)
-
-    def block_size(self, block: int) -> int:
-        """Shots of a block."""
-        first = block * self.block_cycles
-        return (min(first + self.block_cycles, self.cycles) - first) * self.shots_a_cycle
-
-    def points_in(self, blocks: np.ndarray) -> int:
-        """Shots in the blocks that are marked in an ndarray of bool (blocks,)."""
-        full = int(np.count_nonzero(blocks)) * self.block_cycles * self.shots_a_cycle
-        short = self.block_cycles * self.shots_a_cycle - self.block_size(self.n_blocks - 1)
-        return full - short * bool(blocks[-1])
-
     def attributes(self) -> dict[str, Any]:
         """The geometry, as it was hashed."""
         return {
@@ -109,15 +97,10 @@ class EyepointStudy:
             "shots_a_cycle": self.shots_a_cycle,
         }
 
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """None."""
-        return {}
-
-    def arrays(self) -> list[ArrayLayout]:
-        """Shots, cycles, beamlets, and the beamlets' weights."""
-        shape = self.weight.shape
-        weights = scene_array("weight", WEIGHT, shape, shape, values=self.weight)
-        return [weights, *(self._array(name) for name in self._outputs)]
+    def known_arrays(self) -> list[ArrayLayout]:
+        """Weights of the beamlets."""
+        about = described(WEIGHT.units, WEIGHT.long_name)
+        return [ArrayLayout.known("weight", WEIGHT.dims, self.weight, about, fill=FILLS["f"])]
 
     @cached_property
     def weight(self) -> np.ndarray:
@@ -126,39 +109,20 @@ class EyepointStudy:
 
         return beamlets(self.beamlets, self.spec.pattern)[1]
 
-    @property
-    def _outputs(self) -> dict[str, Output]:
-        return SHOTS | BEAMLETS | CYCLES
-
-    def _array(self, name: str) -> ArrayLayout:
-        output = self._outputs[name]
-        sizes = SIZES | {"beamlet": self.beamlets, "shot": self.points, "cycle": self.cycles}
-        cut = {"cycle": self.block_cycles, "shot": self.block_cycles * self.shots_a_cycle}
-        return scene_array(
-            name,
-            output,
-            tuple(sizes[dim] for dim in output.dims),
-            tuple((sizes | cut)[dim] for dim in output.dims),
-        )
-
-    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
-        """The block's chunk of every array."""
-        return {
-            name: (block, *(0 for _ in output.dims[1:])) for name, output in self._outputs.items()
-        }
-
-    def owners(self) -> dict[str, np.ndarray]:
-        """The blocks along the first dimension of every array."""
-        blocks = np.arange(self.n_blocks)
-        return {
-            name: blocks.reshape(-1, *(1 for _ in output.dims[1:]))
-            for name, output in self._outputs.items()
-        }
+    def outputs(self) -> list[ArrayLayout]:
+        """Shots, beamlets and cycles."""
+        sizes = SIZES | {"beamlet": self.beamlets}
+        return [
+            self._grid.array(name, output, output.dims, sizes)
+            for name, output in (SHOTS | BEAMLETS | CYCLES).items()
+        ]
 
     def evaluate(self, block: int) -> Results:
         """What the shots of a block see."""
-        first, size = block * self.block_cycles * self.shots_a_cycle, self.block_size(block)
-        return self.see(np.arange(first, first + size))
+        (cycles,) = self._grid.block(block)
+        return self.see(
+            np.arange(cycles.start * self.shots_a_cycle, cycles.stop * self.shots_a_cycle)
+        )
 
     def compile(self) -> None:
         """Compile the ray caster, on the first cycle."""
@@ -220,7 +184,7 @@ class EyepointStudy:
 
     @cached_property
     def _optics(self) -> dict[str, Any]:
-        """What looks at the scene, as :func:`sweep.model.eyepoints.observe` takes it."""
+        """Arguments of :func:`sweep.model.eyepoints.observe` that say what looks at the scene."""
         return {
             "flight": self.spec.flight(),
             "scanner": self.spec.scan(self.scanner),
@@ -249,24 +213,48 @@ def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray
     return np.asarray(world.caster.bundle(position, down, poses=poses).range)
 
 
-def scene_array(
-    name: str,
-    output: Output,
-    shape: tuple[int, ...],
-    chunks: tuple[int, ...],
-    *,
-    axes: tuple[str, ...] = (),
-    values: np.ndarray | None = None,
-) -> ArrayLayout:
-    """Layout of one of the model's arrays, with a study's axes before its own dimensions."""
-    fills = {"f": float("nan"), "i": -1, "u": 0}
-    return ArrayLayout(
-        name=name,
-        shape=shape,
-        chunks=chunks,
-        dims=axes + output.dims,
-        dtype=output.dtype,
-        fill=fills[output.dtype[0]],
-        attributes=described(output.units, output.long_name, output.comment),
-        values=values,
-    )
+class FinerRays:
+    """Casts shots of a scene with any number of rays.
+
+    ``make`` makes the study of what is seen with so many.
+    """
+
+    def __init__(self, spec: SceneSpec, make: Callable[..., EyepointStudy] = EyepointStudy) -> None:
+        self._spec, self._make = spec, make
+        self._known: dict[tuple[str, int], EyepointStudy] = {}
+
+    def see(self, scanner: str, shots: np.ndarray, rays: int) -> Eyepoints:
+        """What shots see, by number (n,)."""
+        if (scanner, rays) not in self._known:
+            self._known[scanner, rays] = self._make(self._spec, scanner, beamlets=rays)
+        return self._known[scanner, rays].observe(shots)
+
+
+def refine(
+    rays: int,
+    error: np.ndarray,
+    accuracy: Accuracy,
+    again: Callable[[np.ndarray, int], np.ndarray],
+) -> None:
+    """Look at shots again, with more rays, until what these leave is within the tolerance.
+
+    How many that are follows from each shot alone.
+
+    Parameters
+    ----------
+    rays
+        Of each shot so far.
+    error
+        (n,): what they leave.
+    accuracy
+        Of the study.
+    again
+        Looks at some shots, by their places (m,), with so many rays; says what these leave, (m,).
+    """
+    needed = more_rays(rays, error, accuracy)
+    for number in accuracy.rays:  # rising, and so are the needs of each shot
+        places = np.flatnonzero(needed == number)
+        step = max(1, CAST_BEAMLETS // number)
+        for start in range(0, len(places), step):
+            some = places[start : start + step]
+            needed[some] = more_rays(number, again(some, number), accuracy)

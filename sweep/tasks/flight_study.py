@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property, partial
-from itertools import takewhile
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
+from sweep.model.effects.catalogue import flag_attributes
+from sweep.model.outputs import (
+    BEAMLETS,
+    CYCLES,
+    NAVIGATION,
+    POINTS,
+    SHOTS,
+    SIMULATED,
+    STATISTICS,
+)
+from sweep.model.resolution import by_tolerance
 from sweep.storage.locations import Location
-from sweep.tasks import flight_layout
-from sweep.tasks.calling import TILE_SHOTS, Called, ShotsCalling, ShotsPlan
-from sweep.tasks.earlier import Earlier
-from sweep.tasks.eyepoint_reader import EyepointReader
-from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path, world_of
-from sweep.tasks.finer_rays import FinerRays, refine
-from sweep.tasks.flight_navigation import solved
+from sweep.storage.opening import open_group
+from sweep.tasks.calling import EFFECTS, ERROR, TILE_SHOTS, Called, ShotsPlan, plan_shots
+from sweep.tasks.eyepoint_study import (
+    SIZES,
+    EyepointStudy,
+    FinerRays,
+    eyepoints_path,
+    refine,
+    world_of,
+)
+from sweep.tasks.grid import Lattice
 from sweep.tasks.grid_study import coordinates
-from sweep.tasks.patches import KnownCloud, Patch, completed
-from sweep.tasks.stretches import Part, Stretches
-from sweep.tasks.study import ArrayLayout, Results
+from sweep.tasks.reuse import GrowingStudy
+from sweep.tasks.study import ArrayLayout, BlockGrid, Results
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
@@ -34,92 +46,136 @@ if TYPE_CHECKING:
 #: same along every axis and for every instrument.
 DOMAIN = "sweep.flight"
 
+#: Shots that a cycle must have for a velocity vector.
+LEAST_BEAMS = 3
 
-class FlightStudy:
+#: Geometry of shots and cycles, the same at every place along a study's axes.
+GEOMETRY = SHOTS | CYCLES
+
+
+class Part(NamedTuple):
+    """A block: a stretch of cycles and of draws, at one place along the axes, of one scanner."""
+
+    scanner: str
+    axes: tuple[int, ...]
+    draws: int  # number of its stretch of draws
+    cycles: int  # number of its stretch of cycles
+
+
+class ScannerBlocks(Lattice, BlockGrid):
+    """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
+
+    def __init__(self, spec: SceneSpec, scanner: str) -> None:
+        Lattice.__init__(self, spec)
+        self.scanner, self.axes = scanner, self.shape
+        self.total_cycles, self.shots_a_cycle = spec.cycles(scanner), spec.shots_a_cycle(scanner)
+        self.draws = int(spec.draws.number)
+        fitting = max(1, int(spec.storage.block_shots) // self.shots_a_cycle)
+        BlockGrid.__init__(
+            self,
+            (*(axis.name for axis in spec.axes), "draw", "cycle"),
+            (*self.axes, self.draws, self.total_cycles),
+            (
+                *(1 for _ in self.axes),
+                min(self.draws, int(spec.storage.block_draws)),
+                min(self.total_cycles, fitting),
+            ),
+            group=scanner,
+            finer="shot",
+            each=self.shots_a_cycle,
+        )
+
+    @cached_property
+    def values(self) -> list[dict[str, np.ndarray]]:
+        """Values along each dimension: parameters, and numbers of draws and cycles."""
+        return [
+            *super().values,
+            {"draw": np.arange(self.draws)},
+            {"cycle": np.arange(self.total_cycles)},
+        ]
+
+    @property
+    def navigates(self) -> bool:
+        """Whether a cycle has the shots that a velocity vector takes."""
+        return self.shots_a_cycle >= LEAST_BEAMS
+
+    def part(self, number: int) -> Part:
+        """A block of this scanner by its number."""
+        *axes, draws, cycles = self.position(number)
+        return Part(self.scanner, tuple(axes), draws, cycles)
+
+    def draw_range(self, part: Part) -> tuple[int, int]:
+        """First draw of a block, and the one after its last."""
+        return _range(part.draws, self.block_shape[-2], self.draws)
+
+    def cycle_range(self, part: Part) -> tuple[int, int]:
+        """First cycle of a block, and the one after its last."""
+        return _range(part.cycles, self.block_shape[-1], self.total_cycles)
+
+    def shot_range(self, part: Part) -> tuple[int, int]:
+        """First shot of a block, and the one after its last."""
+        first, stop = self.cycle_range(part)
+        return first * self.shots_a_cycle, stop * self.shots_a_cycle
+
+
+def _range(number: int, each: int, total: int) -> tuple[int, int]:
+    return number * each, min((number + 1) * each, total)
+
+
+class KnownCloud(NamedTuple):
+    """Results of a flight's block that are there before it is computed."""
+
+    there: np.ndarray
+    """(shots, draws): which."""
+    results: Results
+    """(shots or cycles, draws, ...) by name; (shots, ...) what no draw changes."""
+
+
+class FlightStudy(GrowingStudy):
     """The point clouds of a flight, a group of arrays for each scanner.
 
     Parameters
     ----------
-    spec
-        The study.
-    path
-        Its store, beside which the eyepoints are.
-    look_up
-        Finds where some of its results are already; asked as the first block is computed.
+    spec, path
+        The study, and its store, beside which the eyepoints are.
     """
 
     unit = "shots"
 
-    def __init__(
-        self,
-        spec: SceneSpec,
-        path: Location,
-        look_up: Callable[[FlightStudy], Earlier[KnownCloud] | None] | None = None,
-    ) -> None:
-        self.spec, self.path, self._look_up = spec, path, look_up
-        self._stretches = [Stretches(spec, scanner) for scanner in spec.scanners]
-        self._readers: dict[str, EyepointReader] = {}
-        self._parameters: dict[tuple[int, ...], Mapping[str, Any]] = {}
-        self._calling: dict[tuple[int, ...], ShotsCalling] = {}
-
-    @cached_property
-    def earlier(self) -> Earlier[KnownCloud] | None:
-        """Where some of its results are already, if anywhere."""
-        return self._look_up(self) if self._look_up else None
+    def __init__(self, spec: SceneSpec, path: Location) -> None:
+        super().__init__(spec)
+        self.path = path
+        self.scanners = {scanner: ScannerBlocks(spec, scanner) for scanner in spec.scanners}
+        self._eyepoints = cache(self._open_eyepoints)
+        self._parameters = cache(self._parameters_along)
 
     @property
-    def id(self) -> str:
-        """Hash of the spec's identity."""
-        return self.spec.id
-
-    @property
-    def scanners(self) -> dict[str, Stretches]:
+    def grids(self) -> list[ScannerBlocks]:
         """Blocks of each scanner."""
-        return {stretches.scanner: stretches for stretches in self._stretches}
+        return list(self.scanners.values())
 
-    @property
-    def points(self) -> int:
-        """Shots of all scanners, times draws, times places along the axes."""
-        return sum(
-            s.total_cycles * s.shots_a_cycle * s.draws * math.prod(s.axes) for s in self._stretches
-        )
+    def lattice(self, grid: BlockGrid) -> Lattice:
+        """Parameters along the axes, and numbers of draws and cycles."""
+        return self.scanners[grid.group]
 
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-        return sum(stretches.number for stretches in self._stretches)
+    def follows_tolerance(self, block: int) -> np.ndarray | bool:
+        """Whether shots are computed more closely with a tighter tolerance, effects apart."""
+        return bool(self.spec.rays_by_tolerance or by_tolerance(self.spec.parameters()))
 
-    def part(self, block: int) -> tuple[Stretches, Part]:
-        """What a block is, and the blocks of its scanner.
-
-        Raises
-        ------
-        IndexError
-            Where there is no such block.
-        """
-        if block < 0:
-            raise IndexError(f"there is no block {block}")
-        for stretches in self._stretches:
-            if block < stretches.number:
-                return stretches, stretches.part(block)
-            block -= stretches.number
-        raise IndexError(f"block is beyond the {self.n_blocks} of the study")
+    def part(self, block: int) -> tuple[ScannerBlocks, Part]:
+        """The blocks of a block's scanner, and which one it is; IndexError where there is none."""
+        grid, number = self.find(block)
+        blocks = self.scanners[grid.group]
+        return blocks, blocks.part(number)
 
     def block(self, part: Part) -> int:
         """Number of a block."""
-        before = takewhile(lambda stretches: stretches.scanner != part.scanner, self._stretches)
-        return sum(each.number for each in before) + self.scanners[part.scanner].block(part)
+        number = self.scanners[part.scanner].number((*part.axes, part.draws, part.cycles))
+        return self.first_block(part.scanner) + number
 
-    def block_size(self, block: int) -> int:
-        """Shots of a block, times draws."""
-        stretches, part = self.part(block)
-        return stretches.points(part)
-
-    def points_in(self, blocks: np.ndarray) -> int:
-        """Shots in the blocks that are marked in an ndarray of bool (blocks,), times draws."""
-        numbers = [stretches.number for stretches in self._stretches]
-        parts = np.split(np.asarray(blocks, bool), np.cumsum(numbers)[:-1])
-        return sum(s.points_in(part) for s, part in zip(self._stretches, parts, strict=True))
+    def home(self, block: int) -> int:
+        """Block of the first draws of the same shots, with all that no draw changes."""
+        return self.block(self.part(block)[1]._replace(draws=0))
 
     def attributes(self) -> dict[str, Any]:
         """Title, question, spec, and what the numbers of scanners and surfaces mean."""
@@ -138,78 +194,75 @@ class FlightStudy:
         """A group for each scanner."""
         names = " ".join(member.name for axis in self.spec.axes for member in axis.members)
         return {
-            s.scanner: {
-                "shots_a_cycle": s.shots_a_cycle,
-                "geometry_id": self.spec.geometry_id(s.scanner),
+            name: {
+                "shots_a_cycle": blocks.shots_a_cycle,
+                "geometry_id": self.spec.geometry_id(name),
                 "coordinates": names,
             }
-            for s in self._stretches
+            for name, blocks in self.scanners.items()
         }
 
-    def arrays(self) -> list[ArrayLayout]:
-        """The map of the scene, and every scanner's coordinates and outputs."""
-        arrays = list(self._map.arrays())
-        for stretches in self._stretches:
-            own = coordinates(self.spec.axes)
-            own += flight_layout.arrays(self.spec, stretches)
-            arrays += [layout.within(stretches.scanner) for layout in own]
-        return arrays
+    def known_arrays(self) -> list[ArrayLayout]:
+        """The map of the scene, and every scanner's coordinates."""
+        return list(self._map.arrays()) + [
+            replace(layout, name=f"{scanner}/{layout.name}")
+            for scanner in self.scanners
+            for layout in coordinates(self.spec.axes)
+        ]
 
-    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
-        """Chunks of a block: what has no draws goes with the first, and so does the geometry."""
-        return flight_layout.chunks(*self.part(block))
-
-    def owners(self) -> dict[str, np.ndarray]:
-        """The blocks along axes, draws and stretches, as far as an array has these dimensions."""
-        found: dict[str, np.ndarray] = {}
-        first = 0
-        for stretches in self._stretches:
-            found |= flight_layout.owners(stretches, first)
-            first += stretches.number
+    def outputs(self) -> list[ArrayLayout]:
+        """Geometry, statistics, points and navigation of each scanner."""
+        axes = tuple(axis.name for axis in self.spec.axes)
+        sizes = SIZES | {"return_number": int(self.spec.draws.returns)}
+        found = []
+        for blocks in self.grids:
+            named = GEOMETRY | STATISTICS | SIMULATED | POINTS
+            named = named | NAVIGATION if blocks.navigates else named
+            for name, output in named.items():
+                dims = output.dims if name in GEOMETRY else axes + output.dims
+                about = flag_attributes() if name == EFFECTS else None
+                found.append(blocks.array(name, output, dims, sizes, about))
         return found
 
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
-        stretches, part = self.part(block)
-        begin, own, shots, around = self._in_tiles(stretches, part)
+        blocks, part = self.part(block)
+        begin, own, shots, around = self._in_tiles(blocks, part)
         called = self.call(part, around, begin + np.arange(len(around.time))).some(own)
         shots = {name: values[own] for name, values in shots.items()}
-        results = shots | self._reader(part.scanner).cycles(*stretches.cycle_range(part))
-        results |= {"effects": called.flags, "effects_error": called.error}
-        known = self.earlier.known(block, called) if self.earlier else KnownCloud()
+        results = shots | self._read(part.scanner, CYCLES, *blocks.cycle_range(part))
+        results |= {EFFECTS: called.flags, ERROR: called.error}
         numbers = np.arange(begin + own.start, begin + own.stop)
+        known = self._known(block, called) if self.earlier else None
         results |= self.look(part, shots, around.some(own), called, numbers, known)
-        depth = len(part.axes)
-        return {
-            f"{part.scanner}/{name}": values.reshape((1,) * depth + values.shape)
-            if flight_layout.is_radiometric(name)
-            else values
-            for name, values in results.items()
-            if flight_layout.belongs(name, part)
-        }
+        found = {}
+        for name in self.chunks(block):
+            values, rank = results[name.rpartition("/")[2]], len(self.layouts[name].shape)
+            found[name] = values.reshape((1,) * (rank - values.ndim) + values.shape)
+        return found
 
     def compile(self) -> None:
         """Compile the radiometry and the navigation, on the first cycle of each scanner."""
-        for stretches in self._stretches:
-            part = stretches.part(0)
-            shots, eyepoints = self._reader(part.scanner).shots(0, stretches.shots_a_cycle)
-            numbers = np.arange(stretches.shots_a_cycle)
+        for blocks in self.grids:
+            part = blocks.part(0)
+            shots, eyepoints = self._seen(part.scanner, 0, blocks.shots_a_cycle)
+            numbers = np.arange(blocks.shots_a_cycle)
             called = self.call(part, eyepoints, numbers)
             self.look(part, shots, eyepoints, called, numbers)
 
     def called(self, block: int) -> Called:
         """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
-        stretches, part = self.part(block)
-        begin, own, _, around = self._in_tiles(stretches, part)
+        blocks, part = self.part(block)
+        begin, own, _, around = self._in_tiles(blocks, part)
         return self.call(part, around, begin + np.arange(len(around.time))).some(own)
 
-    def _in_tiles(self, stretches: Stretches, part: Part) -> tuple[int, slice, Results, Eyepoints]:
+    def _in_tiles(self, blocks: ScannerBlocks, part: Part) -> tuple[int, slice, Results, Eyepoints]:
         """Number of the first shot of a block's tiles, its own among these, and what they see."""
-        first, stop = stretches.shot_range(part)
-        total = stretches.total_cycles * stretches.shots_a_cycle
+        first, stop = blocks.shot_range(part)
+        total = blocks.total_cycles * blocks.shots_a_cycle
         begin = first // TILE_SHOTS * TILE_SHOTS
         end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total)
-        shots, eyepoints = self._reader(part.scanner).shots(begin, end)
+        shots, eyepoints = self._seen(part.scanner, begin, end)
         return begin, slice(first - begin, stop - begin), shots, eyepoints
 
     def call(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Called:
@@ -221,15 +274,10 @@ class FlightStudy:
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
-        if part.axes not in self._calling:
-            self._calling[part.axes] = ShotsCalling(
-                self.parameters_at(part),
-                self.surfaces,
-                modes=self._modes,
-                rotating=self._rotating,
-                rays_by_tolerance=self.rays_accuracy is not None,
-            )
-        return self._calling[part.axes].plans(eyepoints, tiles)
+        return plan_shots(
+            eyepoints, tiles, self.parameters_at(part), self.surfaces, modes=self._modes,
+            rotating=self._rotating, rays_by_tolerance=self.rays_accuracy is not None,
+        )  # fmt: skip
 
     def look(
         self,
@@ -238,7 +286,7 @@ class FlightStudy:
         eyepoints: Eyepoints,
         called: Called,
         numbers: np.ndarray,
-        known: KnownCloud = KnownCloud(),  # noqa: B008
+        known: KnownCloud | None = None,
     ) -> Results:
         """Radiometry, draws and navigation of some shots.
 
@@ -248,23 +296,35 @@ class FlightStudy:
             Scanner, place along the axes and stretch of draws.
         shots, eyepoints
             Whole cycles of them.
-        called
-            What is simulated of each.
-        numbers
-            Of the shots, counted from the flight's first.
+        called, numbers
+            What is simulated of each; their numbers, counted from the flight's first.
         known
-            What need not be computed.
+            Results that need not be computed.
         """
-        stretches = self.scanners[part.scanner]
-        begin, end = stretches.draw_range(part)
-        number, draws = called.flags.size, end - begin
-        clouds = partial(self._clouds, part, eyepoints, called, numbers)
-        found = completed(known.points, (number, draws), clouds)
-        if not stretches.navigates:
-            return found
-        solutions = partial(solved, self.spec, stretches, shots, found)
-        cycles = number // stretches.shots_a_cycle
-        return found | completed(known.navigation, (cycles, draws), solutions)
+        blocks = self.scanners[part.scanner]
+        begin, end = blocks.draw_range(part)
+        draws, each = end - begin, blocks.shots_a_cycle
+        there, results = known or self._nothing_known(blocks, called.flags.size, draws)
+        for rows, some in _gaps(~there):
+            for index, found in self._clouds(part, eyepoints, called, numbers, rows, some):
+                _put(results, index, some, found)
+        if blocks.navigates:
+            lacking = (~there).reshape(-1, each, draws).any(axis=1)
+            for cycles, some in _gaps(np.asarray(lacking)):
+                rows = (cycles[:, None] * each + np.arange(each)).ravel()
+                found = self._solved(each, shots, results, rows, some)
+                _put(results, cycles, some, found)
+        return results
+
+    def _nothing_known(self, blocks: ScannerBlocks, shots: int, draws: int) -> KnownCloud:
+        """Room for the results of some shots."""
+        named = STATISTICS | POINTS | (NAVIGATION if blocks.navigates else {})
+        sizes = SIZES | {
+            "shot": shots, "cycle": shots // blocks.shots_a_cycle, "draw": draws,
+            "return_number": int(self.spec.draws.returns),
+        }  # fmt: skip
+        results = {name: output.empty(sizes) for name, output in named.items()}
+        return KnownCloud(np.zeros((shots, draws), bool), results)
 
     def _clouds(
         self,
@@ -274,7 +334,7 @@ class FlightStudy:
         numbers: np.ndarray,
         rows: np.ndarray,
         draws: slice,
-    ) -> Iterator[Patch]:
+    ) -> Iterator[tuple[np.ndarray, Results]]:
         """Points of some of the shots, those together that call for much the same."""
         for index, effects, flags in called.some(rows).together():
             some = rows[index]
@@ -283,12 +343,12 @@ class FlightStudy:
             if (accuracy := self.rays_accuracy) is not None:
                 own = numbers[some], flags, eyepoints.weight.size
                 self._refine(part.scanner, own, accuracy, results, cloud)
-            yield Patch(some, draws, results)
+            yield some, results
 
     def _cloud(
         self, part: Part, draws: slice, effects: tuple[str, ...]
     ) -> Callable[[Eyepoints, np.ndarray, np.ndarray], Results]:
-        """What makes points of eyepoints, the shots' numbers and flags."""
+        """A function that makes points of eyepoints, the shots' numbers and flags."""
         from sweep.model.clouds import cloud
         from sweep.model.philox import point_keys
 
@@ -332,22 +392,69 @@ class FlightStudy:
 
         refine(rays, results["beamlets_error"], accuracy, again)
 
+    def _solved(
+        self, each: int, shots: Results, found: Results, rows: np.ndarray, draws: slice
+    ) -> Results:
+        """Navigation of cycles, of so many shots each, from the points of these in some draws."""
+        from sweep.model.navigation import solve
+
+        some = slice(None) if rows.size == len(found["flags"]) else rows
+        return solve(
+            {name: values[some] for name, values in shots.items() if name in SHOTS},
+            {name: found[name][some, draws] for name in POINTS},
+            shots_a_cycle=each,
+            test_level=self.spec.navigation.test_level,
+            ground_slope=self.spec.navigation.ground_slope,
+            relief=self.spec.navigation.relief,
+            jitter=self.spec.platform.jitter,
+        )
+
+    def _known(self, block: int, called: Called) -> KnownCloud:
+        """Results of a block that a smaller study has, of shots with the same effects."""
+        assert self.earlier is not None
+        reuse, (blocks, part) = self.earlier, self.part(block)
+        (begin, end), (first, stop) = blocks.draw_range(part), blocks.cycle_range(part)
+        draws, each = end - begin, blocks.shots_a_cycle
+        there, results = known = self._nothing_known(blocks, called.flags.size, draws)
+        for share in reuse.shares(block):
+            home, own = (reuse.read(b) for b in (reuse.older.home(share.block), share.block))
+            if home is None or own is None:
+                continue
+            older = {
+                name.rpartition("/")[2]: values.reshape(values.shape[len(reuse.older.spec.axes) :])
+                for name, values in (home | own).items()
+            }
+            (draw, cycle), (old_draw, old_cycle) = (
+                np.divmod(share.points, stop - first),
+                np.divmod(share.place, len(older["flags"]) // each),
+            )
+            rows, old = (c[:, None] * each + np.arange(each) for c in (cycle, old_cycle))
+            drawn, old_drawn = draw[:, None], old_draw[:, None]
+            there[rows, drawn] = older[EFFECTS][old] == called.flags[rows]
+            found = {name: older[name][old] for name in STATISTICS}
+            found |= {name: older[name][old, old_drawn] for name in POINTS}
+            _put(results, rows, drawn, found)
+            if blocks.navigates:
+                found = {name: older[name][old_cycle, old_draw] for name in NAVIGATION}
+                _put(results, cycle, draw, found)
+        reuse.taken[block] = int(there.sum())
+        return known
+
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
-        """SI values of all parameters at a block's place along the axes, which is asked often."""
-        if part.axes not in self._parameters:
-            parameters: dict[str, Any] = dict(self.spec.parameters())
-            for axis, index in zip(self.spec.axes, part.axes, strict=True):
-                for member in axis.members:
-                    value = member.values[index]
-                    scalar = value.item() if isinstance(value, np.generic) else value
-                    parameters[member.path] = scalar
-            self._parameters[part.axes] = MappingProxyType(parameters)
-        return self._parameters[part.axes]
+        """SI values of all parameters at a block's place along the axes."""
+        return self._parameters(part.axes)
+
+    def _parameters_along(self, place: tuple[int, ...]) -> Mapping[str, Any]:
+        parameters: dict[str, Any] = dict(self.spec.parameters())
+        for axis, index in zip(self.spec.axes, place, strict=True):
+            for member in axis.members:
+                parameters[member.path] = np.asarray(member.values)[index].item()
+        return parameters
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:
         """What surface numbers mean."""
-        return self.spec.surfaces()
+        return tuple(self.spec.surfaces())
 
     @cached_property
     def rays_accuracy(self) -> Accuracy | None:
@@ -356,26 +463,39 @@ class FlightStudy:
 
     @cached_property
     def _modes(self) -> Mapping[str, str]:
-        return self.spec.modes()
+        return dict(self.spec.modes())
 
     @cached_property
     def _rotating(self) -> bool:
-        return self.spec.rotating
+        return bool(self.spec.rotating)
 
     @cached_property
     def _finer_rays(self) -> FinerRays:
         return FinerRays(self.spec)
 
-    def _reader(self, scanner: str) -> EyepointReader:
-        if scanner not in self._readers:
-            path = eyepoints_path(self.path, self.spec.geometry_id(scanner))
-            self._readers[scanner] = EyepointReader(path)
-        return self._readers[scanner]
+    def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
+        """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
+        group = open_group(eyepoints_path(self.path, self.spec.geometry_id(scanner)))
+        arrays: dict[str, Any] = {name: group[name] for name in SHOTS | BEAMLETS | CYCLES}
+        return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
+
+    def _read(self, scanner: str, names: Mapping[str, Any], first: int, stop: int) -> Results:
+        """Arrays of a scanner's eyepoints from `first` to before `stop`."""
+        arrays = self._eyepoints(scanner)
+        return {name: np.asarray(arrays[name][first:stop]) for name in names}
+
+    def _seen(self, scanner: str, first: int, stop: int) -> tuple[Results, Eyepoints]:
+        """Arrays of the shots from `first` to before `stop`, and their eyepoints."""
+        from sweep.scenes.eyepoint_arrays import from_arrays
+
+        shots = self._read(scanner, SHOTS, first, stop)
+        beamlets = self._read(scanner, BEAMLETS, first, stop)
+        return shots, from_arrays(shots | beamlets, self._eyepoints(scanner)["weight"])
 
     def eyepoint_studies(self) -> Iterator[EyepointStudy]:
         """The studies that this one looks with."""
-        for stretches in self._stretches:
-            yield EyepointStudy(self.spec, stretches.scanner)
+        for scanner in self.scanners:
+            yield EyepointStudy(self.spec, scanner)
 
     @property
     def reports(self) -> tuple[str, ...]:
@@ -387,3 +507,19 @@ class FlightStudy:
         from sweep.tasks.scene_map import SceneMap
 
         return SceneMap.of(self.spec)
+
+
+def _gaps(lacking: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
+    """Rows and stretches of draws that are lacking; rows that lack the same come together."""
+    patterns, which = np.unique(lacking, axis=0, return_inverse=True)
+    for number, pattern in enumerate(patterns):
+        rows = np.flatnonzero(which.ravel() == number)
+        edges = np.flatnonzero(np.diff(pattern, prepend=False, append=False))
+        for first, stop in edges.reshape(-1, 2).tolist():
+            yield rows, slice(first, stop)
+
+
+def _put(results: Results, rows: np.ndarray, draws: slice | np.ndarray, found: Results) -> None:
+    """Put results of some rows and draws into those of all."""
+    for name, values in found.items():
+        results[name][rows if name in STATISTICS else (rows, draws)] = values

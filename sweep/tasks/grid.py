@@ -1,7 +1,7 @@
-"""The grid of a study: points in rows along the axes, cut into blocks that are whole chunks.
+"""Points of a study along its axes, and their parameters, block by block.
 
-Everything here is lazy: a block is worked out from its number when it is asked for, so that a grid
-of any size costs the length of its axes and no more.
+A block is worked out from its number when it is asked for, so that a grid of any size costs the
+length of its axes and no more.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from sweep.tasks.study import BlockGrid
 
 if TYPE_CHECKING:
     from sweep.spec import Axis, SceneSpec, Spec
@@ -49,10 +51,6 @@ def is_geometric(axis: Axis) -> bool:
         member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
         for member in axis.members
     )
-
-
-#: Fill of counts; a number of draws or detections is never negative.
-NO_COUNT = -1
 
 
 def points_a_block(points: int) -> int:
@@ -120,13 +118,7 @@ def most_points(spec: Spec, points: int) -> int:
 
 
 class Lattice:
-    """Parameters along the axes of a study.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    """
+    """Parameters along the axes of a study: those that are fixed, and those of each axis."""
 
     def __init__(self, spec: Spec | SceneSpec) -> None:
         self.fixed: dict[str, float | int | str] = dict(spec.parameters())
@@ -139,76 +131,16 @@ class Lattice:
         return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
 
 
-class Grid(Lattice):
-    """Points of a study and the blocks they are computed in.
-
-    Parameters
-    ----------
-    spec
-        The study; its parameters, axes and `storage.block_points` decide everything.
-    """
+class Grid(Lattice, BlockGrid):
+    """Points of a study over a grid, their parameters, and the blocks they are computed in."""
 
     def __init__(self, spec: Spec) -> None:
-        super().__init__(spec)
+        Lattice.__init__(self, spec)
         self.spec = spec
-        self.dims = tuple(axis.name for axis in self._axes)
         self.geometric = tuple(is_geometric(axis) for axis in self._axes)
-        self.block_shape = block_shape(self.shape, self.geometric, most_points(spec, self.points))
-        self.blocks_along = tuple(
-            -(-size // chunk) for size, chunk in zip(self.shape, self.block_shape, strict=True)
-        )
-
-    @property
-    def points(self) -> int:
-        """Number of points of the whole grid."""
-        return math.prod(self.shape)
-
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks of the whole grid."""
-        return math.prod(self.blocks_along)
-
-    def position(self, block: int) -> tuple[int, ...]:
-        """Position of a block among the blocks, also the key of its chunk.
-
-        Raises
-        ------
-        IndexError
-            Where there is no such block.
-        """
-        if not 0 <= block < self.n_blocks:
-            raise IndexError(f"block {block} of a grid of {self.n_blocks}")
-        position = []
-        for count in reversed(self.blocks_along):
-            block, along = divmod(block, count)
-            position.append(along)
-        return tuple(reversed(position))
-
-    def block(self, block: int) -> tuple[slice, ...]:
-        """Slices of a block along each axis, cut at the edge of the grid."""
-        return tuple(
-            slice(p * chunk, min((p + 1) * chunk, size))
-            for p, chunk, size in zip(
-                self.position(block), self.block_shape, self.shape, strict=True
-            )
-        )
-
-    def extent(self, block: int) -> tuple[int, ...]:
-        """Points of a block along each axis."""
-        return tuple(s.stop - s.start for s in self.block(block))
-
-    def block_size(self, block: int) -> int:
-        """Number of points of a block."""
-        return math.prod(self.extent(block))
-
-    def points_in(self, blocks: np.ndarray) -> int:
-        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
-        numbers = np.flatnonzero(blocks)
-        points = np.ones(len(numbers), dtype=np.int64)
-        positions = np.unravel_index(numbers, self.blocks_along) if self.shape else ()
-        for along, chunk, size in zip(positions, self.block_shape, self.shape, strict=True):
-            points *= np.minimum((along + 1) * chunk, size) - along * chunk
-        return int(points.sum())
+        most = most_points(spec, math.prod(self.shape))
+        dims = tuple(axis.name for axis in self._axes)
+        BlockGrid.__init__(self, dims, self.shape, block_shape(self.shape, self.geometric, most))
 
     def parameters(self, block: int) -> dict[str, Value]:
         """Parameters of the points of a block, by dotted path.
@@ -233,10 +165,6 @@ class Grid(Lattice):
             for path, array in values.items():
                 selected[path] = array[along]
         return selected
-
-    def point_rows(self, block: int) -> np.ndarray:
-        """Canonical rows of the parameters of a block's points (`canonical_rows`)."""
-        return canonical_rows(self.parameters(block), self.block_size(block))
 
     def geometry_order(self, block: int) -> np.ndarray:
         """Order of a block's points that brings equal geometry together.

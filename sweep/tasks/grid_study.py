@@ -1,110 +1,92 @@
-"""A study over a grid of parameters: what its store holds and which block writes what."""
+"""A study over a grid of parameters: arrays of its store, and results of a block."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.tasks.calling import EFFECTS, ERROR, Calling, layouts
-from sweep.tasks.earlier import Earlier
-from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block
-from sweep.tasks.grid import NO_COUNT, Grid
-from sweep.tasks.study import ArrayLayout, Known, Results, Stop
+from sweep.model.effects.catalogue import flag_attributes
+from sweep.model.resolution import by_tolerance
+from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
+from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block, no_sums
+from sweep.tasks.grid import Grid, Lattice
+from sweep.tasks.reuse import DAMAGED, GrowingStudy
+from sweep.tasks.study import (
+    ArrayLayout,
+    BlockGrid,
+    Found,
+    Known,
+    Results,
+    Stop,
+    described,
+    together,
+)
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
-    from sweep.spec import Axis, Member, Spec
+    from sweep.spec import Axis, Spec
 
 #: Dimension of the batches of draws.
 BATCH = "batch"
 
 
 def outputs_of(spec: Spec) -> dict[str, Output]:
-    """What the model yields for each point of a study, by name."""
+    """Arrays that blocks of a study write, sorted by name, with dimensions besides the axes."""
     from sweep.model.outputs import (
         ACCURACY_OUTPUTS,
         DRAW_OUTPUTS,
         ERROR_OUTPUTS,
         OUTPUTS,
+        RUNNING,
         RUNNING_OUTPUTS,
+        SIMULATED,
         SPECTRA_OUTPUTS,
     )
 
-    if not spec.draws.any:
-        return dict(OUTPUTS)
+    error = replace(
+        SIMULATED[ERROR],
+        comment="sum over the effects left out of what each may change: of pd in all three "
+        "segments, of log10 of the probability of a false alarm, or of a relative magnitude, "
+        "whichever is most",
+    )
+    found = {EFFECTS: replace(SIMULATED[EFFECTS], dims=()), ERROR: replace(error, dims=())}
     drawn = ACCURACY_OUTPUTS | DRAW_OUTPUTS
-    if spec.draws.whole_spectra:
-        return SPECTRA_OUTPUTS | drawn
-    return OUTPUTS | ERROR_OUTPUTS | drawn | (RUNNING_OUTPUTS if spec.has_random_effects else {})
+    if not spec.draws.any:
+        found |= OUTPUTS
+    elif spec.draws.whole_spectra:
+        found |= SPECTRA_OUTPUTS | drawn
+    else:
+        sums = RUNNING_OUTPUTS if spec.has_random_effects else {}
+        found |= OUTPUTS | ERROR_OUTPUTS | drawn | sums
+    further = {RUNNING: ("sum",)}
+    if not spec.draws.adaptive:
+        further |= dict.fromkeys(DRAW_OUTPUTS, (BATCH,))
+    return {name: replace(found[name], dims=further.get(name, ())) for name in sorted(found)}
 
 
-def output_names(spec: Spec) -> list[str]:
-    """Names of the arrays that blocks write, sorted."""
-    return sorted([*outputs_of(spec), EFFECTS, ERROR])
+class GridStudy(GrowingStudy):
+    """A study over a grid of parameters."""
 
-
-def further_dims(spec: Spec) -> dict[str, tuple[str, int]]:
-    """Outputs that have a dimension besides the axes, with its name and size."""
-    from sweep.model.outputs import DRAW_OUTPUTS, RUNNING
-    from sweep.model.realisations import RUNNING_COLUMNS
-
-    batches = (BATCH, len(batch_sizes(spec)))
-    found = {} if spec.draws.adaptive else dict.fromkeys(DRAW_OUTPUTS, batches)
-    return found | {RUNNING: ("sum", RUNNING_COLUMNS)}
-
-
-class GridStudy:
-    """A study over a grid of parameters.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    look_up
-        Finds where some of its results are already; asked as the first block is computed.
-    """
-
-    unit = "points"
-
-    def __init__(
-        self, spec: Spec, look_up: Callable[[GridStudy], Earlier[Known] | None] | None = None
-    ) -> None:
-        self.spec = spec
-        self._look_up = look_up
+    def __init__(self, spec: Spec) -> None:
+        super().__init__(spec)
         self.grid = Grid(spec)
         self.calling = Calling(spec, self.grid)
-        self._names, self._further = output_names(spec), further_dims(spec)
-
-    @cached_property
-    def earlier(self) -> Earlier[Known] | None:
-        """Where some of its results are already, if anywhere."""
-        return self._look_up(self) if self._look_up else None
 
     @property
-    def id(self) -> str:
-        """Hash of the spec's identity."""
-        return self.spec.id
+    def grids(self) -> tuple[Grid]:
+        """Its points."""
+        return (self.grid,)
 
-    @property
-    def points(self) -> int:
-        """Number of points of the whole grid."""
-        return self.grid.points
+    def lattice(self, grid: BlockGrid) -> Lattice:
+        """Parameters along its axes."""
+        return self.grid
 
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-        return self.grid.n_blocks
-
-    def block_size(self, block: int) -> int:
-        """Points of a block."""
-        return self.grid.block_size(block)
-
-    def points_in(self, blocks: np.ndarray) -> int:
-        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
-        return self.grid.points_in(blocks)
+    def follows_tolerance(self, block: int) -> np.ndarray | bool:
+        """Which points of a block are computed more closely with a tighter tolerance, (points,)."""
+        return by_tolerance(self.grid.parameters(block))
 
     def attributes(self) -> dict[str, Any]:
         """Title, question, spec and the blocks' shape."""
@@ -120,51 +102,38 @@ class GridStudy:
             "coordinates": " ".join(coordinates),
         }
 
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """None."""
-        return {}
-
-    def arrays(self) -> list[ArrayLayout]:
-        """Coordinates, the sizes of batches, and an array for each output."""
+    def known_arrays(self) -> list[ArrayLayout]:
+        """Coordinates, and the sizes of batches."""
         arrays = coordinates(self.spec.axes)
         if sizes := batch_sizes(self.spec):
-            arrays.append(_batches(np.array(sizes, dtype=np.int64)))
-        arrays += layouts(self.grid.shape, self.grid.block_shape, self.grid.dims)
-        return arrays + [self._output(n) for n in self._names if n not in (EFFECTS, ERROR)]
+            about = described("1", "draws in the batch")
+            arrays.append(
+                ArrayLayout.known("batch_draws", (BATCH,), np.array(sizes, np.int64), about)
+            )
+        return arrays
 
-    def _output(self, name: str) -> ArrayLayout:
+    def outputs(self) -> list[ArrayLayout]:
+        """An array for each output of the model, and those that say what was simulated."""
         from sweep.model.outputs import ACCURACY_OUTPUTS
+        from sweep.model.realisations import RUNNING_COLUMNS
 
-        output = outputs_of(self.spec)[name]
-        further, whole = self._further.get(name), output.dtype == "int64"
-        promise = self._promise() if name in ACCURACY_OUTPUTS and not whole else {}
-        return ArrayLayout(
-            name=name,
-            shape=self.grid.shape + ((further[1],) if further else ()),
-            chunks=self.grid.block_shape + ((further[1],) if further else ()),
-            dims=self.grid.dims + ((further[0],) if further else ()),
-            dtype=output.dtype,
-            fill=NO_COUNT if whole else float("nan"),
-            attributes=described(output.units, output.long_name, output.comment) | promise,
-        )
+        sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
+        found = []
+        for name, output in outputs_of(self.spec).items():
+            layout = self.grid.array(name, output, self.grid.dims + output.dims, sizes)
+            about = dict(layout.attributes)
+            if name == EFFECTS:
+                about = flag_attributes()
+            elif name in ACCURACY_OUTPUTS and output.dtype != "int64":
+                about |= self._promise()
+            found.append(replace(layout, attributes=about))
+        return found
 
     def _promise(self) -> dict[str, float]:
         """Tolerance and confidence that half-widths are held against, but for those on axes."""
         promised = {f"accuracy.{name}": name for name in ("tolerance", "confidence")}
         off_axes = self.spec.parameters_off_axes()
         return {n: float(off_axes[path]) for path, n in promised.items() if path in off_axes}
-
-    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
-        """The block's chunk of every output."""
-        position = self.grid.position(block)
-        return {name: position + ((0,) if name in self._further else ()) for name in self._names}
-
-    def owners(self) -> dict[str, np.ndarray]:
-        """The blocks as they lie along the axes, for every output."""
-        blocks = np.arange(self.n_blocks).reshape(self.grid.blocks_along)
-        return {
-            name: blocks[..., None] if name in self._further else blocks for name in self._names
-        }
 
     def evaluate(
         self,
@@ -174,13 +143,46 @@ class GridStudy:
     ) -> Results:
         """Outputs of a block; `begun` and `stop` are those of :func:`evaluate_block`."""
         called = self.calling.of_block(block)
-        known = self.earlier.known(block, called) if self.earlier else Known()
+        known = self._known(block, called)
         results = evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
-        for layout in map(self._output, set(self._names) - set(results)):
-            # all of its points are beyond the model
-            room = self.grid.extent(block) + layout.shape[len(self.grid.shape) :]
-            results[layout.name] = np.full(room, layout.fill, layout.dtype)
+        extent = self.grid.extent(block)
+        for name in self.layouts.keys() - results.keys():  # all points are beyond the model
+            layout = self.layouts[name]
+            room = extent + layout.shape[len(extent) :]
+            results[name] = np.full(room, layout.fill, layout.dtype)
         return results
+
+    def _known(self, block: int, called: Called) -> Known:
+        """Points of a block that a smaller study has: whole, or their first draws."""
+        if (reuse := self.earlier) is None:
+            return Known()
+        found = []
+        for share in reuse.shares(block):
+            if (older := reuse.read(share.block)) is None:
+                continue
+            rank, size = len(reuse.older.grids[0].shape), reuse.older.block_size(share.block)
+            same = older[EFFECTS].ravel()[share.place] == called.flags[share.points]
+            results = {
+                name: values.reshape(size, *values.shape[rank:])[share.place[same]]
+                for name, values in older.items()
+                if name not in (EFFECTS, ERROR)
+            }
+            found.append(Found(share.points[same], results))
+        points, results = together(found)
+        there = Found(points, no_sums(self.spec, points.size) | results)
+        reuse.taken[block] = points.size if reuse.is_whole else 0
+        return Known(done=there) if reuse.is_whole else Known(begun=there)
+
+    def there(self, block: int) -> int:
+        """Points of a block that the smaller study has, with the same effects."""
+        if (reuse := self.earlier) is None:
+            return 0
+        called, number = self.calling.of_block(block), 0
+        for share in reuse.shares(block):
+            with suppress(*DAMAGED):
+                flags = reuse.chunk(EFFECTS, share.block).ravel()
+                number += int(np.sum(flags[share.place] == called.flags[share.points]))
+        return number
 
     def compile(self) -> None:
         """Compile the model's kernels."""
@@ -189,37 +191,13 @@ class GridStudy:
 
 def coordinates(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
     """Arrays of the values along axes, in the units that they were written in."""
-    return [_coordinate(axis, member) for axis in axes for member in axis.members]
-
-
-def _coordinate(axis: Axis, member: Member) -> ArrayLayout:
-    values = np.asarray(member.display)
-    text = values.dtype.kind in "UOT"
-    long_name = member.name.replace("_", " ")
-    return ArrayLayout(
-        name=member.name,
-        shape=values.shape,
-        chunks=values.shape,
-        dims=(axis.name,),
-        dtype="string" if text else str(values.dtype),
-        attributes={**described(member.units, long_name, ""), "path": member.path},
-        values=values.astype(object) if text else values,
-    )
-
-
-def described(units: str, long_name: str, comment: str) -> dict[str, str]:
-    """Attributes that say what an array holds."""
-    attributes = {"units": units, "long_name": long_name}
-    return attributes | ({"comment": comment} if comment else {})
-
-
-def _batches(sizes: np.ndarray) -> ArrayLayout:
-    return ArrayLayout(
-        name="batch_draws",
-        shape=sizes.shape,
-        chunks=sizes.shape,
-        dims=(BATCH,),
-        dtype="int64",
-        attributes=described("1", "draws in the batch", ""),
-        values=sizes,
-    )
+    return [
+        ArrayLayout.known(
+            member.name,
+            (axis.name,),
+            np.asarray(member.display),
+            {**described(member.units, member.name.replace("_", " ")), "path": member.path},
+        )
+        for axis in axes
+        for member in axis.members
+    ]

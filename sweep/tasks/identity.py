@@ -19,24 +19,6 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
 
 
-def read_spec(path: Location, text: str, base: Path | None = None) -> Spec | SceneSpec:
-    """A spec that a store holds.
-
-    Raises
-    ------
-    StoreError
-        Where this program can't read it.
-    """
-    from sweep.spec import SpecError, from_stored
-
-    try:
-        return from_stored(text, base=base)
-    except (SpecError, ValueError) as error:
-        raise StoreError(
-            f"{path} holds a spec that this version of sweep can't read:\n{error}"
-        ) from error
-
-
 def refuse_foreign(path: Location) -> None:
     """Refuse what no version of this program has made; a damaged store of ours passes.
 

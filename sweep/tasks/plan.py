@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from sweep.tasks.evaluate import compile_kernels, evaluate_points, select, with_
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid import Grid, Value
-from sweep.tasks.grid_study import further_dims, output_names
+from sweep.tasks.studies import study_of
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -42,60 +42,85 @@ WRITE_CHUNK = 2e-3
 
 
 @dataclass(frozen=True, kw_only=True)
+class ScannerPlan:
+    """What one scanner will take."""
+
+    name: str
+    cycles: int
+    shots: int
+    rays: int
+    is_cast: bool  # eyepoints are there already
+    seconds_a_ray: float  # on one worker, measured
+    seconds_a_draw: float  # of one shot, with radiometry and navigation
+
+
+@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a study will take."""
+    """What a study will take; scanners and reports are those of a flight."""
 
     points: int
     blocks: int
-    block_shape: dict[str, int]  # points along each axis
+    block_shape: dict[str, int]  # points along each axis; none of a flight
     chunks: int
     bytes: int  # before compression, of all results
     workers: int
     seconds_a_point: float  # on one worker, measured
     seconds: float  # of the whole study, estimated
     worker_memory: int  # bytes, estimated
+    scanners: tuple[ScannerPlan, ...] = ()
+    reports: tuple[str, ...] = ()  # what was mended as the scene was loaded
+
+    @property
+    def work(self) -> float:
+        """Time on one core [s]."""
+        return self.points * self.seconds_a_point
 
 
-def plan(spec: Spec, *, workers: int | None = None) -> Plan:
+def plan(
+    spec: Spec | SceneSpec, *, store: Location | None = None, workers: int | None = None
+) -> Plan:
     """What a study will take, from its size and a second of measuring its own points.
 
     Parameters
     ----------
     spec
         The study.
+    store
+        Where it would be stored: eyepoints are looked for beside it.
     workers
         Workers it would run on; default those of the spec, else all cores.
     """
-    grid, names = Grid(spec), output_names(spec)
+    study = study_of(spec, (store or Path("nowhere.zarr")).absolute())
+    scanners: tuple[ScannerPlan, ...] = ()
+    reports: tuple[str, ...] = ()
+    shape = {}
+    if isinstance(study, FlightStudy):
+        eyepoints = list(study.eyepoint_studies())
+        scanners = tuple(_scanner(study, each) for each in eyepoints)
+        rays = sum(0 if s.is_cast else s.rays * s.seconds_a_ray for s in scanners)
+        looking = sum(
+            grid.points * s.seconds_a_draw for grid, s in zip(study.grids, scanners, strict=True)
+        )
+        each, reports = (rays + looking) / study.points, eyepoints[0].world.reports
+    else:
+        each = measured(study.spec, study.grid)
+        shape = dict(zip(study.grid.dims, study.grid.block_shape, strict=True))
     workers = workers or spec.execution.workers or cluster.cores()
-    each = measured(spec, grid)
-    writing = grid.n_blocks * len(names) * WRITE_CHUNK
-    busy = min(workers, grid.n_blocks)
+    work = study.points * each + study.n_chunks * WRITE_CHUNK
     return Plan(
-        points=grid.points,
-        blocks=grid.n_blocks,
-        block_shape=dict(zip(grid.dims, grid.block_shape, strict=True)),
-        chunks=grid.n_blocks * len(names),
-        bytes=grid.points * point_bytes(spec, names),
+        points=study.points,
+        blocks=study.n_blocks,
+        block_shape=shape,
+        chunks=study.n_chunks,
+        bytes=study.bytes,
         workers=workers,
         seconds_a_point=each,
-        seconds=START + (grid.points * each + writing) / busy,
-        worker_memory=worker_memory(spec, grid, names),
+        seconds=START + work / min(workers, study.n_blocks),
+        # with the model loaded, and a block's results twice: its own, and those being encoded
+        worker_memory=psutil.Process().memory_info().rss + 2 * study.block_bytes,
+        scanners=scanners,
+        reports=reports,
     )
-
-
-def point_bytes(spec: Spec, names: list[str]) -> int:
-    """Bytes of one point's results: 8 an output, or as often as that has a further dimension."""
-    further = further_dims(spec)
-    return 8 * sum(further[name][1] if name in further else 1 for name in names)
-
-
-def worker_memory(spec: Spec, grid: Grid, names: list[str]) -> int:
-    """Bytes a worker takes: as this process does with the model loaded, and two copies of a block's
-    results, its own and the one being encoded.
-    """
-    block = grid.block_size(0) * point_bytes(spec, names)
-    return psutil.Process().memory_info().rss + 2 * block
 
 
 def measured(spec: Spec, grid: Grid) -> float:
@@ -182,76 +207,6 @@ def timed(
         return Seconds(taken, each * (most - drawn))
     unsettled = float(np.mean(found["accuracy_missed"] > 0)) if spec.draws.adaptive else 1.0
     return Seconds(taken, taken * unsettled * (most / drawn - 1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScannerPlan:
-    """What one scanner will take."""
-
-    name: str
-    cycles: int
-    shots: int
-    rays: int
-    is_cast: bool  # eyepoints are there already
-    seconds_a_ray: float  # on one worker, measured
-    seconds_a_draw: float  # of one shot, with radiometry and navigation
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenePlan:
-    """What a study of a scene will take."""
-
-    scanners: tuple[ScannerPlan, ...]
-    draws: int
-    places: int  # along the axes
-    blocks: int
-    chunks: int
-    bytes: int  # before compression, of the point clouds
-    workers: int
-    seconds: float  # of the whole study, estimated
-    worker_memory: int  # bytes, estimated
-    reports: tuple[str, ...]  # what was mended as the scene was loaded
-
-
-def scene_plan(spec: SceneSpec, *, store: Location, workers: int | None = None) -> ScenePlan:
-    """What a study of a scene will take, from its size and from measuring some of its own shots.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    store
-        Where it would be stored: eyepoints are looked for beside it.
-    workers
-        Workers it would run on; default those of the spec, else all cores.
-    """
-    study = FlightStudy(spec, store.absolute())
-    eyepoints = list(study.eyepoint_studies())
-    scanners = tuple(_scanner(study, each) for each in eyepoints)
-    arrays = [a for a in study.arrays() if a.values is None]
-    chunks = sum(
-        math.prod(-(-n // c) for n, c in zip(a.shape, a.chunks, strict=True)) for a in arrays
-    )
-    workers = workers or spec.execution.workers or cluster.cores()
-    places = math.prod(int(axis.size) for axis in spec.axes)
-    draws = int(spec.draws.number)
-    work = sum(
-        (0 if s.is_cast else s.rays * s.seconds_a_ray) + s.shots * draws * places * s.seconds_a_draw
-        for s in scanners
-    )
-    block = sum(math.prod(a.chunks) * np.dtype(a.dtype).itemsize for a in arrays)
-    return ScenePlan(
-        scanners=scanners,
-        draws=draws,
-        places=places,
-        blocks=study.n_blocks,
-        chunks=chunks,
-        bytes=sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in arrays),
-        workers=workers,
-        seconds=START + (work + chunks * WRITE_CHUNK) / min(workers, study.n_blocks),
-        worker_memory=psutil.Process().memory_info().rss + 2 * block // len(scanners),
-        reports=eyepoints[0].world.reports,
-    )
 
 
 def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:

@@ -1,34 +1,93 @@
-"""Points of an older store that a larger study has too: taken from there, bit for bit.
+"""Results of an older store that a larger study has too: taken from there, bit for bit.
 
-What a point comes to follows from its parameters, its draws and the effects that are simulated,
-and from nothing else. Effects are planned tile by tile, and a larger grid has other tiles: a point
-whose effects are not those of the older store is computed anew.
+A result follows from the parameters at its point, its draws and the effects that are simulated,
+and from nothing else. Points are looked up axis by axis, so that studies of any size cost the
+lengths of their axes. The older store is only read; a block of it that does not match the digest in
+its receipt counts as absent. Points with other effects in the larger study are computed anew.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cache, cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.resolution import by_tolerance
-from sweep.spec import Spec
+from sweep.spec import SceneSpec, Spec, SpecError, difference
 from sweep.spec.grid_rules import is_method
-from sweep.storage import opening
+from sweep.spec.fields import parameter_rules
+from sweep.spec.mistakes import Mistake
+from sweep.storage import sealing
 from sweep.storage.locations import Location
-from sweep.tasks import identity
-from sweep.tasks.calling import EFFECTS, ERROR, TOLERANCE, Called
+from sweep.storage.opening import open_group
+from sweep.tasks import store
+from sweep.tasks.calling import TOLERANCE
 from sweep.tasks.errors import StoreError
-from sweep.tasks.evaluate import no_sums
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.matching import Matching
-from sweep.tasks.older_blocks import DAMAGED, OlderBlocks
-from sweep.tasks.study import Found, Known, Results, together
+from sweep.tasks.grid import Lattice, Value, canonical_rows
+from sweep.tasks.journal import committed, digests
+from sweep.tasks.study import BlockGrid, Results, Study
 
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec
+Declared = Spec | SceneSpec
+
+#: Fields that may grow, and one that may shrink; blocks may be of any size.
+GROWING = ("draws.number", "draws.limit")
+SHRINKING = (TOLERANCE,)
+FREE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
+
+#: Values of an axis that are told where they would be lost.
+MOST_TOLD = 5
+
+#: Blocks of the older store that a process keeps in memory.
+BLOCKS_KEPT = 2
+
+#: Errors of Zarr at a chunk that is not there, or not as it was written.
+DAMAGED = (OSError, ValueError, RuntimeError)
+
+
+class GrowingStudy(Study):
+    """A study that may be extended, and may extend another.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    """
+
+    spec: Any
+
+    def __init__(self, spec: Declared) -> None:
+        self.spec = spec
+        self.look_up: Callable[[], Reuse | None] = lambda: None
+
+    @cached_property
+    def earlier(self) -> Reuse | None:
+        """Results of a smaller study, if any; looked for as the first block is computed."""
+        return self.look_up()
+
+    @property
+    def id(self) -> str:
+        """Hash of the spec's identity."""
+        return str(self.spec.id)
+
+    @abstractmethod
+    def lattice(self, grid: BlockGrid) -> Lattice:
+        """Parameters along the dimensions of one of its grids."""
+
+    @abstractmethod
+    def follows_tolerance(self, block: int) -> np.ndarray | bool:
+        """Which points of a block are computed more closely with a tighter tolerance, (points,)."""
+
+    def home(self, block: int) -> int:
+        """Block with all that the draws of a block have in common."""
+        return block
+
+    def there(self, block: int) -> int:
+        """Points of a block that the smaller study has, if nothing is damaged."""
+        shares = self.earlier.shares(block) if self.earlier else ()
+        return sum(share.points.size for share in shares) * self.find(block)[0].each
 
 
 class Share(NamedTuple):
@@ -37,13 +96,13 @@ class Share(NamedTuple):
     block: int
     """Of the older store."""
     points: np.ndarray
-    """(m,) int64: their numbers in the block."""
+    """(m,) int64: their numbers in C order over the block."""
     place: np.ndarray
     """(m,) int64: their numbers in the older one."""
 
 
-class OlderStore:
-    """What a store knows of a larger study.
+class Reuse:
+    """Results that a store has of a larger study.
 
     Parameters
     ----------
@@ -53,109 +112,93 @@ class OlderStore:
         The larger one.
     """
 
-    def __init__(self, path: Location, older: GridStudy, study: GridStudy) -> None:
-        self._older, self._study = older, study
-        self._blocks = OlderBlocks(path, older)
-        self.taken: dict[int, int] = {}
-        self._is_whole = are_alike(older.spec, study.spec)
-        self._is_begun = not self._is_whole and goes_on(older.spec, study.spec)
+    def __init__(self, path: Location, older: GrowingStudy, study: GrowingStudy) -> None:
+        self._path, self.older, self._study = path, older, study
+        self.taken: dict[int, int] = {}  # points of each block that need not be computed
+        self.is_whole = are_alike(older.spec, study.spec)
+        self.is_begun = not self.is_whole and goes_on(older.spec, study.spec)
+        self._other_tolerance = other_tolerance(older.spec, study.spec)
+        self._digests = digests(path, older.n_blocks)
+        self.read = lru_cache(maxsize=BLOCKS_KEPT)(self._read)
+        self._matching = cache(self._match)
+
+    def shares(self, block: int) -> Iterator[Share]:
+        """The committed older blocks that have points of a block of the larger study."""
+        ours, number = self._study.find(block)
+        older = {grid.group: grid for grid in self.older.grids}
+        if not (self.is_whole or self.is_begun) or ours.group not in older:
+            return
+        theirs, first = older[ours.group], self.older.first_block(ours.group)
+        numbers = self._matching(ours.group).of(ours.block(number))
+        there = numbers >= 0
+        if self._other_tolerance:
+            there = there & ~np.asarray(self._study.follows_tolerance(block))
+        points = np.flatnonzero(there)
+        blocks, place = theirs.locate(numbers[points])
+        for found in np.unique(blocks).tolist():
+            if self._digests[first + found] and self._digests[self.older.home(first + found)]:
+                own = blocks == found
+                yield Share(first + found, points[own], place[own])
+
+    def _match(self, group: str) -> Matching:
+        theirs, ours = (
+            next(study.lattice(grid) for grid in study.grids if grid.group == group)
+            for study in (self.older, self._study)
+        )
+        return Matching(theirs, ours, ignored(self.older.spec, self._study.spec))
+
+    def _read(self, block: int) -> Results | None:
+        """Results of an older block, each with its chunk's shape; None where damaged or lost."""
+        try:
+            objects = store.block_objects(self.older, block)
+            if sealing.digest(self._path, objects).encode() != self._digests[block]:
+                return None
+            return {name: self.chunk(name, block) for name in self.older.chunks(block)}
+        except DAMAGED:
+            return None
+
+    def chunk(self, name: str, block: int) -> np.ndarray:
+        """An older block's chunk of an array, whether damaged or not."""
+        array: Any = self._group[name]
+        return np.asarray(array.blocks[self.older.chunks(block)[name]])
 
     @cached_property
-    def _matching(self) -> Matching:
-        older, study = self._older, self._study
-        return Matching(older.grid, study.grid, ignored(older.spec, study.spec))
-
-    def known(self, block: int, called: Called) -> Known:
-        """What is there of a block of the larger study."""
-        found: list[Found] = []
-        for share in self._shares(block):
-            if (older := self._read(share.block)) is None:
-                continue
-            same = older[EFFECTS][share.place] == called.flags[share.points]
-            results = {name: values[share.place[same]] for name, values in older.items()}
-            found.append(Found(share.points[same], results))
-        together = self._together(found)
-        self.taken[block] = together.points.size if self._is_whole else 0
-        return Known(done=together) if self._is_whole else Known(begun=together)
-
-    def _together(self, found: list[Found]) -> Found:
-        """Outputs found in several blocks, as the larger study has them."""
-        points, results = together(found)
-        outputs = {name: v for name, v in results.items() if name not in (EFFECTS, ERROR)}
-        return Found(points, no_sums(self._study.spec, points.size) | outputs)
-
-    def count(self, block: int) -> int:
-        """Points of a block of which `known` would tell, if nothing is damaged."""
-        called, number = self._study.calling.of_block(block), 0
-        for share in self._shares(block):
-            with suppress(*DAMAGED):
-                flags = self._blocks.chunk(EFFECTS, share.block).ravel()
-                number += int(np.sum(flags[share.place] == called.flags[share.points]))
-        return number
+    def _group(self) -> Any:
+        return open_group(self._path)
 
     def remark(self) -> str:
         """What is not simply taken from it, in words; empty where all of it is."""
-        if not (self._is_whole or self._is_begun):
+        if not (self.is_whole or self.is_begun):
             return "whole spectra are drawn anew"
-        said = ["points that are there are drawn further"] if self._is_begun else []
-        if self._other_tolerance:
+        said = ["points that are there are drawn further"] if self.is_begun else []
+        spec = self._study.spec
+        if self._other_tolerance and isinstance(spec, SceneSpec) and self._shots_stay():
+            said.append("shots that call for more effects with the tolerance are computed anew")
+        elif self._other_tolerance:
+            rays = "footprint.beamlets, " if getattr(spec, "rays_by_tolerance", True) else ""
             said.append(
                 "with the tolerance all is computed more closely, and anew, but where "
-                "footprint.beamlets, accuracy.line_error and accuracy.leakage_error are numbers"
+                f"{rays}accuracy.line_error and accuracy.leakage_error are numbers"
             )
         return "; ".join(said)
 
-    def _shares(self, block: int) -> list[Share]:
-        """The committed older blocks that have points of a block."""
-        if not (self._is_whole or self._is_begun):
-            return []
-        grid = self._older.grid
-        numbers = self._matching.of(self._study.grid.block(block))
-        points = np.flatnonzero((numbers >= 0) & self._same_resolution(block))
-        at = np.unravel_index(numbers[points], grid.shape) if grid.shape else ()
-        blocks, place = np.zeros((2, points.size), np.int64)
-        for k, index in enumerate(at):
-            chunk = grid.block_shape[k]
-            start = index // chunk * chunk
-            blocks = blocks * grid.blocks_along[k] + index // chunk
-            place = place * np.minimum(chunk, grid.shape[k] - start) + index - start
-        return [
-            Share(int(b), points[blocks == b], place[blocks == b])
-            for b in np.unique(blocks)
-            if self._blocks.has(int(b))
-        ]
-
-    @cached_property
-    def _other_tolerance(self) -> bool:
-        return other_tolerance(self._older.spec, self._study.spec)
-
-    def _same_resolution(self, block: int) -> np.ndarray | bool:
-        """Which points of a block are computed as finely here as there, (points,)."""
-        if not self._other_tolerance:
-            return True
-        return ~by_tolerance(self._study.grid.parameters(block))
-
-    def _read(self, block: int) -> Results | None:
-        """Results of an older block, (points, ...) each; None where it is damaged or lost."""
-        size, rank = self._older.block_size(block), len(self._older.grid.shape)
-        found = self._blocks.read(block)
-        return found and {n: v.reshape(size, *v.shape[rank:]) for n, v in found.items()}
+    def _shots_stay(self) -> bool:
+        return not np.any(self._study.follows_tolerance(0))
 
 
-def older_store(path: Location, study: GridStudy) -> OlderStore | None:
-    """What the store at a path knows of a study; None where it is gone, or knows nothing."""
-    try:
-        attributes = opening.read_attributes(path)
-        identity.refuse_other_versions(path, attributes, where="this machine")
-        held = identity.read_spec(path, attributes.get("spec", "{}"))
-    except StoreError:
-        return None
-    if not isinstance(held, Spec) or held.seed != study.spec.seed:
-        return None
-    return OlderStore(path, GridStudy(held), study)
+def what_is_there(path: Location, study: GrowingStudy) -> str:
+    """How many points of a larger study there are, here and in the store that it extends."""
+    done = committed(path, study)
+    there, remark = study.points_in(done), ""
+    if study.earlier is not None:
+        there += sum(study.there(int(block)) for block in np.flatnonzero(~done))
+        remark = study.earlier.remark()
+    told = f"{there:,} of {study.points:,} {study.unit} are there; "
+    told += f"{study.points - there:,} to compute"
+    return f"{told} ({remark})" if remark else told
 
 
-def ignored(older: Spec | SceneSpec, spec: Spec | SceneSpec) -> tuple[str, ...]:
+def ignored(older: Declared, spec: Declared) -> tuple[str, ...]:
     """Parameters in which points may differ that are to be taken for the same.
 
     The tolerance, where neither study varies it, and what looks at spectra where none are drawn.
@@ -166,14 +209,19 @@ def ignored(older: Spec | SceneSpec, spec: Spec | SceneSpec) -> tuple[str, ...]:
     return (*ours, TOLERANCE) if fixed else tuple(ours)
 
 
-def other_tolerance(older: Spec | SceneSpec, spec: Spec | SceneSpec) -> bool:
+def other_tolerance(older: Declared, spec: Declared) -> bool:
     """Whether all points have another tolerance; one on an axis tells points apart."""
     theirs, ours = _tolerance(older), _tolerance(spec)
     return theirs is not None and ours is not None and theirs != ours
 
 
-def are_alike(older: Spec, spec: Spec) -> bool:
-    """Whether points of two studies that are computed as finely have the same results."""
+def are_alike(older: Declared, spec: Declared) -> bool:
+    """Whether points of two studies that are computed as finely have the same results.
+
+    Of a flight each draw stands by itself.
+    """
+    if isinstance(spec, SceneSpec) or isinstance(older, SceneSpec):
+        return True
     if not spec.draws.any:
         return not older.draws.any
     return older.draws == spec.draws and _tolerance(older) == _tolerance(spec)
@@ -197,7 +245,212 @@ def goes_on(older: Spec, spec: Spec) -> bool:
     )
 
 
-def _tolerance(spec: Spec | SceneSpec) -> float | None:
+def _tolerance(spec: Declared) -> float | None:
     """The tolerance of all points; None where an axis varies it."""
     value = spec.parameters_off_axes().get(TOLERANCE)
     return None if value is None else float(value)
+
+
+def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
+    """A study with some of its fields written anew.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    changes
+        Values by dotted path, as in a file: ``{"axes.target.range": ["1 km", "2 km"]}``.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in what comes out; where a path goes through a single value.
+    """
+    written = spec.to_yaml_mapping()
+    for path, value in changes.items():
+        first, _, rest = path.partition(".")
+        if first == "axes":
+            written[first] = {**written.get(first, {}), rest: value}
+            continue
+        *sections, last = path.split(".")
+        section: Any = written
+        for name in sections:
+            section = section.setdefault(name, {}) if isinstance(section, dict) else None
+        if not isinstance(section, dict):
+            parent = ".".join(sections)
+            raise SpecError([Mistake(path, f"is no field: {parent} holds none", str(value))])
+        section[last] = value
+    return type(spec).from_mapping(written, base=getattr(spec, "base", "."))
+
+
+def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:
+    """Refuse what is not a larger study than the one in a store.
+
+    Raises
+    ------
+    StoreError
+        With each field, its rule, its values, and what to do.
+    """
+    if type(older) is not type(spec):
+        raise StoreError(
+            f"{path} can't be extended to this study: a flight over a scene and a study over a "
+            "grid have nothing in common. Run it into a store of its own: "
+            "sweep run SPEC --store NEW"
+        )
+    lines = unlike(older, spec)
+    if lines:
+        listed = "\n".join(f"  {line}" for line in lines)
+        scanners = " new scanners," if _scanners(spec) else ""
+        raise StoreError(
+            f"{path} can't be extended to this study (in the store -> asked for):\n{listed}\n"
+            f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
+            "accuracy.tolerance. Any other study needs a store of its own: "
+            "sweep run SPEC --store NEW"
+        )
+
+
+def unlike(older: Declared, spec: Declared) -> list[str]:
+    """Why a study is no larger one than another of its kind, field by field; empty where it is."""
+    return [*_altered(older, spec), *_lost(older, spec)]
+
+
+def _altered(older: Declared, spec: Declared) -> Iterator[str]:
+    """Fields that are not as they must be."""
+    on_axes = {
+        member.path for each in (older, spec) for axis in each.axes for member in axis.members
+    }
+    for line in difference(older, spec):
+        path = line.partition(": ")[0]
+        section, _, rest = path.partition(".")
+        if path in on_axes or path in FREE or section == "axes":
+            continue
+        if section == "scanners" and rest.partition(".")[0] not in _scanners(older):
+            continue
+        growth = _value(spec, path) - _value(older, path) if path in GROWING + SHRINKING else 0
+        if path in GROWING and not growth > 0 < _value(older, path):
+            yield f"{line}, and may only grow"
+        elif path in SHRINKING and not growth < 0:
+            yield f"{line}, and may only become tighter"
+        elif path not in GROWING + SHRINKING:
+            yield f"{line}, and must stay as it is"
+
+
+def _scanners(spec: Declared) -> Collection[str]:
+    """Names of a flight's scanners; a study over a grid has none."""
+    return getattr(spec, "scanners", ())
+
+
+def _value(spec: Declared, path: str) -> float:
+    section, _, name = path.partition(".")
+    return float(getattr(getattr(spec, section), name))
+
+
+def _lost(older: Declared, spec: Declared) -> Iterator[str]:
+    """Values of the store that the study lacks."""
+    had, grid = Lattice(older), Lattice(spec)
+    varying = {path for each in (had, grid) for values in each.values for path in values}
+    for places in Matching(grid, had, ignored(older, spec)).places:
+        if (places.where >= 0).all() or varying.isdisjoint(places.paths):
+            continue
+        at = np.argwhere(places.where < 0).T
+        told = ", ".join(_told(had, path, at) for path in places.paths)
+        yield f"{told}: lost, and must stay among the values"
+
+
+def _told(grid: Lattice, path: str, at: np.ndarray) -> str:
+    """Values of a parameter at places of a grid, (axes, places)."""
+    values: list[object] = [grid.fixed[path]]
+    for own, index in zip(grid.values, at, strict=True):
+        if path in own:
+            values = own[path][np.unique(index)].tolist()
+    shown = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+    more = ["..."] if len(shown) > MOST_TOLD else []
+    units = parameter_rules()[path].units
+    return f"{path}: {', '.join(shown[:MOST_TOLD] + more)}{f' {units}' if units else ''}"
+
+
+class Places(NamedTuple):
+    """Places of the values of some parameters of one study along an axis of another."""
+
+    paths: tuple[str, ...]
+    axis: int | None
+    """Axis that is looked in; None for parameters that are fixed there."""
+    where: np.ndarray
+    """int64, of the shape that is looked from, but 1 along axes without any of these parameters:
+    index along the axis, -1 where it lacks the values."""
+
+
+class Matching:
+    """Points along the axes of one study by the points of another.
+
+    Axes may be longer, in another order, new, or zipped otherwise.
+
+    Parameters
+    ----------
+    other, grid
+        Those that are looked in, and those that are looked from.
+    ignored
+        Dotted paths of parameters that may differ.
+    """
+
+    def __init__(self, other: Lattice, grid: Lattice, ignored: Collection[str] = ()) -> None:
+        self._other = other
+        self.places = [
+            _places(grid, axis, {path: v for path, v in values.items() if path not in ignored})
+            for axis, values in _parts(other, grid)
+        ]
+
+    def of(self, slices: tuple[slice, ...]) -> np.ndarray:
+        """Numbers, in C order over the other axes, of points in slices along one's own.
+
+        Returns
+        -------
+        ndarray of int64 (points,)
+            -1 of those that are not there.
+        """
+        numbers = np.zeros((1,) * len(slices), np.int64)
+        lacking = np.zeros((1,) * len(slices), bool)
+        for places in self.places:
+            varies = [size > 1 for size in places.where.shape]
+            part = (s if v else slice(None) for s, v in zip(slices, varies, strict=True))
+            index = places.where[tuple(part)]
+            lacking = lacking | (index < 0)
+            if places.axis is not None:
+                numbers = numbers + index * math.prod(self._other.shape[places.axis + 1 :])
+        numbers = np.where(lacking, -1, numbers)
+        return np.broadcast_to(numbers, [s.stop - s.start for s in slices]).ravel()
+
+
+def _parts(other: Lattice, grid: Lattice) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
+    """Parameters that are looked up together: those of each axis, and all that are fixed."""
+    yield from enumerate(other.values)
+    on_axes = {path for values in other.values for path in values}
+    fixed = {path: np.array([v]) for path, v in other.fixed.items() if path not in on_axes}
+    for values in grid.values:
+        yield None, {path: fixed.pop(path) for path in values if path in fixed}
+    yield None, fixed
+
+
+def _places(grid: Lattice, axis: int | None, values: dict[str, np.ndarray]) -> Places:
+    """Places of a grid's values among others of the same parameters, which go together."""
+    along = [k for k, own in enumerate(grid.values) if not own.keys().isdisjoint(values)]
+    shape = tuple(size if k in along else 1 for k, size in enumerate(grid.shape))
+    index = [i.ravel() for i in np.indices([grid.shape[k] for k in along])]
+    wanted: dict[str, Value] = {path: grid.fixed[path] for path in values if path in grid.fixed}
+    for k, i in zip(along, index, strict=True):
+        wanted |= {path: a[i] for path, a in grid.values[k].items() if path in values}
+    number = len(next(iter(values.values()))) if values else 1
+    rows = canonical_rows(values, number)
+    found = _looked_up(rows, canonical_rows(wanted, math.prod(shape)))
+    return Places(tuple(values), axis, found.reshape(shape))
+
+
+def _looked_up(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Index of each wanted row, (m,), among rows (n, columns); -1 of those that are not there."""
+    if not rows.shape[1]:
+        return np.zeros(len(wanted), np.int64)
+    both = np.concatenate([rows, wanted]).view(np.uint64)
+    codes = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    place = np.full(len(both), -1)
+    place[codes[: len(rows)]] = np.arange(len(rows))
+    return place[codes[len(rows) :]]

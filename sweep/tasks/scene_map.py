@@ -8,8 +8,7 @@ import numpy as np
 
 from sweep.model.geometry.rays import Pose
 from sweep.tasks.eyepoint_study import world_of
-from sweep.tasks.grid_study import described
-from sweep.tasks.study import ArrayLayout
+from sweep.tasks.study import FILLS, ArrayLayout, described
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec
@@ -57,9 +56,12 @@ class SceneMap(NamedTuple):
     def arrays(self) -> list[ArrayLayout]:
         """Arrays of a store that hold the map."""
         return [
-            _whole("map_x", ("map_x",), self.x, "x of the map's nodes"),
-            _whole("map_y", ("map_y",), self.y, "y of the map's nodes"),
-            _whole("map_height", ("map_y", "map_x"), self.height, "height seen from above"),
+            ArrayLayout.known(name, dims, values, described("m", long_name), fill=FILLS["f"])
+            for name, dims, values, long_name in (
+                ("map_x", ("map_x",), self.x, "x of the map's nodes"),
+                ("map_y", ("map_y",), self.y, "y of the map's nodes"),
+                ("map_height", ("map_y", "map_x"), self.height, "height seen from above"),
+            )
         ]
 
 
@@ -105,16 +107,3 @@ def _nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     middle = (low + high) / 2
     x, y = (m + step * (np.arange(n) - (n - 1) / 2) for m, n in zip(middle, count, strict=True))
     return x, y
-
-
-def _whole(name: str, dims: tuple[str, ...], values: np.ndarray, long_name: str) -> ArrayLayout:
-    return ArrayLayout(
-        name=name,
-        shape=values.shape,
-        chunks=values.shape,
-        dims=dims,
-        dtype="float64",
-        fill=float("nan"),
-        attributes=described("m", long_name, ""),
-        values=values,
-    )

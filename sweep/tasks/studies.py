@@ -6,17 +6,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.scenes.files import SceneError
+from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, located
-from sweep.storage.opening import read_attributes
+from sweep.tasks import identity
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_reuse import older_flight
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.identity import read_spec
 from sweep.tasks.recipe import EXTENDS, read_recipe
-from sweep.tasks.reuse import older_store
+from sweep.tasks.reuse import Reuse, unlike
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -32,18 +32,27 @@ def study_of(
 ) -> GridStudy | FlightStudy:
     """The study that a spec declares, to be stored at a path.
 
-    Parameters
-    ----------
-    spec, path
-        The study and its place.
-    extends
-        The store of a smaller one, whose results are taken; by default there is none.
+    ``extends``: the store of a smaller one, whose results are taken; by default there is none.
     """
     from sweep.spec import SceneSpec
 
-    if isinstance(spec, SceneSpec):
-        return FlightStudy(spec, path, partial(older_flight, extends) if extends else None)
-    return GridStudy(spec, partial(older_store, extends) if extends else None)
+    study = FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
+    if extends:
+        study.look_up = partial(_reuse, extends, study)
+    return study
+
+
+def _reuse(path: Location, study: GridStudy | FlightStudy) -> Reuse | None:
+    """Results that the store at a path has of a study; None where it is gone, or has none."""
+    try:
+        attributes = opening.read_attributes(path)
+        identity.refuse_other_versions(path, attributes, where="this machine")
+        spec = _spec(path, read_recipe(path), attributes.get("spec", "{}"))
+        if type(spec) is not type(study.spec) or unlike(spec, study.spec):
+            return None
+        return Reuse(path, study_of(spec, path), study)
+    except (StoreError, SceneError):
+        return None
 
 
 def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
@@ -54,7 +63,7 @@ def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
     StoreError
         Where there is no store, or not one of this program's, or one it can't read.
     """
-    attributes = read_attributes(path)
+    attributes = opening.read_attributes(path)
     if attributes["kind"] == ACCURACY:
         raise StoreError(f"{path} holds what accuracy costs, no study: sweep figures draws it")
     return attributes, described(path, attributes)
@@ -69,15 +78,24 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
         Where this program can't read it.
     """
     recipe = read_recipe(path)
-    base = Path(recipe["base"]) if "base" in recipe else None
     if attributes["kind"] == "eyepoints":
-        return _eyepoints(path, recipe, base)
-    spec = read_spec(path, attributes["spec"], base)
+        if "spec" not in recipe:
+            raise StoreError(
+                f"{path} does not say how its eyepoints were made: run their study again"
+            )
+        return EyepointStudy(_spec(path, recipe, recipe["spec"]), recipe["scanner"])
+    spec = _spec(path, recipe, attributes["spec"])
     extends = located(recipe[EXTENDS]) if EXTENDS in recipe else None
     return study_of(spec, path, extends if extends != real(path) else None)
 
 
-def _eyepoints(path: Location, recipe: dict[str, Any], base: Path | None) -> EyepointStudy:
-    if "spec" not in recipe:
-        raise StoreError(f"{path} does not say how its eyepoints were made: run their study again")
-    return EyepointStudy(read_spec(path, recipe["spec"], base), recipe["scanner"])  # type: ignore[arg-type]
+def _spec(path: Location, recipe: dict[str, Any], text: str) -> Any:
+    """A spec that a store holds; StoreError where this program can't read it."""
+    from sweep.spec import SpecError, from_stored
+
+    try:
+        return from_stored(text, base=Path(recipe["base"]) if "base" in recipe else None)
+    except (SpecError, ValueError) as error:
+        raise StoreError(
+            f"{path} holds a spec that this version of sweep can't read:\n{error}"
+        ) from error

@@ -1,15 +1,395 @@
-"""What every kind of study is to those that run it: blocks, and arrays that take them."""
+"""Studies as blocks: arrays with named dimensions, cut into chunks, whole ones for each block.
+
+A :class:`BlockGrid` cuts points into blocks. An array follows it along the dimensions that it has,
+so that which chunks a block owns needs no further rule::
+
+    blocks of (y, x)       array (y, x)           array (x,)
+    +---+---+---+          +---+---+---+
+    | 0 | 1 | 2 |          | 0 | 1 | 2 |          +---+---+---+
+    +---+---+---+          +---+---+---+          | 0 | 1 | 2 |
+    | 3 | 4 | 5 |          | 3 | 4 | 5 |          +---+---+---+
+    +---+---+---+          +---+---+---+
+
+Of what lacks a dimension the first block along it is the owner. A grid's dimensions are its axes; a
+flight has a grid for each scanner, of (axes, draw, cycle); eyepoints have (cycle).
+"""
 
 from __future__ import annotations
 
+import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from sweep.model.outputs import Output
+
 Results = dict[str, np.ndarray]
+
+#: Fill of arrays by the kind of their numbers: a count or a surface's number is never negative.
+FILLS = {"f": float("nan"), "i": -1, "u": 0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayLayout:
+    """An array of a store.
+
+    Parameters
+    ----------
+    name
+        Its path inside the store, ``range`` or ``group/range``.
+    shape, chunks, dims, dtype
+        As Zarr has them; text has the type ``string``.
+    fill
+        Value of what is not written.
+    attributes
+        Units, name in words and so on.
+    values
+        Content, where it is known as the store is made; else blocks write it.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dims: tuple[str, ...]
+    dtype: str
+    fill: float | int | str | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    values: np.ndarray | None = None
+
+    @classmethod
+    def known(
+        cls,
+        name: str,
+        dims: tuple[str, ...],
+        values: np.ndarray,
+        attributes: Mapping[str, Any],
+        *,
+        fill: float | None = None,
+    ) -> ArrayLayout:
+        """An array whose values are known as the store is made, in a single chunk."""
+        text = values.dtype.kind in "UOT"
+        return cls(
+            name=name, shape=values.shape, chunks=values.shape, dims=dims,
+            dtype="string" if text else str(values.dtype), fill=fill, attributes=attributes,
+            values=values.astype(object) if text else values,
+        )  # fmt: skip
+
+
+def described(units: str, long_name: str, comment: str = "") -> dict[str, str]:
+    """Attributes that say what an array holds."""
+    attributes = {"units": units, "long_name": long_name}
+    return attributes | ({"comment": comment} if comment else {})
+
+
+class BlockGrid:
+    """Points cut into blocks along named dimensions, the last one fastest.
+
+    Parameters
+    ----------
+    dims, shape, block_shape
+        Names of the dimensions, and steps along each: of all points, and of a block.
+    group
+        Group of the store that its arrays are in; empty for the root.
+    finer, each
+        Dimension that divides every step of the last one, and into how many: shots of a cycle.
+
+    Examples
+    --------
+    >>> grid = BlockGrid(("y", "x"), (4, 5), (2, 2))
+    >>> grid.n_blocks, grid.position(5), grid.block(5), grid.block_size(5)
+    (6, (1, 2), (slice(2, 4, None), slice(4, 5, None)), 2)
+    """
+
+    def __init__(
+        self,
+        dims: tuple[str, ...],
+        shape: tuple[int, ...],
+        block_shape: tuple[int, ...],
+        *,
+        group: str = "",
+        finer: str = "",
+        each: int = 1,
+    ) -> None:
+        self.dims, self.shape, self.block_shape = dims, shape, block_shape
+        self.group, self.finer, self.each = group, finer, each
+        self.along = tuple(-(-n // chunk) for n, chunk in zip(shape, block_shape, strict=True))
+        self.n_blocks = math.prod(self.along)
+
+    @property
+    def points(self) -> int:
+        """Number of points of all blocks."""
+        return math.prod(self.shape) * self.each
+
+    def position(self, block: int) -> tuple[int, ...]:
+        """Position of a block among the blocks.
+
+        Raises
+        ------
+        IndexError
+            Where there is no such block.
+        """
+        if not 0 <= block < self.n_blocks:
+            raise IndexError(f"block {block} of {self.n_blocks}")
+        return tuple(int(i) for i in np.unravel_index(block, self.along))
+
+    def number(self, position: tuple[int, ...]) -> int:
+        """Number of the block at a position."""
+        return int(np.ravel_multi_index(position, self.along)) if position else 0
+
+    def block(self, block: int) -> tuple[slice, ...]:
+        """Slices of a block along each dimension, cut at the edge of the grid."""
+        return tuple(
+            slice(p * chunk, min((p + 1) * chunk, size))
+            for p, chunk, size in zip(
+                self.position(block), self.block_shape, self.shape, strict=True
+            )
+        )
+
+    def extent(self, block: int) -> tuple[int, ...]:
+        """Steps of a block along each dimension."""
+        return tuple(s.stop - s.start for s in self.block(block))
+
+    def block_size(self, block: int) -> int:
+        """Number of points of a block."""
+        return math.prod(self.extent(block)) * self.each
+
+    def points_in(self, blocks: np.ndarray) -> int:
+        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
+        marked = np.asarray(blocks, bool).reshape(self.along)
+        for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
+            marked = marked @ np.minimum(chunk, size - np.arange(0, size, chunk))
+        return int(marked) * self.each
+
+    def locate(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks of points, which are given in C order over the grid, and places in these."""
+        blocks, place = np.zeros((2, numbers.size), np.int64)
+        index = np.unravel_index(numbers, self.shape) if self.shape else ()
+        for i, size, chunk, along in zip(
+            index, self.shape, self.block_shape, self.along, strict=True
+        ):
+            start = i // chunk * chunk
+            blocks = blocks * along + i // chunk
+            place = place * np.minimum(chunk, size - start) + i - start
+        return blocks, place
+
+    def array(
+        self,
+        name: str,
+        output: Output,
+        dims: tuple[str, ...],
+        sizes: Mapping[str, int],
+        attributes: Mapping[str, Any] | None = None,
+    ) -> ArrayLayout:
+        """An array of the model's, cut along the dimensions that follow the grid.
+
+        ``sizes``: of its further dimensions, along which it is whole.
+        """
+        whole = dict(sizes) | dict(zip(self.dims, self.shape, strict=True))
+        cut = dict(sizes) | dict(zip(self.dims, self.block_shape, strict=True))
+        if self.finer:
+            last = self.dims[-1]
+            whole[self.finer], cut[self.finer] = whole[last] * self.each, cut[last] * self.each
+        described_ = described(output.units, output.long_name, output.comment)
+        return ArrayLayout(
+            name=f"{self.group}/{name}" if self.group else name,
+            shape=tuple(whole[dim] for dim in dims),
+            chunks=tuple(cut[dim] for dim in dims),
+            dims=dims,
+            dtype=output.dtype,
+            fill=FILLS[output.dtype[0]],
+            attributes=described_ if attributes is None else attributes,
+        )
+
+    def follows(self, layout: ArrayLayout) -> tuple[int | None, ...]:
+        """Dimension of the grid that each of an array's dimensions follows; None for none."""
+        place: dict[str, int] = {self.finer: len(self.dims) - 1} if self.finer else {}
+        place |= {dim: k for k, dim in enumerate(self.dims)}
+        return tuple(place.get(dim) for dim in layout.dims)
+
+    def owners(self, layout: ArrayLayout) -> np.ndarray:
+        """Block that writes each chunk of an array, in the shape of its grid of chunks."""
+        follows = self.follows(layout)
+        blocks = np.arange(self.n_blocks).reshape(self.along)
+        own = blocks[tuple(slice(None) if k in follows else 0 for k in range(len(self.dims)))]
+        order = [k for k in follows if k is not None]
+        turned = own.transpose(np.argsort(np.argsort(order)))
+        return turned.reshape([1 if k is None else self.along[k] for k in follows])
+
+
+class Content(Protocol):
+    """Anything that a store is made of."""
+
+    @property
+    def id(self) -> str:
+        """Hash of all that its results depend on."""
+
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of its store, but for versions; the same wherever it is made."""
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """Groups of its store and their attributes."""
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Every array of its store."""
+
+
+class Study(ABC):
+    """A study as the driver and its workers see it.
+
+    No two blocks share a chunk of any array, and every chunk belongs to a block. Blocks are
+    numbered grid by grid.
+    """
+
+    unit = "points"
+    """Name of its points, in the plural."""
+
+    @property
+    @abstractmethod
+    def id(self) -> str:
+        """Hash of all that its results depend on."""
+
+    @abstractmethod
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of its store, but for versions; the same wherever it is made."""
+
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """Groups of its store and their attributes."""
+        return {}
+
+    @property
+    @abstractmethod
+    def grids(self) -> Sequence[BlockGrid]:
+        """Blocks of each group of its store."""
+
+    @abstractmethod
+    def known_arrays(self) -> list[ArrayLayout]:
+        """Arrays whose values are known as the store is made."""
+
+    @abstractmethod
+    def outputs(self) -> list[ArrayLayout]:
+        """Arrays that blocks write."""
+
+    @abstractmethod
+    def evaluate(self, block: int) -> Results:
+        """Results of a block by the names of its arrays, each with its chunk's shape."""
+
+    @abstractmethod
+    def compile(self) -> None:
+        """Compile what evaluation compiles, so that workers find it on disk."""
+
+    def arrays(self) -> list[ArrayLayout]:
+        """Every array of its store."""
+        return [*self.known_arrays(), *self.layouts.values()]
+
+    @cached_property
+    def layouts(self) -> dict[str, ArrayLayout]:
+        """Arrays that blocks write, by name."""
+        return {layout.name: layout for layout in self.outputs()}
+
+    @property
+    def n_chunks(self) -> int:
+        """Number of chunks of all blocks."""
+        return sum(
+            math.prod(-(-n // chunk) for n, chunk in zip(a.shape, a.chunks, strict=True))
+            for a in self.layouts.values()
+        )
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all results, before compression."""
+        return sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in self.layouts.values())
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of the results of the largest block, before compression."""
+        of_groups = dict.fromkeys((grid.group for grid in self.grids), 0)
+        for a in self.layouts.values():
+            size = math.prod(a.chunks) * np.dtype(a.dtype).itemsize
+            of_groups[a.name.rpartition("/")[0]] += size
+        return max(of_groups.values())
+
+    @property
+    def points(self) -> int:
+        """Number of points of all blocks."""
+        return sum(grid.points for grid in self.grids)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return sum(grid.n_blocks for grid in self.grids)
+
+    def find(self, block: int) -> tuple[BlockGrid, int]:
+        """The grid that a block is of, and its number there.
+
+        Raises
+        ------
+        IndexError
+            Where there is no such block.
+        """
+        number = block
+        for grid in self.grids:
+            if 0 <= number < grid.n_blocks:
+                return grid, number
+            number -= grid.n_blocks
+        raise IndexError(f"block {block} of {self.n_blocks}")
+
+    def first_block(self, group: str) -> int:
+        """Number of the first block of a group."""
+        before = [grid.group for grid in self.grids].index(group)
+        return sum(grid.n_blocks for grid in self.grids[:before])
+
+    def block_size(self, block: int) -> int:
+        """Points of a block."""
+        grid, number = self.find(block)
+        return grid.block_size(number)
+
+    def points_in(self, blocks: np.ndarray) -> int:
+        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
+        marked = np.split(blocks, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
+        return sum(grid.points_in(part) for grid, part in zip(self.grids, marked, strict=True))
+
+    @cached_property
+    def _follows(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
+        """Dimensions that arrays follow, by group and name."""
+        found: dict[str, dict[str, tuple[int | None, ...]]] = {g.group: {} for g in self.grids}
+        grids = {grid.group: grid for grid in self.grids}
+        for name, layout in self.layouts.items():
+            group = name.rpartition("/")[0]
+            found[group][name] = grids[group].follows(layout)
+        return found
+
+    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
+        """Chunks that a block writes, whole: the position of one in each of some arrays."""
+        grid, number = self.find(block)
+        position = grid.position(number)
+        apart = {k for k, at in enumerate(position) if at}  # of these an array must have them all
+        return {
+            name: tuple(0 if k is None else position[k] for k in follows)
+            for name, follows in self._follows[grid.group].items()
+            if apart.issubset(follows)
+        }
+
+    def owners(self) -> dict[str, np.ndarray]:
+        """Block that writes each chunk, in the shape of the grid of chunks, of every output."""
+        grids = {grid.group: (self.first_block(grid.group), grid) for grid in self.grids}
+        found = {}
+        for name, layout in self.layouts.items():
+            first, grid = grids[name.rpartition("/")[0]]
+            found[name] = first + grid.owners(layout)
+        return found
+
+
+class Evaluate(Protocol):
+    """Computes a block in place of the study itself, with the same results."""
+
+    def __call__(self, study: Any, block: int) -> Results:
+        """Results of one block by name."""
 
 
 class Found(NamedTuple):
@@ -25,7 +405,7 @@ NONE_FOUND = Found(np.zeros(0, np.int64), {})
 
 
 class Known(NamedTuple):
-    """What is known of a block before it is computed."""
+    """Results of a block that are there before it is computed."""
 
     done: Found = NONE_FOUND
     """Points that need not be computed."""
@@ -46,12 +426,12 @@ def together(found: Sequence[Found]) -> Found:
 
 @dataclass
 class Stop:
-    """Time that a piece of a block's work may take: asked between draws whether it is over."""
+    """End of the time that a piece of a block's work may take, asked for between draws."""
 
     at: float = float("inf")
     """By `time.monotonic`."""
     told: bool = False
-    """Tell whether it was over when asked."""
+    """True once it was over when asked."""
 
     def __call__(self) -> bool:
         """Tell whether the time is over."""
@@ -65,96 +445,3 @@ class Unfinished(Exception):
     def __init__(self, known: Known, points: float) -> None:
         super().__init__()
         self.known, self.points = known, points
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArrayLayout:
-    """An array of a store.
-
-    Parameters
-    ----------
-    name
-        Its path inside the store, ``range`` or ``group/range``.
-    shape, chunks, dims, dtype
-        As Zarr has them; text has the type ``string``.
-    fill
-        What stands where nothing is written.
-    attributes
-        Units, name in words and so on.
-    values
-        What it holds, where that is known as the store is made; else blocks write it.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    dims: tuple[str, ...]
-    dtype: str
-    fill: float | int | str | None = None
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    values: np.ndarray | None = None
-
-    def within(self, group: str) -> ArrayLayout:
-        """The same array in a group."""
-        return replace(self, name=f"{group}/{self.name}")
-
-
-class Content(Protocol):
-    """What a store is made of."""
-
-    @property
-    def id(self) -> str:
-        """Hash of all that its results depend on."""
-
-    def attributes(self) -> dict[str, Any]:
-        """What its store says of it, but for versions; the same wherever it is made."""
-
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """Groups of its store and their attributes."""
-
-    def arrays(self) -> list[ArrayLayout]:
-        """Every array of its store."""
-
-
-class Study(Content, Protocol):
-    """A study as the driver and its workers see it.
-
-    No two blocks share a chunk of any array, and every chunk belongs to a block.
-    """
-
-    @property
-    def unit(self) -> str:
-        """What its points are called, in the plural."""
-
-    @property
-    def points(self) -> int:
-        """Number of points of all blocks."""
-
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-
-    def block_size(self, block: int) -> int:
-        """Points of a block."""
-
-    def points_in(self, blocks: np.ndarray) -> int:
-        """Points in the blocks that are marked in an ndarray of bool (blocks,)."""
-
-    def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
-        """Chunks that a block writes, whole: the position of one in each of some arrays."""
-
-    def owners(self) -> dict[str, np.ndarray]:
-        """Block that writes each chunk, in the shape of the grid of chunks, of every such array."""
-
-    def evaluate(self, block: int) -> Results:
-        """Results of a block by the names of its arrays, each with its chunk's shape."""
-
-    def compile(self) -> None:
-        """Compile what evaluation compiles, so that workers find it on disk."""
-
-
-class Evaluate(Protocol):
-    """What computes a block in place of the study itself, with the same results."""
-
-    def __call__(self, study: Any, block: int) -> Results:
-        """Results of one block by name."""

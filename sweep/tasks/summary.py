@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +15,9 @@ from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.evaluate import evaluate_points, select, with_few_draws
-from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import receipted
-from sweep.tasks.stretches import Part, Stretches
 
 if TYPE_CHECKING:
     from sweep.spec import Axis
@@ -47,6 +46,17 @@ class Row:
     pd_shot: float  # medians
     pd_doppler: float
 
+    @classmethod
+    def of(cls, part: str, shot: np.ndarray, doppler: np.ndarray) -> Row:
+        """The row of some points, (n,) each; there may be no Doppler segment."""
+        known = ~np.isnan(shot)
+        shot, doppler = shot[known], doppler[known & np.isfinite(doppler)]
+        if not shot.size:
+            return cls(part, 0, float("nan"), float("nan"), float("nan"))
+        median = float(np.median(doppler)) if doppler.size else float("nan")
+        detected = float(np.mean(shot > DETECTED))
+        return cls(part, shot.size, detected, float(np.median(shot)), median)
+
 
 def summary(store: str | Location) -> tuple[str, list[Row], float]:
     """Heading and rows of the table.
@@ -69,22 +79,24 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         raise StoreError(f"{path} holds no study over a grid")
-    spec, grid = study.spec, study.grid
     done = done_blocks(path, study)
-    blocks = _some(done, int(np.prod(grid.block_shape)))
-    parts = list(_parts(spec.axes[0])) if grid.shape else [("all", slice(None))]
-    found: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in parts]
-    for place, values in pieces(path, study, ("pd_shot", "pd_doppler"), blocks):
-        both = np.stack(values)
-        for into, (_, part) in zip(found, parts, strict=True):
-            into.append(_within(both, place, part))
-    of_parts = [np.concatenate(each, axis=1) for each in found]
-    rows = [_row("all", *np.concatenate(of_parts, axis=1))]
+    blocks = _some(done, int(np.prod(study.grid.block_shape)))
     share = len(blocks) / max(len(done), 1)
-    if not grid.shape:
-        return "", rows, share
-    told = [_row(name, *values) for (name, _), values in zip(parts, of_parts, strict=True)]
-    return _heading(spec.axes[0]), [*told, *rows], share
+    axis = study.spec.axes[0] if study.spec.axes else None
+    edges = _edges(axis) if axis else np.array([0, 1])
+    found: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in edges[1:]]
+    for place, values in pieces(path, study, ("pd_shot", "pd_doppler"), blocks):
+        both = np.stack(values).reshape(2, -1, *values[0].shape[1:])
+        numbers = np.arange(both.shape[1]) + (place[0].start if place else 0)
+        for into, (first, stop) in zip(found, pairwise(edges), strict=True):
+            into.append(both[:, (first <= numbers) & (numbers < stop)].reshape(2, -1))
+    of_parts = [np.concatenate(each, axis=1) for each in found]
+    whole = Row.of("all", *np.concatenate(of_parts, axis=1))
+    if axis is None:
+        return "", [whole], share
+    names = [_name(axis, first, stop) for first, stop in pairwise(edges)]
+    rows = [Row.of(name, *values) for name, values in zip(names, of_parts, strict=True)]
+    return _heading(axis), [*rows, whole], share
 
 
 def beyond_model(store: str | Location) -> tuple[int, str]:
@@ -114,14 +126,6 @@ def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
     return "it is not any more"
 
 
-def _within(values: np.ndarray, place: tuple[slice, ...], part: slice) -> np.ndarray:
-    """Of two arrays of a block, what lies in a part of the first axis, (2, points)."""
-    if place:
-        start = place[0].start
-        values = values[:, max(part.start - start, 0) : max(part.stop - start, 0)]
-    return values.reshape(2, -1)
-
-
 def _some(done: np.ndarray, block_points: int) -> np.ndarray:
     """Blocks to look at, rising: all, or as many as may be, drawn by chance but always the same."""
     most = min(MOST_BLOCKS, max(MOST_POINTS // block_points, 1))
@@ -137,11 +141,9 @@ def _heading(axis: Axis) -> str:
     return f"{axis.name} [{axis.members[0].units}]"
 
 
-def _parts(axis: Axis) -> Iterator[tuple[str, slice]]:
-    """Parts of an axis: its values, or stretches of them where there are many."""
-    edges = np.linspace(0, axis.size, min(axis.size, MOST_ROWS) + 1).astype(int)
-    for start, stop in pairwise(edges):
-        yield _name(axis, start, stop), slice(start, stop)
+def _edges(axis: Axis) -> np.ndarray:
+    """Edges of the parts of an axis: its values, or stretches of them where there are many."""
+    return np.linspace(0, axis.size, min(axis.size, MOST_ROWS) + 1).astype(int)
 
 
 def _name(axis: Axis, start: int, stop: int) -> str:
@@ -153,26 +155,6 @@ def _name(axis: Axis, start: int, stop: int) -> str:
 
 def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _row(part: str, shot: np.ndarray, doppler: np.ndarray) -> Row:
-    known = ~np.isnan(shot)
-    shot, doppler = shot[known], doppler[known]
-    if not shot.size:
-        return Row(part, 0, float("nan"), float("nan"), float("nan"))
-    return Row(
-        part,
-        int(shot.size),
-        float(np.mean(shot > DETECTED)),
-        _median(shot),
-        _median(doppler),
-    )
-
-
-def _median(values: np.ndarray) -> float:
-    """Median of what there is; nan where there is nothing (no Doppler segment)."""
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if there.size else float("nan")
 
 
 def done_blocks(store: Location, study: GridStudy) -> np.ndarray:
@@ -209,6 +191,27 @@ class SceneRow:
         seen = np.concatenate([*self.chances, np.empty(0)])
         return float(seen.mean()) if seen.size else float("nan")
 
+    def add(self, arrays: Any, blocks: ScannerBlocks, part: Part) -> None:
+        """Count a block."""
+        from sweep.model.navigation import EXCLUDED
+        from sweep.model.pairing import TRUE
+
+        shots, cycles, draws = (
+            slice(*edges(part))
+            for edges in (blocks.shot_range, blocks.cycle_range, blocks.draw_range)
+        )
+        flags = np.asarray(arrays["flags"][*part.axes, shots, draws])
+        self.shots += flags[..., 0].size
+        self.true += int(((flags & TRUE) > 0).any(axis=-1).sum())
+        self.false += int(((flags > 0) & ((flags & TRUE) == 0)).sum())
+        if part.draws == 0:
+            chance = np.asarray(arrays["pd_shot"][*part.axes, shots])
+            self.chances.append(chance[np.isfinite(chance)])
+        if blocks.navigates:
+            status = np.asarray(arrays["velocity_status"][*part.axes, cycles, draws])
+            self.cycles += status.size
+            self.solved += int((status <= EXCLUDED).sum())
+
 
 def scene_summary(store: str | Location) -> list[SceneRow]:
     """A row for each scanner and each place along the axes, or for each scanner where there are
@@ -223,56 +226,25 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
     _, study = studies.read(path)
     if not isinstance(study, FlightStudy):
         raise StoreError(f"{path} holds no study of a scene")
-    done = receipted(path, study)
-    rows: list[SceneRow] = []
-    first = 0
-    for stretches in study.scanners.values():
-        numbers = np.flatnonzero(done[first : first + stretches.number])
-        parts = [stretches.part(int(number)) for number in numbers]
-        rows += _scene_rows(path, study, stretches, parts)
-        first += stretches.number
-    return rows
+    places = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
+    apart = len(places) <= MOST_PLACES
+    rows = {
+        (scanner, place): SceneRow(", ".join([scanner, *_words(study.spec.axes, place)]))
+        for scanner in study.scanners
+        for place in (places if apart else [()])
+    }
+    group: Any = open_group(path)
+    for block in np.flatnonzero(receipted(path, study)).tolist():
+        blocks, part = study.part(block)
+        row = rows[part.scanner, part.axes if apart else ()]
+        row.add(group[part.scanner], blocks, part)
+    return list(rows.values())
 
 
-def _scene_rows(
-    path: Location, study: FlightStudy, stretches: Stretches, done: list[Part]
-) -> Iterator[SceneRow]:
-    places = list(product(*map(range, stretches.axes)))
-    if len(places) > MOST_PLACES:
-        yield _scene_row(path, stretches, stretches.scanner, done)
-        return
-    for place in places:
-        words = [
-            f"{member.name} {_shown(member.display[index])}{' ' * bool(member.units)}{member.units}"
-            for axis, index in zip(study.spec.axes, place, strict=True)
-            for member in axis.members
-        ]
-        part = ", ".join([stretches.scanner, *words])
-        yield _scene_row(path, stretches, part, [each for each in done if each.axes == place])
-
-
-def _scene_row(path: Location, stretches: Stretches, part: str, done: list[Part]) -> SceneRow:
-    from sweep.model.navigation import EXCLUDED
-    from sweep.model.pairing import TRUE
-
-    arrays: Any = open_group(path)[stretches.scanner]
-    flags, pd = arrays["flags"], arrays["pd_shot"]
-    status = arrays["velocity_status"] if stretches.navigates else None
-    row = SceneRow(part)
-    for block in done:
-        shots, cycles, draws = (
-            slice(*edges(block))
-            for edges in (stretches.shot_range, stretches.cycle_range, stretches.draw_range)
-        )
-        found = np.asarray(flags[*block.axes, shots, draws])
-        row.shots += found[..., 0].size
-        row.true += int(((found & TRUE) > 0).any(axis=-1).sum())
-        row.false += int(((found > 0) & ((found & TRUE) == 0)).sum())
-        if block.draws == 0:
-            chance = np.asarray(pd[*block.axes, shots])
-            row.chances.append(chance[np.isfinite(chance)])
-        if status is not None:
-            solved = np.asarray(status[*block.axes, cycles, draws])
-            row.cycles += solved.size
-            row.solved += int((solved <= EXCLUDED).sum())
-    return row
+def _words(axes: Sequence[Axis], place: tuple[int, ...]) -> list[str]:
+    """Values at a place along axes; of its first axes, where there are more."""
+    return [
+        f"{member.name} {_shown(member.display[index])}{' ' * bool(member.units)}{member.units}"
+        for axis, index in zip(axes, place, strict=False)
+        for member in axis.members
+    ]

@@ -13,9 +13,8 @@ from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.plan import scene_plan
-from sweep.tasks.stretches import Part
+from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.plan import plan
 from sweep.tasks.study import Results
 
 UNIT = 1e-9
@@ -37,7 +36,7 @@ def judge_flight(file: Path) -> Verdict:
             study = FlightStudy(spec, file.with_suffix(".zarr"))
             for eyepoints in study.eyepoint_studies():
                 _look_through(study, eyepoints)
-            scene_plan(spec, store=file.with_suffix(".zarr"))
+            plan(spec, store=file.with_suffix(".zarr"))
         except SceneError as error:
             # Of a field of the spec, or of a file that the scene names.
             assert error.rule and error.remedy, f"no remedy: {error}"

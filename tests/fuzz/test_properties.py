@@ -19,9 +19,8 @@ from random_studies import drop, mended, studies
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import SceneSpec, Spec, SpecError, from_stored
-from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.flight_study import FlightStudy, Part
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.stretches import Part
 
 SOME = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),

@@ -16,7 +16,7 @@ from sweep.tasks.accuracy.bench import GridBench, Seen, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
 from sweep.tasks.accuracy.run import measure as measured
 from sweep.tasks.errors import StoreError
-from sweep.tasks.stretches import Part
+from sweep.tasks.flight_study import Part
 from sweep.tasks.studies import study_of
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}

@@ -5,10 +5,9 @@ import pytest
 from small import small
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
-from sweep.tasks.calling import Called, Calling, _stretches
+from sweep.tasks.calling import TILE_POINTS, Called, Calling, Tiles, _stretches, tile_shape
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.tiles import TILE_POINTS, Tiles, tile_shape
 
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 WIDE = {

@@ -17,7 +17,7 @@ from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
 from sweep.report.asked import accuracy
 from sweep.spec import SceneSpec
-from sweep.tasks import finer_rays
+from sweep.tasks import eyepoint_study
 from sweep.tasks.accuracy_table import rays_table
 from sweep.tasks.driver import extend
 from sweep.tasks.errors import StoreError
@@ -169,11 +169,11 @@ def test_rays_are_added_until_they_are_enough():
         return rough[places] / rays
 
     latest = np.full(rough.size, 37)
-    finer_rays.refine(37, rough / 37, Accuracy(1e-4), again)
+    eyepoint_study.refine(37, rough / 37, Accuracy(1e-4), again)
     error = rough / latest
     assert (error[latest < RAYS[-1]] <= 1e-4).all() and (latest == 37).any()
     assert (latest[error > 1e-4] == RAYS[-1]).all() and (latest < RAYS[-1]).mean() > 0.8
-    assert max(rays * number for rays, number in asked) <= finer_rays.CAST_BEAMLETS
+    assert max(rays * number for rays, number in asked) <= eyepoint_study.CAST_BEAMLETS
     wasted = latest[latest > 37] / (rough[latest > 37] / 1e-4)
     assert wasted.max() <= 60, "no more than a step of the ladder and the least jump call for"
 

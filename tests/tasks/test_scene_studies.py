@@ -22,7 +22,7 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.lock import Lock
-from sweep.tasks.plan import scene_plan
+from sweep.tasks.plan import plan
 from sweep.tasks.progress import Silent
 from sweep.tasks.status import status
 from sweep.tasks.store import create
@@ -250,7 +250,7 @@ def test_another_study_in_the_store_is_refused_with_what_differs(undisturbed):
 
 
 def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
-    found = scene_plan(small_scene(), store=tmp_path / "none.zarr", workers=2)
+    found = plan(small_scene(), store=tmp_path / "none.zarr", workers=2)
     assert {s.name: s.rays for s in found.scanners} == undisturbed.rays
     assert found.blocks == undisturbed.blocks and not found.scanners[0].is_cast
     chunks = [p for p in undisturbed.store.rglob("c/**/*") if p.is_file()]
@@ -260,7 +260,7 @@ def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
         child[name].nbytes for child in opened(undisturbed.store).children.values()
         for name in child.data_vars
     )  # fmt: skip
-    assert scene_plan(small_scene(), store=undisturbed.store).scanners[0].is_cast
+    assert plan(small_scene(), store=undisturbed.store).scanners[0].is_cast
 
 
 def test_the_summary_counts_what_the_arrays_hold(undisturbed):

@@ -29,10 +29,8 @@ from sweep.tasks.accuracy.bench import (
 )
 from sweep.tasks.accuracy.rungs import Rung
 from sweep.tasks.calling import TILE_SHOTS, Called
-from sweep.tasks.eyepoint_study import EyepointStudy, world_of
-from sweep.tasks.finer_rays import FinerRays, refine
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.stretches import Part, Stretches
+from sweep.tasks.eyepoint_study import EyepointStudy, FinerRays, refine, world_of
+from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
@@ -272,7 +270,7 @@ class FlightBench(Bench):
         return self._finer[rung.name]
 
 
-def _spread_shots(stretches: Stretches, tiles: int) -> np.ndarray:
+def _spread_shots(stretches: ScannerBlocks, tiles: int) -> np.ndarray:
     """Numbers of the shots, in whole cycles, of some tiles of a scanner."""
     cycle = stretches.shots_a_cycle
     total = stretches.total_cycles * cycle
