@@ -227,14 +227,11 @@ class FlightStudy(GrowingStudy):
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
         blocks, part = self.part(block)
-        begin, own, shots, around = self._in_tiles(blocks, part)
-        called = self.call(part, around, begin + np.arange(len(around.time))).some(own)
-        shots = {name: values[own] for name, values in shots.items()}
+        numbers, shots, eyepoints, called = self._looked_at(blocks, part)
         results = shots | self._read(part.scanner, CYCLES, *blocks.cycle_range(part))
         results |= {EFFECTS: called.flags, ERROR: called.error}
-        numbers = np.arange(begin + own.start, begin + own.stop)
         known = self._known(block, called) if self.earlier else None
-        results |= self.look(part, shots, around.some(own), called, numbers, known)
+        results |= self.look(part, shots, eyepoints, called, numbers, known)
         found = {}
         for name in self.chunks(block):
             values, rank = results[name.rpartition("/")[2]], len(self.layouts[name].shape)
@@ -251,19 +248,25 @@ class FlightStudy(GrowingStudy):
             self.look(part, shots, eyepoints, called, numbers)
 
     def called(self, block: int) -> Called:
-        """What is simulated of a block's shots, whatever the block: whole tiles are looked at."""
-        blocks, part = self.part(block)
-        begin, own, _, around = self._in_tiles(blocks, part)
-        return self.call(part, around, begin + np.arange(len(around.time))).some(own)
+        """What is simulated of a block's shots."""
+        return self._looked_at(*self.part(block))[-1]
 
-    def _in_tiles(self, blocks: ScannerBlocks, part: Part) -> tuple[int, slice, Results, Eyepoints]:
-        """Number of the first shot of a block's tiles, its own among these, and what they see."""
+    def _looked_at(
+        self, blocks: ScannerBlocks, part: Part
+    ) -> tuple[np.ndarray, Results, Eyepoints, Called]:
+        """Numbers of a block's shots, what they see, and what is simulated of them.
+
+        Whole tiles are planned, so that this does not depend on the block.
+        """
         first, stop = blocks.shot_range(part)
-        total = blocks.total_cycles * blocks.shots_a_cycle
         begin = first // TILE_SHOTS * TILE_SHOTS
-        end = min(-(-stop // TILE_SHOTS) * TILE_SHOTS, total)
+        end = -(-stop // TILE_SHOTS) * TILE_SHOTS
+        end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
         shots, eyepoints = self._seen(part.scanner, begin, end)
-        return begin, slice(first - begin, stop - begin), shots, eyepoints
+        own = slice(first - begin, stop - begin)
+        called = self.call(part, eyepoints, np.arange(begin, end)).some(own)
+        shots = {name: values[own] for name, values in shots.items()}
+        return np.arange(first, stop), shots, eyepoints.some(own), called
 
     def call(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Called:
         """Effects simulated at shots of these numbers, rising."""
@@ -274,10 +277,7 @@ class FlightStudy(GrowingStudy):
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
-        return plan_shots(
-            eyepoints, tiles, self.parameters_at(part), self.surfaces, modes=self._modes,
-            rotating=self._rotating, rays_by_tolerance=self.rays_accuracy is not None,
-        )  # fmt: skip
+        return self._plan(eyepoints, tiles, self.parameters_at(part))
 
     def look(
         self,
@@ -338,50 +338,53 @@ class FlightStudy(GrowingStudy):
         """Points of some of the shots, those together that call for much the same."""
         for index, effects, flags in called.some(rows).together():
             some = rows[index]
-            cloud = self._cloud(part, draws, effects)
+            cloud = partial(self._cloud, part, draws, effects)
             results = cloud(eyepoints.some(some), numbers[some], flags)
-            if (accuracy := self.rays_accuracy) is not None:
-                own = numbers[some], flags, eyepoints.weight.size
-                self._refine(part.scanner, own, accuracy, results, cloud)
+            if self.rays_accuracy is not None:
+                rays = eyepoints.weight.size
+                self._refine(part.scanner, rays, numbers[some], flags, results, cloud)
             yield some, results
 
     def _cloud(
-        self, part: Part, draws: slice, effects: tuple[str, ...]
-    ) -> Callable[[Eyepoints, np.ndarray, np.ndarray], Results]:
-        """A function that makes points of eyepoints, the shots' numbers and flags."""
+        self,
+        part: Part,
+        draws: slice,
+        effects: tuple[str, ...],
+        eyepoints: Eyepoints,
+        numbers: np.ndarray,
+        flags: np.ndarray,
+    ) -> Results:
+        """Points of eyepoints, of shots with these numbers and flags."""
         from sweep.model.clouds import cloud
         from sweep.model.philox import point_keys
 
         begin, _ = self.scanners[part.scanner].draw_range(part)
-        make = partial(
-            cloud,
+        rows = numbers[:, None].astype(float)
+        return cloud(
+            eyepoints,
             parameters=self.parameters_at(part),
             surfaces=self.surfaces,
+            keys=point_keys(rows, domain=DOMAIN, seed=int(self.spec.seed)),
             first_draw=begin + draws.start,
             draws=draws.stop - draws.start,
             method=self.spec.draws.method,
             returns=int(self.spec.draws.returns),
             effects=effects,
+            flags=flags,
             estimates_rays=self.rays_accuracy is not None,
-        )
-        keys = partial(point_keys, domain=DOMAIN, seed=int(self.spec.seed))
-        return lambda seen, numbers, flags: make(
-            seen, keys=keys(numbers[:, None].astype(float)), flags=flags
         )
 
     def _refine(
         self,
         scanner: str,
-        own: tuple[np.ndarray, np.ndarray, int],
-        accuracy: Accuracy,
+        rays: int,
+        numbers: np.ndarray,
+        flags: np.ndarray,
         results: Results,
         cloud: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
-        """Put points of shots that need more rays in the place of their results.
-
-        ``own``: the shots' numbers, flags, and how many rays they had.
-        """
-        numbers, flags, rays = own
+        """Put points of shots that need more rays in the place of their results."""
+        assert self.rays_accuracy is not None
 
         def again(places: np.ndarray, more: int) -> np.ndarray:
             some = numbers[places]
@@ -390,7 +393,7 @@ class FlightStudy(GrowingStudy):
                 results[name][places] = values
             return finer["beamlets_error"]
 
-        refine(rays, results["beamlets_error"], accuracy, again)
+        refine(rays, results["beamlets_error"], self.rays_accuracy, again)
 
     def _solved(
         self, each: int, shots: Results, found: Results, rows: np.ndarray, draws: slice
@@ -462,12 +465,14 @@ class FlightStudy(GrowingStudy):
         return Accuracy.of(self.spec.parameters()) if self.spec.rays_by_tolerance else None
 
     @cached_property
-    def _modes(self) -> Mapping[str, str]:
-        return dict(self.spec.modes())
-
-    @cached_property
-    def _rotating(self) -> bool:
-        return bool(self.spec.rotating)
+    def _plan(self) -> Callable[..., ShotsPlan | None]:
+        return partial(
+            plan_shots,
+            surfaces=self.surfaces,
+            modes=self.spec.modes(),
+            rotating=self.spec.rotating,
+            rays_by_tolerance=self.rays_accuracy is not None,
+        )
 
     @cached_property
     def _finer_rays(self) -> FinerRays:

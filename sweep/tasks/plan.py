@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,11 +13,11 @@ import psutil
 
 from sweep.storage.locations import Location
 from sweep.tasks import cluster
-from sweep.tasks.calling import Calling
-from sweep.tasks.evaluate import compile_kernels, evaluate_points, select, with_few_draws
+from sweep.tasks.evaluate import evaluate_points, select, with_few_draws
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid import Grid, Value
+from sweep.tasks.grid import Value
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.studies import study_of
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def plan(
         )
         each, reports = (rays + looking) / study.points, eyepoints[0].world.reports
     else:
-        each = measured(study.spec, study.grid)
+        each = measured(study)
         shape = dict(zip(study.grid.dims, study.grid.block_shape, strict=True))
     workers = workers or spec.execution.workers or cluster.cores()
     work = study.points * each + study.n_chunks * WRITE_CHUNK
@@ -123,46 +123,65 @@ def plan(
     )
 
 
-def measured(spec: Spec, grid: Grid) -> float:
+def measured(study: GridStudy) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
     Whole sets of points that share a geometry are taken, so that sharing shows as it will. Where
     points are drawn until their accuracy is met, those that are not after few draws are taken to
     reach their limit.
     """
+    grid = study.grid
+    blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))
+
+    def look(rows: int) -> Round:
+        begun = time.perf_counter()
+        found = [_evaluate_some(study, int(block), rows) for block in blocks]
+        taken = time.perf_counter() - begun
+        points, left_out = (sum(each) for each in zip(*found, strict=True))
+        return Round(points, taken, (taken + left_out,))
+
+    study.compile()
+    enough = _enough(look, grid.points, MEASURING)
+    return enough.parts[0] / enough.points
+
+
+class Round(NamedTuple):
+    """A look at some points."""
+
+    points: int
+    seconds: float
+    """That it has taken."""
+    parts: tuple[float, ...]
+    """Time of each kind of work [s]."""
+
+
+def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
+    """A look at so much of a study that it takes long enough, or at all of it."""
     from numba.core.event import install_recorder
 
-    compile_kernels(spec, grid)
-    calling = Calling(spec, grid)
-    rows, begun = 1, time.perf_counter()
+    amount, begun = 1, time.perf_counter()
     while True:  # once at the least, however long this process has been held up
-        points, left_out = 0, 0.0
-        round_begun = time.perf_counter()
         with install_recorder("numba:compile") as compiled:
-            for block in np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64)):
-                more, seconds = _evaluate_some(spec, calling, int(block), rows)
-                points, left_out = points + more, left_out + seconds
+            found = look(amount)
         now = time.perf_counter()
         if compiled.buffer:  # a round that compiles tells nothing of those that do not
             begun = now
             continue
-        taken = now - round_begun
-        if points >= grid.points or taken > MEASURING / 4 or now - begun > MEASURING / 2:
-            return (taken + left_out) / points
-        rows *= 4
+        if found.points >= points or found.seconds > seconds / 4 or now - begun > seconds / 2:
+            return found
+        amount *= 4
 
 
-def _evaluate_some(spec: Spec, calling: Calling, block: int, rows: int) -> tuple[int, float]:
+def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]:
     """Number of points evaluated, and the time [s] that draws left out of them would take."""
-    left_out = 0.0
-    grid, sharing = calling.tiles.grid, 1
+    spec, grid, left_out, sharing = study.spec, study.grid, 0.0, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
     sets = grid.geometry_order(block).reshape(-1, sharing)
     few = np.unique(np.linspace(0, len(sets) - 1, rows).astype(np.int64))
     chosen = sets[few].ravel()
     parameters = grid.parameters(block)
-    for members, effects in calling.of_block(block).some(chosen).groups():
+    for members, effects in study.calling.of_block(block).some(chosen).groups():
         part = select(parameters, chosen[members])
         most = MOST_SPECTRA if spec.draws.whole_spectra else MOST_DRAWS
         left_out += timed(spec, part, len(members), effects, most_draws=most).left_out
@@ -210,38 +229,29 @@ def timed(
 
 
 def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
-    from numba.core.event import install_recorder
-
     from sweep.scenes.eyepoint_arrays import from_arrays
 
-    part = study.scanners[eyepoints.scanner].part(0)
-    first_draw, end = study.scanners[eyepoints.scanner].draw_range(part)
-    weight = eyepoints.weight
+    blocks = study.scanners[eyepoints.scanner]
+    part = blocks.part(0)
 
-    def measured(tiles: int) -> tuple[int, float, float]:
-        """Number of shots, and what casting and looking take [s], compiling apart."""
-        with install_recorder("numba:compile") as compiled:
-            begun = time.perf_counter()
-            numbers = eyepoints.spread(tiles)
-            seen = eyepoints.see(numbers)
-            cast = time.perf_counter()
-            shots = from_arrays(seen, weight)
-            called = study.call(part, shots, numbers)
-            study.look(part, seen, shots, called, numbers)
-            looked = time.perf_counter()
-        return measured(tiles) if compiled.buffer else (len(numbers), cast - begun, looked - cast)
+    def look(tiles: int) -> Round:
+        begun = time.perf_counter()
+        numbers = eyepoints.spread(tiles)
+        seen = eyepoints.see(numbers)
+        cast = time.perf_counter()
+        shots = from_arrays(seen, eyepoints.weight)
+        study.look(part, seen, shots, study.call(part, shots, numbers), numbers)
+        looked = time.perf_counter()
+        return Round(len(numbers), looked - begun, (cast - begun, looked - cast))
 
-    tiles = 1
-    shots, casting, looking = measured(tiles)
-    while casting + looking < MEASURING_SCANNER / 4 and shots < eyepoints.points:
-        tiles *= 4
-        shots, casting, looking = measured(tiles)
+    found = _enough(look, eyepoints.points, MEASURING_SCANNER)
+    casting, looking = found.parts
     return ScannerPlan(
         name=eyepoints.scanner,
         cycles=eyepoints.cycles,
         shots=eyepoints.points,
         rays=eyepoints.rays,
         is_cast=eyepoints_path(study.path, eyepoints.id).exists(),
-        seconds_a_ray=casting / eyepoints.rays_in(shots),
-        seconds_a_draw=looking / (shots * (end - first_draw)),
+        seconds_a_ray=casting / eyepoints.rays_in(found.points),
+        seconds_a_draw=looking / (found.points * blocks.block_shape[-2]),
     )
