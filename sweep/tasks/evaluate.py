@@ -52,20 +52,15 @@ def evaluate_block(
     begun: Known = Known(),  # noqa: B008
     stop: Stop | None = None,
 ) -> Results:
-    """Results of one block.
+    """Results of one block of a study.
 
     Parameters
     ----------
-    spec, grid
-        The study and its grid.
-    block
-        Number of the block.
     called
-        What is simulated at each of its points, in C order over it.
-    known
-        What need not be computed: whole points, or their first draws.
-    begun
-        What there is of the block itself, from one that was stopped.
+        Effects simulated at each of its points, in C order over it.
+    known, begun
+        Results that need not be computed, whole or of first draws: of another study, and of the
+        block itself from a call that was stopped.
     stop
         When to stop, with at least some draws taken; by default never.
 
@@ -149,19 +144,12 @@ def evaluate_points(
     ----------
     spec, parameters
         The study; dotted path to scalars, strings or arrays (count,).
-    count
-        Number of points.
     effects
         Names of the effects that are simulated in all of them. Outputs are means over the
-        study's draws where random ones are among them.
+        study's draws where random ones are among them, and an error where it has no draws.
     before, stop
         Draws that there are already; when to return with those that there are then, by default
         with all.
-
-    Raises
-    ------
-    ValueError
-        An effect is random and the study has no draws.
     """
     if spec.draws.any:
         return _drawn(spec, parameters, count, effects, before, stop)

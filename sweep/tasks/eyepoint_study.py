@@ -37,6 +37,17 @@ BLOCK_BEAMLETS = 1 << 20
 #: Beamlets cast at once, which bounds a worker's memory where cycles are long.
 CAST_BEAMLETS = 1 << 18
 
+#: Nodes of a scene's map along the longer side, and along the shorter at least.
+NODES = 256
+LEAST_NODES = 16
+
+#: Shots of each scanner that say where the flight looks, and the room left around what they see.
+SAMPLE = 512
+MARGIN = 0.08
+
+#: Distance above the scene from which it is seen for its map [m].
+ABOVE = 1.0
+
 #: Size of an axis named by the model.
 SIZES = {"xyz": 3, "xyz_again": 3}
 
@@ -205,12 +216,16 @@ def world_of(spec: SceneSpec) -> World:
 
 def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
+    down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
+    return np.asarray(world.caster.bundle(position, down, poses=_poses(world, time)).range)
+
+
+def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)) -> list[Any]:
+    """Place and attitude of each body at some times; None of those at rest."""
     from sweep.model.geometry.rays import Pose
 
-    states = [None if body is None else body.state(time) for body in world.bodies]
-    poses = [None if state is None else Pose(state.position, state.attitude) for state in states]
-    down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
-    return np.asarray(world.caster.bundle(position, down, poses=poses).range)
+    states = [None if body is None else body.state(np.atleast_1d(time)) for body in world.bodies]
+    return [None if s is None else Pose(s.position[at], s.attitude[at]) for s in states]
 
 
 class FinerRays:
@@ -258,3 +273,63 @@ def refine(
         for start in range(0, len(places), step):
             some = places[start : start + step]
             needed[some] = more_rays(number, again(some, number), accuracy)
+
+
+def scene_map(spec: SceneSpec) -> list[ArrayLayout]:
+    """Heights of what a flight passes and looks at, as seen from above at its start."""
+    world = world_of(spec)
+    seen = np.concatenate([_passed(spec, world, name) for name in spec.scanners])
+    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    room = MARGIN * max(*(high - low), 1.0)
+    x, y = _nodes(low - room, high + room)
+    top = max(mesh_top(world), seen[:, 2].max()) + ABOVE
+    grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), top)], axis=-1).reshape(-1, 3)
+    down = np.broadcast_to([0.0, 0.0, -1.0], (len(grid), 1, 3))
+    poses = _poses(world, spec.flight().start, 0)
+    depth = world.caster.bundle(grid, down, poses=poses).range
+    height = np.where(np.isfinite(depth), top - depth, np.nan).reshape(len(y), len(x))
+    return [
+        ArrayLayout.known(name, dims, values, described("m", long_name), fill=FILLS["f"])
+        for name, dims, values, long_name in (
+            ("map_x", ("map_x",), x, "x of the map's nodes"),
+            ("map_y", ("map_y",), y, "y of the map's nodes"),
+            ("map_height", ("map_y", "map_x"), height, "height seen from above"),
+        )
+    ]
+
+
+def _passed(spec: SceneSpec, world: World, scanner: str) -> np.ndarray:
+    """Positions of the platform and of what its beams hit, (n, 3)."""
+    from sweep.model.geometry.quaternion import rotate
+
+    shots = spec.cycles(scanner) * spec.shots_a_cycle(scanner)
+    scan = spec.scan(scanner).shots(np.unique(np.linspace(0, shots - 1, SAMPLE).astype(int)))
+    flight = spec.flight()
+    state = flight.state(flight.start + scan.time)
+    direction = rotate(state.attitude, scan.direction)
+    # Bodies that move are looked at where they are as the flight begins: it is only a map.
+    hits = world.caster.bundle(
+        state.position, direction[:, None], poses=_poses(world, flight.start, 0)
+    )
+    hit = np.isfinite(hits.range)
+    ground = state.position[hit] + direction[hit] * hits.range[hit, None]
+    return np.concatenate([state.position, ground])
+
+
+def mesh_top(world: World) -> float:
+    """Height of the highest vertex of the bodies at rest [m]."""
+    tops = [
+        float(mesh.vertices[:, 2].max() + mesh.origin[2])
+        for mesh, body in zip(world.caster.meshes, world.bodies, strict=True)
+        if body is None
+    ]
+    return max(tops, default=0.0)
+
+
+def _nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates of square cells over a rectangle."""
+    step = float((high - low).max()) / (NODES - 1)
+    count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, LEAST_NODES)
+    middle = (low + high) / 2
+    x, y = (m + step * (np.arange(n) - (n - 1) / 2) for m, n in zip(middle, count, strict=True))
+    return x, y

@@ -30,6 +30,7 @@ from sweep.tasks.eyepoint_study import (
     FinerRays,
     eyepoints_path,
     refine,
+    scene_map,
     world_of,
 )
 from sweep.tasks.grid import Lattice
@@ -187,7 +188,7 @@ class FlightStudy(GrowingStudy):
             "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
             "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
-            "origin": self._map.origin.tolist(),
+            "origin": np.asarray(world_of(self.spec).origin, float).tolist(),
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:
@@ -204,7 +205,7 @@ class FlightStudy(GrowingStudy):
 
     def known_arrays(self) -> list[ArrayLayout]:
         """The map of the scene, and every scanner's coordinates."""
-        return list(self._map.arrays()) + [
+        return scene_map(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanners
             for layout in coordinates(self.spec.axes)
@@ -423,9 +424,11 @@ class FlightStudy(GrowingStudy):
             home, own = (reuse.read(b) for b in (reuse.older.home(share.block), share.block))
             if home is None or own is None:
                 continue
+            named = {name.rpartition("/")[2]: values for name, values in (home | own).items()}
             older = {
-                name.rpartition("/")[2]: values.reshape(values.shape[len(reuse.older.spec.axes) :])
-                for name, values in (home | own).items()
+                name: values.reshape(values.shape[len(reuse.older.spec.axes) :])
+                for name, values in named.items()
+                if name not in GEOMETRY
             }
             (draw, cycle), (old_draw, old_cycle) = (
                 np.divmod(share.points, stop - first),
@@ -506,12 +509,6 @@ class FlightStudy(GrowingStudy):
     def reports(self) -> tuple[str, ...]:
         """What loading the scene found and mended, a line an object."""
         return tuple(world_of(self.spec).reports)
-
-    @cached_property
-    def _map(self) -> Any:
-        from sweep.tasks.scene_map import SceneMap
-
-        return SceneMap.of(self.spec)
 
 
 def _gaps(lacking: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:

@@ -239,7 +239,7 @@ class Content(Protocol):
         """Every array of its store."""
 
 
-class Study(ABC):
+class Study(Content, ABC):
     """A study as the driver and its workers see it.
 
     No two blocks share a chunk of any array, and every chunk belongs to a block. Blocks are
@@ -249,17 +249,8 @@ class Study(ABC):
     unit = "points"
     """Name of its points, in the plural."""
 
-    @property
-    @abstractmethod
-    def id(self) -> str:
-        """Hash of all that its results depend on."""
-
-    @abstractmethod
-    def attributes(self) -> dict[str, Any]:
-        """Attributes of its store, but for versions; the same wherever it is made."""
-
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Groups of its store and their attributes."""
+        """Groups of its store and their attributes; none but the root."""
         return {}
 
     @property

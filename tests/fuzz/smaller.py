@@ -10,7 +10,7 @@ from unittest import mock
 
 from spoilt_specs import NOTHING, places, put
 
-from sweep.tasks import effects_table, plan, scene_map
+from sweep.tasks import effects_table, eyepoint_study, plan
 
 
 @contextmanager
@@ -19,7 +19,7 @@ def swiftly() -> Iterator[None]:
     with (
         mock.patch.object(plan, "MEASURING", 1e-3),
         mock.patch.object(plan, "MEASURING_SCANNER", 1e-3),
-        mock.patch.object(scene_map, "NODES", 24),
+        mock.patch.object(eyepoint_study, "NODES", 24),
         mock.patch.object(effects_table, "COST_POINTS", 1),
         mock.patch.object(effects_table, "COST_TILES", 1),
         mock.patch.object(effects_table, "ROUNDS", 1),
