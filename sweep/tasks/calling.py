@@ -48,7 +48,7 @@ UNDIVIDED = (
 
 
 class Called(NamedTuple):
-    """What is simulated at some points, (n,) each."""
+    """Effects that are simulated at some points, (n,) each."""
 
     flags: np.ndarray
     """uint32: bit k for the k-th effect of the catalogue."""
@@ -56,7 +56,7 @@ class Called(NamedTuple):
     """Largest change of a probability that all that is left out may make."""
 
     def some(self, index: slice | np.ndarray) -> Called:
-        """What is simulated at some of the points."""
+        """The same of some of the points."""
         return Called(self.flags[index], self.error[index])
 
     def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
@@ -188,7 +188,7 @@ class Calling:
         self._known: dict[int, tuple[int, float]] = {}
 
     def of_block(self, block: int) -> Called:
-        """What is simulated at the points of a block, in C order over it."""
+        """Effects simulated at the points of a block, in C order over it."""
         tiles, place = self.tiles.of_block(block)
         lacking = np.array([t for t in tiles.tolist() if t not in self._known], np.int64)
         for chosen, plan in self.plans(lacking):
@@ -267,7 +267,7 @@ class ShotsPlan(NamedTuple):
     """Of the tiles."""
 
     def called(self, number: int) -> Called:
-        """What is simulated of that many shots; nothing where nothing is seen."""
+        """Effects simulated at that many shots; none where nothing is seen."""
         called = Called(np.zeros(number, np.uint32), np.zeros(number))
         called.flags[self.shots] = flags_of(self.plan.kept)[self.tile]
         called.error[self.shots] = self.plan.error[self.tile]

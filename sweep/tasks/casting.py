@@ -26,7 +26,7 @@ WAITING = 0.5
 
 
 def eyepoints_are_sound(study: FlightStudy) -> bool:
-    """Whether no block is missing of the eyepoints that are there; all of them may be gone."""
+    """True if no block is missing of the eyepoints that are there; all of them may be gone."""
     paths = {eyepoints_path(study.path, e.id): e for e in study.eyepoint_studies()}
     return all(_is_whole(path, e) for path, e in paths.items() if path.exists())
 
@@ -78,7 +78,7 @@ def cast(
 
 
 def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
-    """Whether an eyepoint store is there with all of its blocks."""
+    """True if an eyepoint store is there with all of its blocks."""
     if not path.exists():
         return False
     attributes = opening.read_attributes(path)
@@ -133,7 +133,7 @@ def _fill(
 
 
 def _why(outcome: Outcome) -> str:
-    """Why a session ended before its blocks did."""
+    """Reason why a session ended before its blocks did."""
     if outcome.stopped:
         return outcome.stopped
     if not outcome.failures:

@@ -58,7 +58,7 @@ def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
 
 
 class EyepointStudy(Study):
-    """What the shots of a flight see through one scanner.
+    """Eyepoints of the shots of a flight through one scanner.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class EyepointStudy(Study):
         ]
 
     def evaluate(self, block: int) -> Results:
-        """What the shots of a block see."""
+        """Eyepoints of a block."""
         (cycles,) = self._grid.block(block)
         return self.see(
             np.arange(cycles.start * self.shots_a_cycle, cycles.stop * self.shots_a_cycle)
@@ -140,12 +140,12 @@ class EyepointStudy(Study):
         self.see(np.arange(self.shots_a_cycle))
 
     def see(self, index: np.ndarray) -> Results:
-        """What shots see, by number (n,), in whole cycles, and these."""
+        """Arrays of shots, by number (n,), in whole cycles, and of these."""
         shots = self.cast(index)
         return shots | self._cycles(shots)
 
     def cast(self, index: np.ndarray) -> Results:
-        """What any shots see, by number (n,)."""
+        """Arrays of any shots, by number (n,)."""
         from sweep.scenes.eyepoint_arrays import to_arrays
 
         step = max(1, CAST_BEAMLETS // self.beamlets)
@@ -239,7 +239,7 @@ class FinerRays:
         self._known: dict[tuple[str, int], EyepointStudy] = {}
 
     def see(self, scanner: str, shots: np.ndarray, rays: int) -> Eyepoints:
-        """What shots see, by number (n,)."""
+        """Eyepoints of shots, by number (n,)."""
         if (scanner, rays) not in self._known:
             self._known[scanner, rays] = self._make(self._spec, scanner, beamlets=rays)
         return self._known[scanner, rays].observe(shots)

@@ -97,7 +97,7 @@ class ScannerBlocks(Lattice, BlockGrid):
 
     @property
     def navigates(self) -> bool:
-        """Whether a cycle has the shots that a velocity vector takes."""
+        """True if a cycle has the shots that a velocity vector takes."""
         return self.shots_a_cycle >= LEAST_BEAMS
 
     def part(self, number: int) -> Part:
@@ -160,7 +160,7 @@ class FlightStudy(GrowingStudy):
         return self.scanners[grid.group]
 
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
-        """Whether shots are computed more closely with a tighter tolerance, effects apart."""
+        """True if a tighter tolerance computes shots more closely, effects apart."""
         return bool(self.spec.rays_by_tolerance or by_tolerance(self.spec.parameters()))
 
     def part(self, block: int) -> tuple[ScannerBlocks, Part]:
@@ -249,7 +249,7 @@ class FlightStudy(GrowingStudy):
             self.look(part, shots, eyepoints, called, numbers)
 
     def called(self, block: int) -> Called:
-        """What is simulated of a block's shots."""
+        """Effects simulated at a block's shots."""
         return self._looked_at(*self.part(block))[-1]
 
     def _looked_at(
@@ -459,7 +459,7 @@ class FlightStudy(GrowingStudy):
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:
-        """What surface numbers mean."""
+        """Surfaces by their numbers."""
         return tuple(self.spec.surfaces())
 
     @cached_property
@@ -507,7 +507,7 @@ class FlightStudy(GrowingStudy):
 
     @property
     def reports(self) -> tuple[str, ...]:
-        """What loading the scene found and mended, a line an object."""
+        """Findings as the scene was loaded and mended, a line an object."""
         return tuple(world_of(self.spec).reports)
 
 

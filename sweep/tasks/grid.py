@@ -46,7 +46,7 @@ MOST_BLOCKS = 1 << 14
 
 
 def is_geometric(axis: Axis) -> bool:
-    """Whether any member of an axis changes where the beamlets fall."""
+    """True if any member of an axis changes where the beamlets fall."""
     return any(
         member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
         for member in axis.members
@@ -59,7 +59,7 @@ def points_a_block(points: int) -> int:
 
 
 def seconds_a_point(spec: Spec) -> float:
-    """What the dearest point of a study takes of a core, by the study alone [s].
+    """Time of the dearest point of a study on one core, by the study alone [s].
 
     Measured on one machine and rounded up, which is all that a block's size asks for: results'
     places must not depend on who computes them. A draw of a whole spectrum takes time by its bins,
@@ -88,17 +88,10 @@ def block_shape(
 
     Parameters
     ----------
-    sizes
-        Points along each axis.
-    geometric
-        Whether each axis changes the geometry.
+    sizes, geometric
+        Points along each axis, and whether it changes the geometry.
     block_points
         Most points in a block [1], at least 1.
-
-    Returns
-    -------
-    tuple of int
-        Each in 1..size; their product is at most `block_points`.
     """
     order = sorted(range(len(sizes)), key=lambda k: (geometric[k], -k))
     shape, room = [1] * len(sizes), block_points

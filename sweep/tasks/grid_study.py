@@ -85,7 +85,7 @@ class GridStudy(GrowingStudy):
         return self.grid
 
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
-        """Which points of a block are computed more closely with a tighter tolerance, (points,)."""
+        """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
         return by_tolerance(self.grid.parameters(block))
 
     def attributes(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Whether a store is the one that a study belongs in; if not, why, in so many words."""
+"""Refusals of stores that a study does not belong in, in so many words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which blocks have all of their chunks, from listings of a store's folders: one look a folder.
+"""Blocks that have all of their chunks, from listings of a store's folders: one look a folder.
 
 A file's size is asked of the operating system one by one, some 3 us each: 27 arrays of a million
 blocks take more than a minute. So the look goes on in threads, beside what else there is to do;
@@ -51,7 +51,7 @@ class Look:
         self._arrays = [self._threads.submit(lacking, *array) for array in owners.items()]
 
     def within(self, seconds: float | None = None) -> bool:
-        """Whether the look is over, waited for no longer than that."""
+        """Wait no longer than that, and tell whether the look is over."""
         return not wait(self._arrays, seconds).not_done
 
     def whole(self) -> np.ndarray:
@@ -75,7 +75,7 @@ class Look:
 
 
 def listed(path: Location, study: Study, among: np.ndarray) -> np.ndarray:
-    """Which of some blocks have every object in the store, and bytes in it, (blocks,) bool.
+    """Mark those of some blocks that have every object in the store, with bytes in it, (blocks,).
 
     The parameters are those of :class:`Look`.
     """
@@ -88,7 +88,7 @@ def listed(path: Location, study: Study, among: np.ndarray) -> np.ndarray:
 
 
 def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
-    """Which chunks of an array are there and hold something, in the shape of its grid of them."""
+    """Mark the chunks of an array that hold something, in the shape of its grid of them."""
     there = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
         for position, size in _keys(folder, shape):

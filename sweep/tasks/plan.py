@@ -1,4 +1,4 @@
-"""What a study will take, before anything runs: points, blocks, bytes, time, memory."""
+"""Plans of studies, before anything runs: points, blocks, bytes, time, memory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ WRITE_CHUNK = 2e-3
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerPlan:
-    """What one scanner will take."""
+    """Plan of one scanner."""
 
     name: str
     cycles: int
@@ -56,7 +56,7 @@ class ScannerPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a study will take; scanners and reports are those of a flight."""
+    """Plan of a study; scanners and reports are those of a flight."""
 
     points: int
     blocks: int
@@ -79,7 +79,7 @@ class Plan:
 def plan(
     spec: Spec | SceneSpec, *, store: Location | None = None, workers: int | None = None
 ) -> Plan:
-    """What a study will take, from its size and a second of measuring its own points.
+    """Plan a study, by its size and a second of measuring its own points.
 
     Parameters
     ----------

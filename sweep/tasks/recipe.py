@@ -1,4 +1,4 @@
-"""What a store's own bytes do not say: where its study's files are, and which store it extends.
+"""Facts that a store's own bytes do not hold: places of its study's files, the store it extends.
 
 A study is the same wherever its files are, and however much of it was computed before, so that
 stands in the journal's directory. It is written anew by whoever runs the study from its spec.
@@ -31,7 +31,7 @@ def write_recipe(store_path: Location, **facts: Any) -> None:
 
 
 def read_recipe(store_path: Location) -> dict[str, Any]:
-    """What was put down; empty where nothing was, or where it is damaged."""
+    """Facts that were put down; empty where none were, or where they are damaged."""
     records = [record for _, record in read_sealed(store_path / JOURNAL / RECIPE)]
     return records[0] or {} if len(records) == 1 else {}
 

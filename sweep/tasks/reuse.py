@@ -78,7 +78,7 @@ class GrowingStudy(Study):
 
     @abstractmethod
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
-        """Which points of a block are computed more closely with a tighter tolerance, (points,)."""
+        """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
 
     def home(self, block: int) -> int:
         """Block with all that the draws of a block have in common."""
@@ -167,7 +167,7 @@ class Reuse:
         return open_group(self._path)
 
     def remark(self) -> str:
-        """What is not simply taken from it, in words; empty where all of it is."""
+        """Remark on what is not simply taken from it; empty where all of it is."""
         if not (self.is_whole or self.is_begun):
             return "whole spectra are drawn anew"
         said = ["points that are there are drawn further"] if self.is_begun else []
@@ -187,7 +187,7 @@ class Reuse:
 
 
 def what_is_there(path: Location, study: GrowingStudy) -> str:
-    """How many points of a larger study there are, here and in the store that it extends."""
+    """Number of points that there are of a larger study, here and in the store it extends."""
     done = committed(path, study)
     there, remark = study.points_in(done), ""
     if study.earlier is not None:
@@ -210,13 +210,13 @@ def ignored(older: Declared, spec: Declared) -> tuple[str, ...]:
 
 
 def other_tolerance(older: Declared, spec: Declared) -> bool:
-    """Whether all points have another tolerance; one on an axis tells points apart."""
+    """True if all points have another tolerance; one on an axis tells points apart."""
     theirs, ours = _tolerance(older), _tolerance(spec)
     return theirs is not None and ours is not None and theirs != ours
 
 
 def are_alike(older: Declared, spec: Declared) -> bool:
-    """Whether points of two studies that are computed as finely have the same results.
+    """True if points of two studies that are computed as finely have the same results.
 
     Of a flight each draw stands by itself.
     """
@@ -228,7 +228,7 @@ def are_alike(older: Declared, spec: Declared) -> bool:
 
 
 def goes_on(older: Spec, spec: Spec) -> bool:
-    """Whether draws of a study are the first ones of another.
+    """True if the draws of a study are the first ones of another.
 
     Not of whole spectra: there what a user's own function sees depends on how draws are cut.
     """
@@ -310,7 +310,7 @@ def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:
 
 
 def unlike(older: Declared, spec: Declared) -> list[str]:
-    """Why a study is no larger one than another of its kind, field by field; empty where it is."""
+    """Reasons why a study is no larger one than another of its kind, field by field."""
     return [*_altered(older, spec), *_lost(older, spec)]
 
 

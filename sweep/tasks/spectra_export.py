@@ -141,7 +141,7 @@ def _dataset(
 
 
 def _lines(shots: Shots, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the beamlets' lines appear [Hz], (segments, lines), and their amplitudes [V]."""
+    """Frequencies of the beamlets' lines [Hz], (segments, lines), and their amplitudes [V]."""
     from sweep.model.returns import beamlet_lines
 
     lines = beamlet_lines(shots)[-1, list(shots.segments)]

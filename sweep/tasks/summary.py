@@ -165,7 +165,7 @@ def done_blocks(store: Location, study: GridStudy) -> np.ndarray:
 def pieces(
     store: Location, study: GridStudy, names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Where in the grid each block is, and its values in some arrays."""
+    """Slices of the grid that each block has, and its values in some arrays."""
     group = open_group(store)
     arrays: list[Any] = [group[name] for name in names]
     for block in blocks:

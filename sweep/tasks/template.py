@@ -1,4 +1,4 @@
-"""Whether a store's template, all that it held before there were results, is as it was made.
+"""A store's template, all that it held before there were results: checked, and put back.
 
 Metadata, coordinates and the spec are listed with their digests in the journal's directory. They
 follow from the study, so that any of them can be made again, to the same bytes.
@@ -51,7 +51,7 @@ def digests(path: Location) -> dict[str, str]:
 
 
 def damages(path: Location) -> list[Damage]:
-    """What of a template, or of its list, is not as it was made."""
+    """Objects of a template, or lines of its list, that are not as they were made."""
     lines = [record for _, record in read_sealed(path / LIST)]
     if not lines:
         return [Damage(LIST, "is missing or empty", mended_by="repair")]
