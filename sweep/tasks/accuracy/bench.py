@@ -297,7 +297,7 @@ class GridBench(Bench):
             return np.zeros(times, np.int64)
         point = np.unravel_index(number, grid.shape)
         along = [int(p) // side for p, side in zip(point, grid.block_shape, strict=True)]
-        block = int(np.ravel_multi_index(along, grid.blocks_along))
+        block = int(np.ravel_multi_index(along, grid.along))
         order, slices = grid.geometry_order(block), grid.block(block)
         own = [int(p) - s.start for p, s in zip(point, slices, strict=True)]
         first = np.flatnonzero(order == np.ravel_multi_index(own, grid.extent(block)))
