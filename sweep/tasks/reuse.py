@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.spec import SceneSpec, Spec, SpecError, difference
-from sweep.spec.grid_rules import is_method
 from sweep.spec.fields import parameter_rules
+from sweep.spec.grid_rules import is_method
 from sweep.spec.mistakes import Mistake
 from sweep.storage import sealing
 from sweep.storage.locations import Location
