@@ -127,15 +127,6 @@ def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
                 assert disagreement(shots) < AGREEMENT
 
 
-def test_the_fast_path_is_the_truth_where_doppler_and_range_beats_are_equal(table_4_1):
-    range_beat = 2e12 * 2 * 1500.0 / speed_of_light
-    for sense in (1, -1):
-        v = sense * range_beat * 1550e-9 / 2
-        for phases in ("coherent", "incoherent"):
-            scene = table_4_1(range=1500.0, radial_velocity=v, fft_size=8192, phases=phases)
-            assert disagreement(prepared(scene)) < AGREEMENT
-
-
 @pytest.mark.parametrize(
     "changes",
     [

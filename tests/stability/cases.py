@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 EPS = sys.float_info.epsilon
 """Distance from 1 to the next float64; half of it is the error of one rounding."""
@@ -26,37 +27,24 @@ MODULES = (
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case.
-
-    Parameters
-    ----------
-    hard : str
-        What is hard about it.
-    reference : str
-        What it is held against.
-    measure : str
-        What the error is an error of.
-    allowed : float
-        Largest error with which the case is met.
-    limit : float
-        Error that float64 alone can make, estimated as `because` says.
-    slow : bool
-        Longer than the fast suite allows.
-    needs : Path or None
-        File with reference values, without which the case cannot be looked at.
-    find : callable
-        Gives the worst error.
-    """
+    """One hard case."""
 
     hard: str
     reference: str
+    """Against what the error is taken."""
     measure: str
+    """Of what it is an error."""
     allowed: float
+    """Largest error with which the case is met."""
     limit: float
+    """Error that float64 alone can make, estimated as `because` says."""
     because: str
     slow: bool
+    """Longer than the fast suite allows."""
     needs: Path | None
+    """File with reference values, without which the case cannot be looked at."""
     find: Callable[[], float]
+    """Gives the worst error."""
 
 
 @dataclass
@@ -68,23 +56,12 @@ class Family:
     cases: list[Case] = field(default_factory=list)
 
     def case(
-        self,
-        hard: str,
-        *,
-        reference: str,
-        measure: str,
-        allowed: float,
-        limit: float,
-        because: str,
-        slow: bool = False,
-        needs: Path | None = None,
+        self, hard: str, *, slow: bool = False, needs: Path | None = None, **told: Any
     ) -> Callable[[Callable[[], float]], Callable[[], float]]:
         """Decorator that registers a function that returns its worst error."""
 
         def register(find: Callable[[], float]) -> Callable[[], float]:
-            self.cases.append(
-                Case(hard, reference, measure, allowed, limit, because, slow, needs, find)
-            )
+            self.cases.append(Case(hard, slow=slow, needs=needs, find=find, **told))
             return find
 
         return register

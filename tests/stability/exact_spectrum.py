@@ -91,3 +91,11 @@ def peak(shots: Shots, i: int, segment: int) -> float:
     """Height on a bin of a line with the weight of all lines of a segment."""
     lines = (Line(shots, i, segment, b) for b in range(shots.offset.shape[1]))
     return float(mp.fsum(abs(line.weight) for line in lines)) * shots.window.sum
+
+
+def departure_of(shots: Shots, segment: int, bins: list[int], found: Iterable[float]) -> float:
+    """Largest error of |X| in some bins of a shot, over the peak."""
+    with mp.workdps(40):
+        exact = magnitudes(shots, 0, segment, bins)
+        errors = [abs(mp.mpf(float(x)) - right) for x, right in zip(found, exact, strict=True)]
+        return float(max(errors)) / peak(shots, 0, segment)

@@ -4,10 +4,9 @@ import itertools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import mpmath as mp
 import numpy as np
 from cases import EPS, Family
-from exact_spectrum import magnitudes, peak
+from exact_spectrum import departure_of, peak
 from table_shots import shots, velocity_for
 
 from sweep.model import segments, truth
@@ -55,13 +54,10 @@ def looked_at(one: Shots, segment: int) -> list[int]:
 def departure(one: Shots) -> float:
     """Largest error of the fast path's bins over the peak, all segments."""
     worst = 0.0
-    for segment in np.flatnonzero(one.segments):
-        bins = looked_at(one, int(segment))
-        _, found = segments.spectrum(one, 0, int(segment))
-        with mp.workdps(40):
-            exact = magnitudes(one, 0, int(segment), bins)
-            errors = [abs(mp.mpf(float(found[k])) - x) for k, x in zip(bins, exact, strict=True)]
-            worst = max(worst, float(max(errors)) / peak(one, 0, int(segment)))
+    for segment in np.flatnonzero(one.segments).tolist():
+        bins = looked_at(one, segment)
+        _, found = segments.spectrum(one, 0, segment)
+        worst = max(worst, departure_of(one, segment, bins, found[bins]))
     return worst
 
 
@@ -231,10 +227,7 @@ def floor_of_the_truth() -> float:
         for segment in range(3):
             bins = looked_at(one, segment)
             record = truth.spectrum(one, 0, segment, range_walk=False)
-            with mp.workdps(40):
-                exact = magnitudes(one, 0, segment, bins)
-                errors = [abs(record[k] - x) for k, x in zip(bins, exact, strict=True)]
-            worst = max(worst, float(max(errors)) / peak(one, 0, segment))
+            worst = max(worst, departure_of(one, segment, bins, record[bins]))
     return worst
 
 

@@ -4,10 +4,9 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import mpmath as mp
 import numpy as np
 from cases import EPS, Family
-from exact_spectrum import magnitudes, peak
+from exact_spectrum import departure_of, peak
 from hard_beats import departure
 from table_shots import shots, velocity_for
 
@@ -35,10 +34,7 @@ def few_bins(one: Shots, segment: int, level: float) -> float:
     bins, found = segments.spectrum(one, 0, segment, level=level * height)
     top = int(np.argmax(found))
     chosen = sorted({0, len(bins) - 1, *range(max(top - 4, 0), min(top + 5, len(bins)))})
-    with mp.workdps(40):
-        exact = magnitudes(one, 0, segment, [int(bins[j]) for j in chosen])
-        errors = [abs(float(found[j]) - x) for j, x in zip(chosen, exact, strict=True)]
-        return float(max(errors)) / height
+    return departure_of(one, segment, bins[chosen].tolist(), found[chosen])
 
 
 def long_fft(size: int, **changes: Any) -> float:
@@ -118,10 +114,7 @@ def record_error(size: int, window: str) -> float:
         found = truth.spectrum(one, 0, segment, range_walk=False)
         top = int(np.argmax(found))
         chosen = [1, size // 5, *range(top - 4, top + 5)]
-        with mp.workdps(40):
-            exact = magnitudes(one, 0, segment, chosen)
-            errors = [abs(float(found[k]) - x) for k, x in zip(chosen, exact, strict=True)]
-            worst = max(worst, float(max(errors)) / peak(one, 0, segment))
+        worst = max(worst, departure_of(one, segment, chosen, found[chosen]))
     return worst
 
 
