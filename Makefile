@@ -59,9 +59,11 @@ $(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
 compile-%: $(READY)
 	$(BIN)/python tests/compiling.py $*
 
-# Lines, modules and compiled functions; tests/test_layers.py holds what they may come to.
-size:
-	$(PYTHON) tests/house_size.py
+# Lines, modules and compiled functions; tests/test_layers.py holds what they may come to. And the
+# modules that a run of a grid and of a flight enters.
+size: $(READY)
+	$(BIN)/python tests/house_size.py
+	$(BIN)/python tests/modules_entered.py experiments/quickstart.yaml experiments/square_low_descent.yaml
 
 stability: $(READY)
 	PYTHONPATH=tests $(BIN)/python tests/stability/stability_table.py
