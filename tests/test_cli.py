@@ -344,8 +344,10 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
 
 def test_no_effect_costs_more_than_its_points(here):
     from sweep.tasks.effects_table import effects_table
+    from sweep.tasks.grid_study import GridStudy
 
-    costs = [row.cost for row in effects_table(Spec.from_mapping(yaml.safe_load(STUDY))).rows]
+    study = GridStudy(Spec.from_mapping(yaml.safe_load(STUDY)))
+    costs = [row.cost for row in effects_table(study).rows]
     assert max(cost for cost in costs if cost == cost) <= 1
 
 

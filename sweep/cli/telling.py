@@ -371,14 +371,10 @@ def warn_before(study: Spec | SceneSpec, store: Location) -> None:
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
     """Which effects a study calls for, where, and what they cost if that is asked for."""
-    from sweep.spec import SceneSpec
-    from sweep.tasks.effects_table import effects_table, flight_effects_table
+    from sweep.tasks.effects_table import effects_table
+    from sweep.tasks.studies import study_of
 
-    if isinstance(study, SceneSpec):
-        from sweep.tasks.flight_study import FlightStudy
-
-        return flight_effects_table(FlightStudy(study, store.absolute()))
-    return effects_table(study, costs=costs)
+    return effects_table(study_of(study, store.absolute()), costs=costs)
 
 
 def warn(table: EffectsTable) -> None:

@@ -197,18 +197,18 @@ class Calling:
                 self._known[int(tile)] = int(flag), float(error)
         found = [self._known[t] for t in tiles.tolist()]
         flags, errors = np.array([f for f, _ in found], np.uint32), np.array([e for _, e in found])
-        return Called(flags[place] & ~self._absent(block), errors[place])
+        absent = self.absent(self.tiles.grid.parameters(block), len(place))
+        return Called(flags[place] & ~absent, errors[place])
 
-    def _absent(self, block: int) -> np.ndarray:
+    def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
         """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
         from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.catalogue import EFFECTS as ALL
 
-        grid = self.tiles.grid
-        parameters = DEFAULTS | grid.parameters(block)
-        flags = np.zeros(grid.block_size(block), np.uint32)
+        flags = np.zeros(count, np.uint32)
         for k, effect in enumerate(ALL):
-            flags |= np.where(effect.absent(parameters), np.uint32(1 << k), np.uint32(0))
+            absent = effect.absent(DEFAULTS | dict(parameters))
+            flags |= np.where(absent, np.uint32(1 << k), np.uint32(0))
         return flags
 
     def of_point(self, point: int) -> tuple[str, ...]:

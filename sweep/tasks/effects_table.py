@@ -12,18 +12,18 @@ import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.tasks.calling import TILE_SHOTS, Calling
-from sweep.tasks.grid import Grid
+from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import timed
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.flight_study import FlightStudy
 
 #: Tiles that are looked at; of larger grids as many as these, spread over them.
 MOST_TILES = 1024
 
-#: Tiles of a flight that are looked at, of each scanner.
-FLIGHT_TILES = 16
+#: Tiles of a flight that are looked at, of each scanner, and places along its axes.
+FLIGHT_TILES, FLIGHT_PLACES = 16, 12
 
 #: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
 #: which the best counts.
@@ -64,92 +64,108 @@ class EffectsTable:
                 )
 
 
-def effects_table(spec: Spec, *, costs: bool = True) -> EffectsTable:
-    """Effects of a study of a grid, from the plans of its tiles.
+def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
+    """Effects of a study: where they are simulated, as its store will tell.
 
-    ``costs``: whether to measure what effects cost, in a second or so.
+    By the plans of its tiles, as many as are looked at, and of a flight at some places along its
+    axes. ``costs``: whether to measure what effects of a grid cost, in a second or so.
     """
-    calling = Calling(spec, Grid(spec))
+    if isinstance(study, GridStudy):
+        return _of_grid(study, costs)
+    return _of_flight(study)
+
+
+def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
+    spec, calling = study.spec, study.calling
     number = calling.tiles.number
     tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
     kept = np.empty((len(EFFECTS), len(tiles)), bool)
     change, error = np.empty(kept.shape), np.empty(len(tiles))
     for chosen, plan in calling.plans(tiles):
         kept[:, chosen], change[:, chosen], error[chosen] = plan.kept, plan.change, plan.error
-    sizes = [math.prod(_shape(calling.tiles.points(tile))) for tile in tiles.tolist()]
+    numbers = [_numbers(calling, tile) for tile in tiles.tolist()]
+    sizes = np.array([len(each) for each in numbers])
+    flags = calling.absent(study.grid.parameters_at(np.concatenate(numbers)), int(sizes.sum()))
+    first = np.cumsum(sizes) - sizes
+    there = np.array([np.add.reduceat((flags >> k & 1) == 0, first) for k in range(len(EFFECTS))])
     return _table(
         spec,
-        _Planned(kept, change, error, np.array(sizes)),
+        _Planned(kept * there, change, error),
+        points=int(sizes.sum()),
         where=lambda some: _region(spec, calling, tiles[some]),
         cost=lambda name, called: _cost(spec, calling, tiles[called], name) if costs else math.nan,
         looked_at=len(tiles) / number,
     )
 
 
-def flight_effects_table(study: FlightStudy) -> EffectsTable:
-    """Effects of a study of a scene, at the first place along its axes."""
+def _of_flight(study: FlightStudy) -> EffectsTable:
     from sweep.scenes.eyepoint_arrays import from_arrays
 
-    found, times, total = [], [], 0
+    found, times, shots = [], [], 0
+    axes = tuple(int(axis.size) for axis in study.spec.axes)
+    places = list(np.ndindex(axes))
     for eyepoints in study.eyepoint_studies():
         index = eyepoints.tiles(FLIGHT_TILES)
         seen = from_arrays(eyepoints.cast(index), eyepoints.weight)
-        part = study.scanners[eyepoints.scanner].part(0)
-        planned = study.planned(part, seen, index // TILE_SHOTS)
-        total += eyepoints.points
-        if planned is not None:
-            plan, shots = planned.plan, np.bincount(planned.tile)
-            found.append(_Planned(plan.kept, plan.change, plan.error, shots))
-            first = np.searchsorted(planned.tile, np.arange(shots.size))
-            times.append(seen.time[planned.shots][first])
+        for k in np.unique(np.linspace(0, len(places) - 1, FLIGHT_PLACES).astype(int)).tolist():
+            shots += len(index)
+            part = Part(eyepoints.scanner, places[k], 0, 0)
+            planned = study.planned(part, seen, index // TILE_SHOTS)
+            if planned is not None:
+                plan, seeing = planned.plan, np.bincount(planned.tile)
+                found.append(_Planned(plan.kept * seeing, plan.change, plan.error))
+                first = np.searchsorted(planned.tile, np.arange(seeing.size))
+                times.append(seen.time[planned.shots][first])
     if not found:
         tolerance = float(study.spec.accuracy.tolerance)
         return EffectsTable(rows=(), tolerance=tolerance, error=0.0, looked_at=1.0)
-    together = _Planned(*(np.concatenate(each, axis=-1) for each in zip(*found, strict=True)))
     time = np.concatenate(times)
     return _table(
         study.spec,
-        together,
+        _Planned(*(np.concatenate(each, axis=-1) for each in zip(*found, strict=True))),
+        points=shots,
         where=lambda some: _times(time[some]),
         cost=lambda name, called: math.nan,
-        looked_at=float(together.weight.sum() / total),
+        looked_at=shots * study.spec.draws.number / study.points,
     )
 
 
 class _Planned(NamedTuple):
     """Plans of m tiles."""
 
-    kept: np.ndarray
-    """(effects, m)"""
+    simulated: np.ndarray
+    """(effects, m): points at which each effect is simulated."""
     change: np.ndarray
+    """(effects, m)"""
     error: np.ndarray
     """(m,)"""
-    weight: np.ndarray
-    """(m,): points of each."""
 
 
 def _table(
     spec: Spec | SceneSpec,
     planned: _Planned,
     *,
+    points: int,
     where: Callable[[np.ndarray], str],
     cost: Callable[[str, np.ndarray], float],
     looked_at: float,
 ) -> EffectsTable:
     """The table, from what is kept and changed in tiles."""
-    modes, weight = spec.modes(), planned.weight
+    modes = spec.modes()
     rows = tuple(
         EffectRow(
             name=effect.name,
             about=effect.about,
             mode=modes[effect.name],
-            share=float(weight[called].sum() / weight.sum()),
-            where=where(called) if called.any() else "",
+            share=float(simulated.sum() / points),
+            where=where(simulated > 0) if simulated.any() else "",
             bound=float(changes.max()),
             at=where(np.arange(changes.size) == changes.argmax()),
-            cost=cost(effect.name, called) if called.any() else math.nan,
+            cost=cost(effect.name, simulated > 0) if simulated.any() else math.nan,
         )
-        for effect, called, changes in zip(EFFECTS, planned.kept, planned.change, strict=True)
+        for effect, simulated, changes in zip(
+            EFFECTS, planned.simulated, planned.change, strict=True
+        )
     )
     tolerance, error = float(spec.accuracy.tolerance), float(planned.error.max())
     return EffectsTable(rows=rows, tolerance=tolerance, error=error, looked_at=looked_at)
@@ -158,10 +174,6 @@ def _table(
 def _times(times: np.ndarray) -> str:
     low, high = times.min(), times.max()
     return f"time {low:.4g} s" if low == high else f"time {low:.4g}..{high:.4g} s"
-
-
-def _shape(slices: tuple[slice, ...]) -> tuple[int, ...]:
-    return tuple(s.stop - s.start for s in slices)
 
 
 def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
@@ -189,7 +201,9 @@ def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
         spec = spec.model_copy(update={"draws": draws})
     spent = total = 0.0
     for tile in tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]:
-        parameters = calling.tiles.grid.parameters_at(numbers := _some_points(calling, int(tile)))
+        parameters = calling.tiles.grid.parameters_at(
+            numbers := _numbers(calling, int(tile), COST_POINTS)
+        )
         ((_, plan),) = calling.plans(np.array([tile]))
         names = tuple(compress(NAMES, plan.kept[:, 0]))
         with_it, without = (
@@ -204,11 +218,12 @@ def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
     return spent / total
 
 
-def _some_points(calling: Calling, tile: int) -> np.ndarray:
-    """Numbers of some points of a tile."""
+def _numbers(calling: Calling, tile: int, most: int | None = None) -> np.ndarray:
+    """Numbers of the points of a tile, or of some, in C order over the grid."""
     slices = calling.tiles.points(tile)
-    shape = _shape(slices)
-    few = np.unique(np.linspace(0, math.prod(shape) - 1, COST_POINTS).astype(np.int64))
+    shape = tuple(s.stop - s.start for s in slices)
+    size = math.prod(shape)
+    few = np.unique(np.linspace(0, size - 1, most or size).astype(np.int64))
     along = np.unravel_index(few, shape) if shape else ()
     at = [i + s.start for i, s in zip(along, slices, strict=True)]
     return np.asarray(np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few)

@@ -62,8 +62,8 @@ def judge(file: Path) -> Verdict:
         assert from_stored(spec.to_json()).id == spec.id, "a stored spec is another"
         try:
             planned = planning.plan(spec)
-            effects_table(spec, costs=False)
             study = GridStudy(spec)
+            effects_table(study, costs=False)
             for block in range(study.n_blocks):
                 results = study.evaluate(block)
                 if (beyond := np.flatnonzero(np.isnan(results["pd_shot"]))).size:

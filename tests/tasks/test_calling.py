@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
-from small import small
+import zarr
+from small import quiet, small
+from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
 from sweep.tasks.calling import TILE_POINTS, Called, Calling, Tiles, _stretches, tile_shape
+from sweep.tasks.effects_table import effects_table
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.studies import study_of
 
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 WIDE = {
@@ -181,3 +185,21 @@ def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
     )
     assert (whole(beside, "pd_shot_error")[0] == 0).all()
     assert (whole(beside, "pd_shot_error")[1] > 0).any()
+
+
+HALF_ROUGH = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [small(), small(axes=HALF_ROUGH, draws={"number": 3}), small_scene(), small_scene(axes={})],
+    ids=["grid", "grid with absent effects", "flight", "flight without axes"],
+)
+def test_a_plan_tells_the_shares_of_points_that_the_store_has(spec, tmp_path):
+    store = quiet(spec, tmp_path / "some.zarr").store
+    arrays = [zarr.open_array(path, mode="r")[...] for path in store.rglob("effects")]
+    flags = np.concatenate([values.ravel() for values in arrays])
+    shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(NAMES)}
+    table = effects_table(study_of(spec, store), costs=False)
+    assert {row.name: row.share for row in table.rows} == pytest.approx(shares)
+    assert len(set(shares.values())) > 1 and table.looked_at == 1

@@ -17,7 +17,6 @@ from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, ST
 from sweep.spec import SpecError
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run
-from sweep.tasks.effects_table import flight_effects_table
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
@@ -293,19 +292,6 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
     status = opened(undisturbed.store)["three"].velocity_status.values[0, :20, :2]
     assert weak.solved == (status <= 1).sum()
     assert strong.shots == strong.cycles == strong.solved == rows["line, power 1 W"].shots == 0
-
-
-def test_a_plan_looks_at_the_tiles_that_the_study_plans(undisturbed):
-    """Shares of shots with each effect are those that the store has, to the shot."""
-    from sweep.model.effects.catalogue import NAMES
-
-    spec = small_scene()
-    table = flight_effects_table(FlightStudy(spec, undisturbed.store))
-    found = opened(undisturbed.store)
-    flags = np.concatenate([found[name].effects.values[0] for name in ("three", "line")])
-    shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(NAMES)}
-    assert {row.name: row.share for row in table.rows} == pytest.approx(shares)
-    assert len(set(shares.values())) > 1
 
 
 def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
