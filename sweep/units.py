@@ -90,13 +90,7 @@ class Unit:
         return self.text in (DECIBEL, DECIBEL_PER_HERTZ)
 
     def to_si(self, value: Fraction) -> float:
-        """SI value of `value` in this unit, correctly rounded.
-
-        Raises
-        ------
-        QuantityError
-            Where the value exceeds what a float holds.
-        """
+        """SI value of `value` in this unit, correctly rounded."""
         try:
             return float(_ratio(value) if self.decibel else self.factor * value + self.offset)
         except OverflowError:
@@ -104,13 +98,7 @@ class Unit:
 
 
 def read_number(written: object) -> tuple[Fraction, Unit]:
-    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
-
-    Raises
-    ------
-    QuantityError
-        Where it is no finite number, or carries a unit other than ``%``.
-    """
+    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``."""
     value, unit = _split(written)
     if unit not in ("", "%"):
         ratio = f"; {_show(value)} dB is {_show(_ratio(value))}" if unit == DECIBEL else ""
@@ -121,20 +109,8 @@ def read_number(written: object) -> tuple[Fraction, Unit]:
 def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
     """Exact value and unit of a written quantity, such as ``"25 mm"``.
 
-    Parameters
-    ----------
-    written : object
-        What the user wrote.
-    si_unit : str
-        Unit that the quantity is measured in inside, which fixes its dimension; ``"dB"`` for a
-        power ratio written in decibels.
-    example : str
-        A good value, shown where the unit is missing.
-
-    Raises
-    ------
-    QuantityError
-        For a missing, unknown or unfit unit and anything that is not a finite number.
+    The SI unit fixes its dimension: ``"dB"`` for a power ratio written in decibels. The example
+    is shown where the unit is missing, unknown or unfit: a `QuantityError`.
     """
     value, text = _split(written)
     if not text:
@@ -144,13 +120,7 @@ def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fract
 
 @lru_cache(maxsize=4096)
 def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
-    """Unit of the given text, if it measures what `si_unit` measures.
-
-    Raises
-    ------
-    QuantityError
-        For an unknown unit, or one of another dimension.
-    """
+    """Unit of the given text, which must measure what `si_unit` measures."""
     if DECIBEL in (si_unit, text):
         if si_unit == text:
             return Unit(DECIBEL)

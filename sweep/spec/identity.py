@@ -14,11 +14,10 @@ from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.fields import parameter_rules
+from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.motion import Platform
 from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
 from sweep.spec.rules import File
-from sweep.spec.scanners import AnyScanner
 from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
 
 LISTED_VALUES = 64

@@ -6,10 +6,11 @@ import dataclasses
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
 from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
 from sweep.model.effects.effect import MODES, Parameter
@@ -182,6 +183,19 @@ def place_of(location: Location, root: type[BaseModel]) -> Place:
 
 
 # Values of sections
+
+
+def read_as(kind: Any, written: object) -> Any:
+    """A part as written, read by itself as a model or one of several; None where it can't be."""
+    try:
+        return _adapter(kind).validate_python(written)
+    except ValidationError:
+        return None
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
 
 
 def values_of(part: BaseModel, prefix: str) -> dict[str, Any]:

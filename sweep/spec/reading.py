@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from sweep.spec.fields import parameter_rules
-from sweep.spec.figures import FIGURE_KINDS, SCENE_FIGURE_KINDS
+from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.mistakes import (
     ABSENT,
     Finding,
@@ -28,7 +28,16 @@ from sweep.spec.mistakes import (
     near_miss,
     shown,
 )
-from sweep.spec.parts import Models, Place, fields_of, kind_of, place_of, rule_of, rules_of
+from sweep.spec.parts import (
+    Models,
+    Place,
+    fields_of,
+    kind_of,
+    models_at,
+    place_of,
+    rule_of,
+    rules_of,
+)
 from sweep.spec.rules import BROKEN_RULE, Numeric
 
 LARGEST_FILE = 1_000_000
@@ -293,7 +302,12 @@ _OTHER_STUDYS = {
 }
 """Remedy for a section that only the other kind of study has."""
 
-_DRAWN_BY = dict.fromkeys(FIGURE_KINDS, "a target") | dict.fromkeys(SCENE_FIGURE_KINDS, "a scene")
+_DRAWN_BY = {
+    kind_of(model): target
+    for kind, target in ((Figure, "a target"), (SceneFigure, "a scene"))
+    for model in models_at(kind)
+}
+"""Whose studies make a kind of figure."""
 
 
 def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:

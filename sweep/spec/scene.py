@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 import sweep.spec.declaring as of
+from sweep.spec.flight import Motion, Turn
 from sweep.spec.grounds import (
     ArrayGround,
     Hills,
@@ -19,7 +20,6 @@ from sweep.spec.grounds import (
     ReliefGround,
     generator,
 )
-from sweep.spec.motion import Motion, Turn
 from sweep.spec.parts import Files, Part
 from sweep.spec.sections import sunlight
 

@@ -6,13 +6,10 @@ Names and references, objects, files, the flight, and axes that would move the r
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 import sweep.spec.declaring as of
 from sweep.model import beam
@@ -21,12 +18,19 @@ from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
 from sweep.spec.axes import Axis
+from sweep.spec.flight import (
+    AnyScanner,
+    Motion,
+    Platform,
+    Span,
+    Tracked,
+    WaypointPath,
+    shots_a_cycle,
+)
 from sweep.spec.grid_rules import at as written_at
 from sweep.spec.grounds import Craters, Ground, Jacksboro
 from sweep.spec.mistakes import Finding, Location, near_miss
-from sweep.spec.motion import Motion, Platform, Span, Tracked, WaypointPath
-from sweep.spec.parts import Files, named_files
-from sweep.spec.scanners import AnyScanner, shots_a_cycle
+from sweep.spec.parts import Files, named_files, read_as
 from sweep.spec.scene import WORLD, AnyObject, Boulders, Box, MeshObject, Solid, Sphere, Trees
 from sweep.units import QuantityError, read_unit
 
@@ -37,11 +41,6 @@ _LOOKS = 257
 """Times at which an attitude is tried."""
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
 def _section(written: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
     """A mapping in a spec; empty where there is none."""
     found = written_at(written, ".".join(map(str, path)))
@@ -50,11 +49,8 @@ def _section(written: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
 
 def _readable(section: Mapping[str, Any], kind: Any) -> dict[str, Any]:
     """Parts of a kind in a section that can be read, by name."""
-    found = {}
-    for name, value in section.items():
-        with suppress(ValidationError):
-            found[name] = _adapter(kind).validate_python(value)
-    return found
+    read = {name: read_as(kind, value) for name, value in section.items()}
+    return {name: part for name, part in read.items() if part is not None}
 
 
 def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Finding]:
@@ -69,7 +65,7 @@ def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Findin
     """
     objects = _readable(_section(written, *OBJECTS), AnyObject)
     scanners = _readable(_section(written, "scanners"), AnyScanner)
-    platform = _readable({"platform": written.get("platform")}, Platform).get("platform")
+    platform = read_as(Platform, written.get("platform"))
     findings = [
         *_name_findings(written, OBJECTS, lambda name: name == WORLD, "scene"),
         *_name_findings(written, ("scanners",), lambda name: name in RESERVED, "store"),

@@ -14,15 +14,13 @@ from pydantic import Field, PrivateAttr
 from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
-from sweep.spec.figure_check import scene_figure_findings
-from sweep.spec.figures import SceneFigure
+from sweep.spec.figures import SceneFigure, scene_figure_findings
+from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import Grid, is_method, not_in_flights
 from sweep.spec.identity import axis_identity, digest, geometry_of, leaf_values
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
-from sweep.spec.motion import Platform
 from sweep.spec.parts import Files, named_files, values_of
 from sweep.spec.reading import Document, plain
-from sweep.spec.scanners import AnyScanner, shots_a_cycle
 from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
     Arrangement,

@@ -6,8 +6,7 @@ import copy
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -20,14 +19,13 @@ from sweep.model import VERSION
 from sweep.model.threshold import WAYS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
 from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
-from sweep.spec.figure_check import figure_findings
-from sweep.spec.figures import Figure
+from sweep.spec.figures import Figure, figure_findings
 from sweep.spec.generators import values_in
 from sweep.spec.grid_rules import Grid, grid_findings, is_method, spectra_findings, without_draws
 from sweep.spec.identity import axis_identity, digest
 from sweep.spec.instrument import Instrument
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
-from sweep.spec.parts import Part, fill, leaves, values_of
+from sweep.spec.parts import Part, fill, leaves, read_as, values_of
 from sweep.spec.reading import Document, findings_of, plain, resolve_instrument
 from sweep.spec.rules import Numeric, Rule, Special
 from sweep.spec.sections import (
@@ -296,13 +294,11 @@ class Spec(Study):
     ) -> list[Finding]:
         """Figures of what the study lacks, random effects without draws, draws without an end."""
         findings = list(figure_findings(written, grid.axes)) if axes_are_whole else []
-        with suppress(ValidationError):
-            draws = Draws.model_validate(written.get("draws", {}))
+        draws = read_as(Draws, written.get("draws", {}))
+        if draws is not None:
             findings += spectra_findings(draws, grid)
-            if not draws.any:
-                findings += without_draws(grid)
-            if draws.number and draws.adaptive:
-                findings.append(_two_numbers(draws))
+            findings += () if draws.any else without_draws(grid)
+            findings += _number_findings(draws)
         return findings
 
     def parameters(self) -> dict[str, float | int | str]:
@@ -342,8 +338,9 @@ class Spec(Study):
         }
 
 
-def _two_numbers(draws: Draws) -> Finding:
+def _number_findings(draws: Draws) -> Iterator[Finding]:
     """A fixed number of draws beside a limit."""
-    rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to draw"
-    remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many times"
-    return Finding(("draws", "limit"), rule, remedy, draws.limit)
+    if draws.number and draws.limit:
+        rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to "
+        remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many "
+        yield Finding(("draws", "limit"), f"{rule}draw", f"{remedy}times", draws.limit)

@@ -14,8 +14,8 @@ from sweep.model.geometry.rays import Caster
 from sweep.scenes.files import SceneError
 from sweep.scenes.meshes import Facets
 from sweep.scenes.terrain import Terrain
+from sweep.spec.flight import Span
 from sweep.spec.grounds import Ground, PlacedGround
-from sweep.spec.motion import Span
 from sweep.spec.parts import Files
 from sweep.spec.scene import Boulders, Scene, Solid, Trees, materials
 
