@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,41 +90,33 @@ def join(parts: Sequence[Facets]) -> Facets:
     )
 
 
+def _count(words: str) -> int:
+    """A count of `Report`, with its words for people."""
+    return field(default=0, metadata={"words": words})  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True)
 class Report:
-    """Counts of facets that `clean` was given, found and mended; `_WORDS` has their meaning."""
+    """Counts of facets that `clean` was given, found and mended."""
 
     vertices: int
     faces: int
-    non_finite: int = 0
-    degenerate: int = 0
-    duplicate: int = 0
-    merged: int = 0
-    unreferenced: int = 0
-    open_edges: int = 0
-    crowded_edges: int = 0
-    opposed_edges: int = 0
-    inside_out: int = 0
+    non_finite: int = _count("{} faces without data dropped")
+    degenerate: int = _count("{} faces without area dropped")  # corners that are one, or in line
+    duplicate: int = _count("{} duplicate faces dropped")  # in whatever winding
+    merged: int = _count("{} coincident vertices merged")
+    unreferenced: int = _count("{} unused vertices dropped")
+    open_edges: int = _count("{} open edges (not watertight)")  # a face on one side only
+    crowded_edges: int = _count("{} edges of more than two faces")
+    opposed_edges: int = _count("{} edges with one side's normal inverted")
+    inside_out: int = _count("closed, with normals pointing inwards")  # 1 where it is so
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
-        counts = {words: getattr(self, name) for name, words in _WORDS.items()}
-        said = [words.format(count) for words, count in counts.items() if count]
+        counts = [(each.metadata.get("words"), getattr(self, each.name)) for each in fields(self)]
+        said = [words.format(count) for words, count in counts if words and count]
         given = f"{self.faces} faces on {self.vertices} vertices"
         return "; ".join([given, *(said or ["nothing to mend"])])
-
-
-_WORDS = {
-    "non_finite": "{} faces without data dropped",
-    "degenerate": "{} faces without area dropped",  # a repeated vertex, or three in one line
-    "duplicate": "{} duplicate faces dropped",  # in whatever winding
-    "merged": "{} coincident vertices merged",
-    "unreferenced": "{} unused vertices dropped",
-    "open_edges": "{} open edges (not watertight)",  # a face on one side only
-    "crowded_edges": "{} edges of more than two faces",
-    "opposed_edges": "{} edges with one side's normal inverted",
-    "inside_out": "closed, with normals pointing inwards",  # 1 where it is so
-}
 
 
 def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Mesh, Report]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING, Any
@@ -217,51 +217,44 @@ class Content:
 
     def arrays(self) -> list[ArrayLayout]:
         """Coordinates, errors, seconds."""
-        return list(self._arrays())
-
-    def _arrays(self) -> Iterator[ArrayLayout]:
         measured, rungs = self._measured, self._measured.ladder.rungs
-        yield _array("rung", ("rung",), _texts([rung.name for rung in rungs]))
-        yield _array("kind", ("rung",), _texts([rung.kind for rung in rungs]))
-        yield _array(
-            "tolerance", ("rung",), np.array([_tolerance(rung) for rung in rungs]),
-            units="1", long_name="tolerance of an adaptive setting",
-        )  # fmt: skip
-        yield _array(
-            "times", ("rung",), measured.times,
-            units="1", long_name="points of each stretch that is timed",
-        )  # fmt: skip
-        yield _array(
-            "seconds", ("rung", "round"), measured.seconds,
-            units="s", long_name="time a point on one core, planning included",
-        )  # fmt: skip
-        yield _array(
-            "planning", ("rung", "round"), measured.planning,
-            units="s", long_name="planning's share of it",
-        )  # fmt: skip
-        errors = differences(measured)
-        errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
-        for name, values in errors.items():
-            yield _array(name, ("rung", "point"), values, units="1", long_name=_ABOUT[name])
         truth = np.full(len(measured.done), np.nan)
         for place, (in_time, reference) in measured.truth.items():
             truth[np.flatnonzero(measured.done == place)] = apart(in_time, reference)[0]
-        about = "difference of a probability of detection from the time domain's"
-        yield _array("truth_pd_difference", ("point",), truth, units="1", long_name=about)
-        for name, (values, attributes) in self._bench.coordinates().items():
-            some = np.asarray(values)[measured.done]
-            yield _array(
-                name, ("point",), _texts(some) if some.dtype == object else some, **attributes
-            )  # fmt: skip
+        errors = differences(measured)
+        errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
+        by_rung, by_round, by_point = ("rung",), ("rung", "round"), ("rung", "point")
+        told = {
+            "tolerance": (by_rung, np.array([_tolerance(rung) for rung in rungs]), "1",
+                          "tolerance of an adaptive setting"),
+            "times": (by_rung, measured.times, "1", "points of each stretch that is timed"),
+            "seconds": (by_round, measured.seconds, "s",
+                        "time a point on one core, planning included"),
+            "planning": (by_round, measured.planning, "s", "planning's share of it"),
+            **{name: (by_point, values, "1", _ABOUT[name]) for name, values in errors.items()},
+            "truth_pd_difference": (
+                ("point",), truth, "1",
+                "difference of a probability of detection from the time domain's",
+            ),
+        }  # fmt: skip
+        names, kinds = ([getattr(rung, each) for rung in rungs] for each in ("name", "kind"))
+        return [
+            _array("rung", by_rung, np.array(names, object)),
+            _array("kind", by_rung, np.array(kinds, object)),
+            *(
+                _array(name, dims, values, units=units, long_name=about)
+                for name, (dims, values, units, about) in told.items()
+            ),
+            *(
+                _array(name, ("point",), np.asarray(values)[measured.done], **attributes)
+                for name, (values, attributes) in self._bench.coordinates().items()
+            ),
+        ]
 
 
 def _tolerance(rung: Rung) -> float:
     value = rung.overrides.get("accuracy.tolerance", np.nan)
     return float(value) if rung.kind != REFERENCE else np.nan
-
-
-def _texts(values: Any) -> np.ndarray:
-    return np.array(list(values), object)
 
 
 def _array(name: str, dims: tuple[str, ...], values: np.ndarray, **attributes: Any) -> ArrayLayout:
