@@ -13,7 +13,7 @@ from shared import DOCS, EXPERIMENTS, table
 
 from sweep.analysis import accuracy, accuracy_figure, canvas
 from sweep.spec import load
-from sweep.tasks.accuracy.run import measure
+from sweep.tasks.accuracy.measure import measure
 from sweep.tasks.accuracy.rungs import WRITTEN, Rung
 
 

@@ -311,7 +311,7 @@ def accuracy(
       sweep accuracy experiments/square_high_descent.yaml --overwrite
     """  # noqa: D301
     from sweep.spec import load
-    from sweep.tasks.accuracy.run import measure
+    from sweep.tasks.accuracy.measure import measure
 
     path = store or Path("results") / f"{spec.stem}_accuracy.zarr"
     measured = measure(

@@ -11,10 +11,10 @@ from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
 from sweep.tasks import flight_study, progress, store
-from sweep.tasks.accuracy import flight_bench, measure, run, rungs
+from sweep.tasks.accuracy import flight_bench, measure, rungs
 from sweep.tasks.accuracy.bench import GridBench, Seen, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
-from sweep.tasks.accuracy.run import measure as measured
+from sweep.tasks.accuracy.measure import measure as measured
 from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import Part
 from sweep.tasks.studies import study_of
@@ -391,8 +391,8 @@ def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
         return write(self, block, results)
 
     monkeypatch.setattr(store.Arrays, "write", noted)
-    monkeypatch.setattr(run, "process_time", lambda: float(next(ticks)))
-    assert run.storing(study) == 1.0 + study.n_blocks
+    monkeypatch.setattr(measure, "process_time", lambda: float(next(ticks)))
+    assert measure.storing(study) == 1.0 + study.n_blocks
     assert {block for block, _ in written} == {study.n_blocks // 2}
     # Whole chunks of all the block's arrays: anything else would have been refused.
     assert written[0][1].keys() == study.chunks(study.n_blocks // 2).keys() >= {name}

@@ -190,7 +190,7 @@ def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
 
 
 def test_what_accuracy_costs_is_not_asked_of_whole_spectra(tmp_path):
-    from sweep.tasks.accuracy.run import measure
+    from sweep.tasks.accuracy.measure import measure
 
     with pytest.raises(TaskError, match="draws whole spectra"):
         measure(study(), store_path=tmp_path / "a.zarr")
