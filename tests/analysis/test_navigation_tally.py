@@ -75,21 +75,6 @@ def test_tallies_are_merged_in_a_fixed_tree():
     assert not _same_bits(other, merge(parts))
 
 
-def test_a_bias_far_above_the_spread_costs_no_digits_of_the_spread():
-    """Sums of squares would lose the twelve digits that lie between (1e6)^2 and 1."""
-    error, covariance, available = _draws(8000, bias=(1e6, -1e6, 1e6))
-    available[:] = True
-    ends = np.arange(0, 8001, 1000)
-    parts = [_of_all(error[a:b], covariance[a:b], available[a:b]) for a, b in pairwise(ends)]
-    mean = [math.fsum(column) / 8000 for column in error.T]
-    apart = error - mean
-    exact = [[math.fsum(p * q) / 7999 for q in apart.T] for p in apart.T]
-    # a mean rounds to 1e-10; times the 0.1 between means of parts, that is 1e-11 of the spread
-    np.testing.assert_allclose(merge(parts).covariance, exact, rtol=3e-11)
-    whole = _of_all(error, covariance, available).covariance
-    np.testing.assert_allclose(whole, exact, rtol=1e-12)
-
-
 def test_cells_of_altitude_hold_their_own_draws():
     error, covariance, available = _draws(3000)
     altitude = np.random.default_rng(2).uniform(0, 700, 3000)

@@ -1,7 +1,5 @@
 """Draws of random effects: their bits, their means, and quadratures over what is random."""
 
-import math
-
 import numpy as np
 import pytest
 from mean_over_draws import evaluate
@@ -161,29 +159,6 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
         np.testing.assert_allclose(means["log10_" + name], exact, rtol=1e-12, atol=1e-14)
         assert np.isfinite(means["log10_" + name]).all()
     assert (means["pfa_shot"] == 0).all() == (tnr == 60)
-
-
-def test_the_logarithm_of_a_mean_keeps_twelve_digits_over_hundreds_of_decades():
-    """Against exact sums of the numbers over the largest; few of the draws carry them all."""
-    random = np.random.default_rng(4)
-    logs = np.array([-2000.0, -300.0, -20.0])[:, None] * random.uniform(0.9, 1.1, (3, 5000))
-    means = realisations.Means(3)
-    values = {name: np.zeros(logs.size) for name in OUTPUTS} | {"log10_pfa_bin": logs.ravel()}
-    means.add(np.repeat(np.arange(3), 5000), values)
-    largest = logs.max(axis=1)
-    sums = [math.fsum(10.0 ** (row - top)) for row, top in zip(logs, largest, strict=True)]
-    exact = largest + np.log10(np.array(sums) / 5000)
-    np.testing.assert_allclose(means.results()["log10_pfa_bin"], exact, rtol=1e-13)
-
-
-def test_an_average_without_counted_bins_has_the_logarithm_of_zero():
-    means = realisations.Means(2)
-    values = {name: np.zeros(4) for name in OUTPUTS}
-    values["log10_pfa_shot"] = np.array([-np.inf, -np.inf, -np.inf, -3.0])
-    means.add(np.array([0, 0, 1, 1]), values)
-    found = means.results()["log10_pfa_shot"]
-    assert found[0] == -np.inf
-    assert found[1] == pytest.approx(np.log10(0.5e-3), rel=1e-12)
 
 
 def test_direct_detection_has_no_doppler_segment_in_any_draw(table_4_1):

@@ -21,6 +21,12 @@ FAMILY = Family(
     "Written quantities are exact fractions until they are rounded once to a float, so every "
     "spelling of one gives the same bits.",
 )
+NEAREST = {
+    "measure": "steps between floats",
+    "allowed": 0.0,
+    "limit": 0.0,
+    "because": "one rounding, to the nearest",
+}
 PREFIXES = {
     "q": -30, "r": -27, "y": -24, "z": -21, "a": -18, "f": -15, "p": -12, "n": -9, "u": -6,
     "m": -3, "": 0, "k": 3, "M": 6, "G": 9, "T": 12, "P": 15, "E": 18, "Z": 21, "Y": 24, "R": 27,
@@ -45,10 +51,7 @@ def steps(a: float, b: float) -> int:
 @FAMILY.case(
     "every prefix from quecto to quetta, of every unit that takes one",
     reference="the decimal itself, read by Python's float",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest",
+    **NEAREST,
 )
 def prefixes() -> float:
     units = ("m", "s", "Hz", "W", "A", "V", "ohm", "rad", "K")
@@ -61,10 +64,7 @@ def prefixes() -> float:
 @FAMILY.case(
     "numbers of 1e-323 to 1e308, in the largest unit and in the smallest",
     reference="the decimal itself, read by Python's float",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest, denormal or not",
+    **NEAREST | {"because": "one rounding, to the nearest, denormal or not"},
 )
 def extremes() -> float:
     powers = (-323, -310, -308, -300, -100, 0, 100, 250, 300, 308)
@@ -91,10 +91,7 @@ COMPOUND = (
 @FAMILY.case(
     "compound units: pW/rtHz, mW/cm^2/um, km/h, 1/Gm, degC",
     reference="the decimal in SI, read by Python's float",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest",
+    **NEAREST,
 )
 def compounds() -> float:
     return max(steps(si(text, unit), float(exact)) for text, exact, unit in COMPOUND)
@@ -103,10 +100,7 @@ def compounds() -> float:
 @FAMILY.case(
     "degrees, minutes and seconds of arc, from 1e-9 to 90 deg",
     reference="pi / 180, 60 digits, rounded",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest: pi has digits enough",
+    **NEAREST | {"because": "one rounding, to the nearest: pi has digits enough"},
 )
 def angles() -> float:
     with mp.workdps(60):
@@ -120,10 +114,7 @@ def angles() -> float:
 @FAMILY.case(
     "decibels from -3200 to 3000, and per hertz",
     reference="10^(dB / 10), 60 digits, rounded",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest",
+    **NEAREST,
 )
 def decibels() -> float:
     texts = ("-3200", "-3000", "-155", "-2", "-0.01", "0", "0.1", "3", "29.9", "300", "3000")
@@ -181,10 +172,7 @@ STUDY = {
 @FAMILY.case(
     "a whole spec in pm, ps and pW, in Gm, Gs and GW, and in between",
     reference="the same spec in customary units",
-    measure="parameters that differ, in bits, and in the study's identity",
-    allowed=0.0,
-    limit=0.0,
-    because="one rounding, to the nearest",
+    **NEAREST | {"measure": "parameters that differ, in bits, and in the study's identity"},
 )
 def whole_spec() -> float:
     plain = Spec.from_mapping(STUDY, base=ROOT)
@@ -212,10 +200,7 @@ def round_trips() -> Iterator[int]:
 @FAMILY.case(
     "what a store writes of a parameter, read back",
     reference="the parameter",
-    measure="steps between floats",
-    allowed=0.0,
-    limit=0.0,
-    because="17 digits say which float it is",
+    **NEAREST | {"because": "17 digits say which float it is"},
 )
 def written_and_read() -> float:
     return max(round_trips())
