@@ -18,7 +18,7 @@ from shared import EXPERIMENTS, show
 import sweep
 from sweep.model.effects.catalogue import names_of
 from sweep.tasks.accuracy.rungs import ADAPTIVE, FIXED, Rung, ladder
-from sweep.tasks.calling import Called
+from sweep.tasks.effect_selection import Selected
 from sweep.tasks.flight_study import FlightStudy
 
 FLIGHTS = ("morpheus_three_beam", "oblique_descent", "gale_crater_descent", "square_low_descent",
@@ -32,13 +32,13 @@ class Unplanned(FlightStudy):
 
     def __init__(self, planned: FlightStudy) -> None:
         super().__init__(planned.spec, planned.path)
-        self._planned, self._called = planned, {}
+        self._planned, self._selected = planned, {}
 
-    def call(self, part, eyepoints, numbers) -> Called:
+    def select(self, part, eyepoints, numbers) -> Selected:
         """What is simulated of shots, planned once."""
-        if (part, numbers[0]) not in self._called:
-            self._called[part, numbers[0]] = self._planned.call(part, eyepoints, numbers)
-        return self._called[part, numbers[0]]
+        if (part, numbers[0]) not in self._selected:
+            self._selected[part, numbers[0]] = self._planned.select(part, eyepoints, numbers)
+        return self._selected[part, numbers[0]]
 
 
 def stored(rung: Rung, spec, path: Path) -> FlightStudy:
@@ -54,7 +54,7 @@ def variants(spec, tolerance: float, folder: Path) -> list[FlightStudy]:
     first = stored(adaptive, spec, folder / "adaptive.zarr")
     flags = np.uint32(0)
     for block in range(first.n_blocks):
-        flags |= np.bitwise_or.reduce(first.called(block).flags)
+        flags |= np.bitwise_or.reduce(first.selected(block).flags)
     sets = {tolerance: frozenset(names_of(int(flags)))}
     (same,) = (rung for rung in ladder(spec).with_fixed(sets).rungs if rung.kind == FIXED)
     fixed = stored(same, spec, folder / "fixed.zarr")

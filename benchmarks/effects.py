@@ -70,7 +70,7 @@ def evaluated(spec: Spec | SceneSpec, folder: Path, told: Progress, title: str) 
     total = planning = 0.0
     for block in range(study.n_blocks):
         begun = time.perf_counter()  # of a grid a plan is kept, of a flight it is made again
-        study.called(block) if isinstance(study, FlightStudy) else study.calling.of_block(block)
+        study.selected(block) if isinstance(study, FlightStudy) else study.selection.of_block(block)
         planned = time.perf_counter()
         results = study.evaluate(block)
         total += time.perf_counter() - (planned if flight else begun)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
-from sweep.tasks.calling import TILE_SHOTS, Calling
+from sweep.tasks.effect_selection import TILE_SHOTS, EffectSelection
 from sweep.tasks.flight_study import FlightStudy, Part
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import timed
@@ -76,24 +76,26 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
 
 
 def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
-    spec, calling = study.spec, study.calling
-    number = calling.tiles.number
+    spec, selection = study.spec, study.selection
+    number = selection.tiles.number
     tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
     kept = np.empty((len(EFFECTS), len(tiles)), bool)
     change, error = np.empty(kept.shape), np.empty(len(tiles))
-    for chosen, plan in calling.plans(tiles):
+    for chosen, plan in selection.plans(tiles):
         kept[:, chosen], change[:, chosen], error[chosen] = plan.kept, plan.change, plan.error
-    numbers = [_numbers(calling, tile) for tile in tiles.tolist()]
+    numbers = [_numbers(selection, tile) for tile in tiles.tolist()]
     sizes = np.array([len(each) for each in numbers])
-    flags = calling.absent(study.grid.parameters_at(np.concatenate(numbers)), int(sizes.sum()))
+    flags = selection.absent(study.grid.parameters_at(np.concatenate(numbers)), int(sizes.sum()))
     first = np.cumsum(sizes) - sizes
     there = np.array([np.add.reduceat((flags >> k & 1) == 0, first) for k in range(len(EFFECTS))])
     return _table(
         spec,
         _Planned(kept * there, change, error),
         points=int(sizes.sum()),
-        where=lambda some: _region(spec, calling, tiles[some]),
-        cost=lambda name, called: _cost(spec, calling, tiles[called], name) if costs else math.nan,
+        where=lambda some: _region(spec, selection, tiles[some]),
+        cost=lambda name, selected: (
+            _cost(spec, selection, tiles[selected], name) if costs else math.nan
+        ),
         looked_at=len(tiles) / number,
     )
 
@@ -125,7 +127,7 @@ def _of_flight(study: FlightStudy) -> EffectsTable:
         _Planned(*(np.concatenate(each, axis=-1) for each in zip(*found, strict=True))),
         points=shots,
         where=lambda some: _times(time[some]),
-        cost=lambda name, called: math.nan,
+        cost=lambda name, some: math.nan,
         looked_at=shots * study.spec.draws.number / study.points,
     )
 
@@ -176,9 +178,9 @@ def _times(times: np.ndarray) -> str:
     return f"time {low:.4g} s" if low == high else f"time {low:.4g}..{high:.4g} s"
 
 
-def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
+def _region(spec: Spec, selection: EffectSelection, tiles: np.ndarray) -> str:
     """The least box of the grid that holds some tiles, in the user's units."""
-    slices = [calling.tiles.points(tile) for tile in tiles.tolist()]
+    slices = [selection.tiles.points(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):
         first, stop = min(s[k].start for s in slices), max(s[k].stop for s in slices)
@@ -194,17 +196,17 @@ def _region(spec: Spec, calling: Calling, tiles: np.ndarray) -> str:
     return ", ".join(words) or "the point"
 
 
-def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
+def _cost(spec: Spec, selection: EffectSelection, tiles: np.ndarray, name: str) -> float:
     """Share of the time of points that an effect takes, from points with it and without."""
     if spec.draws.whole_spectra:  # what an effect costs does not go by what looks at spectra
         draws = spec.draws.model_copy(update={"method": "probabilities"})
         spec = spec.model_copy(update={"draws": draws})
     spent = total = 0.0
     for tile in tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]:
-        parameters = calling.tiles.grid.parameters_at(
-            numbers := _numbers(calling, int(tile), COST_POINTS)
+        parameters = selection.tiles.grid.parameters_at(
+            numbers := _numbers(selection, int(tile), COST_POINTS)
         )
-        ((_, plan),) = calling.plans(np.array([tile]))
+        ((_, plan),) = selection.plans(np.array([tile]))
         names = tuple(compress(NAMES, plan.kept[:, 0]))
         with_it, without = (
             min(
@@ -218,12 +220,12 @@ def _cost(spec: Spec, calling: Calling, tiles: np.ndarray, name: str) -> float:
     return spent / total
 
 
-def _numbers(calling: Calling, tile: int, most: int | None = None) -> np.ndarray:
+def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:
     """Numbers of the points of a tile, or of some, in C order over the grid."""
-    slices = calling.tiles.points(tile)
+    slices = selection.tiles.points(tile)
     shape = tuple(s.stop - s.start for s in slices)
     size = math.prod(shape)
     few = np.unique(np.linspace(0, size - 1, most or size).astype(np.int64))
     along = np.unravel_index(few, shape) if shape else ()
     at = [i + s.start for i, s in zip(along, slices, strict=True)]
-    return np.asarray(np.ravel_multi_index(at, calling.tiles.grid.shape) if at else few)
+    return np.asarray(np.ravel_multi_index(at, selection.tiles.grid.shape) if at else few)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.model.unsupported import UnsupportedShot
-from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
+from sweep.tasks.effect_selection import EFFECTS, ERROR, Selected
 from sweep.tasks.grid import Grid, Value, canonical_rows
 from sweep.tasks.study import (
     FILLS,
@@ -47,7 +46,7 @@ def evaluate_block(
     spec: Spec,
     grid: Grid,
     block: int,
-    called: Called,
+    selected: Selected,
     known: Known = Known(),  # noqa: B008
     begun: Known = Known(),  # noqa: B008
     stop: Stop | None = None,
@@ -56,7 +55,7 @@ def evaluate_block(
 
     Parameters
     ----------
-    called
+    selected
         Effects simulated at each of its points, in C order over it.
     known, begun
         Results that need not be computed, whole or of first draws: of another study, and of the
@@ -79,8 +78,8 @@ def evaluate_block(
     from sweep.model.outputs import RUNNING
 
     extent, size = grid.extent(block), grid.block_size(block)
-    results: Results = {EFFECTS: called.flags, ERROR: called.error}
-    computed = _computed(spec, grid, block, called, known, begun, stop or Stop())
+    results: Results = {EFFECTS: selected.flags, ERROR: selected.error}
+    computed = _computed(spec, grid, block, selected, known, begun, stop or Stop())
     for points, found in (known.done, begun.done, *computed):
         for name, values in found.items():
             room = (size, *values.shape[1:])
@@ -93,7 +92,7 @@ def evaluate_block(
 
 
 def _computed(
-    spec: Spec, grid: Grid, block: int, called: Called, known: Known, begun: Known, stop: Stop
+    spec: Spec, grid: Grid, block: int, selected: Selected, known: Known, begun: Known, stop: Stop
 ) -> Iterator[Found]:
     """Outputs of a block's points that are not done, those together that call for the same."""
     parameters, order = grid.parameters(block), grid.geometry_order(block)
@@ -101,7 +100,7 @@ def _computed(
     done, step = [begun.done], _step(spec)
     left = deque(
         (effects, points)
-        for members, effects in called.some(order).groups()
+        for members, effects in selected.some(order).groups()
         for points in np.split(order[members], range(step, len(members), step))
     )
     while left:
@@ -252,18 +251,3 @@ def with_few_draws(spec: Spec, most: int) -> Spec:
     """The same study with so many draws at the most, where it has any."""
     fewer = {"number": min(spec.draws.number, most), "limit": min(spec.draws.limit, most)}
     return spec.model_copy(update={"draws": spec.draws.model_copy(update=fewer)})
-
-
-def compile_kernels(spec: Spec, grid: Grid) -> None:
-    """Compile what the model compiles, once, before workers get blocks and find it on disk.
-
-    One draw of a point with every effect that may be called for, and one with none. Random effects
-    are not for every instrument: of these, only what the point itself calls for.
-    """
-    from sweep.model.effects.catalogue import EFFECTS as ALL
-
-    modes, once = spec.modes(), with_few_draws(spec, 1)
-    may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
-    for effects in ({*may_be, *Calling(spec, grid).of_point(0)}, ()):
-        with suppress(UnsupportedShot):
-            evaluate_points(once, grid.parameters_at(np.zeros(1, dtype=np.int64)), 1, effects)

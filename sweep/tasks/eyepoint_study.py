@@ -19,7 +19,7 @@ from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
 from sweep.model.resolution import more_rays
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
-from sweep.tasks.calling import TILE_SHOTS
+from sweep.tasks.effect_selection import TILE_SHOTS
 from sweep.tasks.study import FILLS, ArrayLayout, BlockGrid, Results, Study, described
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from sweep.model.outputs import (
 from sweep.model.resolution import by_tolerance
 from sweep.storage.locations import Location
 from sweep.storage.opening import open_group
-from sweep.tasks.calling import EFFECTS, ERROR, TILE_SHOTS, Called, ShotsPlan, plan_shots
+from sweep.tasks.effect_selection import EFFECTS, ERROR, TILE_SHOTS, Selected, ShotsPlan, plan_shots
 from sweep.tasks.eyepoint_study import (
     SIZES,
     EyepointStudy,
@@ -228,11 +228,11 @@ class FlightStudy(GrowingStudy):
     def evaluate(self, block: int) -> Results:
         """Point cloud, statistics and navigation of a block."""
         blocks, part = self.part(block)
-        numbers, shots, eyepoints, called = self._looked_at(blocks, part)
+        numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
         results = shots | self._read(part.scanner, CYCLES, *blocks.cycle_range(part))
-        results |= {EFFECTS: called.flags, ERROR: called.error}
-        known = self._known(block, called) if self.earlier else None
-        results |= self.look(part, shots, eyepoints, called, numbers, known)
+        results |= {EFFECTS: selected.flags, ERROR: selected.error}
+        known = self._known(block, selected) if self.earlier else None
+        results |= self.look(part, shots, eyepoints, selected, numbers, known)
         found = {}
         for name in self.chunks(block):
             values, rank = results[name.rpartition("/")[2]], len(self.layouts[name].shape)
@@ -245,16 +245,16 @@ class FlightStudy(GrowingStudy):
             part = blocks.part(0)
             shots, eyepoints = self._seen(part.scanner, 0, blocks.shots_a_cycle)
             numbers = np.arange(blocks.shots_a_cycle)
-            called = self.call(part, eyepoints, numbers)
-            self.look(part, shots, eyepoints, called, numbers)
+            selected = self.select(part, eyepoints, numbers)
+            self.look(part, shots, eyepoints, selected, numbers)
 
-    def called(self, block: int) -> Called:
+    def selected(self, block: int) -> Selected:
         """Effects simulated at a block's shots."""
         return self._looked_at(*self.part(block))[-1]
 
     def _looked_at(
         self, blocks: ScannerBlocks, part: Part
-    ) -> tuple[np.ndarray, Results, Eyepoints, Called]:
+    ) -> tuple[np.ndarray, Results, Eyepoints, Selected]:
         """Numbers of a block's shots, what they see, and what is simulated of them.
 
         Whole tiles are planned, so that this does not depend on the block.
@@ -265,16 +265,16 @@ class FlightStudy(GrowingStudy):
         end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
         shots, eyepoints = self._seen(part.scanner, begin, end)
         own = slice(first - begin, stop - begin)
-        called = self.call(part, eyepoints, np.arange(begin, end)).some(own)
+        selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
         shots = {name: values[own] for name, values in shots.items()}
-        return np.arange(first, stop), shots, eyepoints.some(own), called
+        return np.arange(first, stop), shots, eyepoints.some(own), selected
 
-    def call(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Called:
+    def select(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Selected:
         """Effects simulated at shots of these numbers, rising."""
         number = len(numbers)
         planned = self.planned(part, eyepoints, numbers // TILE_SHOTS)
-        nothing = Called(np.zeros(number, np.uint32), np.zeros(number))
-        return nothing if planned is None else planned.called(number)
+        nothing = Selected(np.zeros(number, np.uint32), np.zeros(number))
+        return nothing if planned is None else planned.selected(number)
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
@@ -285,7 +285,7 @@ class FlightStudy(GrowingStudy):
         part: Part,
         shots: Results,
         eyepoints: Eyepoints,
-        called: Called,
+        selected: Selected,
         numbers: np.ndarray,
         known: KnownCloud | None = None,
     ) -> Results:
@@ -297,7 +297,7 @@ class FlightStudy(GrowingStudy):
             Scanner, place along the axes and stretch of draws.
         shots, eyepoints
             Whole cycles of them.
-        called, numbers
+        selected, numbers
             What is simulated of each; their numbers, counted from the flight's first.
         known
             Results that need not be computed.
@@ -305,9 +305,9 @@ class FlightStudy(GrowingStudy):
         blocks = self.scanners[part.scanner]
         begin, end = blocks.draw_range(part)
         draws, each = end - begin, blocks.shots_a_cycle
-        there, results = known or self._nothing_known(blocks, called.flags.size, draws)
+        there, results = known or self._nothing_known(blocks, selected.flags.size, draws)
         for rows, some in _gaps(~there):
-            for index, found in self._clouds(part, eyepoints, called, numbers, rows, some):
+            for index, found in self._clouds(part, eyepoints, selected, numbers, rows, some):
                 _put(results, index, some, found)
         if blocks.navigates:
             lacking = (~there).reshape(-1, each, draws).any(axis=1)
@@ -331,13 +331,13 @@ class FlightStudy(GrowingStudy):
         self,
         part: Part,
         eyepoints: Eyepoints,
-        called: Called,
+        selected: Selected,
         numbers: np.ndarray,
         rows: np.ndarray,
         draws: slice,
     ) -> Iterator[tuple[np.ndarray, Results]]:
         """Points of some of the shots, those together that call for much the same."""
-        for index, effects, flags in called.some(rows).together():
+        for index, effects, flags in selected.some(rows).together():
             some = rows[index]
             cloud = partial(self._cloud, part, draws, effects)
             results = cloud(eyepoints.some(some), numbers[some], flags)
@@ -413,13 +413,13 @@ class FlightStudy(GrowingStudy):
             jitter=self.spec.platform.jitter,
         )
 
-    def _known(self, block: int, called: Called) -> KnownCloud:
+    def _known(self, block: int, selected: Selected) -> KnownCloud:
         """Results of a block that a smaller study has, of shots with the same effects."""
         assert self.earlier is not None
         reuse, (blocks, part) = self.earlier, self.part(block)
         (begin, end), (first, stop) = blocks.draw_range(part), blocks.cycle_range(part)
         draws, each = end - begin, blocks.shots_a_cycle
-        there, results = known = self._nothing_known(blocks, called.flags.size, draws)
+        there, results = known = self._nothing_known(blocks, selected.flags.size, draws)
         for share in reuse.shares(block):
             home, own = (reuse.read(b) for b in (reuse.older.home(share.block), share.block))
             if home is None or own is None:
@@ -436,7 +436,7 @@ class FlightStudy(GrowingStudy):
             )
             rows, old = (c[:, None] * each + np.arange(each) for c in (cycle, old_cycle))
             drawn, old_drawn = draw[:, None], old_draw[:, None]
-            there[rows, drawn] = older[EFFECTS][old] == called.flags[rows]
+            there[rows, drawn] = older[EFFECTS][old] == selected.flags[rows]
             found = {name: older[name][old] for name in STATISTICS}
             found |= {name: older[name][old, old_drawn] for name in POINTS}
             _put(results, rows, drawn, found)

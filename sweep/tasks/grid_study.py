@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.effects.catalogue import flag_attributes
+from sweep.model.effects.catalogue import flag_attributes, names_of
 from sweep.model.resolution import by_tolerance
-from sweep.tasks.calling import EFFECTS, ERROR, Called, Calling
-from sweep.tasks.evaluate import batch_sizes, compile_kernels, evaluate_block, no_sums
+from sweep.model.unsupported import UnsupportedShot
+from sweep.tasks.effect_selection import EFFECTS, ERROR, EffectSelection, Selected
+from sweep.tasks.evaluate import (
+    batch_sizes,
+    evaluate_block,
+    evaluate_points,
+    no_sums,
+    with_few_draws,
+)
 from sweep.tasks.grid import Grid, Lattice
 from sweep.tasks.reuse import DAMAGED, GrowingStudy
 from sweep.tasks.study import (
@@ -73,7 +80,7 @@ class GridStudy(GrowingStudy):
     def __init__(self, spec: Spec) -> None:
         super().__init__(spec)
         self.grid = Grid(spec)
-        self.calling = Calling(spec, self.grid)
+        self.selection = EffectSelection(spec, self.grid)
 
     @property
     def grids(self) -> tuple[Grid]:
@@ -142,9 +149,9 @@ class GridStudy(GrowingStudy):
         stop: Stop | None = None,
     ) -> Results:
         """Outputs of a block; `begun` and `stop` are those of :func:`evaluate_block`."""
-        called = self.calling.of_block(block)
-        known = self._known(block, called)
-        results = evaluate_block(self.spec, self.grid, block, called, known, begun, stop)
+        selected = self.selection.of_block(block)
+        known = self._known(block, selected)
+        results = evaluate_block(self.spec, self.grid, block, selected, known, begun, stop)
         extent = self.grid.extent(block)
         for name in self.layouts.keys() - results.keys():  # all points are beyond the model
             layout = self.layouts[name]
@@ -152,7 +159,7 @@ class GridStudy(GrowingStudy):
             results[name] = np.full(room, layout.fill, layout.dtype)
         return results
 
-    def _known(self, block: int, called: Called) -> Known:
+    def _known(self, block: int, selected: Selected) -> Known:
         """Points of a block that a smaller study has: whole, or their first draws."""
         if (reuse := self.earlier) is None:
             return Known()
@@ -161,7 +168,7 @@ class GridStudy(GrowingStudy):
             if (older := reuse.read(share.block)) is None:
                 continue
             rank, size = len(reuse.older.grids[0].shape), reuse.older.block_size(share.block)
-            same = older[EFFECTS].ravel()[share.place] == called.flags[share.points]
+            same = older[EFFECTS].ravel()[share.place] == selected.flags[share.points]
             results = {
                 name: values.reshape(size, *values.shape[rank:])[share.place[same]]
                 for name, values in older.items()
@@ -177,16 +184,27 @@ class GridStudy(GrowingStudy):
         """Points of a block that the smaller study has, with the same effects."""
         if (reuse := self.earlier) is None:
             return 0
-        called, number = self.calling.of_block(block), 0
+        selected, number = self.selection.of_block(block), 0
         for share in reuse.shares(block):
             with suppress(*DAMAGED):
                 flags = reuse.chunk(EFFECTS, share.block).ravel()
-                number += int(np.sum(flags[share.place] == called.flags[share.points]))
+                number += int(np.sum(flags[share.place] == selected.flags[share.points]))
         return number
 
     def compile(self) -> None:
-        """Compile the model's kernels."""
-        compile_kernels(self.spec, self.grid)
+        """Compile what the model compiles, once, before workers find it on disk.
+
+        One draw of a point with every effect that may be called for, and one with none. Random
+        effects are not for every instrument: of these, only what the point itself calls for.
+        """
+        from sweep.model.effects.catalogue import EFFECTS as ALL
+
+        modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
+        may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
+        own = names_of(int(self.selection.of_block(0).flags[0]))
+        for effects in ({*may_be, *own}, ()):
+            with suppress(UnsupportedShot):
+                evaluate_points(once, self.grid.parameters_at(np.zeros(1, np.int64)), 1, effects)
 
 
 def coordinates(axes: tuple[Axis, ...]) -> list[ArrayLayout]:

@@ -181,7 +181,7 @@ def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]
     few = np.unique(np.linspace(0, len(sets) - 1, rows).astype(np.int64))
     chosen = sets[few].ravel()
     parameters = grid.parameters(block)
-    for members, effects in study.calling.of_block(block).some(chosen).groups():
+    for members, effects in study.selection.of_block(block).some(chosen).groups():
         part = select(parameters, chosen[members])
         most = MOST_SPECTRA if spec.draws.whole_spectra else MOST_DRAWS
         left_out += timed(spec, part, len(members), effects, most_draws=most).left_out
@@ -240,7 +240,7 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         seen = eyepoints.see(numbers)
         cast = time.perf_counter()
         shots = from_arrays(seen, eyepoints.weight)
-        study.look(part, seen, shots, study.call(part, shots, numbers), numbers)
+        study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
         looked = time.perf_counter()
         return Round(len(numbers), looked - begun, (cast - begun, looked - cast))
 

@@ -24,7 +24,7 @@ from sweep.storage import sealing
 from sweep.storage.locations import Location
 from sweep.storage.opening import open_group
 from sweep.tasks import store
-from sweep.tasks.calling import TOLERANCE
+from sweep.tasks.effect_selection import TOLERANCE
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid import Lattice, Value, canonical_rows
 from sweep.tasks.journal import committed, digests

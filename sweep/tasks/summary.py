@@ -117,7 +117,7 @@ def beyond_model(store: str | Location) -> tuple[int, str]:
 
 def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
     """Reason that the model does not hold for a point of a block."""
-    ((_, names),) = study.calling.of_block(block).some(point).groups()
+    ((_, names),) = study.selection.of_block(block).some(point).groups()
     try:
         parameters = select(study.grid.parameters(block), point)
         evaluate_points(with_few_draws(study.spec, 1), parameters, 1, names)

@@ -56,9 +56,9 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
     stretches = study.scanners[eyepoints.scanner]
     for *axes, draws in np.ndindex(*stretches.along[:-1]):
         part = Part(eyepoints.scanner, tuple(axes), draws, 0)
-        called = study.call(part, shots, np.arange(len(shots.time)))
-        assert np.isfinite(called.error).all() and (called.error >= 0).all(), "effects_error"
-        found = study.look(part, seen, shots, called, numbers)
+        selected = study.select(part, shots, np.arange(len(shots.time)))
+        assert np.isfinite(selected.error).all() and (selected.error >= 0).all(), "effects_error"
+        found = study.look(part, seen, shots, selected, numbers)
         architecture = study.parameters_at(part)["instrument.receiver.architecture"]
         look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
 

@@ -201,7 +201,7 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     numbers = np.arange(eyepoints.points)
     seen = eyepoints.see(numbers)
     shots, part = from_arrays(seen, eyepoints.weight), Part("cone", (), 0, 0)
-    return seen, study.look(part, seen, shots, study.call(part, shots, numbers), numbers)
+    return seen, study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
 
 
 @settings(SOME, max_examples=6)

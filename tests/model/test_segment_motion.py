@@ -19,7 +19,7 @@ from sweep.model.realisations import realise
 from sweep.model.returns import beamlet_lines, draw_returns
 from sweep.model.shot import prepare
 from sweep.model.waveform import SIGNS
-from sweep.tasks.calling import plan_shots
+from sweep.tasks.effect_selection import plan_shots
 
 MOVING = (*CORE, "segment_motion")
 
@@ -220,7 +220,7 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
             seen, np.zeros(1, np.int64), instrument(table_4_1, beamlets=7), ground, modes={},
             rotating=False,
         )  # fmt: skip
-        flags = planned.called(1).flags
+        flags = planned.selected(1).flags
         called.append({"acceleration", "segment_motion"} & set(names_of(int(flags[0]))))
     assert called == [{"acceleration", "segment_motion"}, set()]
 

@@ -181,7 +181,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     seen = bench.try_on(rung, np.arange(72), 3).seen
     study = GridStudy(rung.of(spec))
     blocks = [
-        evaluate_block(study.spec, study.grid, b, study.calling.of_block(b))
+        evaluate_block(study.spec, study.grid, b, study.selection.of_block(b))
         for b in range(study.n_blocks)
     ]
     whole = np.full(study.grid.shape, np.nan)
@@ -194,7 +194,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
 def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
     bench = GridBench(small(footprint=COHERENT, storage={"block_points": 24}), 8)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
-    grid = bench._calling_of(rung).tiles.grid
+    grid = bench._selection_of(rung).tiles.grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
     for number in bench._numbers:
         beside = bench._beside(rung, number, 30)
@@ -313,7 +313,7 @@ def test_shots_are_timed_with_so_many_that_follow_round_the_end():
 @pytest.mark.parametrize("rays", [7, "auto"])
 def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     """Statistics of a trial against those of the flight's own machinery, more rays and all."""
-    from sweep.tasks.calling import TILE_SHOTS
+    from sweep.tasks.effect_selection import TILE_SHOTS
 
     spec = small_scene(
         footprint={"beamlets": rays, "speckle": "none"}, accuracy={"tolerance": 1e-6}
@@ -329,7 +329,7 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
 
     shots = caster.see(tiles.index)
     eyepoints = from_arrays(shots, caster.weight)
-    called = study.call(tiles.part, eyepoints, np.arange(len(tiles.index)))
+    called = study.select(tiles.part, eyepoints, np.arange(len(tiles.index)))
     assert len(tiles.index) <= TILE_SHOTS
     found = study.look(tiles.part, shots, eyepoints, called, tiles.index)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)

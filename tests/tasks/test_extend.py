@@ -43,7 +43,7 @@ def computed(monkeypatch):
         return real(spec, parameters, count, *rest)
 
     monkeypatch.setattr(evaluate, "evaluate_points", counted)
-    monkeypatch.setattr("sweep.tasks.grid_study.compile_kernels", lambda spec, grid: None)
+    monkeypatch.setattr(GridStudy, "compile", lambda self: None)
     return calls
 
 

@@ -15,7 +15,7 @@ from scipy.stats import qmc
 
 from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
 from sweep.tasks.accuracy.rungs import WRITTEN, Rung
-from sweep.tasks.calling import Called, Calling
+from sweep.tasks.effect_selection import EffectSelection, Selected
 from sweep.tasks.evaluate import evaluate_points
 from sweep.tasks.grid import Grid
 
@@ -207,7 +207,7 @@ class GridBench(Bench):
         self.spec = spec
         self._grid = Grid(spec)
         self._numbers = spread(self._grid.shape, points) if numbers is None else numbers
-        self._calling: dict[str, Calling] = {}
+        self._calling: dict[str, EffectSelection] = {}
         self._block_points = math.prod(self._grid.block_shape)
         self.size, self.whole = len(self._numbers), self._grid.points
         self.most_times = min(MOST_TIMES, self._block_points)
@@ -234,7 +234,7 @@ class GridBench(Bench):
             spent, planning = (sum(each) for each in zip(*runs, strict=True))
             timed, planning = stretches.size, planning / len(runs)
         planning = planning if rung.plans else 0.0
-        draws = int(self._calling_of(rung).tiles.grid.spec.draws.number)
+        draws = int(self._selection_of(rung).tiles.grid.spec.draws.number)
         seen = seen_in(outputs, draws if rung.counts else 0)
         return Trial(seen, spent / timed + planning, planning)
 
@@ -246,7 +246,7 @@ class GridBench(Bench):
         number = self._numbers[[place]]
         flags, _ = self._planned(rung, number)
         effects = [n for n in names_of(int(flags[0])) if n not in lacking]
-        parameters = self._calling_of(rung).tiles.grid.parameters_at(number)
+        parameters = self._selection_of(rung).tiles.grid.parameters_at(number)
         # Records walk by themselves, whatever effects are named.
         in_time = shot.evaluate(parameters, effects, look=truth.find)
         return seen_in(in_time), seen_in(shot.evaluate(parameters, effects))
@@ -260,23 +260,23 @@ class GridBench(Bench):
     def _flags(self, rung: Rung) -> np.ndarray:
         return self._planned(rung, self._numbers)[0]
 
-    def _calling_of(self, rung: Rung) -> Calling:
+    def _selection_of(self, rung: Rung) -> EffectSelection:
         if rung.name not in self._calling:
             spec = rung.of(self.spec)
-            self._calling[rung.name] = Calling(spec, Grid(spec))  # type: ignore[arg-type]
+            self._calling[rung.name] = EffectSelection(spec, Grid(spec))  # type: ignore[arg-type]
         return self._calling[rung.name]
 
     def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
         """Outputs of points, the time they take together, and that of planning one of them."""
         from sweep.model.shot import evaluate
 
-        grid = self._calling_of(rung).tiles.grid
+        grid = self._selection_of(rung).tiles.grid
         flags, planning = self._planned(rung, numbers)
-        called = Called(flags, np.zeros(flags.size)).groups()
+        selected = Selected(flags, np.zeros(flags.size)).groups()
         outputs: dict[str, np.ndarray] = {}
         spent = 0.0
         for members, effects in (
-            [(np.arange(len(flags)), self.of_lines())] if rung.of_lines else called
+            [(np.arange(len(flags)), self.of_lines())] if rung.of_lines else selected
         ):
             parameters = grid.parameters_at(numbers[members])
             begun = thread_time()
@@ -292,7 +292,7 @@ class GridBench(Bench):
 
     def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
         """A point and those that its block computes after it, round the block's end."""
-        grid = self._calling_of(rung).tiles.grid
+        grid = self._selection_of(rung).tiles.grid
         if not grid.shape:
             return np.zeros(times, np.int64)
         point = np.unravel_index(number, grid.shape)
@@ -312,14 +312,14 @@ class GridBench(Bench):
 
         A plan serves a whole tile, so that a point takes its share.
         """
-        tiles = self._calling_of(rung).tiles
+        tiles = self._selection_of(rung).tiles
         index = np.unravel_index(numbers, tiles.grid.shape) if tiles.grid.shape else ()
         along = [i // side for i, side in zip(index, tiles.shape, strict=True)]
         own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(numbers), int)
         met, where = np.unique(own, return_inverse=True)
         flags = np.empty(len(met), np.uint32)
         begun = thread_time()
-        for chosen, plan in self._calling_of(rung).plans(met):
+        for chosen, plan in self._selection_of(rung).plans(met):
             flags[chosen] = flags_of(plan.kept)
         spent = thread_time() - begun
         served = sum(math.prod(s.stop - s.start for s in tiles.points(int(tile))) for tile in met)

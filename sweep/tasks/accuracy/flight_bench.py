@@ -28,7 +28,7 @@ from sweep.tasks.accuracy.bench import (
     spread,
 )
 from sweep.tasks.accuracy.rungs import Rung
-from sweep.tasks.calling import TILE_SHOTS, Called
+from sweep.tasks.effect_selection import TILE_SHOTS, Selected
 from sweep.tasks.eyepoint_study import EyepointStudy, FinerRays, refine, world_of
 from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
 
@@ -133,9 +133,9 @@ class FlightBench(Bench):
         """A rung on a part of the sample, timed with its rays and the tiles beside it."""
         tiles, own = self._around(part, times)
         cast = self._see(rung, tiles)
-        called, planning = self._called(rung, tiles, cast.eyepoints)
+        selected, planning = self._selected(rung, tiles, cast.eyepoints)
         begun = thread_time()
-        seen = self._look(rung, tiles, cast.eyepoints, called)
+        seen = self._look(rung, tiles, cast.eyepoints, selected)
         spent = thread_time() - begun + cast.seconds + planning
         number = len(tiles.index)
         return Trial(Seen(*(values[own] for values in seen)), spent / number, planning / number)
@@ -150,11 +150,11 @@ class FlightBench(Bench):
 
         tiles, one = self._around(np.array([place]), 1)
         cast = self._see(rung, tiles)
-        called, _ = self._called(rung, tiles, cast.eyepoints)
+        selected, _ = self._selected(rung, tiles, cast.eyepoints)
         eyepoints = cast.eyepoints.some(one)
         if not eyepoints.seen.all():
             return nothing(1), nothing(1)
-        every = names_of(int(called.flags[one[0]]))
+        every = names_of(int(selected.flags[one[0]]))
         names = tuple(name for name in every if name not in NOT_IN_TRUTH)
         study = self._study(rung)
         in_time, ordinary = (
@@ -226,29 +226,29 @@ class FlightBench(Bench):
         return self._cast[which_shots]
 
     def _flags(self, rung: Rung) -> np.ndarray:
-        called = [
-            self._called(rung, tiles, self._see(rung, tiles).eyepoints) for tiles in self._tiles
+        selected = [
+            self._selected(rung, tiles, self._see(rung, tiles).eyepoints) for tiles in self._tiles
         ]
-        return np.concatenate([each.flags for each, _ in called])
+        return np.concatenate([each.flags for each, _ in selected])
 
-    def _called(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints) -> tuple[Called, float]:
+    def _selected(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints) -> tuple[Selected, float]:
         """What is simulated of shots, planned in their tiles, and the time [s] that it took."""
         if rung.of_lines:
             flag = flags_of(np.array([[name in self.of_lines()] for name in NAMES]))[0]
             flags = np.where(eyepoints.seen, flag, 0).astype(np.uint32)
-            return Called(flags, np.zeros(flags.size)), 0.0
+            return Selected(flags, np.zeros(flags.size)), 0.0
         begun = thread_time()
-        called = self._study(rung).call(tiles.part, eyepoints, tiles.index)
-        return called, thread_time() - begun if rung.plans else 0.0
+        selected = self._study(rung).select(tiles.part, eyepoints, tiles.index)
+        return selected, thread_time() - begun if rung.plans else 0.0
 
-    def _look(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints, called: Called) -> Seen:
+    def _look(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints, selected: Selected) -> Seen:
         """Statistics of shots, of those that see anything; more rays are cast where they must."""
-        whole, study = nothing(len(called.flags)), self._study(rung)
+        whole, study = nothing(len(selected.flags)), self._study(rung)
         accuracy = study.rays_accuracy
         if rung.rays_error:
             accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
         seen = np.flatnonzero(eyepoints.seen)
-        for among, names, flags in called.some(seen).together():
+        for among, names, flags in selected.some(seen).together():
             look = partial(_statistics, study, tiles.part, names, look_of(rung))
             group = _Group(
                 whole=whole,

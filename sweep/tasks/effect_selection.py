@@ -47,7 +47,7 @@ UNDIVIDED = (
 )
 
 
-class Called(NamedTuple):
+class Selected(NamedTuple):
     """Effects that are simulated at some points, (n,) each."""
 
     flags: np.ndarray
@@ -55,9 +55,9 @@ class Called(NamedTuple):
     error: np.ndarray
     """Largest change of a probability that all that is left out may make."""
 
-    def some(self, index: slice | np.ndarray) -> Called:
+    def some(self, index: slice | np.ndarray) -> Selected:
         """The same of some of the points."""
-        return Called(self.flags[index], self.error[index])
+        return Selected(self.flags[index], self.error[index])
 
     def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
         """Points that call for the same effects, and these."""
@@ -180,14 +180,14 @@ def tile_shape(sizes: tuple[int, ...], undivided: tuple[bool, ...]) -> tuple[int
     return tuple(shape)
 
 
-class Calling:
+class EffectSelection:
     """Plans of a grid's tiles, each made once."""
 
     def __init__(self, spec: Spec, grid: Grid) -> None:
         self._modes, self.tiles = spec.modes(), Tiles(grid)
         self._known: dict[int, tuple[int, float]] = {}
 
-    def of_block(self, block: int) -> Called:
+    def of_block(self, block: int) -> Selected:
         """Effects simulated at the points of a block, in C order over it."""
         tiles, place = self.tiles.of_block(block)
         lacking = np.array([t for t in tiles.tolist() if t not in self._known], np.int64)
@@ -198,7 +198,7 @@ class Calling:
         found = [self._known[t] for t in tiles.tolist()]
         flags, errors = np.array([f for f, _ in found], np.uint32), np.array([e for _, e in found])
         absent = self.absent(self.tiles.grid.parameters(block), len(place))
-        return Called(flags[place] & ~absent, errors[place])
+        return Selected(flags[place] & ~absent, errors[place])
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
         """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
@@ -210,10 +210,6 @@ class Calling:
             absent = effect.absent(DEFAULTS | dict(parameters))
             flags |= np.where(absent, np.uint32(1 << k), np.uint32(0))
         return flags
-
-    def of_point(self, point: int) -> tuple[str, ...]:
-        """Names of the effects that are simulated at a point of the first block."""
-        return names_of(int(self.of_block(0).flags[point]))
 
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these.
@@ -266,12 +262,12 @@ class ShotsPlan(NamedTuple):
     plan: Plan
     """Of the tiles."""
 
-    def called(self, number: int) -> Called:
+    def selected(self, number: int) -> Selected:
         """Effects simulated at that many shots; none where nothing is seen."""
-        called = Called(np.zeros(number, np.uint32), np.zeros(number))
-        called.flags[self.shots] = flags_of(self.plan.kept)[self.tile]
-        called.error[self.shots] = self.plan.error[self.tile]
-        return called
+        selected = Selected(np.zeros(number, np.uint32), np.zeros(number))
+        selected.flags[self.shots] = flags_of(self.plan.kept)[self.tile]
+        selected.error[self.shots] = self.plan.error[self.tile]
+        return selected
 
 
 def plan_shots(

@@ -7,7 +7,14 @@ from small import quiet, small
 from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
-from sweep.tasks.calling import TILE_POINTS, Called, Calling, Tiles, _stretches, tile_shape
+from sweep.tasks.effect_selection import (
+    TILE_POINTS,
+    EffectSelection,
+    Selected,
+    Tiles,
+    _stretches,
+    tile_shape,
+)
 from sweep.tasks.effects_table import effects_table
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
@@ -77,13 +84,13 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
         footprint={"phases": "incoherent", "speckle": "none"},
         accuracy={"tolerance": 1e-2},
     )
-    calling = Calling(spec, Grid(spec))
-    tiles = np.arange(calling.tiles.number)
+    selection = EffectSelection(spec, Grid(spec))
+    tiles = np.arange(selection.tiles.number)
     kept = np.zeros((len(NAMES), tiles.size), bool)
-    for chosen, plan in calling.plans(tiles):
+    for chosen, plan in selection.plans(tiles):
         kept[:, chosen] = plan.kept
-    for alike in calling.tiles.alike(tiles):
-        whole = calling._plan(alike)
+    for alike in selection.tiles.alike(tiles):
+        whole = selection._plan(alike)
         assert (kept[:, alike.tiles] == whole.kept).all()
     assert not kept.all(axis=1)[kept.any(axis=1)].all()
 
@@ -101,10 +108,10 @@ def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_a
     bit = {name: np.uint32(1 << k) for k, name in enumerate(NAMES)}
     base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
     flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
-    found = {tuple(index): names for index, names, own in Called(flags, flags * 0.0).together()}
+    found = {tuple(index): names for index, names, own in Selected(flags, flags * 0.0).together()}
     plain = ("footprint", "doppler", "signal_shot_noise")
     assert found == {(0, 1, 3): plain, (2, 4): (*plain, "image")}
-    for index, _, own in Called(flags, flags * 0.0).together():
+    for index, _, own in Selected(flags, flags * 0.0).together():
         np.testing.assert_array_equal(own, flags[index])
 
 
@@ -146,7 +153,7 @@ def test_less_is_simulated_the_larger_the_tolerance():
     counts = [
         np.bitwise_count(
             GridStudy(small(axes=WIDE, accuracy={"tolerance": t}, storage={"block_points": 65536}))
-            .calling.of_block(0)
+            .selection.of_block(0)
             .flags
         ).sum()
         for t in (1e-3, 1e-2, 1e-1)
@@ -163,12 +170,12 @@ def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
 
 def test_a_plan_is_made_once_for_a_tile(monkeypatch):
     spec = small(axes=WIDE, storage={"block_points": 100})
-    calling, planned = Calling(spec, Grid(spec)), []
-    plans = calling.plans
-    monkeypatch.setattr(calling, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
+    selection, planned = EffectSelection(spec, Grid(spec)), []
+    plans = selection.plans
+    monkeypatch.setattr(selection, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
     for block in range(Grid(spec).n_blocks):
-        calling.of_block(block)
-    assert sorted(planned) == list(range(calling.tiles.number))
+        selection.of_block(block)
+    assert sorted(planned) == list(range(selection.tiles.number))
 
 
 def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
