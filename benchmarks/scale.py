@@ -46,12 +46,12 @@ class Line:
 
 def receipt(block, points=65_536):
     """A receipt as workers give it."""
-    from sweep.tasks import versions
+    from sweep.tasks import identity
     from sweep.tasks.journal import Receipt
 
     return Receipt(
         block=block, points=points, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
-        write_seconds=0.0123, host="node-0123", pid=12_345, versions=versions.software(),
+        write_seconds=0.0123, host="node-0123", pid=12_345, versions=identity.software(),
     )  # fmt: skip
 
 
@@ -74,7 +74,7 @@ def filled(directory, n_blocks):
 
 def receipt_lines(n_blocks, points=65_536):
     """Lines of a log, of so many blocks all done."""
-    from sweep.storage.sealing import closed
+    from sweep.storage.logs import closed
 
     record = {**vars(receipt(0, points)), "time": round(time.time(), 3)}
     rest = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
@@ -89,11 +89,10 @@ def timed(what):
 
 def blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
-    from sweep.storage.receipts import read_receipts
+    from sweep.storage.logs import read_receipts
     from sweep.tasks.grid import Grid
-    from sweep.tasks.journal import Journal
-    from sweep.tasks.listing import listed
-    from sweep.tasks.todo import Todo
+    from sweep.tasks.journal import Journal, listed
+    from sweep.tasks.scheduler import BlockQueue
 
     axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip
@@ -110,8 +109,8 @@ def blocks(n_blocks, store):
         assert found.all()
 
     def hand_out():
-        todo = Todo(np.zeros(n_blocks, bool))
-        while todo.take(1000):
+        queue = BlockQueue(np.zeros(n_blocks, bool))
+        while queue.take(1000):
             pass
 
     _, _, handing = timed(hand_out)
@@ -134,7 +133,7 @@ def block_rows(directory):
 def nap_for(seconds):
     """What workers do in place of computing: wait, and answer as for one long block a task."""
 
-    def nap(path, study_id, blocks, terms):
+    def nap(job, blocks):
         from sweep.tasks.journal import Receipt
         from sweep.tasks.worker import Answer
 
@@ -173,13 +172,13 @@ def worker_rows(slots, lengths, measured):
 
 def through(client, seconds, measured):
     """Tasks a second that go through, once all slots have work, and processor time of each."""
-    from sweep.tasks import window
-    from sweep.tasks.todo import Todo
-    from sweep.tasks.window import Job, Window
+    from sweep.tasks import scheduler
+    from sweep.tasks.worker import Job
 
-    window.work = nap_for(seconds)
+    scheduler.work = nap_for(seconds)
     slots = sum(client.nthreads().values())
-    tasks = Window(client, 0, Job("x", f"waiting {seconds}", "0"), Todo(np.zeros(10**7, bool)))
+    queue, job = scheduler.BlockQueue(np.zeros(10**7, bool)), Job("x", f"waiting {seconds}")
+    tasks = scheduler.Scheduler(client, 0, job, queue, seen=lambda *_: True, say=print)
     arrived, counted, stop = 0, 0, threading.Event()
     begun = cpu = rate = spent = 0.0
     for answer in tasks.answers(stop.is_set):

@@ -15,7 +15,8 @@ from drawn_files import shows
 
 from sweep.cli import main
 from sweep.spec import Spec
-from sweep.tasks import driver, pool, progress
+from sweep.tasks import driver, progress
+from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
 from sweep.tasks.lock import Lock
 
 STUDY = """\
@@ -521,8 +522,19 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
     assert "Probability of detection" in output
 
 
-def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys):
-    lines = progress.Lines(every=0.0)
+def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys, monkeypatch):
+    with monkeypatch.context() as often:
+        often.setattr(progress, "LINE_EVERY", 0.0)
+        _lines_of_progress(capsys)
+    patient = progress.Lines()
+    patient.begin(points=100, done=0, unit="points")
+    for _ in range(50):
+        patient.advance(points=1, failed=0)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def _lines_of_progress(capsys):
+    lines = progress.Lines()
     lines.begin(points=100, done=20, unit="points")
     lines.advance(points=30, failed=0)
     lines.advance(points=0, failed=2)
@@ -531,11 +543,6 @@ def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys)
     assert shown[0] == "20 of 100 points"
     assert shown[1].startswith("50 of 100 points, ")
     assert shown[-1].endswith("2 blocks failed")
-    patient = progress.Lines()
-    patient.begin(points=100, done=0, unit="points")
-    for _ in range(50):
-        patient.advance(points=1, failed=0)
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -550,12 +557,24 @@ def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(h
     spec = Spec.from_mapping(
         {**_mapping(), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
-    assert pool.Place().for_spec(spec).scheduler == "none"
-    here_with_two = pool.Place(workers=2).for_spec(spec)
-    assert here_with_two.scheduler is None
-    assert here_with_two.cluster.workers == (2, 2)
+    assert RunOptions().place(spec) is None
+    assert RunOptions(workers=2).place(spec).workers == (2, 2)
     spec = Spec.from_mapping({**_mapping(), "execution": {"workers": 3}}, base=here)
-    assert pool.Place().for_spec(spec).cluster.workers == (3, 3)
+    assert RunOptions().place(spec).workers == (3, 3)
+
+
+def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwise(here):
+    little, large = _mapping(), _mapping()
+    large["axes"]["target.range"]["number"] = 10**6
+    little, large = (Spec.from_mapping(mapping, base=here) for mapping in (little, large))
+    assert about_seconds(little) < LITTLE < about_seconds(large)
+    assert RunOptions().place(little) is None
+    assert RunOptions().place(large).kind == "local"
+    for said in ({"workers": 1}, {"processes": False}, {"block_timeout": 9.0},
+                 {"performance_report": "r.html"}, {"evaluate": print}):  # fmt: skip
+        assert RunOptions(**said).place(little).kind == "local"
+    assert RunOptions(scheduler="tcp://10.0.0.5:8786").place(little).kind == "scheduler"
+    assert RunOptions(scheduler="none").place(large) is None
 
 
 def _mapping() -> dict:

@@ -13,19 +13,20 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.threshold import segment_bins, tnr_of
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from sweep.spec import SceneSpec, Spec
 
 #: Thresholds and detectors of a study that are looked at, about.
 MOST_LOOKED_AT = 400
 
-Chances = TypeVar("Chances", np.ndarray, xr.DataArray)
+Chances = TypeVar("Chances", np.ndarray, "xr.DataArray")
 
 
 def bin_exponent(tnr: float) -> float:

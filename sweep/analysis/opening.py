@@ -12,11 +12,10 @@ import xarray as xr
 
 import sweep.analysis.answers.accessor  # noqa: F401  # ds.sweep
 from sweep.model.outputs import RUNNING
-from sweep.storage import opening, sealing
+from sweep.storage import logs, opening
 from sweep.storage.locations import JOURNAL, Location, located
+from sweep.storage.logs import read_lines, read_receipts
 from sweep.storage.opening import CHECKED, NotAStoreError
-from sweep.storage.receipts import read_receipts
-from sweep.storage.sealing import read_lines
 from sweep.storage.unreplaced import readable
 
 BATCH = "batch"
@@ -97,7 +96,7 @@ def refuse_lost(path: Location) -> None:
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in names:
             with suppress(OSError):
-                if sealing.digest(path, [name]) == record["digest"]:
+                if logs.digest(path, [name]) == record["digest"]:
                     continue
             raise NotAStoreError(
                 f"{path} has lost {name}, of a coordinate: `sweep verify {path} --repair` puts "

@@ -13,11 +13,16 @@ import click
 from sweep.cli.options import (
     ALLOW_CODE,
     FORMAT,
+    OVERWRITE,
+    SPEC,
+    STORE,
     WORKERS,
     LocalPath,
     StorePath,
     assignments,
+    at,
     computing,
+    folder,
     shown,
 )
 from sweep.cli.telling import (
@@ -38,16 +43,13 @@ from sweep.cli.telling import (
 from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
+    pass
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG,
 }  # fmt: skip
-
-SPEC = click.argument("spec", type=LocalPath(exists=True, dir_okay=False))
-STORE = click.argument("store", type=StorePath())
 
 
 class Commands(click.Group):
@@ -69,7 +71,7 @@ class Commands(click.Group):
             from sweep.model.unsupported import UnsupportedShot
             from sweep.scenes.files import SceneError
             from sweep.spec import SpecError
-            from sweep.storage.objects import ObjectStoreError, worded
+            from sweep.storage.locations import ObjectStoreError, worded
             from sweep.storage.unreplaced import ReplacedError
             from sweep.tasks.errors import StoreError, TaskError
 
@@ -220,20 +222,10 @@ def plan(spec: Path, workers: int | None) -> None:
 
 @main.command()
 @SPEC
-@click.option(
-    "--at",
-    "at",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="A parameter's value; as often as needed.",
-)
+@at("A parameter's value; as often as needed.")
 @click.option("--noise/--no-noise", default=True, help="Draw the noise of one shot, or only lines.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of that noise [the spec's].")
-@click.option(
-    "--output",
-    type=LocalPath(file_okay=False),
-    help="Directory of the figure [results/<name of the spec>].",
-)
+@folder("Directory of the figure [results/<name of the spec>].")
 @FORMAT
 def shot(
     spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None, form: str
@@ -288,7 +280,7 @@ def _list(files: Sequence[Location]) -> None:
     metavar="SECONDS",
     help="Time that it may take, about [60].",
 )
-@click.option("--overwrite", is_flag=True, help="Put the new store in the place of an old one.")
+@OVERWRITE
 def accuracy(
     spec: Path, store: Location | None, points: int, time_limit: float, overwrite: bool
 ) -> None:
@@ -325,11 +317,7 @@ def accuracy(
 
 @main.command()
 @STORE
-@click.option(
-    "--output",
-    type=LocalPath(file_okay=False),
-    help="Directory of the figures [NAME-figures beside NAME.zarr].",
-)
+@folder("Directory of the figures [NAME-figures beside NAME.zarr].")
 @FORMAT
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables that the study in STORE asks for."""
@@ -351,13 +339,7 @@ def figures(store: Location, output: Path | None, form: str) -> None:
     default="interpolated",
     help="Ranges and velocities: interpolated between bins [default], or quantised to them.",
 )
-@click.option(
-    "--at",
-    "at",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Value of a coordinate, where the study has axes; as often as needed.",
-)
+@at("Value of a coordinate, where the study has axes; as often as needed.")
 def export(
     store: Location, file: Path, scanner: str | None, draw: int, ranges: str, at: tuple[str, ...]
 ) -> None:
@@ -469,33 +451,9 @@ def extend(
     conclude(outcome, shown(to or store))
 
 
-def declared(place: Location) -> Spec:
-    """The study of a flat target in a spec's file or in a store.
-
-    Raises
-    ------
-    UsageError
-        Where it flies over a scene.
-    """
-    from sweep.spec import Spec, load
-    from sweep.tasks.studies import read
-
-    is_file = isinstance(place, Path) and not place.is_dir()
-    study = load(str(place)) if is_file else read(place)[1].spec
-    if not isinstance(study, Spec):
-        raise click.UsageError(f"{place} is a study of a scene: spectra are those of a flat target")
-    return study
-
-
 @main.command()
 @click.argument("study", type=StorePath())
-@click.option(
-    "--at",
-    "at",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="A parameter's value; as often as needed. Axes that are not named take their first value.",
-)
+@at("A parameter's value; as often as needed. Axes that are not named take their first value.")
 @click.option("--draws", type=click.IntRange(min=1), default=1, help="Number of draws [1].")
 @click.option("--first", type=click.IntRange(min=0), default=0, help="Number of the first [0].")
 @click.option(
@@ -505,7 +463,7 @@ def declared(place: Location) -> Spec:
     required=True,
     help="File to write: .zarr (opens with xarray) or .npz (with numpy).",
 )
-@click.option("--overwrite", is_flag=True, help="Put the new file in the place of an old one.")
+@OVERWRITE
 def spectra(
     study: Location, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
 ) -> None:
@@ -521,11 +479,16 @@ def spectra(
       sweep spectra s3://bucket/cfar.zarr --at range=2km -o spectra.npz
     """  # noqa: D301
     from sweep.analysis.shot_figure import chosen
+    from sweep.spec import Spec, load
     from sweep.tasks.progress import working
     from sweep.tasks.spectra_export import spectra as drawn
     from sweep.tasks.spectra_export import write
+    from sweep.tasks.studies import read
 
-    spec = declared(study)
+    is_file = isinstance(study, Path) and not study.is_dir()
+    spec = load(str(study)) if is_file else read(study)[1].spec
+    if not isinstance(spec, Spec):
+        raise click.UsageError(f"{study} is a study of a scene: spectra are those of a flat target")
     _, parameters = chosen(spec, assignments(at))[0]
     with working("drawing spectra"):
         dataset = drawn(spec, parameters, draws=draws, first=first)

@@ -53,13 +53,7 @@ def shown(path: Location) -> Location:
 def assignments(
     texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
 ) -> dict[str, str]:
-    """Values by name, as written after an option.
-
-    Raises
-    ------
-    BadParameter
-        Where one is not NAME=VALUE.
-    """
+    """Values by name, as written after an option; refused where one is not NAME=VALUE."""
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -71,10 +65,13 @@ def assignments(
     return found
 
 
+SPEC = click.argument("spec", type=LocalPath(exists=True, dir_okay=False))
+STORE = click.argument("store", type=StorePath())
+
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Workers to start [all cores here; those of --cluster].",
+    help="Workers to start [all cores here, none for little work; those of --cluster].",
 )
 SCHEDULER = click.option(
     "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
@@ -100,6 +97,10 @@ DURABLE = click.option(
     "--durable", is_flag=True, help="Blocks count once they are on the disk: safe from power loss."
 )
 
+OVERWRITE = click.option(
+    "--overwrite", is_flag=True, help="Put the new one in the place of an old one."
+)
+
 FORMAT = click.option(
     "--format",
     "form",
@@ -107,6 +108,16 @@ FORMAT = click.option(
     default="png",
     help="Format of the pictures [png]; pdf and svg for print.",
 )
+
+
+def at(help: str) -> Callable[..., Any]:
+    """Option of values by name; :func:`assignments` reads them."""
+    return click.option("--at", "at", multiple=True, metavar="NAME=VALUE", help=help)
+
+
+def folder(help: str) -> Callable[..., Any]:
+    """Option of the folder that files are put into."""
+    return click.option("--output", type=LocalPath(file_okay=False), help=help)
 
 
 def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:

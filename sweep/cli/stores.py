@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sweep.cli.options import LocalPath, StorePath, shown
+from sweep.cli.options import STORE, LocalPath, StorePath, shown
 from sweep.cli.telling import INCOMPLETE, in_bytes, print_table, tell_accuracy
 from sweep.storage.locations import Location, beside, files_below
 
@@ -22,8 +22,6 @@ DAMAGED, DIFFERENT = 1, 4
 
 #: Damaged objects of one store that are listed.
 MOST_LISTED = 20
-
-STORE = click.argument("store", type=StorePath())
 
 
 @click.command()
@@ -70,7 +68,7 @@ def _tell_what_is_under_way(store: Location) -> None:
     from sweep.storage.atomic_replace import real
     from sweep.tasks.errors import StoreError
     from sweep.tasks.identity import under_way
-    from sweep.tasks.recipe import EXTENDS, read_recipe
+    from sweep.tasks.journal import EXTENDS, read_recipe
 
     try:
         if new := under_way(real(store)):
@@ -161,7 +159,7 @@ def _tell(report: Report) -> None:
 
 
 def _say_what_to_do(store: Location, reports: list[Report]) -> None:
-    """What mends what was found."""
+    """Print what mends what was found."""
     for report in reports:
         if report.unmarked:
             click.echo(
@@ -209,18 +207,7 @@ def report(store: Location, output: Path | None) -> None:
 
 @contextmanager
 def bar(begin: str) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error while its block runs; gone at its end.
-
-    Parameters
-    ----------
-    begin
-        What is being done at first.
-
-    Yields
-    ------
-    callable
-        Is told what is being done next.
-    """
+    """A bar on standard error while its block runs, gone at its end, which is told what is next."""
     from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn

@@ -1,4 +1,4 @@
-"""What the commands print: plans before a run, tables and counts after it."""
+"""Output of the commands: plans before a run, tables and counts after it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.accuracy_table import Row
     from sweep.tasks.effects_table import EffectRow, EffectsTable
     from sweep.tasks.plan import Plan
     from sweep.tasks.session import Outcome
@@ -36,12 +35,7 @@ LEAST_WORDS, BETWEEN = 14, 3
 def conclude(outcome: Outcome, store: Location) -> None:
     """Say what a run has come to, and leave with its exit code.
 
-    Parameters
-    ----------
-    outcome
-        What it has come to.
-    store
-        The store that the user named: one that is being extended lies beside it.
+    The store is the one that the user named: one that is being extended lies beside it.
     """
     from sweep.tasks.progress import duration
 
@@ -76,21 +70,19 @@ def _print_summary(store: Location) -> None:
     from sweep.tasks import studies
 
     attributes, study = studies.read(store)
-    print_table(*(_scene_rows if attributes["kind"] == "scene" else _grid_rows)(store))
+    (_print_scene if attributes["kind"] == "scene" else _print_grid)(store)
     if alarms := alarms_told(study.spec):
         click.echo(f"False alarms of noise: {alarms}.")
 
 
-def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
-    """Title, headings and rows of a grid's summary."""
+def _print_grid(store: Location) -> None:
     from sweep.tasks.summary import DETECTED, summary
 
     part, rows, share = summary(store)
-    headings = [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"]
-    return (
+    print_table(
         "Probability of detection"
         + (f", by {100 * share:.2g} % of the blocks" if share < 1 else ""),
-        headings,
+        [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"],
         [
             [
                 row.part,
@@ -100,6 +92,26 @@ def _grid_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
                 f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
             ]
             for row in rows
+        ],
+    )
+
+
+def _print_scene(store: Location) -> None:
+    from sweep.tasks.summary import scene_summary
+
+    print_table(
+        "What came back",
+        ["scanner", "shots", "mean pd", "true", "false points", "velocity"],
+        [
+            [
+                row.part,
+                f"{row.shots:,}",
+                f"{row.pd:.4g}",
+                f"{100 * row.true / max(row.shots, 1):.1f} %",
+                f"{row.false:,}",
+                f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
+            ]
+            for row in scene_summary(store)
         ],
     )
 
@@ -117,7 +129,18 @@ def tell_accuracy(store: Location) -> None:
         print_table(
             "Half-widths of what is drawn",
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
-            [_accuracy_cells(row) for row in rows],
+            [
+                [
+                    row.name,
+                    f"{row.met:,} of {row.points:,}",
+                    f"{row.error:.3g}",
+                    f"{row.missed:.2g}",
+                    f"{row.number:,}",
+                    f"{row.needed:,.0f}" if row.needed < float("inf") else "-",
+                    row.where,
+                ]
+                for row in rows
+            ],
             "at",
         )
     if rays := rays_table(store):
@@ -125,54 +148,19 @@ def tell_accuracy(store: Location) -> None:
         print_table(
             f"What more {kind} may change",
             ["", f"{kind} a {each}", "met", "worst", "missed by", "at"],
-            [_rays_cells(row) for row in rays],
+            [
+                [
+                    row.name,
+                    f"{row.mean:,.0f}, at most {row.most:,}",
+                    f"{row.met:,} of {row.points:,}",
+                    f"{row.error:.3g}",
+                    f"{row.missed:.2g}",
+                    row.where,
+                ]
+                for row in rays
+            ],
             "at",
         )
-
-
-def _rays_cells(row: Row) -> list[str]:
-    return [
-        row.name,
-        f"{row.mean:,.0f}, at most {row.most:,}",
-        f"{row.met:,} of {row.points:,}",
-        f"{row.error:.3g}",
-        f"{row.missed:.2g}",
-        row.where,
-    ]
-
-
-def _accuracy_cells(row: Row) -> list[str]:
-    return [
-        row.name,
-        f"{row.met:,} of {row.points:,}",
-        f"{row.error:.3g}",
-        f"{row.missed:.2g}",
-        f"{row.number:,}",
-        f"{row.needed:,.0f}" if row.needed < float("inf") else "-",
-        row.where,
-    ]
-
-
-def _scene_rows(store: Location) -> tuple[str, list[str], list[list[str]]]:
-    """Title, headings and rows of a scene's summary."""
-    from sweep.tasks.summary import scene_summary
-
-    headings = ["scanner", "shots", "mean pd", "true", "false points", "velocity"]
-    return (
-        "What came back",
-        headings,
-        [
-            [
-                row.part,
-                f"{row.shots:,}",
-                f"{row.pd:.4g}",
-                f"{100 * row.true / max(row.shots, 1):.1f} %",
-                f"{row.false:,}",
-                f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
-            ]
-            for row in scene_summary(store)
-        ],
-    )
 
 
 def print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
@@ -370,7 +358,7 @@ def warn_before(study: Spec | SceneSpec, store: Location) -> None:
 
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
-    """Which effects a study calls for, where, and what they cost if that is asked for."""
+    """Table of the effects that a study calls for, where, and their costs if asked for."""
     from sweep.tasks.effects_table import effects_table
     from sweep.tasks.studies import study_of
 

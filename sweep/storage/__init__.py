@@ -1,1 +1,1 @@
-"""Where stores are kept, on disk or in an object store, and what the engine needs of a place."""
+"""Places of stores, on disk or in an object store, and their logs and documents."""

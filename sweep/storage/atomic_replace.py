@@ -64,17 +64,7 @@ def replaced_by(path: Path) -> Path:
 def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """A hidden place in which a file or folder is made; it is put in its own place at the end.
 
-    Parameters
-    ----------
-    path
-        Its own place.
-    replace
-        Whether what is there may be replaced.
-
-    Raises
-    ------
-    OSError
-        Where something is there that may not, or the folder can't be written.
+    What is there stays, with an OSError, unless it may be replaced.
     """
     settle(path)
     path.parent.mkdir(parents=True, exist_ok=True)

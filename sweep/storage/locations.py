@@ -1,22 +1,29 @@
-"""Where a store is: a folder on disk, or a key in an object store."""
+"""Places of stores: a folder on disk, or a key in an object store, and files put there whole.
+
+Which credentials and which endpoint an object store takes is for the environment to say
+(AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
+import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
+from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sweep.storage.objects import SCHEMES, ObjectPath, ObjectStoreError
-
-Location = Path | ObjectPath
-"""What stands for a place; both know `/`, `name`, `parent`, `exists()` and `read_bytes()`."""
+#: Kinds of addresses; `memory` is for tests, and lives as long as its process.
+SCHEMES = ("s3", "gs", "az", "memory")
 
 #: Directory of the journal inside a store.
 JOURNAL = ".sweep"
@@ -30,13 +37,249 @@ PACKED = "packed"
 #: Requests to an object store at once: each takes some ms, nearly all of it waiting.
 REQUESTS = 16
 
+#: What is tried again, and for how long: replies of 500 and more, none in time, lost connections.
+RETRIES = {
+    "max_retries": 8,
+    "retry_timeout": timedelta(seconds=90),
+    "backoff": {
+        "init_backoff": timedelta(milliseconds=100),
+        "max_backoff": timedelta(seconds=10),
+        "base": 2,
+    },
+}
+
+#: The same at first contact, where a wrong address is likelier than a passing fault.
+FIRST_RETRIES = {**RETRIES, "max_retries": 3, "retry_timeout": timedelta(seconds=10)}
+
+CLIENT = {"timeout": "30s", "connect_timeout": "5s"}
+
+Tag = Any
+"""Mark by which an object store knows a state of an object."""
+
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 
+_clients: dict[str, Any] = {}
+_opening = threading.RLock()
 
-def is_url(text: str) -> bool:
-    """Whether a text names a place in an object store."""
-    return re.match(rf"({'|'.join(SCHEMES)}):/", text) is not None
+
+class ObjectStoreError(OSError):
+    """An object store that can't be used as asked: the text says why and what to do."""
+
+    def __str__(self) -> str:
+        return f"{self.filename}: {self.strerror}"
+
+
+@dataclass(frozen=True, order=True)
+class ObjectPath:
+    """A key in an object store, spoken to as far as needed in the words of `pathlib`.
+
+    Parameters
+    ----------
+    root
+        Kind and bucket: ``s3://bucket``.
+    key
+        The key, without a slash at either end.
+    """
+
+    root: str
+    key: str
+
+    def __str__(self) -> str:
+        return f"{self.root}/{self.key}"
+
+    def __truediv__(self, other: str) -> ObjectPath:
+        return ObjectPath(self.root, "/".join(filter(None, [self.key, str(other).strip("/")])))
+
+    def joinpath(self, *others: str) -> ObjectPath:
+        """The key below this one."""
+        return self / "/".join(others)
+
+    @property
+    def name(self) -> str:
+        """Last part of the key."""
+        return self.key.rpartition("/")[2]
+
+    @property
+    def parent(self) -> ObjectPath:
+        """The key without its last part."""
+        return ObjectPath(self.root, self.key.rpartition("/")[0])
+
+    def with_name(self, name: str) -> ObjectPath:
+        """A key beside this one."""
+        return self.parent / name
+
+    def absolute(self) -> ObjectPath:
+        """Itself."""
+        return self
+
+    @property
+    def client(self) -> Any:
+        """The object store, connected once a process; on first contact it is asked whether it is
+        there at all.
+        """
+        with _opening:
+            if self.root not in _clients:
+                with in_words(self):
+                    if not self.root.startswith("memory:"):
+                        _client(self.root, FIRST_RETRIES).list_with_delimiter(self.key or None)
+                    _clients[self.root] = _client(self.root, RETRIES)
+            return _clients[self.root]
+
+    def _head(self) -> Any:
+        """Metadata of the object; None where there is none."""
+        with in_words(self), suppress(FileNotFoundError):
+            return self.client.head(self.key)
+
+    def exists(self) -> bool:
+        """Tell whether there is an object at the key, or a Zarr group or array under it."""
+        return self.size() >= 0 or (self / "zarr.json").size() >= 0
+
+    def size(self) -> int:
+        """Bytes of the object; -1 where there is none."""
+        head = self._head()
+        return -1 if head is None else int(head["size"])
+
+    def modified(self) -> float | None:
+        """Time at which the object was last written [s since the epoch]; None without one."""
+        head = self._head()
+        return None if head is None else float(head["last_modified"].timestamp())
+
+    def read_bytes(self) -> bytes:
+        """The object whole."""
+        with in_words(self):
+            return bytes(self.client.get(self.key).bytes())
+
+    def write_bytes(self, content: bytes) -> None:
+        """Put an object, whole, in the place of whatever is there."""
+        with in_words(self):
+            self.client.put(self.key, content)
+
+    def unlink(self, missing_ok: bool = False) -> None:
+        """Take the object away; that there is none is no error, whatever is asked for."""
+        with in_words(self), suppress(FileNotFoundError):
+            self.client.delete(self.key)
+
+    def below(self) -> Iterator[tuple[str, int]]:
+        """Keys under this one, relative to it, and their sizes, a page in memory at a time."""
+        with in_words(self):
+            for page in self.client.list(self.key or None):
+                for found in page:
+                    yield found["path"][len(self.key) :].lstrip("/"), found["size"]
+
+    def _children(self) -> list[str]:
+        with in_words(self):
+            found = self.client.list_with_delimiter(self.key or None)
+        paths = [*found["common_prefixes"], *(one["path"] for one in found["objects"])]
+        return sorted(path.rpartition("/")[2] for path in paths)
+
+    def is_dir(self) -> bool:
+        """Tell whether keys lie under this one."""
+        return bool(self._children())
+
+    def glob(self, pattern: str) -> list[ObjectPath]:
+        """Keys right under this one whose name fits a pattern."""
+        return [self / name for name in self._children() if fnmatch(name, pattern)]
+
+    def read_tagged(self) -> tuple[bytes, Tag] | None:
+        """The object and the tag of what it holds; None where there is none."""
+        with in_words(self), suppress(FileNotFoundError):
+            found = self.client.get(self.key)
+            return bytes(found.bytes()), _tag(found.meta)
+        return None
+
+    def put_if(self, content: bytes, tag: Tag | None) -> Tag | None:
+        """Put an object if none is there, or only what has a tag.
+
+        Returns
+        -------
+        dict or None
+            The new tag; None where somebody was quicker.
+        """
+        from obstore.exceptions import AlreadyExistsError, PreconditionError
+
+        mode = "create" if tag is None else tag
+        quicker = (AlreadyExistsError, PreconditionError, FileNotFoundError)
+        with in_words(self), suppress(*quicker):
+            return _tag(self.client.put(self.key, content, mode=mode))
+        return None
+
+
+def _tag(found: Any) -> Tag:
+    return {key: found[key] for key in ("e_tag", "version") if found[key] is not None}
+
+
+def _client(root: str, retries: Any) -> Any:
+    from obstore.store import MemoryStore, from_url
+
+    if root.startswith("memory:"):
+        return MemoryStore()
+    allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
+    options: Any = {**CLIENT, "allow_http": allowed or _endpoint().startswith("http:")}
+    return from_url(root, client_options=options, retry_config=retries)
+
+
+def _endpoint() -> str:
+    return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
+
+
+@contextmanager
+def in_words(where: object) -> Iterator[None]:
+    """Errors of an object store in words, with what to do; nothing where a path is a file's."""
+    if not isinstance(where, ObjectPath):
+        yield
+        return
+    from obstore.exceptions import BaseError
+
+    try:
+        yield
+    except BaseError as error:
+        number, why = explained(str(error), where.root)
+        raise ObjectStoreError(number, why, str(where)) from error
+
+
+def worded(error: Exception) -> Exception:
+    """An error as it is, or in words where an object store raised it through Zarr or xarray."""
+    if type(error).__module__.partition(".")[0] != "obstore":
+        return error
+    return ObjectStoreError(*explained(str(error), ""), "the store")
+
+
+def explained(text: str, root: str) -> tuple[int, str]:
+    """Number and words of what an object store's library says, of a kind and bucket."""
+    bucket, at = root.partition("://")[2], _endpoint() or f"the service of {root.split(':')[0]}://"
+    said = text.partition("\n\nDebug source")[0]
+    status = re.search(r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", said)
+    answer = (status[1] or status[2]).strip() if status else ""
+    if "NoSuchBucket" in text or "ContainerNotFound" in text:
+        return errno.ENXIO, f"{at} has no bucket {bucket!r}: make it, or mend its name"
+    if (
+        "169.254.169.254" in text
+        or re.search(r"Missing \w*Key", said)
+        or "metadata.google.internal" in text
+    ):
+        return errno.EACCES, (
+            "no credentials are set: give AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (workers "
+            "need them too); AWS_SKIP_SIGNATURE=true reads what is public"
+        )
+    if answer[:3] in ("401", "403") or "PermissionDenied" in text:
+        return errno.EACCES, (
+            f"{at} refuses access{f' ({answer})' if answer else ''}: "
+            "check the credentials, and that they may list, read and write there"
+        )
+    if "imed out" in text or "Timeout" in text:
+        return errno.ETIMEDOUT, f"{at} does not answer in time: try again, or look at the network"
+    if "error sending request" in text or "onnect" in said:
+        return errno.ECONNREFUSED, (
+            f"{at} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
+        )
+    if answer:
+        return errno.EIO, f"{at} keeps failing ({answer}): try again"
+    return errno.EIO, said
+
+
+Location = Path | ObjectPath
+"""A place; both know `/`, `name`, `parent`, `exists()` and `read_bytes()`."""
 
 
 def located(where: str | Location) -> Location:
@@ -50,7 +293,7 @@ def located(where: str | Location) -> Location:
     if isinstance(where, ObjectPath):
         return where
     text = str(where)
-    if not is_url(text):
+    if not re.match(rf"({'|'.join(SCHEMES)}):/", text):
         if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", text):
             kinds = ", ".join(f"{scheme}://" for scheme in SCHEMES if scheme != "memory")
             raise ObjectStoreError(22, f"is no place for a store: write a path, or {kinds}", text)
@@ -65,7 +308,7 @@ def located(where: str | Location) -> Location:
 
 
 def zarr_store(location: Location) -> Any:
-    """What Zarr and xarray open."""
+    """A place as Zarr and xarray open it."""
     if isinstance(location, Path):
         return location
     from zarr.storage import ObjectStore, StorePath
@@ -101,8 +344,7 @@ def files_below(location: Location) -> dict[str, int]:
     """Sizes of all files below a place by their names, relative to it."""
     if isinstance(location, ObjectPath):
         return dict(location.below())
-    files = (file for file in location.rglob("*") if file.is_file())
-    return {str(file.relative_to(location)): file.stat().st_size for file in files}
+    return {name: (location / name).stat().st_size for name in names_below(location)}
 
 
 def beside(location: Location) -> Path:

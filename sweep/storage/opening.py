@@ -18,10 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.storage.atomic_replace import settle
-from sweep.storage.chunks import ZSTD_LEVEL
-from sweep.storage.locations import JOURNAL, Location, zarr_store
-from sweep.storage.objects import ObjectStoreError
-from sweep.storage.sealing import read_lines
+from sweep.storage.locations import JOURNAL, Location, ObjectStoreError, zarr_store
+from sweep.storage.logs import read_lines
 
 if TYPE_CHECKING:
     import zarr
@@ -31,6 +29,9 @@ MANIFEST = "template.jsonl"
 
 #: Version of the layout of stores.
 LAYOUT = 5
+
+#: How chunks of every array are compressed.
+ZSTD_LEVEL = 1
 
 #: For xarray's functions: so they read the document that was checked, and no other.
 CHECKED: dict[str, Any] = {"consolidated": True, "zarr_format": 3}
@@ -144,13 +145,7 @@ def recognised(path: Location, attributes: Any) -> dict[str, Any]:
 
 
 def refuse_foreign(path: Location) -> None:
-    """Refuse what no version of this program has made.
-
-    Raises
-    ------
-    NotAStoreError
-        Where that is so.
-    """
+    """Refuse what no version of this program has made."""
     _ours(path, _document(path)["attributes"])
 
 
@@ -195,7 +190,7 @@ def study_id(path: Location) -> str:
 
 
 def remedy(path: Location) -> str:
-    """How to put back what a store was made of, where it says what that was."""
+    """Remark on how to put back what a store was made of, where it says what that was."""
     if not (path / JOURNAL / MANIFEST).exists():
         return ""
     how = "`" if listed_attributes(path) else " --spec FILE`, with the study's spec,"

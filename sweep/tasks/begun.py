@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.storage.locations import JOURNAL, Location, put_whole
-from sweep.storage.sealing import sealed, unsealed
+from sweep.storage.logs import sealed, unsealed
 from sweep.tasks.study import Found, Known
 
 #: Beginning of the names of files in the journal, each of one block.

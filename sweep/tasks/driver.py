@@ -1,8 +1,9 @@
-"""A study from its first block to its last: run, resume, commit."""
+"""A study from its first block to its last, and its rays before: run, resume, extend."""
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,59 +13,42 @@ import numpy as np
 
 from sweep.storage.atomic_replace import beside, put, real, replaced_by, settle
 from sweep.storage.locations import PACKED, Location, located
-from sweep.storage.opening import study_id
+from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import identity, studies, user_code
-from sweep.tasks.casting import cast, eyepoints_are_sound
-from sweep.tasks.cluster import declared
-from sweep.tasks.errors import ClusterError, StoreError
-from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.cluster import Pool, RunOptions
+from sweep.tasks.errors import BusyError, ClusterError, StoreError, told
+from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Journal, committed, receipted
-from sweep.tasks.lock import Lock
-from sweep.tasks.pool import Place, Pool
-from sweep.tasks.progress import Progress, chosen, working
-from sweep.tasks.recipe import (
+from sweep.tasks.journal import (
     CODE,
     EXTENDS,
     REPLACES,
+    committed,
     forget_older,
     read_recipe,
+    receipted,
     refuse_damaged_recipe,
     write_recipe,
 )
+from sweep.tasks.lock import Lock
+from sweep.tasks.progress import working
 from sweep.tasks.reuse import changed, refuse_unlike, what_is_there
-from sweep.tasks.session import Outcome, Session, unwritable
+from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import create, remove, sync
-from sweep.tasks.study import Evaluate
-from sweep.tasks.template import refuse_damaged
-from sweep.tasks.worker import Terms
+from sweep.tasks.verify import refuse_damaged
 
 if TYPE_CHECKING:
-    from distributed import Client
-
-    from sweep.spec import AnyCluster, SceneSpec, Spec
+    from sweep.spec import SceneSpec, Spec
 
     Declared = Spec | SceneSpec
-    Declaration = str | Path | Mapping[str, Any] | AnyCluster
+
+#: Seconds between looks at rays that another run casts.
+WAITING = 0.5
 
 
 def run(
-    spec: Declared,
-    *,
-    store: str | Location,
-    client: Client | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: Declaration | None = None,
-    processes: bool = True,
-    overwrite: bool = False,
-    progress: bool | Progress = True,
-    block_timeout: float | None = None,
-    durable: bool = False,
-    performance_report: str | Path | None = None,
-    evaluate: Evaluate | None = None,
+    spec: Declared, *, store: str | Location, overwrite: bool = False, **options: Any
 ) -> Outcome:
     """Compute a study into a new store.
 
@@ -72,27 +56,11 @@ def run(
     ----------
     spec, store
         The study, and the path of the store to make: on disk, or `s3://bucket/key.zarr` (gs, az).
-    client
-        Dask client to compute with; without one, `scheduler` and `workers` say what to use.
-    workers, processes
-        Workers to start on this machine, default all cores, as processes or as threads.
-    scheduler
-        Address of a Dask scheduler, or "none" for a plain loop in this process.
-    cluster
-        The file that describes a cluster, or what such a file holds; `workers` fixes how many.
     overwrite
         Whether to put the new store in the place of one that is there, once it is complete.
-    progress
-        True for a bar or lines on standard error, False for none, or a `Progress`.
-    block_timeout
-        Seconds that a block may take; beyond, it is tried once more and then given up.
-    durable
-        Whether blocks are on the disk, and not only with the operating system, once committed: a
-        power failure then loses none of them.
-    performance_report
-        HTML file to put Dask's own account of the run into.
-    evaluate
-        What computes a block in place of the model, with the same results; for instrumenting.
+    **options
+        Where and how to compute, by the names of :class:`sweep.tasks.cluster.RunOptions`:
+        ``workers=4``, ``client=...``, ``progress=False`` and so on.
 
     Returns
     -------
@@ -105,34 +73,15 @@ def run(
         Where a store is in the way or can't be written; where no scheduler or worker is to be had;
         where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
-    path, told = real(located(store)), chosen(progress)
+    path, how = real(located(store)), RunOptions(**options)
     user_code.check(spec)
-    place = Place(
-        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
-        processes=processes, terms=Terms(evaluate, block_timeout, durable),
-        performance_report=None if performance_report is None else Path(performance_report),
-    ).for_spec(spec)  # fmt: skip
+    pool = Pool(how, spec)
     if not overwrite:
         _refuse_in_the_way(path, studies.study_of(spec, path))
-    return _into(path, spec, place, told, replace=overwrite, anew=True)
+    return _into(path, spec, pool, replace=overwrite, anew=True)
 
 
-def resume(
-    store: str | Location,
-    *,
-    spec: Declared | None = None,
-    client: Client | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: Declaration | None = None,
-    processes: bool = True,
-    retry_failed: bool = False,
-    progress: bool | Progress = True,
-    block_timeout: float | None = None,
-    durable: bool = False,
-    performance_report: str | Path | None = None,
-    evaluate: Evaluate | None = None,
-) -> Outcome:
+def resume(store: str | Location, *, spec: Declared | None = None, **options: Any) -> Outcome:
     """Compute what a store lacks; where it is being extended or replaced, what the new one lacks.
 
     Parameters
@@ -141,10 +90,7 @@ def resume(
         Where a store is that `run` made.
     spec
         The study that the store is expected to hold; without it, whatever it holds.
-    retry_failed
-        Whether to try blocks again that were given up, for their errors, in an earlier run.
-    client, workers, scheduler, cluster, processes, progress, block_timeout, durable,
-    performance_report, evaluate
+    **options
         As in `run`.
 
     Raises
@@ -156,7 +102,7 @@ def resume(
     ClusterError
         Where there is no scheduler or worker to be had.
     """
-    named = real(located(store))
+    named, how = real(located(store)), RunOptions(**options)
     named = replaced_by(named) if isinstance(named, Path) else named
     path = identity.under_way(named) or named
     attributes, study = _held(path)
@@ -164,21 +110,17 @@ def resume(
         identity.refuse_other_study(path, attributes, study.spec, spec)
     _refuse_unsound(path, attributes, study)
     user_code.check(study.spec)
-    asked = study if spec is None else studies.study_of(spec, path)  # it knows where its files are
     if spec is None:
         refuse_damaged_recipe(path)
-    place = Place(
-        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
-        processes=processes, terms=Terms(evaluate, block_timeout, durable),
-        performance_report=None if performance_report is None else Path(performance_report),
-    ).for_spec(spec or study.spec)  # fmt: skip
-    if path != named:
-        extends = read_recipe(path).get(EXTENDS)
-        return _into(
-            named, spec or study.spec, place, chosen(progress), replace=True, anew=False,
-            extends=extends and located(extends), retry_failed=retry_failed,
-        )  # fmt: skip
-    return _go_on(path, asked, place, chosen(progress), retry_failed=retry_failed)
+    else:
+        study = studies.study_of(spec, path)  # it knows where its files are
+    pool = Pool(how, study.spec)
+    if path == named:
+        return _go_on(path, study, pool)
+    extends = read_recipe(path).get(EXTENDS)
+    return _into(
+        named, study.spec, pool, replace=True, anew=False, extends=extends and located(extends)
+    )
 
 
 def extend(
@@ -187,17 +129,8 @@ def extend(
     *,
     changes: Mapping[str, Any] | None = None,
     to: str | Location | None = None,
-    client: Client | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: Declaration | None = None,
-    processes: bool = True,
     overwrite: bool = False,
-    progress: bool | Progress = True,
-    block_timeout: float | None = None,
-    durable: bool = False,
-    performance_report: str | Path | None = None,
-    evaluate: Evaluate | None = None,
+    **options: Any,
 ) -> Outcome:
     """Turn a store into that of a larger study, and compute only what is new.
 
@@ -217,8 +150,7 @@ def extend(
         Another place for the larger store: the old one then stays. Needed in an object store.
     overwrite
         Whether to begin anew where an extension was begun, or another store is in the place `to`.
-    client, workers, scheduler, cluster, processes, progress, block_timeout, durable,
-    performance_report, evaluate
+    **options
         As in `run`.
 
     Returns
@@ -231,30 +163,20 @@ def extend(
     StoreError, ClusterError
         As in `run` and `resume`; where the study asked for is not a larger one.
     """
-    path, told = real(located(store)), chosen(progress)
+    path, how = real(located(store)), RunOptions(**options)
     attributes, older = _held(path)
     asked = changed(older.spec if spec is None else spec, changes or {})
     user_code.check(asked)
-    place = Place(
-        client=client, workers=workers, scheduler=scheduler, cluster=_declared(cluster),
-        processes=processes, terms=Terms(evaluate, block_timeout, durable),
-        performance_report=None if performance_report is None else Path(performance_report),
-    ).for_spec(asked)  # fmt: skip
+    pool = Pool(how, asked)
     _refuse_unsound(path, attributes, older)
     if asked.id == attributes["study_id"]:
-        told.say(f"nothing to extend: {path} holds this very study")
-        return _go_on(path, older, place, told)
+        pool.told.say(f"nothing to extend: {path} holds this very study")
+        return _go_on(path, older, pool)
     refuse_unlike(path, older.spec, asked)
     goal = path if to is None else real(located(to))
     if not overwrite:
         identity.under_way(goal)
-    return _into(
-        goal, asked, place, told, replace=overwrite or goal == path, anew=overwrite, extends=path
-    )
-
-
-def _declared(cluster: Declaration | None) -> AnyCluster | None:
-    return None if cluster is None else declared(cluster)
+    return _into(goal, asked, pool, replace=overwrite or goal == path, anew=overwrite, extends=path)
 
 
 def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:
@@ -298,29 +220,19 @@ def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
 def _into(
     path: Location,
     asked: Declared,
-    place: Place,
-    told: Progress,
+    pool: Pool,
     *,
     replace: bool,
     anew: bool,
     extends: Location | None = None,
-    retry_failed: bool = False,
 ) -> Outcome:
     """Compute a study into its place, or beside a store whose place it takes once it is complete.
 
-    Parameters
-    ----------
-    path, asked
-        The place, and the study.
-    replace
-        Whether a store that is there is to be replaced.
-    anew
-        Whether to begin anew where the study was begun.
-    extends
-        The store of a smaller study, whose results are taken.
+    A store that is there is replaced where `replace` says so; what was begun of the study is begun
+    `anew`. Results are taken from the store of a smaller study that it `extends`.
     """
     settle(path)
-    new, facts = path, _facts(asked)
+    new, facts, durable = path, _facts(asked), pool.options.durable
     with ExitStack() as stack:
         if replace and path.exists():
             identity.refuse_to_replace(path)
@@ -340,30 +252,29 @@ def _into(
             _refuse_unsound(new, begun, held)
             write_recipe(new, **read_recipe(new) | facts)
         if isinstance(study, FlightStudy) and (anew or not there):
-            with working("building the scene", told):
+            with working("building the scene", pool.told):
                 reports = study.reports
             for line in reports:
-                told.say(line)
+                pool.told.say(line)
 
-        def prepare(pool: Pool) -> None:
-            if there and anew:
+        def prepare() -> None:
+            if there and anew and not pool.is_plain:
                 pool.connect()  # what was begun goes when there are workers for what replaces it
             if anew or not there:
-                durable = place.terms.durable
                 create(new, study, replace=there, recipe=facts, durable=durable)
             if extends is not None:
-                told.say(what_is_there(new, study))
+                pool.told.say(what_is_there(new, study))
             if new != path:
-                told.say(f"{path} stays as it is until {new} is complete and takes its place")
+                pool.told.say(f"{path} stays as it is until {new} is complete and takes its place")
 
         try:
-            outcome = _go_on(new, study, place, told, prepare=prepare, retry_failed=retry_failed)
+            outcome = _go_on(new, study, pool, prepare)
         except ClusterError:
             if not there:
                 remove(new)  # nothing was computed, and the next try should not meet it
             raise
         if outcome.complete and isinstance(path, Path) and new == beside(path):
-            _succeed(path, durable=place.terms.durable)
+            _succeed(path, durable=durable)
             return dataclasses.replace(outcome, store=path)
         return outcome
 
@@ -371,15 +282,11 @@ def _into(
 def _succeed(path: Path, *, durable: bool) -> None:
     """Put the complete store beside a place, which the caller has locked, into it."""
     new = beside(path)
-    try:
+    with told(f"{new} can't take the place of {path}"):
         if durable:
             sync(new)
         put(new, path)
         forget_older(path)  # where it stands now it extends and replaces nothing
-    except OSError as error:
-        raise StoreError(
-            f"{new} can't take the place of {path}: {error.strerror or error}"
-        ) from error
 
 
 def _facts(spec: Declared) -> dict[str, str]:
@@ -388,7 +295,7 @@ def _facts(spec: Declared) -> dict[str, str]:
     return {} if base is None else {"base": str(base.absolute())}
 
 
-def _tell_changed_code(path: Location, spec: Declared, told: Progress) -> None:
+def _tell_changed_code(path: Location, spec: Declared, say: Callable[[str], None]) -> None:
     """Say which of the user's modules a store, or the one that it extends, was not begun with."""
     if not (here := user_code.digests(spec)):
         return
@@ -398,7 +305,7 @@ def _tell_changed_code(path: Location, spec: Declared, told: Progress) -> None:
     write_recipe(path, **recipe | {CODE: begun})
     for module in here:
         if begun[module] != here[module]:
-            told.say(
+            say(
                 f"the module {module} has changed since {path} was begun: what was computed before "
                 "has the results of the old code. Put it back, or run the study anew"
             )
@@ -407,43 +314,104 @@ def _tell_changed_code(path: Location, spec: Declared, told: Progress) -> None:
 def _go_on(
     path: Location,
     study: GridStudy | FlightStudy,
-    place: Place,
-    told: Progress,
-    *,
-    retry_failed: bool = False,
-    prepare: Callable[[Pool], None] = lambda pool: None,
+    pool: Pool,
+    prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    with (
-        Interrupts() as interrupts,
-        ExitStack() as stack,  # the lock goes when the workers are gone
-        Pool(place, most=study.n_blocks, say=told.say) as pool,
-    ):
-        prepare(pool)
+    pool.most = study.n_blocks
+    with pool.interrupts, ExitStack() as stack, pool:  # the lock goes when the workers are gone
+        prepare()
         lock = Lock(path)
         stack.callback(lock.release)
-        _tell_changed_code(path, study.spec, told)
-        session = Session(
-            path, study, pool=pool, progress=told, interrupts=interrupts,
-            journal=_journal(path, place.terms.durable), lock=lock, retry_failed=retry_failed,
-        )  # fmt: skip
+        _tell_changed_code(path, study.spec, pool.told.say)
+        session = Session(path, study, pool, lock)
         if isinstance(study, GridStudy):
-            return session.to_its_end()
+            return session.run()
         write_recipe(path, **read_recipe(path) | _facts(study.spec))
-        if _is_done(path, study) and eyepoints_are_sound(study):
-            return session.to_its_end()
-        rays, why = cast(
-            study, pool=pool, told=told, interrupts=interrupts, retry_failed=retry_failed
-        )
-        return session.to_its_end(before=why, rays=rays)
+        if _is_done(path, study):
+            return session.run()
+        rays, why = _cast(study, pool)
+        return session.run(before=why, rays=rays)
 
 
 def _is_done(path: Location, study: FlightStudy) -> bool:
-    """Whether no block is missing; the folders are looked at only where the log says so."""
-    return bool(receipted(path, study).all() and committed(path, study).all())
+    """Tell whether no block is missing, nor any of those eyepoints that are there.
+
+    Folders are looked at only where the log says so.
+    """
+    return bool(receipted(path, study).all() and committed(path, study).all()) and all(
+        _is_whole(place, eyepoints)
+        for eyepoints in study.eyepoint_studies()
+        if (place := eyepoints_path(path, eyepoints.id)).exists()
+    )
 
 
-def _journal(path: Location, durable: bool) -> Journal:
-    try:
-        return Journal(path, durable=durable)
-    except OSError as error:
-        raise StoreError(unwritable(path, error)) from error
+def _cast(study: FlightStudy, pool: Pool) -> tuple[dict[str, int], str]:
+    """Cast what is missing of a study's eyepoints.
+
+    Returns
+    -------
+    rays : dict of int
+        Rays cast by scanner; 0 where its eyepoints were there.
+    why : str
+        Why eyepoints are still missing; empty where none is.
+
+    Raises
+    ------
+    StoreError
+        Where an eyepoint store is not what its name says, or can't be written.
+    SceneError
+        Where a file of the scene is missing, changed or unfit.
+    """
+    rays: dict[str, int] = {}
+    for eyepoints in study.eyepoint_studies():
+        path, scanner = eyepoints_path(study.path, eyepoints.id), eyepoints.scanner
+        rays[scanner] = 0
+        if _is_whole(path, eyepoints):
+            continue
+        _ = eyepoints.world  # what is wrong with the scene is the user's to mend, not a block's
+        with ExitStack() as stack:
+            if not (lock := _locked(path, eyepoints, pool)):
+                del rays[scanner]
+                return rays, f"eyepoints of '{scanner}': interrupted"
+            stack.callback(lock.release)
+            if _is_whole(path, eyepoints):  # another run has cast them meanwhile
+                continue
+            pool.told.say(f"casting {eyepoints.rays:,} rays through the scanner '{scanner}'")
+            spec = eyepoints.spec
+            write_recipe(path, spec=spec.to_json(), scanner=scanner, **_facts(spec))
+            outcome = Session(path, eyepoints, pool, lock).run()
+        rays[scanner] = eyepoints.rays_in(outcome.points_computed)
+        if not outcome.complete:
+            return rays, f"eyepoints of '{scanner}': {outcome.why}"
+    return rays, ""
+
+
+def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
+    """Tell whether an eyepoint store is there with all of its blocks."""
+    if not path.exists():
+        return False
+    attributes = read_attributes(path)
+    if attributes["study_id"] != eyepoints.id:
+        raise StoreError(f"{path} holds other eyepoints than its name says: remove it")
+    identity.refuse_other_versions(path, attributes, where="this machine")
+    refuse_damaged(path)
+    return bool(read_recipe(path)) and bool(committed(path, eyepoints).all())
+
+
+def _locked(path: Location, eyepoints: EyepointStudy, pool: Pool) -> Lock | None:
+    """The lock of an eyepoint store, made if need be, once no other run casts the same rays.
+
+    None where the run is interrupted before.
+    """
+    waiting = False
+    while not pool.interrupts.stopping:
+        try:
+            if not path.exists():
+                create(path, eyepoints, durable=pool.options.durable)
+            return Lock(path)
+        except BusyError as error:
+            if not waiting:
+                pool.told.say(f"waiting for rays that another run casts: {error}")
+                waiting = True
+            time.sleep(WAITING)
+    return None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from sweep.storage.opening import StoreError as StoreError
 
 
@@ -23,3 +26,12 @@ class CodeError(TaskError):
 
 class SchedulerLost(Exception):
     """A scheduler that went away with work still out; what was committed stays."""
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Say what can't be done where the disk, or an object store, raises."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{what}: {error.strerror or error}") from error

@@ -16,24 +16,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.storage import sealing
+from sweep.storage import logs
 from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
     Location,
     files_below,
+    in_words,
     located,
     put_whole,
     zarr_store,
 )
-from sweep.storage.objects import in_words
-from sweep.storage.sealing import read_lines, sealed
-from sweep.tasks import remote, store, studies
-from sweep.tasks.errors import StoreError
-from sweep.tasks.journal import LOGS, committed
+from sweep.storage.logs import read_lines, sealed
+from sweep.tasks import store, studies
+from sweep.tasks.errors import StoreError, told
+from sweep.tasks.journal import LOGS, RECIPE, committed
 from sweep.tasks.progress import Late, Progress, chosen
-from sweep.tasks.recipe import RECIPE
 from sweep.tasks.study import ArrayLayout, Study
 
 if TYPE_CHECKING:
@@ -47,16 +46,9 @@ THREADS = 4
 def pack(
     path: str | Location, output: str | Location, *, progress: bool | Progress = True
 ) -> Location:
-    """Copy a complete store into one of few files, each many chunks.
+    """Copy a complete store into one of few files, each many chunks: whole, or not at all.
 
-    Parameters
-    ----------
-    path
-        The store.
-    output
-        Where the copy goes; nothing is there. It is there whole, or not at all.
-    progress
-        As in `run`; shown after two seconds.
+    Progress is as in `run`; shown after two seconds.
 
     Raises
     ------
@@ -72,22 +64,20 @@ def pack(
         raise StoreError(f"{path} {why}")
     if output.exists():
         raise StoreError(f"{output} is there already: name another place")
-    told = Late(chosen(progress))
-    try:
+    shown = Late(chosen(progress))
+    with told(f"{output} can't be made"):
         if isinstance(output, Path):
             with draft(output) as aside:
                 aside.mkdir()
-                _pack(path, aside, study, told)
+                _pack(path, aside, study, shown)
                 store.sync(aside)  # else a power cut may leave the name without the values
         else:
-            with remote.making(output):
-                _pack(path, output, study, told)
-    except OSError as error:
-        raise StoreError(f"{output} can't be made: {error.strerror or error}") from error
+            with store.making(output):
+                _pack(path, output, study, shown)
     return output
 
 
-def _pack(path: Location, output: Location, study: Study, told: Progress) -> None:
+def _pack(path: Location, output: Location, study: Study, shown: Progress) -> None:
     """Write a packed copy, the document of its group last."""
     attributes = {**studies.read(path)[0], PACKED: True}
     with tempfile.TemporaryDirectory() as directory:
@@ -97,37 +87,29 @@ def _pack(path: Location, output: Location, study: Study, told: Progress) -> Non
         for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{store.MANIFEST}"}:
             put_whole(output / name, (template / name).read_bytes())
     names, arrays = sorted(study.owners()), store.open_group(path)
-    told.begin(points=len(names), done=0, unit="arrays")
+    shown.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:
             with in_words(path), in_words(output):
                 _pack_array(arrays[name], output / name)
-            told.advance(points=1, failed=0)
+            shown.advance(points=1, failed=0)
     finally:
-        told.end()
+        shown.end()
     if studies.read(path)[0]["study_id"] != study.id:
         raise StoreError(f"{path} was extended or replaced while it was copied: try again")
     for name in (*LOGS, RECIPE):
         if content := b"".join(map(_without_host, read_lines(path / JOURNAL / name))):
             put_whole(output / JOURNAL / name, content)
-    _list(output, attributes, root)
+    names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
+    digests = {name: logs.digest(output, [name]) for name in names}
+    digests["zarr.json"] = logs.digest_of([("zarr.json", root)])
+    store.list_objects(output, attributes, digests)
     put_whole(output / "zarr.json", root)
 
 
 def _without_host(record: dict[str, Any]) -> bytes:
     """A line of a log without the machine that it was written on: copies are given away."""
     return sealed({name: value for name, value in record.items() if name not in ("host", "pid")})
-
-
-def _list(output: Location, attributes: dict[str, Any], root: bytes) -> None:
-    """Put down what the copy is made of, with digests, for `sweep verify`."""
-    names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
-    lines = [sealed({"attributes": attributes, "objects": len(names) + 1})]
-    lines += [sealed({"object": n, "digest": sealing.digest(output, [n])}) for n in sorted(names)]
-    lines.append(
-        sealed({"object": "zarr.json", "digest": sealing.digest_of([("zarr.json", root)])})
-    )
-    put_whole(output / JOURNAL / store.MANIFEST, b"".join(lines))
 
 
 def _pack_array(source: Any, output: Location) -> None:
@@ -160,10 +142,7 @@ def _copy(source: zarr.Array[Any], target: zarr.Array[Any], part: tuple[slice, .
 def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
     """Whole chunks along each axis that make a file, the last axis filled first.
 
-    Returns
-    -------
-    tuple of int or None
-        Multiples of the chunks; None where a single chunk is a file, or what it holds is known.
+    None where a single chunk is a file, or what it holds is known.
     """
     if layout.values is not None:
         return None

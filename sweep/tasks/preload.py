@@ -1,4 +1,4 @@
-"""What a local worker does as it starts: leave Ctrl-C to the client, and import the model early."""
+"""Start of a local worker: leave Ctrl-C to the client, and import the model early."""
 
 from __future__ import annotations
 

@@ -1,13 +1,15 @@
-"""How far a run is: a bar in a terminal, a plain line now and then elsewhere."""
+"""Progress of a run: a bar in a terminal, a plain line now and then elsewhere; and Ctrl-C."""
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -24,9 +26,11 @@ BROAD = 100
 #: Seconds before anything is shown of what is mostly over by then.
 LATE = 2.0
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-class Progress(Protocol):
-    """What a run tells of itself while it goes on."""
+
+class Progress:
+    """Listener to a run, told of how far it is; this one shows nothing."""
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
         """The run begins, with so many points of the study done already, some in part."""
@@ -48,19 +52,15 @@ def chosen(progress: bool | Progress) -> Progress:
     """The progress asked for: none, the one given, or what standard error can show."""
     if progress is True:
         return Bar() if sys.stderr.isatty() else Lines()
-    return Silent() if progress is False else progress
+    return Progress() if progress is False else progress
 
 
 @contextmanager
 def working(what: str, told: Progress | None = None) -> Iterator[None]:
     """Say that something goes on while a block runs, from its third second on.
 
-    Parameters
-    ----------
-    what
-        In words. While kernels are compiled that is said in its place, with their number.
-    told
-        Whom to tell; by default what standard error can show.
+    While kernels are compiled that is said in the place of `what`, with their number. It is `told`
+    to what standard error can show, by default.
     """
     from numba.core.event import install_recorder
 
@@ -93,26 +93,36 @@ def working(what: str, told: Progress | None = None) -> Iterator[None]:
             telling.join()
 
 
-class Silent:
-    """No progress shown."""
+class _Counting(Progress):
+    """Progress that adds up what it is told."""
+
+    def __init__(self) -> None:
+        self._points = self._failed = 0
+        self._done = self._before = 0.0
+        self._unit, self._work = "points", ""
+        self._begun = time.monotonic()
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """Nothing."""
+        self._points, self._done, self._before, self._unit = points, done, done, unit
+        self._begun = time.monotonic()
 
     def advance(self, *, points: float, failed: int) -> None:
-        """Nothing."""
+        self._done += points
+        self._failed += failed
 
     def at_work(self, *, workers: int, stored: int) -> None:
-        """Nothing."""
+        from rich.filesize import decimal
 
-    def say(self, text: str) -> None:
-        """Nothing."""
+        count = f"{workers:,} worker{'' if workers == 1 else 's'}"
+        self._work = f"{count}, {decimal(stored)} stored"
 
-    def end(self) -> None:
-        """Nothing."""
+    @property
+    def _rate(self) -> float:
+        """Points a second of this run."""
+        return (self._done - self._before) / max(time.monotonic() - self._begun, 1e-9)
 
 
-class Late:
+class Late(_Counting):
     """Progress of what may be over before anybody looks: nothing is shown of the first seconds.
 
     Parameters
@@ -122,29 +132,17 @@ class Late:
     """
 
     def __init__(self, shown: Progress) -> None:
-        self._shown = shown
-        self._total, self._done, self._unit = 0, 0.0, "points"
-        self._begun = time.monotonic()
-        self._showing = False
-
-    def begin(self, *, points: int, done: float, unit: str) -> None:
-        """The run begins, unseen."""
-        self._total, self._done, self._unit = points, done, unit
-        self._begun, self._showing = time.monotonic(), False
+        super().__init__()
+        self._shown, self._showing = shown, False
 
     def advance(self, *, points: float, failed: int) -> None:
         """Shown from the first time that it is late."""
-        self._done += points
+        super().advance(points=points, failed=failed)
         if self._showing:
             self._shown.advance(points=points, failed=failed)
         elif time.monotonic() - self._begun > LATE:
             self._showing = True
-            self._shown.begin(points=self._total, done=self._done, unit=self._unit)
-
-    def at_work(self, *, workers: int, stored: int) -> None:
-        """Shown where all else is."""
-        if self._showing:
-            self._shown.at_work(workers=workers, stored=stored)
+            self._shown.begin(points=self._points, done=self._done, unit=self._unit)
 
     def say(self, text: str) -> None:
         """Shown at once."""
@@ -154,40 +152,26 @@ class Late:
         """The run is over."""
         if self._showing:
             self._shown.end()
+        self._showing = False
 
 
-class Lines:
-    """One line at the start, every 30 s and at the end, for logs.
+class Lines(_Counting):
+    """One line at the start, every 30 s and at the end, for logs."""
 
-    Parameters
-    ----------
-    every
-        Time between lines [s].
-    """
-
-    def __init__(self, every: float = LINE_EVERY) -> None:
-        self._every = every
-        self._points, self._failed = 0, 0
-        self._done = self._before = 0.0
-        self._unit, self._work = "points", ""
-        self._begun = self._said = time.monotonic()
+    def __init__(self) -> None:
+        super().__init__()
+        self._said = time.monotonic()
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
         """First line."""
-        self._points, self._done, self._before, self._unit = points, done, done, unit
-        self._begun = time.monotonic()
+        super().begin(points=points, done=done, unit=unit)
         self._line()
 
     def advance(self, *, points: float, failed: int) -> None:
         """Another line where it is time for one."""
-        self._done += points
-        self._failed += failed
-        if time.monotonic() - self._said >= self._every:
+        super().advance(points=points, failed=failed)
+        if time.monotonic() - self._said >= LINE_EVERY:
             self._line()
-
-    def at_work(self, *, workers: int, stored: int) -> None:
-        """For the next line."""
-        self._work = at_work(workers, stored)
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -199,9 +183,8 @@ class Lines:
 
     def _line(self) -> None:
         self._said = time.monotonic()
-        rate = (self._done - self._before) / max(self._said - self._begun, 1e-9)
         parts = [f"{amount(self._done)} of {self._points:,} {self._unit}"]
-        if rate > 0:
+        if (rate := self._rate) > 0:
             parts.append(f"{amount(rate)} {self._unit}/s")
             if self._done < self._points:
                 parts.append(f"{duration((self._points - self._done) / rate)} left")
@@ -212,7 +195,7 @@ class Lines:
         self.say(", ".join(parts))
 
 
-class Bar:
+class Bar(_Counting):
     """A bar with points, rate, time left, workers, bytes and failures, on standard error."""
 
     def __init__(self) -> None:
@@ -220,6 +203,7 @@ class Bar:
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
         from rich.table import Column
 
+        super().__init__()
         self.console = Console(stderr=True)
 
         def words(text: str) -> TextColumn:
@@ -237,15 +221,10 @@ class Bar:
             refresh_per_second=REFRESHES,
         )
         self._task: TaskID | None = None
-        self._done = self._points = 0.0
-        self._failed = 0
-        self._unit = "points"
-        self._begun = time.monotonic()
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
         """The bar appears."""
-        self._begun = time.monotonic()
-        self._unit, self._points, self._done = unit, 0.0, done
+        super().begin(points=points, done=done, unit=unit)
         self._task = self._bar.add_task(
             unit,
             total=points,
@@ -259,22 +238,22 @@ class Bar:
 
     def advance(self, *, points: float, failed: int) -> None:
         """The bar moves."""
-        self._points += points
-        self._done += points
-        self._failed += failed
+        super().advance(points=points, failed=failed)
         if self._task is None or not (points or failed):
             return
-        rate = self._points / max(time.monotonic() - self._begun, 1e-9)
-        failures = f"{self._failed} blocks failed" if self._failed else ""
         self._bar.update(
-            self._task, completed=self._done, done=amount(self._done),
-            rate=f"{amount(rate)} {self._unit}/s", failures=failures,
-        )  # fmt: skip
+            self._task,
+            completed=self._done,
+            done=amount(self._done),
+            rate=f"{amount(self._rate)} {self._unit}/s",
+            failures=f"{self._failed} blocks failed" if self._failed else "",
+        )
 
     def at_work(self, *, workers: int, stored: int) -> None:
         """Shown beside the rate."""
+        super().at_work(workers=workers, stored=stored)
         if self._task is not None:
-            self._bar.update(self._task, work=at_work(workers, stored))
+            self._bar.update(self._task, work=self._work)
 
     def say(self, text: str) -> None:
         """A line above the bar."""
@@ -285,12 +264,29 @@ class Bar:
         self._bar.stop()
 
 
-def at_work(workers: int, stored: int) -> str:
-    """Workers and bytes in words: `2 workers, 3.1 MB stored`."""
-    from rich.filesize import decimal
+class Interrupts:
+    """Ctrl-C once: finish what runs and stop; twice: stop at once.
 
-    count = f"{workers:,} worker{'' if workers == 1 else 's'}"
-    return f"{count}, {decimal(stored)} stored"
+    Outside the main thread, where no signal arrives, nothing is ever stopping.
+    """
+
+    def __init__(self) -> None:
+        self.stopping = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.stopping:
+            raise KeyboardInterrupt
+        self.stopping = True
 
 
 def amount(points: float) -> str:

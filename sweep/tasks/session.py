@@ -7,6 +7,7 @@ import os
 import socket
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -14,20 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from sweep.storage.locations import Location
-from sweep.storage.objects import ObjectStoreError
-from sweep.storage.receipts import read_receipts
-from sweep.tasks import begun, store, versions
+from sweep.storage.locations import Location, ObjectStoreError
+from sweep.storage.logs import read_receipts
+from sweep.tasks import begun, store
+from sweep.tasks.cluster import Pool
 from sweep.tasks.errors import SchedulerLost, StoreError
-from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.journal import Failure, Journal, Receipt, given_up
-from sweep.tasks.listing import Look
+from sweep.tasks.journal import Failure, Journal, Look, Receipt, given_up
 from sweep.tasks.lock import Lock
-from sweep.tasks.pool import Pool
-from sweep.tasks.progress import Progress, duration, working
+from sweep.tasks.progress import duration, working
+from sweep.tasks.scheduler import TICK, BlockQueue
 from sweep.tasks.study import Study
-from sweep.tasks.todo import Todo
-from sweep.tasks.window import TICK, Job
 from sweep.tasks.worker import Answer
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
@@ -49,6 +46,8 @@ LOOKING = 2.0
 #: Seconds without any worker after which that is said.
 ABSENT = 20.0
 
+#: Figures of receipts that a run adds up.
+COUNTED = ("points", "taken", "bytes", "seconds", "write_seconds")
 
 NOT_FOUND = (
     "block {} is computed in pieces, and what one worker saved was not found by the next: "
@@ -58,7 +57,7 @@ NOT_FOUND = (
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a run has come to."""
+    """Result of a run."""
 
     store: Location
     unit: str  # what the points are called
@@ -78,30 +77,17 @@ class Outcome:
 
     @property
     def complete(self) -> bool:
-        """Whether every block of the study is committed."""
+        """Tell whether every block of the study is committed."""
         return self.blocks_done == self.blocks
 
-
-@dataclass
-class Tally:
-    """What one run has done so far."""
-
-    points: int = 0
-    taken: int = 0
-    blocks: int = 0
-    seconds: float = 0.0
-    write_seconds: float = 0.0
-    bytes: int = 0
-    failures: list[Failure] = field(default_factory=list)
-
-    def add(self, receipt: Receipt) -> None:
-        """Count a committed block."""
-        self.points += receipt.points
-        self.taken += receipt.taken
-        self.blocks += 1
-        self.bytes += receipt.bytes
-        self.seconds += receipt.seconds
-        self.write_seconds += receipt.write_seconds
+    @property
+    def why(self) -> str:
+        """Why the run ended before its blocks did."""
+        if self.stopped:
+            return self.stopped
+        if not self.failures:
+            return f"{self.left_out} blocks failed before; --retry-failed tries them again"
+        return f"{len(self.failures)} blocks failed, the first with {self.failures[0].error}"
 
 
 class Absence:
@@ -111,7 +97,7 @@ class Absence:
         self._since, self._ever, self._patience = time.monotonic(), False, ABSENT
 
     def told(self, workers: int, *, worked: bool = False) -> str:
-        """What to say now that there are so many workers; mostly nothing.
+        """Words for so many workers at this time; mostly none.
 
         ``worked`` says that one has answered since, which may have gone before it was counted.
         """
@@ -136,38 +122,25 @@ class Session:
     path, study
         The store and the study that it holds.
     pool
-        Where to compute.
-    progress
-        Whom to tell.
-    interrupts
-        Whether to stop.
-    journal, lock
+        Where to compute, whom to tell, and whether to stop.
+    lock
         The store's, held by this process.
-    retry_failed
-        Whether to try blocks again that an earlier run has given up.
     """
 
-    def __init__(
-        self,
-        path: Location,
-        study: Study,
-        *,
-        pool: Pool,
-        progress: Progress,
-        interrupts: Interrupts,
-        journal: Journal,
-        lock: Lock,
-        retry_failed: bool = False,
-    ) -> None:
-        self._path, self._study, self._pool = path, study, pool
-        self._progress, self._interrupts = progress, interrupts
-        self._journal, self._lock = journal, lock
-        self._retry_failed = retry_failed
-        self._tally, self._stored = Tally(), 0
+    def __init__(self, path: Location, study: Study, pool: Pool, lock: Lock) -> None:
+        self._path, self._study, self._pool, self._lock = path, study, pool, lock
+        self._told, self._interrupts = pool.told, pool.interrupts
+        try:
+            self._journal = Journal(path, durable=pool.options.durable)
+        except OSError as error:
+            raise StoreError(unwritable(path, error)) from error
+        self._committed: dict[str, float] = defaultdict(float)  # what receipts of this run come to
+        self._failures: list[Failure] = []
         self._gathered: list[Receipt] = []  # committed as soon as the journal has written them
+        self._stored = 0  # bytes that there were before
         self._begun: dict[int, float] = {}  # points there are of unfinished blocks
 
-    def to_its_end(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
+    def run(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
         """Compute all that is left, or as much as can be.
 
         Parameters
@@ -186,7 +159,7 @@ class Session:
             look.within(LOOKING)
             done = look.whole()
             settled = done.copy()
-            if not self._retry_failed:
+            if not self._pool.options.retry_failed:
                 settled[list(given_up(self._path, done.size))] = True
             left_out = int(np.count_nonzero(settled & ~done))
             stopped = self._record("begun", host=socket.gethostname(), pid=os.getpid()) or before
@@ -194,7 +167,24 @@ class Session:
             done &= look.whole()
         finally:
             look.stop()
-        outcome = self._outcome(done, left_out, stopped, time.monotonic() - start, rays or {})
+        study, committed = self._study, self._committed
+        outcome = Outcome(
+            store=self._path,
+            unit=study.unit,
+            points=study.points,
+            blocks=study.n_blocks,
+            points_done=study.points_in(done) + int(committed["points"]),
+            blocks_done=int(np.count_nonzero(done)) + int(committed["blocks"]),
+            points_computed=int(committed["points"] - committed["taken"]),
+            blocks_computed=int(committed["blocks"]),
+            failures=tuple(self._failures),
+            left_out=left_out,
+            stopped=stopped,
+            seconds=time.monotonic() - start,
+            work_seconds=committed["seconds"],
+            write_seconds=committed["write_seconds"],
+            rays=rays or {},
+        )
         if outcome.complete:
             store.remove_partials(self._path)
             begun.discard(self._path)
@@ -211,37 +201,10 @@ class Session:
             return unwritable(self._path, error)
         return ""
 
-    def _outcome(
-        self,
-        before: np.ndarray,
-        left_out: int,
-        stopped: str,
-        seconds: float,
-        rays: Mapping[str, int],
-    ) -> Outcome:
-        tally = self._tally
-        return Outcome(
-            store=self._path,
-            unit=self._study.unit,
-            points=self._study.points,
-            blocks=self._study.n_blocks,
-            points_done=self._study.points_in(before) + tally.points,
-            blocks_done=int(np.count_nonzero(before)) + tally.blocks,
-            points_computed=tally.points - tally.taken,
-            blocks_computed=tally.blocks,
-            failures=tuple(tally.failures),
-            left_out=left_out,
-            stopped=stopped,
-            seconds=seconds,
-            work_seconds=tally.seconds,
-            write_seconds=tally.write_seconds,
-            rays=rays,
-        )
-
     def _look_on(self, look: Look, done: np.ndarray) -> str:
         """See the look at what was done to its end, and compute what of it is not there."""
         if not look.within(LOOKING):
-            self._progress.say("looking whether the chunks of what was done before are there")
+            self._told.say("looking whether the chunks of what was done before are there")
         while not look.within(LOOKING):
             if self._interrupts.stopping:
                 return "interrupted"
@@ -255,26 +218,26 @@ class Session:
         """
         if settled.all():
             return ""
-        todo, points_before = Todo(settled), self._study.points_in(done) + self._tally.points
+        blocks = BlockQueue(settled)
+        before = self._study.points_in(done) + self._committed["points"]
         with ExitStack() as stack:
             try:
                 compiling = threading.Thread(target=self._compile, daemon=True)
-                job = Job(str(self._path), self._study.id, versions.model(), self._pool.terms)
                 what = "loading the model" + ("" if self._pool.is_plain else ", reaching workers")
-                with working(what, self._progress):
+                with working(what, self._told):
                     compiling.start()  # beside the workers' start, which is mostly waiting
                     answers = self._pool.answers(
-                        job, todo, lambda: self._interrupts.stopping, self._is_seen
+                        str(self._path), self._study.id, blocks, self._is_seen
                     )
                     while compiling.is_alive() and not self._interrupts.stopping:
                         compiling.join(TICK)
-                self._progress.begin(
+                self._told.begin(
                     points=self._study.points,
-                    done=points_before + sum(self._begun.values()),
+                    done=before + sum(self._begun.values()),
                     unit=self._study.unit,
                 )
-                stack.callback(self._progress.end)
-                return self._take(answers, todo)
+                stack.callback(self._told.end)
+                return self._take(answers, blocks)
             except SchedulerLost as error:
                 return f"the scheduler is gone ({error})"
             except KeyboardInterrupt:
@@ -287,70 +250,69 @@ class Session:
                 return unwritable(self._path, FileNotFoundError())
 
     def _compile(self) -> None:
-        if self._pool.terms.evaluate:  # in place of the model
+        if self._pool.options.evaluate:  # in place of the model
             return
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
-
-    def _take(self, answers: Iterator[Answer], todo: Todo) -> str:
-        told, interrupts, absence = False, self._interrupts, Absence()
-        for answer in answers:
-            if not self._lock.is_mine():
-                if not _is_there(self._path):
-                    raise FileNotFoundError(self._path)
-                return "another process took the store's lock"
-            if missing := absence.told(answer.workers, worked=bool(answer.receipts)):
-                self._progress.say(missing)
-                self._pool.revive()
-            self._commit(answer, todo)
-            if interrupts.stopping and not told:
-                self._progress.say("stopping when what runs is written; again to stop at once")
-                told = True
-            if not self._tally.blocks and len(self._tally.failures) >= HOPELESS:
-                return f"the first {HOPELESS} blocks all failed"
-        before = self._points()
-        self._count(now=True)
-        self._progress.advance(points=self._points() - before, failed=0)
-        return "interrupted" if interrupts.stopping else ""
-
-    def _commit(self, answer: Answer, todo: Todo) -> None:
-        before = self._points(), len(self._tally.failures)
-        self._journal.commit(*answer.receipts)
-        self._gathered += answer.receipts
-        for failure in answer.failures:
-            self._fail(failure, todo)
-        for block, points in answer.begun.items():
-            if points <= self._begun.get(block, 0.0):
-                raise StoreError(NOT_FOUND.format(block))
-            self._begun[block] = points
-        self._count()
-        self._progress.at_work(workers=answer.workers, stored=self._stored + self._tally.bytes)
-        self._progress.advance(
-            points=self._points() - before[0], failed=len(self._tally.failures) - before[1]
-        )
 
     def _is_seen(self, receipt: Receipt, read: bool) -> bool:
         objects = store.block_objects(self._study, receipt.block)
         wanted = store.Written(receipt.digest, receipt.bytes)
         return store.is_seen(self._path, objects, wanted, read=read)
 
+    def _take(self, answers: Iterator[Answer], blocks: BlockQueue) -> str:
+        told, absence = False, Absence()
+        for answer in answers:
+            if not self._lock.is_mine():
+                if not _is_there(self._path):
+                    raise FileNotFoundError(self._path)
+                return "another process took the store's lock"
+            if missing := absence.told(answer.workers, worked=bool(answer.receipts)):
+                self._told.say(missing)
+                self._pool.revive()
+            self._commit(answer, blocks)
+            if self._interrupts.stopping and not told:
+                self._told.say("stopping when what runs is written; again to stop at once")
+                told = True
+            if not self._committed["blocks"] and len(self._failures) >= HOPELESS:
+                return f"the first {HOPELESS} blocks all failed"
+        before = self._points()
+        self._count(now=True)
+        self._told.advance(points=self._points() - before, failed=0)
+        return "interrupted" if self._interrupts.stopping else ""
+
+    def _commit(self, answer: Answer, blocks: BlockQueue) -> None:
+        points, failed = self._points(), len(self._failures)
+        self._journal.commit(*answer.receipts)
+        self._gathered += answer.receipts
+        for failure in answer.failures:
+            if not blocks.again(failure.block):
+                self._journal.record_failure(failure)
+                self._failures.append(failure)
+        for block, there in answer.begun.items():
+            if there <= self._begun.get(block, 0.0):
+                raise StoreError(NOT_FOUND.format(block))
+            self._begun[block] = there
+        self._count()
+        stored = self._stored + int(self._committed["bytes"])
+        self._told.at_work(workers=answer.workers, stored=stored)
+        self._told.advance(points=self._points() - points, failed=len(self._failures) - failed)
+
     def _count(self, *, now: bool = False) -> None:
         """Count the blocks whose receipts are written."""
-        if self._journal.flush(now=now):
-            for receipt in self._gathered:
-                self._tally.add(receipt)
-                if self._begun.pop(receipt.block, None) is not None:
-                    begun.discard(self._path, receipt.block)
-            self._gathered.clear()
+        if not self._journal.flush(now=now):
+            return
+        for receipt in self._gathered:
+            self._committed["blocks"] += 1
+            for name in COUNTED:
+                self._committed[name] += getattr(receipt, name)
+            if self._begun.pop(receipt.block, None) is not None:
+                begun.discard(self._path, receipt.block)
+        self._gathered.clear()
 
     def _points(self) -> float:
         """Points that there are so far of this run's blocks."""
-        return self._tally.points + sum(self._begun.values())
-
-    def _fail(self, failure: Failure, todo: Todo) -> None:
-        if not todo.again(failure.block):
-            self._journal.record_failure(failure)
-            self._tally.failures.append(failure)
+        return self._committed["points"] + sum(self._begun.values())
 
 
 def unwritable(path: Location, error: OSError) -> str:
@@ -364,5 +326,5 @@ def unwritable(path: Location, error: OSError) -> str:
 
 
 def _is_there(path: Location) -> bool:
-    """Whether a store is in its place: of one that went away, writers may leave folders anew."""
+    """Tell whether a store is there: of one that went away, writers may leave folders anew."""
     return (path / "zarr.json").exists()

@@ -1,4 +1,4 @@
-"""How far a store is, seen from any process, whoever works on it."""
+"""State of a store, seen from any process, whoever works on it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sweep.storage.locations import PACKED, Location, files_below, located
-from sweep.storage.receipts import read_receipts
+from sweep.storage.logs import read_receipts
 from sweep.tasks import journal, lock, studies
 from sweep.tasks.begun import begun_points
 from sweep.tasks.grid_study import GridStudy
@@ -14,7 +14,7 @@ from sweep.tasks.grid_study import GridStudy
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """How far a store is."""
+    """State of a store."""
 
     store: Location
     title: str
@@ -36,7 +36,7 @@ class Status:
 
     @property
     def complete(self) -> bool:
-        """Whether every block is committed."""
+        """Tell whether every block is committed."""
         return self.blocks_done == self.blocks
 
     @property
@@ -46,7 +46,7 @@ class Status:
 
 
 def status(store: str | Location) -> Status:
-    """How far a store is, by its log of receipts; whether all chunks are there is not looked at.
+    """State of a store, by its log of receipts; whether all chunks are there is not looked at.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def status(store: str | Location) -> Status:
     """
     path = located(store)
     attributes, study = studies.read(path)
-    begun = _begun(path)
+    begun = journal.last_begun(path)
     receipts = read_receipts(path, study.n_blocks, since=begun)
     packed = sum(files_below(path).values()) if PACKED in attributes else 0
     holder = lock.holder(path)
@@ -80,9 +80,3 @@ def status(store: str | Location) -> Status:
         workers=len(receipts.workers),
         heartbeat=lock.heartbeat_age(path) if holder else float("inf"),
     )
-
-
-def _begun(path: Location) -> float:
-    """When the last run began [s since the epoch]; infinite where there was none."""
-    times = [s["time"] for s in journal.sessions(path) if s.get("event") == "begun"]
-    return float(times[-1]) if times else float("inf")

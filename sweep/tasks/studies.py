@@ -15,7 +15,7 @@ from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.recipe import EXTENDS, read_recipe
+from sweep.tasks.journal import EXTENDS, read_recipe
 from sweep.tasks.reuse import Reuse, unlike
 
 if TYPE_CHECKING:

@@ -38,10 +38,7 @@ _PATHS = {
 def allow(modules: Iterable[str]) -> None:
     """Allow this process and the workers that it starts to import modules, also from here.
 
-    Parameters
-    ----------
-    modules
-        Their names, as they stand before the colon in a spec.
+    They are named as they stand before the colon in a spec.
     """
     allowed = {*_allowed(), *modules}
     if allowed:
@@ -71,6 +68,11 @@ def check(spec: Spec | SceneSpec) -> None:
         _try(role, name)
 
 
+def names_any(spec: Spec | SceneSpec) -> bool:
+    """Tell whether a study names a function of the user's."""
+    return any(True for _ in _named(spec))
+
+
 def digests(spec: Spec | SceneSpec) -> dict[str, str]:
     """Digest of each module, as it is imported here, whose functions a study names."""
     modules = {name.partition(":")[0] for _, name in _named(spec)}
@@ -94,13 +96,7 @@ def _named(spec: Spec | SceneSpec) -> Iterator[tuple[str, str]]:
 
 
 def methods(parameters: Mapping[str, Any]) -> Methods:
-    """What the names of detectors and estimators in the parameters of some points mean.
-
-    Raises
-    ------
-    CodeError
-        As of :func:`check`.
-    """
+    """Detectors and estimators by the names in the parameters of some points; as :func:`check`."""
     from sweep.model.detectors import DETECTORS
     from sweep.model.estimators import ESTIMATORS
     from sweep.model.noisy_spectra import Methods
@@ -118,13 +114,7 @@ def methods(parameters: Mapping[str, Any]) -> Methods:
 
 @lru_cache(maxsize=64)
 def guarded(role: str, name: str) -> Callable[..., np.ndarray]:
-    """A function of the user's, given arrays that it can't write to, its answers checked.
-
-    Parameters
-    ----------
-    role, name
-        ``detector`` or ``estimator``; ``module:function``.
-    """
+    """A function of the user's, given arrays that it can't write to, its answers checked."""
     function = _imported(name)
 
     def detect(power: np.ndarray, setting: Setting) -> np.ndarray:

@@ -1,33 +1,49 @@
-"""Every byte of a store held against the digests that were taken as it was written."""
+"""Every byte of a store held against the digests that were taken as it was written.
+
+Metadata, coordinates and the spec, all that a store held before there were results, are listed with
+their digests in the journal's directory. They follow from the study, so that any of them can be
+made again, to the same bytes.
+"""
 
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import google_crc32c
 import numpy as np
 
-from sweep.storage import sealing
+from sweep.storage import opening
 from sweep.storage.atomic_replace import settle
-from sweep.storage.locations import JOURNAL, PACKED, PARTIAL, Location, located, names_below
-from sweep.storage.sealing import damaged_lines, read_sealed
-from sweep.tasks import identity, journal, lock, store, studies, template
-from sweep.tasks.errors import StoreError
+from sweep.storage.locations import (
+    JOURNAL,
+    PACKED,
+    PARTIAL,
+    Location,
+    located,
+    names_below,
+    put_whole,
+)
+from sweep.storage.logs import damaged_lines, digest, read_lines, read_sealed
+from sweep.storage.opening import MANIFEST
+from sweep.tasks import identity, journal, lock, store, studies
+from sweep.tasks.errors import StoreError, told
 from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.journal import Journal
+from sweep.tasks.journal import RECIPE, read_recipe
 from sweep.tasks.progress import Late, Progress, chosen
-from sweep.tasks.recipe import RECIPE, read_recipe
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
-from sweep.tasks.template import Damage
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
+
+LIST = f"{JOURNAL}/{MANIFEST}"
 
 #: Blocks that are read at a time, and by how many threads: reading is waiting.
 BATCH = 256
@@ -39,7 +55,7 @@ CHUNK = re.compile(r"(.+)/c((?:/\d+)*)")
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What a store was found to be."""
+    """State that a store was found in."""
 
     store: Location
     blocks: int
@@ -50,12 +66,12 @@ class Report:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is damaged."""
+        """Tell whether nothing is damaged."""
         return not self.damages
 
     @property
     def complete(self) -> bool:
-        """Whether every block is committed and undamaged."""
+        """Tell whether every block is committed and undamaged."""
         return self.whole == self.blocks
 
 
@@ -95,19 +111,19 @@ def verify(
         Where there is no store, or not one of this program's, or one of another study than
         `spec`; where it can't be repaired.
     """
-    path, told = located(path).absolute(), Late(chosen(progress))
+    path, shown = located(path).absolute(), Late(chosen(progress))
     settle(path)
     study = _study(path, spec if repair else None)
     stores: dict[Location, AnyStudy | None] = {path: study}
     if isinstance(study, FlightStudy):
         stores |= {eyepoints_path(path, each.id): each for each in study.eyepoint_studies()}
-    return [_verify(each, held, repair, told) for each, held in stores.items() if each.exists()]
+    return [_verify(each, held, repair, shown) for each, held in stores.items() if each.exists()]
 
 
 def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
     """The study in a store; None where it holds none, or only who made it could tell."""
     try:
-        attributes = template.attributes(path)
+        attributes = _made_with(path)
     except StoreError:
         if spec is None or not path.exists():
             raise
@@ -123,13 +139,15 @@ def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
     return studies.study_of(spec, path) if spec else studies.described(path, attributes)
 
 
-def _verify(path: Location, study: AnyStudy | None, repair: bool, told: Progress) -> Report:
-    found, restored = template.damages(path), []
+def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progress) -> Report:
+    found, restored = damages(path), []
     if found and study and repair:
-        found, restored = [], _restore(path, study)
+        identity.refuse_foreign(path)  # a lock would be the first thing of ours in it
+        with lock.Lock(path):
+            found, restored = [], restore(path, study)
     logs = _of_logs(path)
-    blocks = list(_of_blocks(path, study, told)) if study else []
-    surplus = [] if template.damages(path) else _surplus(path, study)
+    blocks = list(_of_blocks(path, study, shown)) if study else []
+    surplus = [] if damages(path) else _surplus(path, study)
     return Report(
         store=path,
         blocks=study.n_blocks if study else 0,
@@ -146,25 +164,16 @@ def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
     return int(np.count_nonzero(done))
 
 
-def _restore(path: Location, study: AnyStudy) -> list[str]:
-    identity.refuse_foreign(path)  # a lock would be the first thing of ours in it
-    held = lock.Lock(path)
-    try:
-        return template.restore(path, study)
-    finally:
-        held.release()
-
-
 def _of_logs(path: Location) -> list[Damage]:
     """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
     holder = lock.holder(path)
     alive = holder is not None and lock.is_live(path, holder)
     found = []
     for name in (*journal.LOGS, RECIPE):
-        file = path / store.JOURNAL / name
+        file = path / JOURNAL / name
         unfinished = _unfinished(file) if alive else 0
         found += [
-            Damage(f"{store.JOURNAL}/{name} line {number}", "is damaged or cut short")
+            Damage(f"{JOURNAL}/{name} line {number}", "is damaged or cut short")
             for number in damaged_lines(file)
             if number != unfinished
         ]
@@ -182,7 +191,7 @@ def _unfinished(log: Location) -> int:
 
 def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
     """Files of a store that are no part of it; drafts of writers that were killed are not told."""
-    listed = template.digests(path)
+    listed = digests(path)
     grids = {name: owner.shape for name, owner in study.owners().items()} if study else {}
     for name in names_below(path):
         if name in listed or name.startswith(f"{JOURNAL}/") or name.endswith(PARTIAL):
@@ -196,38 +205,38 @@ def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
             yield Damage(name, "is no part of the store", mended_by="hand")
 
 
-def _of_blocks(path: Location, study: Study, told: Progress) -> Iterator[Damage]:
+def _of_blocks(path: Location, study: Study, shown: Progress) -> Iterator[Damage]:
     """Damages of the blocks that were committed."""
-    digests = journal.digests(path, study.n_blocks)
-    blocks = np.flatnonzero(digests != b"")
-    told.begin(points=len(blocks), done=0, unit="blocks")
+    committed = journal.digests(path, study.n_blocks)
+    blocks = np.flatnonzero(committed != b"")
+    shown.begin(points=len(blocks), done=0, unit="blocks")
     try:
         with ThreadPoolExecutor(THREADS) as pool:
             for start in range(0, len(blocks), BATCH):
                 batch = [int(block) for block in blocks[start : start + BATCH]]
                 for found in pool.map(
-                    lambda b: _of_block(path, study, b, bytes(digests[b])), batch
+                    lambda b: _of_block(path, study, b, bytes(committed[b])), batch
                 ):
                     yield from found
-                told.advance(points=len(batch), failed=0)
+                shown.advance(points=len(batch), failed=0)
     finally:
-        told.end()
+        shown.end()
 
 
-def _of_block(path: Location, study: Study, block: int, digest: bytes) -> list[Damage]:
+def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Damage]:
     objects = store.block_objects(study, block)
     try:
-        if sealing.digest(path, objects) == digest.decode():
+        if digest(path, objects) == known.decode():
             return []
     except OSError:
         pass  # told below, object by object
-    found = [Damage(name, what, block) for name in objects if (what := _wrong(path / name))]
+    found = [Damage(name, what, block) for name in objects if (what := _wrong_chunk(path / name))]
     count = f"one of its {len(objects)} chunks"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
 
 
-def _wrong(chunk: Location) -> str:
-    """What is wrong with a chunk, by the checksum that Zarr's codec put at its end."""
+def _wrong_chunk(chunk: Location) -> str:
+    """Damage of a chunk in words, by the checksum that Zarr's codec put at its end."""
     try:
         content = chunk.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -243,17 +252,147 @@ def _wrong(chunk: Location) -> str:
 def _mark(path: Location, damages: list[Damage]) -> str:
     """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
     try:
-        held = lock.Lock(path)
+        with lock.Lock(path), told(f"{path} can't be written"):
+            log = journal.Journal(path)
+            for block in sorted({damage.block for damage in damages}):
+                named = [f"{d.object} {d.what}" for d in damages if d.block == block]
+                log.withdraw(block, "; ".join(named))
+            log.flush(now=True)
     except StoreError as error:
         return str(error)
-    try:
-        log = Journal(path)
-        for block in sorted({damage.block for damage in damages}):
-            named = [f"{d.object} {d.what}" for d in damages if d.block == block]
-            log.withdraw(block, "; ".join(named))
-        log.flush(now=True)
-    except OSError as error:
-        return f"{path} can't be written: {error.strerror or error}"
-    finally:
-        held.release()
     return ""
+
+
+class Damage(NamedTuple):
+    """An object of a store that is not as it was written."""
+
+    object: str  # path inside the store; a line of a log by its number
+    what: str  # what is wrong with it
+    block: int = -1  # that it belongs to
+    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
+
+
+def _made_with(path: Location) -> dict[str, Any]:
+    """Attributes that a store was made with, from its list, else from its group.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store, or not one of this program's; where both are damaged.
+    """
+    if listed := opening.listed_attributes(path):
+        return opening.recognised(path, listed)
+    found = opening.read_attributes(path)
+    if any(_wrong(path, o, known) for o, known in digests(path).items() if o == "zarr.json"):
+        raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
+    return found
+
+
+def digests(path: Location) -> dict[str, str]:
+    """Digests of what a store was made of, by object, as far as its list is undamaged."""
+    return {r["object"]: r["digest"] for r in read_lines(path / LIST) if "object" in r}
+
+
+def damages(path: Location) -> list[Damage]:
+    """Objects that a store was made of, and lines of their list, that are not as they were."""
+    lines = [record for _, record in read_sealed(path / LIST)]
+    if not lines:
+        return [Damage(LIST, "is missing or empty", mended_by="repair")]
+    found = [
+        Damage(f"{LIST} line {n}", "is damaged", mended_by="repair")
+        for n, each in enumerate(lines, 1)
+        if each is None
+    ]
+    whole = [record for record in lines if record]
+    if not found and whole[0].get("objects") != len(whole) - 1:
+        found.append(Damage(LIST, "lacks lines", mended_by="repair"))
+    return found + [
+        Damage(name, what, mended_by="repair")
+        for name, known in digests(path).items()
+        if (what := _wrong(path, name, known))
+    ]
+
+
+def _wrong(path: Location, name: str, known: str) -> str:
+    try:
+        return "" if digest(path, [name]) == known else "is not as it was made"
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing"
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
+
+
+def refuse_damaged(path: Location) -> None:
+    """Refuse a store whose template is not as it was made: what is added might not fit it."""
+    store.refuse_links(path)
+    if found := damages(path):
+        listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
+        raise StoreError(
+            f"{path} is not as it was made:\n{listed}\n"
+            f"`sweep verify {path} --repair` puts back what was there."
+        )
+
+
+def restore(path: Location, study: Study) -> list[str]:
+    """Put back, each in one step, what a store held before there were results; names of objects.
+
+    The caller holds the store's lock. The study is what it holds, by its attributes or by a spec
+    that is said to be its own.
+
+    Raises
+    ------
+    StoreError
+        Where this machine can't make the same again. Nothing is touched.
+    """
+    store.refuse_links(path)
+    try:
+        written = _made_with(path)
+    except StoreError:
+        written = {}
+    if written:
+        identity.refuse_other_versions(path, written, where="this machine")
+    if written.get("study_id", study.id) != study.id:
+        raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
+    with told(f"{path} can't be mended"), tempfile.TemporaryDirectory() as directory:
+        aside = Path(directory) / path.name
+        store.build(aside, study, written or store.new_attributes(study))
+        _refuse_different(path, aside)
+        names = sorted(names_below(aside))
+        wrong = [name for name in names if not _same(path / name, aside / name)]
+        if not (written or "zarr.json" in digests(path)):
+            _refuse_unproven(path, study, aside, wrong)
+        for name in wrong:
+            put_whole(path / name, (aside / name).read_bytes())
+    return wrong
+
+
+def _refuse_different(path: Location, aside: Path) -> None:
+    """Refuse to put back what an undamaged line of the list says is not what was there."""
+    for name, known in digests(path).items():
+        if _wrong(aside, name, known):
+            raise StoreError(
+                f"{name} of {path} can't be made again as it was on this machine, or from this "
+                "spec: put it back from a copy, or run the study anew into another store"
+            )
+
+
+def _refuse_unproven(path: Location, study: Study, aside: Path, wrong: list[str]) -> None:
+    """Refuse a spec that makes other arrays or results, where all else that could tell is lost."""
+    if others := set(wrong) - {"zarr.json", LIST}:
+        raise StoreError(
+            f"{path} holds another study, or too little is left: {min(others)} differs"
+        )
+    committed = journal.digests(path, study.n_blocks)
+    for block in (committed != b"").nonzero()[0][:1].tolist():
+        written = store.Arrays(aside, study).write(block, study.evaluate(block))
+        for name in store.block_objects(study, block):
+            (aside / name).unlink()
+        if written.digest.encode() != committed[block]:
+            raise StoreError(f"{path} holds another study: its block {block} has other results")
+
+
+def _same(one: Location, other: Path) -> bool:
+    try:
+        return one.read_bytes() == other.read_bytes()
+    except OSError:
+        return False

@@ -1,26 +1,31 @@
-"""What runs on a worker: blocks evaluated, written, and answered for with receipts."""
+"""Blocks on a worker: evaluated, in the time that they may take, written, and receipted."""
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import socket
+import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TypeVar
 
 from sweep.storage.atomic_replace import stamp
 from sweep.storage.locations import located
-from sweep.tasks import begun, store, versions
+from sweep.storage.opening import read_attributes
+from sweep.tasks import begun, identity, store, studies
 from sweep.tasks.begun import Begun
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Failure, Receipt
-from sweep.tasks.study import Evaluate, Results, Stop, Study, Unfinished
-from sweep.tasks.time_limit import limited, worker_address
+from sweep.tasks.study import Evaluate, Results, Stop, Unfinished
+
+T = TypeVar("T")
 
 #: Errors of the place that results go to: every further block would meet them too.
 STORAGE_ERRORS = {
@@ -32,13 +37,27 @@ STORAGE_ERRORS = {
 #: where a worker dies, and waited for after Ctrl-C.
 PIECE_SECONDS = 10.0
 
+#: Seconds that a thread has, after its time, to come back from compiled code and be interrupted.
+GRACE = 10.0
+
 #: Studies that a worker holds open at once.
 STUDIES_OPEN = 4
 
 
+@dataclass(frozen=True)
+class Job:
+    """Part that all tasks of a run have in common; small, for it travels with each."""
+
+    path: str
+    study_id: str
+    evaluate: Evaluate | None = None  # in place of the study, with the same results
+    seconds: float | None = None  # that one block may take
+    durable: bool = False  # whether its chunks are on the disk before its receipt
+
+
 @dataclass
 class Answer:
-    """What became of the blocks of one task."""
+    """Results of one task: what was written, what failed, what is begun."""
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -49,21 +68,13 @@ class Answer:
     workers: int = 1  # that there were as it arrived
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A study opened for computing its blocks."""
-
-    study: Study
-    arrays: store.Arrays
-
-
-_studies: dict[tuple[str, str], Opened] = {}
+_studies: dict[tuple[str, str], store.Arrays] = {}
 _stamps: dict[str, tuple[tuple[int, ...], str]] = {}
 _opening = threading.Lock()
 
 
-def study(path: str, study_id: str) -> Opened:
-    """The study of a store, opened once a process.
+def study(path: str, study_id: str) -> store.Arrays:
+    """The study of a store, opened for writing its blocks, once a process.
 
     Raises
     ------
@@ -79,77 +90,45 @@ def study(path: str, study_id: str) -> Opened:
         return _studies[path, study_id]
 
 
-def _open(path: str, study_id: str) -> Opened:
-    from sweep.tasks.identity import refuse_other_versions
-    from sweep.tasks.studies import read
-
-    attributes, held = read(located(path))
+def _open(path: str, study_id: str) -> store.Arrays:
+    attributes, held = studies.read(located(path))
     _refuse_another(path, study_id)
-    refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
-    return Opened(held, store.Arrays(path, held))
+    identity.refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
+    return store.Arrays(path, held)
 
 
 def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
-    held = _held(path, stamp(located(path)))
+    found, known = stamp(located(path)), _stamps.get(path)
+    if known and found and known[0] == found:
+        held = known[1]
+    else:
+        held = str(read_attributes(located(path))["study_id"])
+        if found:
+            _stamps[path] = found, held
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
 
 
-def _held(path: str, found: tuple[int, ...] | None) -> str:
-    """Id of the study in a store; read again where its stamp is another."""
-    from sweep.storage.opening import read_attributes
-
-    known = _stamps.get(path)
-    if known and found and known[0] == found:
-        return known[1]
-    held = str(read_attributes(located(path))["study_id"])
-    if found:
-        _stamps[path] = found, held
-    return held
-
-
-@dataclass(frozen=True)
-class Terms:
-    """How blocks are computed; nothing of it shows in the results."""
-
-    evaluate: Evaluate | None = None  # in place of the study, with the same results
-    seconds: float | None = None  # that one block may take
-    durable: bool = False  # whether its chunks are on the disk before its receipt
-
-
-def work(path: str, study_id: str, blocks: list[int], terms: Terms) -> Answer:
+def work(job: Job, blocks: list[int]) -> Answer:
     """Evaluate and write blocks, each on its own: one that raises does not stop the next.
 
-    Of one that takes long a piece is computed, and saved for the next task.
-
-    Parameters
-    ----------
-    path, study_id
-        The store and the study that it must hold.
-    blocks
-        Numbers of the blocks.
-    terms
-        How.
-
-    Returns
-    -------
-    Answer
-        Of what was done before the store could not be read or written here, where that is so.
+    Of one that takes long a piece is computed, and saved for the next task. The answer is of what
+    was done before the store could not be read or written here, where that is so.
     """
     answer = Answer(worker=worker_address(), host=socket.gethostname())
     try:
-        _work(answer, study(path, study_id), blocks, terms)
+        _work(answer, study(job.path, job.study_id), blocks, job)
     except (StoreError, OSError) as error:
         answer.unfit = error
     return answer
 
 
-def _work(answer: Answer, opened: Opened, blocks: list[int], terms: Terms) -> None:
+def _work(answer: Answer, arrays: store.Arrays, blocks: list[int], job: Job) -> None:
     written, stop_at = [], time.monotonic() + PIECE_SECONDS
     for block in blocks:
         try:
-            found = _one(opened, block, terms, Stop(stop_at))
+            found = _one(arrays, block, job, Stop(stop_at))
             if isinstance(found, Receipt):
                 written.append(found)
             else:
@@ -160,25 +139,25 @@ def _work(answer: Answer, opened: Opened, blocks: list[int], terms: Terms) -> No
             if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
                 raise
             answer.failures.append(failure(block, error))
-    if terms.durable and (written or answer.begun):
-        store.sync(opened.arrays.path)
+    if job.durable and (written or answer.begun):
+        store.sync(arrays.path)
     answer.receipts = written
 
 
-def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | float:
+def _one(arrays: store.Arrays, block: int, job: Job, stop: Stop) -> Receipt | float:
     """Receipt of a block, or the points that there are of it."""
-    held, path, before = opened.study, opened.arrays.path, Begun()
+    held, path, before = arrays.study, arrays.path, Begun()
     start = time.perf_counter()
     evaluate: Callable[[], Results]
-    if terms.evaluate:
-        evaluate = partial(terms.evaluate, held, block)
+    if job.evaluate:
+        evaluate = partial(job.evaluate, held, block)
     elif isinstance(held, GridStudy) and held.spec.draws.any:
         before = begun.read(path, held.id, block)
         evaluate = partial(held.evaluate, block, before.known, stop)
     else:
         evaluate = partial(held.evaluate, block)
     try:
-        results = limited(evaluate, terms.seconds, before.seconds)
+        results = limited(evaluate, job.seconds, before.seconds)
     except Unfinished as unfinished:
         _refuse_another(str(path), held.id)
         spent = before.seconds + time.perf_counter() - start
@@ -186,7 +165,7 @@ def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | floa
         return unfinished.points
     evaluated = time.perf_counter()
     _refuse_another(str(path), held.id)  # its driver may be long dead
-    written = opened.arrays.write(block, results)
+    written = arrays.write(block, results)
     ended = time.perf_counter()
     earlier = getattr(held, "earlier", None)
     return Receipt(
@@ -198,7 +177,7 @@ def _one(opened: Opened, block: int, terms: Terms, stop: Stop) -> Receipt | floa
         write_seconds=round(ended - evaluated, 6),
         host=socket.gethostname(),
         pid=os.getpid(),
-        versions=versions.software(),
+        versions=identity.software(),
         taken=earlier.taken.pop(block, 0) if earlier else 0,
     )
 
@@ -213,3 +192,109 @@ def failure(block: int, error: BaseException) -> Failure:
         host=socket.gethostname(),
         pid=os.getpid(),
     )
+
+
+class Overtime(Exception):
+    """A block took longer than it may."""
+
+
+class _Interruption(BaseException):
+    """Raised in a thread from outside; no `except Exception` on its way takes it for its own."""
+
+
+class _Alarm:
+    """Interrupts the thread that sets it, unless it is put off in time."""
+
+    def __init__(self, seconds: float, *, deadly: bool) -> None:
+        self._deadly, self._thread = deadly, threading.get_ident()
+        self._guard = threading.RLock()  # its owner may be interrupted while taking it
+        self._over = self.rung = False
+        self._timer = _timer(seconds, self._ring)
+
+    def set(self) -> None:
+        """From here on the thread may be interrupted."""
+        self._timer.start()
+
+    def _ring(self) -> None:
+        with self._guard:
+            if self._over:
+                return
+            self.rung = True
+            _raise_in(self._thread, _Interruption)
+            if self._deadly:
+                self._timer = _timer(GRACE, self._kill)
+                self._timer.start()
+
+    def _kill(self) -> None:
+        with self._guard:
+            if not self._over:
+                os._exit(1)  # stuck in compiled code; a nanny starts another worker
+
+    def put_off(self) -> None:
+        """The work is over: from here on nothing is interrupted."""
+        while not self._over:
+            try:
+                with self._guard:
+                    _raise_in(self._thread, None)  # what was not delivered yet
+                    self._over = True
+            except _Interruption:
+                continue
+        self._timer.cancel()
+
+
+def _timer(seconds: float, action: Callable[[], None]) -> threading.Timer:
+    timer = threading.Timer(seconds, action)
+    timer.daemon = True
+    return timer
+
+
+def _raise_in(thread: int, error: type[BaseException] | None) -> None:
+    raised = ctypes.py_object(error) if error else None
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), raised)
+
+
+def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) -> T:
+    """Do some work, for no longer than some seconds less those spent before; None sets no limit.
+
+    Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
+    later ends itself; a process that computes on its own account waits for it to return.
+
+    Raises
+    ------
+    Overtime
+        Where it took longer.
+    """
+    if seconds is None:
+        return work()
+    alarm = _Alarm(max(seconds - spent, 0.0), deadly=_is_worker_process())
+    where: _Interruption | None = None
+    # No context manager: an interruption on the way into its exit would go past it.
+    try:
+        try:
+            alarm.set()
+            found = work()
+        finally:
+            alarm.put_off()
+    except _Interruption as interruption:
+        alarm.put_off()  # the only one there is may have come before that was begun
+        where = interruption
+    if alarm.rung:
+        raise Overtime(f"took longer than the {seconds:g} s that a block may take") from where
+    return found
+
+
+def _is_worker_process() -> bool:
+    """Tell whether this is a worker in a process of its own, which may end without harm."""
+    return worker_address().partition("://")[0] not in ("", "inproc")
+
+
+def worker_address() -> str:
+    """Address of the Dask worker that this thread computes for; empty where there is none."""
+    if "distributed" not in sys.modules:
+        return ""
+    from distributed import get_worker
+
+    try:
+        return str(get_worker().address)
+    except ValueError:
+        return ""

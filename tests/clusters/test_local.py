@@ -12,10 +12,10 @@ import psutil
 import pytest
 from small import receipts, small, tree
 
-from sweep.tasks import session, window
+from sweep.tasks import scheduler, session
 from sweep.tasks.clusters import local
 from sweep.tasks.driver import run
-from sweep.tasks.progress import Silent
+from sweep.tasks.progress import Progress
 
 SCRIPT = """
 import sys
@@ -56,7 +56,7 @@ def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):
     monkeypatch.setattr(local, "FROZEN", "1 s")  # ten heartbeats at least
-    monkeypatch.setattr(window, "LEASE", 1.0)
+    monkeypatch.setattr(scheduler, "LEASE", 1.0)
     pid = tmp_path / "pid"
 
     def evaluate(study, block):
@@ -73,7 +73,7 @@ def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     assert not psutil.pid_exists(int(pid.read_text()))
 
 
-class Ending(Silent):
+class Ending(Progress):
     """Progress that has all workers end as the first points arrive, and gives up in the end."""
 
     def __init__(self, workers) -> None:
@@ -93,7 +93,7 @@ class Ending(Silent):
 
 def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr(session, "ABSENT", 1.0)
-    monkeypatch.setattr(window, "SLOTS_AGE", 0.1)
+    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
     clusters, start = [], local.start
 
     def started(*given, **options):

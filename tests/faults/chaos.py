@@ -41,7 +41,7 @@ from rich.table import Table
 from small import copied, receipts, small, tree
 
 from sweep.storage import locations
-from sweep.tasks import journal, store, window
+from sweep.tasks import journal, scheduler, store
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.packing import pack
@@ -531,7 +531,7 @@ def prepare() -> None:
     study = GridStudy(small())
     study.compile()
     study.evaluate(0)
-    window.LEASE = 3.0
+    scheduler.LEASE = 3.0
     dask.config.set({
         "distributed.worker.multiprocessing-method": "fork",
         "distributed.comm.timeouts.connect": "5s",

@@ -14,7 +14,7 @@ from faulty import Faulty
 from six_blocks import six
 from small import quiet
 
-from sweep.storage import objects
+from sweep.storage import locations
 
 BUCKET = "bucket"
 
@@ -62,9 +62,9 @@ def faults(server, monkeypatch):
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "key")
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
         monkeypatch.setenv("AWS_REGION", "us-east-1")
-        objects._clients.clear()
+        locations._clients.clear()
         yield faulty
-        objects._clients.clear()
+        locations._clients.clear()
 
 
 @pytest.fixture

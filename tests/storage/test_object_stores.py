@@ -23,9 +23,9 @@ from small import evaluated, logged, quiet, tree
 
 import sweep
 from sweep.cli import main
-from sweep.storage import logs, objects
+from sweep.storage import locations, logs
 from sweep.storage.locations import JOURNAL, located
-from sweep.storage.sealing import read_lines, sealed, unsealed
+from sweep.storage.logs import read_lines, sealed, unsealed
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import LOCK, Holder, Lock, holder
@@ -144,8 +144,8 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
 def test_a_store_that_goes_away_ends_a_run_in_words_and_is_resumed(
     faults, place, undisturbed, monkeypatch
 ):
-    soon = {**objects.RETRIES, "max_retries": 2, "retry_timeout": timedelta(seconds=2)}
-    monkeypatch.setattr(objects, "RETRIES", soon)
+    soon = {**locations.RETRIES, "max_retries": 2, "retry_timeout": timedelta(seconds=2)}
+    monkeypatch.setattr(locations, "RETRIES", soon)
 
     def fails_later(study, block):
         if block == 3:
@@ -209,8 +209,8 @@ def test_a_lock_whose_answers_are_lost_is_had_kept_and_left(faults, place):
 )
 @pytest.mark.parametrize("command", ["status", "resume"])
 def test_what_is_wrong_is_said_in_one_line(faults, monkeypatch, spoil, said, command):
-    few = {**objects.FIRST_RETRIES, "max_retries": 1}
-    monkeypatch.setattr(objects, "FIRST_RETRIES", few)
+    few = {**locations.FIRST_RETRIES, "max_retries": 1}
+    monkeypatch.setattr(locations, "FIRST_RETRIES", few)
     spoil(faults, monkeypatch)
     told = CliRunner().invoke(main, [command, "s3://absent/x.zarr"])
     assert told.exit_code == 2 and said in told.output
@@ -219,7 +219,7 @@ def test_what_is_wrong_is_said_in_one_line(faults, monkeypatch, spoil, said, com
 
 def test_figures_that_are_no_status_are_not_taken_for_one():
     said = "Server error, status code: 503 Service Unavailable, after 2.403s"
-    number, words = objects.explained(said, "s3://bucket")
+    number, words = locations.explained(said, "s3://bucket")
     assert number == errno.EIO and words.endswith(
         "keeps failing (503 Service Unavailable): try again"
     )
@@ -241,7 +241,7 @@ def test_what_is_somebody_elses_is_not_written_over(memory):
 def test_a_creation_cut_short_looks_like_no_store_and_is_cleared(
     faults, place, undisturbed, monkeypatch
 ):
-    monkeypatch.setattr(objects, "RETRIES", {**objects.RETRIES, "max_retries": 0})
+    monkeypatch.setattr(locations, "RETRIES", {**locations.RETRIES, "max_retries": 0})
     faults.fate = lambda n, method, path: ERROR if path.endswith("range/zarr.json") else PASS
     with pytest.raises(StoreError, match="can't be made"):
         quiet(six(seed=4), place)

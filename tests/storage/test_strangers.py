@@ -14,8 +14,8 @@ from small import small
 
 import sweep
 from sweep.cli import main
+from sweep.storage.logs import closed
 from sweep.storage.opening import NotAStoreError
-from sweep.storage.sealing import closed
 from sweep.tasks import store
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy

@@ -12,15 +12,15 @@ import pytest
 from distributed import Client, LocalCluster
 from small import copied, receipts, small, tree
 
-from sweep.tasks import progress, session, store, window, worker
+from sweep.tasks import progress, scheduler, session, store, worker
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import Silent
-from sweep.tasks.time_limit import worker_address
+from sweep.tasks.progress import Progress
+from sweep.tasks.worker import worker_address
 
 
-class Told(Silent):
+class Told(Progress):
     """Progress that does something when a line is said, and once as the first points arrive."""
 
     def __init__(self, at_line, at_first=lambda: None) -> None:
@@ -43,8 +43,8 @@ class Told(Silent):
 def without_workers(monkeypatch):
     """A cluster that has none, looked at often."""
     monkeypatch.setattr(session, "ABSENT", 0.2)
-    monkeypatch.setattr(window, "SLOTS_AGE", 0.1)
-    monkeypatch.setattr(window, "TICK", 0.1)
+    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
+    monkeypatch.setattr(scheduler, "TICK", 0.1)
     with (
         LocalCluster(
             n_workers=0, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
@@ -104,9 +104,9 @@ def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(
 @pytest.fixture
 def two_workers(monkeypatch):
     """A client of a cluster with two workers, whose silence is soon noticed."""
-    monkeypatch.setattr(window, "SLOTS_AGE", 0.1)
-    monkeypatch.setattr(window, "TICK", 0.1)
-    monkeypatch.setattr(window, "LEASE", 1.0)
+    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
+    monkeypatch.setattr(scheduler, "TICK", 0.1)
+    monkeypatch.setattr(scheduler, "LEASE", 1.0)
     with (
         LocalCluster(
             n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
@@ -164,12 +164,12 @@ def disk_is_read_only(path, opened):
     def write(block, results):
         raise OSError(errno.EROFS, "Read-only file system", path)
 
-    opened.arrays.write = write
+    opened.write = write
     return opened
 
 
 def another_store(path, opened):
-    return worker.Opened(opened.study, store.Arrays(f"{path}-copy", opened.study))
+    return store.Arrays(f"{path}-copy", opened.study)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def another_store(path, opened):
 def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
     undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
 ):
-    monkeypatch.setattr(window, "LATENCY", 0.5)
+    monkeypatch.setattr(scheduler, "LATENCY", 0.5)
     path = copied(undisturbed, tmp_path)
     (path / ".sweep" / "receipts.jsonl").unlink()
     held = GridStudy(small())

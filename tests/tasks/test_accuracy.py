@@ -404,7 +404,7 @@ def test_a_store_in_the_way_is_refused_and_left_alone(tmp_path, undisturbed):
         measured(small(), store_path=undisturbed, progress=False)
 
 
-class Broken(progress.Silent):
+class Broken(progress.Progress):
     """Ctrl-C after so many trials."""
 
     stopping = False

@@ -11,14 +11,14 @@ import pytest
 from small import STUDY, quiet, receipts, small, tree
 
 from sweep.model import sampling
-from sweep.storage.objects import ObjectPath
-from sweep.tasks import begun, worker
+from sweep.storage.locations import ObjectPath
+from sweep.tasks import begun, progress, worker
 from sweep.tasks.begun import Begun
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.packing import pack
-from sweep.tasks.progress import Lines, Silent
+from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.study import Found, Known
 from sweep.tasks.verify import verify
@@ -85,7 +85,7 @@ def whole(tmp_path_factory):
     return made
 
 
-class Told(Silent):
+class Told(Progress):
     """Notes how far a run is, and does something then."""
 
     def __init__(self, then=lambda told: None):
@@ -289,8 +289,9 @@ def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
     assert outcome.work_seconds > spent > 0
 
 
-def test_lines_tell_the_part_of_a_point(capsys):
-    lines = Lines(every=-1.0)
+def test_lines_tell_the_part_of_a_point(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_EVERY", -1.0)
+    lines = progress.Lines()
     lines.begin(points=2, done=0, unit="points")
     for part in (0.31, 0.69, 1.0):
         lines.advance(points=part, failed=0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import zarr
 
-from sweep.storage import chunks, locations
-from sweep.tasks.store import WRITTEN_WHOLE, codecs
+from sweep.storage import locations
+from sweep.tasks.store import WRITTEN_WHOLE, Chunked, codecs
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
@@ -34,7 +34,7 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
     for position in itertools.product(*map(range, counts)):
         at = tuple(slice(p * c, (p + 1) * c) for p, c in zip(position, chunk, strict=True))
         file = tmp_path / "hand" / "/".join(["c", *map(str, position)])
-        locations.put(str(file), chunks.Chunked.of(by_hand).encoded(values[at]))
+        locations.put(str(file), Chunked.of(by_hand).encoded(values[at]))
         assert (
             file.read_bytes()
             == (tmp_path / "zarr" / file.relative_to(tmp_path / "hand")).read_bytes()
@@ -45,7 +45,7 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
 def test_chunks_equal_to_the_fill_and_values_of_the_other_byte_order(tmp_path):
     by_zarr = array_at(tmp_path / "zarr", (4,), (4,), "float64", np.nan)
     by_zarr[...] = np.full(4, np.nan)
-    chunked = chunks.Chunked.of(by_zarr)
+    chunked = Chunked.of(by_zarr)
     content = chunked.encoded(np.full(4, np.nan))
     assert content == (tmp_path / "zarr/c/0").read_bytes()
     swapped = np.arange(4.0).astype(">f8")
@@ -68,4 +68,4 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
 
 def test_text_is_left_to_zarr(tmp_path):
     text = zarr.create_array(tmp_path / "text", shape=(2,), dtype=str)
-    assert not chunks.Chunked.of(text).is_plain
+    assert not Chunked.of(text).is_plain

@@ -18,7 +18,7 @@ from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.status import status
 from sweep.tasks.store import Arrays, Written
-from sweep.tasks.worker import Terms, work
+from sweep.tasks.worker import Job, work
 
 
 def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
@@ -269,7 +269,7 @@ def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(t
         store.create(path, GridStudy(small(seed=6)))
         return study.evaluate(block)
 
-    unfit = work(str(path), old.id, [0], Terms(replaced_meanwhile)).unfit
+    unfit = work(Job(str(path), old.id, replaced_meanwhile), [0]).unfit
     assert f"now holds study {small(seed=6).id}, not {old.id}" in str(unfit)
     assert not list(path.glob("*/c/0/0/0"))
 

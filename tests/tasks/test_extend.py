@@ -23,7 +23,7 @@ from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.lock import Lock
-from sweep.tasks.progress import Silent
+from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.verify import verify
 
@@ -432,7 +432,7 @@ def test_one_that_is_written_is_not_extended(tmp_path, undisturbed):
     lock.release()
 
 
-class Interrupting(Silent):
+class Interrupting(Progress):
     """Progress that presses Ctrl-C as the first points are done."""
 
     def advance(self, *, points, failed):

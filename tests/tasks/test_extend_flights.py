@@ -17,7 +17,7 @@ from sweep.tasks import flight_study
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.flight_study import FlightStudy, Part
-from sweep.tasks.recipe import read_recipe
+from sweep.tasks.journal import read_recipe
 from sweep.tasks.verify import verify
 
 POWER, APERTURE = "instrument.laser.power", "instrument.telescope.aperture"

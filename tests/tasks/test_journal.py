@@ -1,9 +1,16 @@
-import json
 import os
 
 import pytest
 
-from sweep.storage.sealing import damaged_lines, sealed, unsealed
+from sweep.storage.locations import JOURNAL
+from sweep.storage.logs import (
+    RECEIPTS,
+    damaged_lines,
+    read_lines,
+    read_receipts,
+    sealed,
+    unsealed,
+)
 from sweep.tasks import journal
 from sweep.tasks.journal import Failure, Journal, Receipt
 
@@ -27,7 +34,7 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
         opened = Journal(tmp_path)
         for block in blocks:
             opened.commit(receipt(block))
-    records = list(journal.read_lines(journal.receipts_path(tmp_path)))
+    records = list(read_lines(tmp_path / JOURNAL / RECEIPTS))
     assert [record["block"] for record in records] == [4, 2, 7]
     assert records[0]["digest"] == "ab"
 
@@ -38,32 +45,27 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
 def test_a_torn_last_line_is_cut_and_what_stands_before_it_stays(tmp_path, tail):
     opened = Journal(tmp_path)
     opened.commit(receipt(1))
-    path = journal.receipts_path(tmp_path)
+    path = tmp_path / JOURNAL / RECEIPTS
     whole = path.read_bytes()
     path.write_bytes(whole + tail.encode("latin-1"))
-    assert [record["block"] for record in journal.read_lines(path)] == [1]
+    assert [record["block"] for record in read_lines(path)] == [1]
     Journal(tmp_path)
     assert path.read_bytes() == whole
 
 
-def test_a_log_that_is_one_torn_line_becomes_empty(tmp_path):
-    log = tmp_path / "log"
-    log.write_bytes(b'{"block"')
-    journal.drop_damaged(log)
-    assert log.read_bytes() == b""
-    journal.drop_damaged(log)
-    journal.drop_damaged(tmp_path / "absent")
-    assert log.read_bytes() == b""
-
-
 def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp_path):
-    log = tmp_path / "log"
+    log = tmp_path / JOURNAL / RECEIPTS
+    log.parent.mkdir()
     one, two, three = (sealed({"block": block}) for block in (1, 2, 3))
     log.write_bytes(one + b'nonsense\n[3]\n{"block":4}\n' + two.replace(b"2", b"5", 1) + three)
-    assert [record["block"] for record in journal.read_lines(log)] == [1, 3]
+    assert [record["block"] for record in read_lines(log)] == [1, 3]
     assert damaged_lines(log) == [2, 3, 4, 5]
-    journal.drop_damaged(log)
+    Journal(tmp_path)
     assert log.read_bytes() == one + three
+    log.write_bytes(b'{"block"')
+    for _ in range(2):
+        Journal(tmp_path)
+        assert log.read_bytes() == b""
 
 
 def test_no_byte_of_a_line_can_change_unseen():
@@ -103,25 +105,35 @@ def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
 def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch):
     opened = Journal(tmp_path)
     opened.commit(receipt(1))
-    before = journal.receipts_path(tmp_path).read_bytes()
+    before = (tmp_path / JOURNAL / RECEIPTS).read_bytes()
     write = os.write
     monkeypatch.setattr(os, "write", lambda log, line: write(log, line[:20]))
     with pytest.raises(OSError, match="No space left"):
         opened.commit(receipt(2))
-    assert journal.receipts_path(tmp_path).read_bytes() == before
+    assert (tmp_path / JOURNAL / RECEIPTS).read_bytes() == before
 
 
 def test_failures_keep_the_last_error_of_a_block_with_its_traceback(tmp_path):
     opened = Journal(tmp_path)
     for text in ("first", "second"):
         opened.record_failure(Failure(block=3, error=text, traceback="trace", host="h", pid=1))
-    assert journal.failures(tmp_path)[3]["error"] == "second"
-    assert journal.failures(tmp_path)[3]["traceback"] == "trace"
+    assert journal.given_up(tmp_path, 4)[3]["error"] == "second"
+    assert journal.given_up(tmp_path, 4)[3]["traceback"] == "trace"
 
 
-def test_sessions_are_recorded_with_their_times(tmp_path):
+def test_runs_are_recorded_with_their_times(tmp_path):
     opened = Journal(tmp_path)
+    assert journal.last_begun(tmp_path) == float("inf")
     opened.record_session("begun", pid=5)
-    (session,) = journal.sessions(tmp_path)
-    assert session["event"] == "begun" and session["pid"] == 5 and session["time"] > 0
-    assert json.dumps(session)
+    opened.record_session("ended", blocks=3)
+    begun, ended = read_lines(tmp_path / JOURNAL / journal.SESSIONS)
+    assert begun["event"] == "begun" and begun["pid"] == 5 and ended["blocks"] == 3
+    assert journal.last_begun(tmp_path) == begun["time"] > 0
+
+
+@pytest.mark.parametrize(("n_blocks", "points"), [(2, [5, 0]), (3, [5, 0, 7]), (4, [5, 0, 7, 0])])
+def test_receipts_of_other_blocks_count_for_nothing(tmp_path, n_blocks, points):
+    (tmp_path / JOURNAL).mkdir()
+    lines = [sealed({"block": b, "points": p, "time": 1.5}) for b, p in ((0, 5), (2, 7))]
+    (tmp_path / JOURNAL / RECEIPTS).write_bytes(b"".join(lines))
+    assert read_receipts(tmp_path, n_blocks).points.tolist() == points

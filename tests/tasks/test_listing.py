@@ -7,12 +7,12 @@ from small import copied, evaluated, logged, quiet, small, tree
 from small_flights import small_scene
 
 from sweep.storage.locations import located
-from sweep.tasks import listing, session
+from sweep.tasks import journal, session
 from sweep.tasks.driver import resume
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.listing import Look, chunks_there, listed
+from sweep.tasks.journal import Look, chunks_there, listed
 from sweep.tasks.status import status
 
 STUDIES = {
@@ -87,13 +87,13 @@ def test_status_says_what_there_is_of_a_run(tmp_path):
 
 def slow_to_look(monkeypatch, seconds):
     """Folders that show what they hold only after some time, and a run that waits for nothing."""
-    there = listing.chunks_there
+    there = journal.chunks_there
 
     def late(folder, shape):
         time.sleep(seconds)
         return there(folder, shape)
 
-    monkeypatch.setattr(listing, "chunks_there", late)
+    monkeypatch.setattr(journal, "chunks_there", late)
     monkeypatch.setattr(session, "LOOKING", 0.01)
 
 

@@ -1,3 +1,4 @@
+import errno
 import json
 import multiprocessing
 import os
@@ -10,11 +11,11 @@ from dataclasses import asdict, replace
 import pytest
 from small import quiet, receipts, small
 
+from sweep.storage.locations import JOURNAL, located
 from sweep.tasks import lock
 from sweep.tasks.driver import resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import Holder, Lock, holder, is_live
-from sweep.tasks.store import JOURNAL
 
 
 def put(store, who: Holder, *, age: float = 0.0) -> None:
@@ -126,3 +127,37 @@ def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
     assert holder(study_path) == other
     with pytest.raises(StoreError, match="process 1 on elsewhere"):
         resume(study_path, progress=False, scheduler="none")
+
+
+@pytest.mark.parametrize("kind", ["file", "object"])
+def test_a_lock_beats_from_the_first_on_and_not_once_it_is_left(kind, tmp_path):
+    store = tmp_path if kind == "file" else located(f"memory://bucket/{time.time_ns()}/s.zarr")
+    assert holder(store) is None and lock.heartbeat_age(store) == float("inf")
+    held = Lock(store)
+    assert held.is_mine() and lock.heartbeat_age(store) < 60
+    held.release()
+    assert holder(store) is None
+
+
+def test_a_lock_on_a_read_only_disk_has_an_age(tmp_path, monkeypatch):
+    held = Lock(tmp_path)
+
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pathlib.Path.write_bytes", refuse)
+        assert lock.heartbeat_age(tmp_path) < 60
+    held.release()
+
+
+def test_no_two_heartbeats_of_an_object_are_alike():
+    """Its tag may be a digest: one who saw it before a beat must not replace it after."""
+    store = located(f"memory://bucket/{time.time_ns()}/s.zarr")
+    held, states = Lock(store), []
+    for _ in range(3):
+        states.append((store / JOURNAL / lock.LOCK).read_bytes())
+        held._claim.beat()
+        assert held.is_mine()
+    held.release()
+    assert len(set(states)) == 3

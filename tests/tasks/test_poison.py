@@ -11,11 +11,11 @@ import pytest
 from distributed import Client, LocalCluster
 from small import copied, evaluated, quiet, receipts, small, tree
 
-from sweep.tasks import time_limit
+from sweep.tasks import worker
 from sweep.tasks.clusters import local
 from sweep.tasks.driver import resume, run
 from sweep.tasks.status import status
-from sweep.tasks.time_limit import Overtime
+from sweep.tasks.worker import Overtime
 
 
 def endless(block, log):
@@ -53,9 +53,9 @@ def stuck_or_hungry(stuck, hungry):
     """The model, with a block stuck in compiled code and one that takes all memory."""
 
     def evaluate(study, block):
-        from sweep.tasks import time_limit
+        from sweep.tasks import worker
 
-        time_limit.GRACE = 0.2
+        worker.GRACE = 0.2
         if block == stuck:
             time.sleep(600)
         taken = []
@@ -92,7 +92,7 @@ def test_a_block_that_failed_goes_to_another_worker(tmp_path):
     log = tmp_path / "log"
 
     def evaluate(study, block):
-        from sweep.tasks.time_limit import worker_address
+        from sweep.tasks.worker import worker_address
 
         with open(log, "a") as lines:
             lines.write(f"{block} {worker_address()}\n")
@@ -125,13 +125,13 @@ def until_about(seconds):
 
 def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
     with pytest.raises(Overtime, match=r"longer than the 0\.05 s"):
-        time_limit.limited(forever, 0.05)
+        worker.limited(forever, 0.05)
     for _ in range(200):  # ends about when the alarm rings
         with contextlib.suppress(Overtime):
-            assert time_limit.limited(partial(until_about, 0.002), 0.002) == "done"
+            assert worker.limited(partial(until_about, 0.002), 0.002) == "done"
         sum(range(1000))  # where a stray interruption would arrive
-    assert time_limit.limited(lambda: "done", 60.0) == "done"
-    assert time_limit.limited(lambda: "done", None) == "done"
+    assert worker.limited(lambda: "done", 60.0) == "done"
+    assert worker.limited(lambda: "done", None) == "done"
     deadline = time.monotonic() + 10
     while any(isinstance(t, threading.Timer) and t.is_alive() for t in threading.enumerate()):
         assert time.monotonic() < deadline, "an alarm is still set"
@@ -139,18 +139,18 @@ def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
 
 
 def test_an_interruption_on_the_way_into_putting_the_alarm_off_is_overtime(monkeypatch):
-    put_off, came = time_limit._Alarm.put_off, []
+    put_off, came = worker._Alarm.put_off, []
 
     def late(alarm):
         if not came:
             came.append(alarm)
             alarm.rung = True
-            raise time_limit._Interruption
+            raise worker._Interruption
         put_off(alarm)
 
-    monkeypatch.setattr(time_limit._Alarm, "put_off", late)
+    monkeypatch.setattr(worker._Alarm, "put_off", late)
     with pytest.raises(Overtime):
-        time_limit.limited(lambda: "done", 60.0)
+        worker.limited(lambda: "done", 60.0)
     came[0]._timer.join(10)
     assert came[0]._over and not came[0]._timer.is_alive()
 

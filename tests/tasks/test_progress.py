@@ -14,7 +14,7 @@ from sweep.tasks.driver import run
 from sweep.tasks.grid_study import GridStudy
 
 
-class Told(progress.Silent):
+class Told(progress.Progress):
     """Progress that keeps what is said."""
 
     def __init__(self):

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from small import STUDY, copied, everything, quiet, small, tree
 
-from sweep.tasks import cluster, driver, versions
+from sweep.tasks import cluster, driver, identity
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.lock import Lock
@@ -42,7 +42,7 @@ def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tm
 @pytest.mark.parametrize(
     ("changes", "shown"),
     [
-        ({"software": {**versions.software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
+        ({"software": {**identity.software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
         ({"model_version": "0.0"}, "model: 0.0 in the store, "),
         ({"study_id": "0" * 32}, "attributes were changed"),
         ({"layout": 99}, "laid out as version 99"),

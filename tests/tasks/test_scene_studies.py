@@ -22,7 +22,7 @@ from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.lock import Lock
 from sweep.tasks.plan import plan
-from sweep.tasks.progress import Silent
+from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.store import create
 from sweep.tasks.summary import scene_summary
@@ -227,7 +227,7 @@ def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_pa
     theirs = eyepoints_path(path, study.id)
     lock = Lock(create(theirs, study))
 
-    class Other(Silent):
+    class Other(Progress):
         """The other run, which goes on when this one waits."""
 
         def say(self, text):

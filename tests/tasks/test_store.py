@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 from small import everything, small, tree
 
-from sweep.storage import sealing
+from sweep.storage import logs
 from sweep.tasks import store
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
@@ -75,7 +75,7 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     assert not is_whole(path, objects)
     written = arrays.write(3, results)
     assert is_whole(path, objects)
-    assert written.digest == sealing.digest(path, objects)
+    assert written.digest == logs.digest(path, objects)
     assert written.bytes == sum((path / name).stat().st_size for name in objects)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
@@ -108,7 +108,7 @@ def test_a_flipped_bit_in_a_chunk_is_seen_on_reading_and_changes_the_digest(path
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    assert sealing.digest(path, store.block_objects(study, 0)) != digest
+    assert logs.digest(path, store.block_objects(study, 0)) != digest
     with pytest.raises(Exception, match=r"(?i)checksum|crc32c"):
         xr.open_zarr(path).pd_shot.values[study.grid.block(0)].sum()
 

@@ -14,7 +14,7 @@ from sweep.tasks import plan as planned
 from sweep.tasks import user_code
 from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
-from sweep.tasks.progress import Silent
+from sweep.tasks.progress import Progress
 
 CODE = """
     import numpy as np
@@ -112,7 +112,7 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
         sweep.resume(tmp_path / "a.zarr", progress=False)
 
 
-class Told(Silent):
+class Told(Progress):
     """Progress that keeps what is said."""
 
     def __init__(self):

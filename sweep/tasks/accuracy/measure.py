@@ -15,7 +15,7 @@ import numpy as np
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
-from sweep.tasks import identity, store, versions
+from sweep.tasks import identity, store
 from sweep.tasks.accuracy.bench import Bench, GridBench, Seen, Trial, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.rungs import (
@@ -29,8 +29,7 @@ from sweep.tasks.accuracy.rungs import (
     ladder,
 )
 from sweep.tasks.errors import StoreError, TaskError
-from sweep.tasks.interrupt import Interrupts
-from sweep.tasks.progress import Progress, chosen, working
+from sweep.tasks.progress import Interrupts, Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study
 
@@ -470,7 +469,7 @@ class Content:
             "question": "What does accuracy cost in time?",
             "spec": self._spec.to_json(),
             "reference": measured.ladder.about,
-            "environment": {"processor": versions.processor(), **versions.software()},
+            "environment": {"processor": identity.processor(), **identity.software()},
             "unit": self._bench.unit,
             "points": len(measured.done),
             "study_points": self._bench.whole,

@@ -1,1 +1,1 @@
-"""How workers are started on each kind of cluster."""
+"""Workers started on each kind of cluster."""

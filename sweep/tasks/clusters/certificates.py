@@ -26,7 +26,7 @@ _USES = (
 
 
 class Files(NamedTuple):
-    """Where the certificates of a cluster are."""
+    """Files of a cluster's certificates."""
 
     ca: Path
     certificate: Path

@@ -1,4 +1,4 @@
-"""What all kinds of clusters start their workers with."""
+"""Settings that all kinds of clusters start their workers with."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def security_settings(cluster: Cluster) -> dict[str, Any]:
 
 
 def scheduler_options(section: Scheduler) -> dict[str, Any]:
-    """Where a scheduler of this process listens, and its dashboard."""
+    """Address at which a scheduler of this process listens, and that of its dashboard."""
     options: dict[str, Any] = {"port": section.port, "dashboard_address": dashboard(section)}
     if section.interface:
         return options | {"interface": section.interface}

@@ -105,7 +105,7 @@ def _is_known(name: str) -> bool:
 
 
 def protocol(cluster: Kubernetes) -> str:
-    """How all parts talk to each other."""
+    """Protocol by which all parts talk to each other."""
     return "tls" if cluster.security else "tcp"
 
 
@@ -115,7 +115,7 @@ def host(cluster: Kubernetes) -> str:
 
 
 def autoscaler(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any] | None:
-    """What keeps the number of workers between bounds; None where it is fixed."""
+    """Resource that keeps the number of workers between bounds; None where it is fixed."""
     if bounds.least == bounds.most:
         return None
     return {

@@ -36,7 +36,7 @@ def start(cluster: SSH, bounds: Bounds) -> Any:
 
 
 def workers(cluster: SSH, number: int) -> dict[str, dict[str, Any]]:
-    """What is started on each machine, by its name: the workers are dealt out evenly."""
+    """Workers to start on each machine, by its name: they are dealt out evenly."""
     from distributed.deploy.ssh import Worker
 
     hosts = cluster.hosts[:number]

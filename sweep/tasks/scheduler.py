@@ -10,24 +10,23 @@ from __future__ import annotations
 import hashlib
 import queue
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import chain, takewhile
+from itertools import chain, islice, takewhile
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.journal import Receipt
 from sweep.tasks.progress import duration
-from sweep.tasks.todo import Todo
-from sweep.tasks.worker import Answer, Terms, failure, work
+from sweep.tasks.worker import Answer, Job, failure, work
 
 if TYPE_CHECKING:
     from dask.typing import Key
     from distributed import Client, Future
-    from distributed.scheduler import KilledWorker
 
 #: Seconds that a task should take: long beside the 3-9 ms that one costs, short beside a study.
 TASK_SECONDS = 2.0
@@ -54,23 +53,59 @@ Seen = Callable[[Receipt, bool], bool]
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Job:
-    """What every task of a run has in common; small, for it travels with each."""
+class BlockQueue:
+    """Blocks that are not done, handed out lazily; what fails comes back once, alone.
 
-    path: str
-    study_id: str
-    code_version: str
-    terms: Terms = field(default_factory=Terms)
+    Parameters
+    ----------
+    done : ndarray of bool (blocks,)
+        Which blocks are done already.
+    """
+
+    def __init__(self, done: np.ndarray) -> None:
+        self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
+        self._fresh = _numbers(done)
+        self._suspects: deque[int] = deque()
+        self._returned: deque[int] = deque()
+        self.failed: set[int] = set()
+
+    def take(self, count: int, *, suspects: bool = True) -> list[int]:
+        """Up to `count` blocks for one task; one that failed before comes by itself, if at all."""
+        if self._suspects and suspects:
+            return [self._suspects.popleft()]
+        if self._returned:
+            return [self._returned.popleft()]
+        blocks = list(islice(self._fresh, count))
+        self.left -= len(blocks)
+        return blocks
+
+    def again(self, block: int) -> bool:
+        """Put a failed block back; False where this was its second failure."""
+        if block in self.failed:
+            return False
+        self.failed.add(block)
+        self._suspects.append(block)
+        return True
+
+    def put_back(self, blocks: list[int]) -> None:
+        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun."""
+        self._returned.extend(blocks)
 
 
-def plain(job: Job, todo: Todo, stopping: Callable[[], bool], seen: Seen) -> Iterator[Answer]:
+def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:
+    for start in range(0, done.size, stretch):
+        yield from (start + np.flatnonzero(~done[start : start + stretch])).tolist()
+
+
+def plain(
+    job: Job, blocks: BlockQueue, stopping: Callable[[], bool], seen: Seen
+) -> Iterator[Answer]:
     """Answers of a study computed here, one block after the other: what defines its bytes."""
-    while not stopping() and (blocks := todo.take(1)):
-        answer = work(job.path, job.study_id, blocks, job.terms)
+    while not stopping() and (some := blocks.take(1)):
+        answer = work(job, some)
         if not all(seen(receipt, False) for receipt in answer.receipts):
-            answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in blocks])
-        todo.put_back(list(answer.begun))
+            answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in some])
+        blocks.put_back(list(answer.begun))
         yield answer
         if answer.unfit is not None:
             raise answer.unfit
@@ -108,7 +143,7 @@ class Slots:
     hoped: int = 0
     count: int = 1
     threads: dict[str, int] = field(default_factory=dict)  # by address of the worker
-    asked: float = field(default=-1e9)
+    asked: float = -1e9
 
     def now(self) -> int:
         """Worker threads, at least 1."""
@@ -128,7 +163,7 @@ class _Task:
     sent: float = 0.0  # last
 
 
-class Window:
+class Scheduler:
     """Tasks in flight on a cluster.
 
     A worker that can't open the store, can't write to it, or writes to another one is left out,
@@ -137,14 +172,10 @@ class Window:
 
     Parameters
     ----------
-    client
-        The cluster.
-    hoped
-        Worker threads that it may come to have.
-    job
-        The study.
-    todo
-        Its blocks.
+    client, hoped
+        The cluster, and worker threads that it may come to have.
+    job, blocks
+        The study and its blocks.
     seen
         Tells whether what a receipt is for is in the store here: by its size, or read and held to
         its digest, as is done with the first block of each worker.
@@ -153,9 +184,9 @@ class Window:
     """
 
     def __init__(
-        self, client: Client, hoped: int, job: Job, todo: Todo, *, seen: Seen, say: Say
+        self, client: Client, hoped: int, job: Job, blocks: BlockQueue, *, seen: Seen, say: Say
     ) -> None:
-        self._client, self._job, self._todo = client, job, todo
+        self._client, self._job, self._blocks = client, job, blocks
         self._seen, self._say = seen, say
         self._flying: dict[Key, _Task] = {}
         self._outrun: dict[Key, Future] = {}  # out still, though another worker has answered
@@ -184,7 +215,11 @@ class Window:
         """
         try:
             while True:
-                self._fill(sending=not stopping())
+                try:
+                    self._fill(sending=not stopping())
+                except (OSError, CancelledError, RuntimeError) as error:
+                    self._check()
+                    raise SchedulerLost(str(error)) from error
                 if stopping() and not (self._flying and self._fit()):
                     return  # nothing that is out will ever come
                 if not (self._flying or self._unseen or self._waits):
@@ -206,16 +241,40 @@ class Window:
         return bool(self._unfit) and not self._fit()
 
     def _fill(self, *, sending: bool) -> None:
-        with self._connected():
-            slots = self._slots.now()
-            if time.monotonic() - self._relieved > SLOTS_AGE:
-                self._relieved = time.monotonic()
-                self._relieve()
-            while sending and not self._waits and len(self._flying) < 2 * slots:
-                count = self._pace.blocks_a_task(self._todo.left, slots)
-                if not (blocks := self._todo.take(count, suspects=not self._suspect_flies())):
-                    return
-                self._send(_Task(blocks), **self._elsewhere(blocks[0]))
+        slots = self._slots.now()
+        if time.monotonic() - self._relieved > SLOTS_AGE:
+            self._relieved = time.monotonic()
+            self._relieve()
+        while sending and not self._waits and len(self._flying) < 2 * slots:
+            count = self._pace.blocks_a_task(self._blocks.left, slots)
+            if not (blocks := self._blocks.take(count, suspects=not self._suspect_flies())):
+                return
+            self._send(_Task(blocks), **self._elsewhere(blocks[0]))
+
+    def _suspect_flies(self) -> bool:
+        """Tell whether a block that failed before is out: two could blame each other's deed.
+
+        Tasks on a worker that one of them kills all count as failed; a second failure is final.
+        """
+        failed = self._blocks.failed
+        return bool(failed) and any(task.blocks[0] in failed for task in self._flying.values())
+
+    def _elsewhere(self, block: int) -> dict[str, Any]:
+        """Workers to send a block to: not where it failed before, if there is anywhere else."""
+        before = self._failed_at.get(block)
+        others = [worker for worker in self._fit() if worker != before]
+        if before and others:
+            return {"workers": others, "allow_other_workers": not self._unfit}
+        return {"workers": self._fit()} if self._unfit else {}
+
+    def _send(self, task: _Task, **where: Any) -> None:
+        first = task.blocks[0]
+        key = task_key(self._job, task.blocks, first in self._blocks.failed, self._copies[first])
+        future = self._client.submit(work, self._job, task.blocks, key=key, retries=0, **where)
+        task.sent = time.monotonic()
+        task.futures[future.key] = future
+        self._flying[future.key] = task
+        future.add_done_callback(self._arrived.put)
 
     def _relieve(self) -> None:
         """Send what silent workers hold to others as well, where these have nothing to do."""
@@ -255,50 +314,6 @@ class Window:
         expected = len(task.blocks) * pace.seconds / pace.blocks if pace.blocks else LEASE
         return max(LEASE, 5 * expected) * 2.0 ** (len(task.futures) - 1)
 
-    @contextmanager
-    def _connected(self) -> Iterator[None]:
-        """What asks the scheduler for something, which may be gone."""
-        try:
-            yield
-        except (OSError, CancelledError, RuntimeError) as error:
-            self._check()
-            raise SchedulerLost(str(error)) from error
-
-    def _suspect_flies(self) -> bool:
-        """Whether a block that failed before is out: two at once could blame each other's deed.
-
-        Tasks on a worker that one of them kills all count as failed; a second failure is final.
-        """
-        return self._todo.any_failed and any(
-            self._todo.attempt(task.blocks[0]) for task in self._flying.values()
-        )
-
-    def _send(self, task: _Task, **where: Any) -> None:
-        job, blocks = self._job, task.blocks
-        tries = self._todo.attempt(blocks[0]), self._copies[blocks[0]]
-        future = self._client.submit(
-            work,
-            job.path,
-            job.study_id,
-            blocks,
-            job.terms,
-            key=task_key(job, blocks, *tries),
-            retries=0,
-            **where,
-        )
-        task.sent = time.monotonic()
-        task.futures[future.key] = future
-        self._flying[future.key] = task
-        future.add_done_callback(self._arrived.put)
-
-    def _elsewhere(self, block: int) -> dict[str, Any]:
-        """Where to send a block: not where it failed before, if there is anywhere else."""
-        before = self._failed_at.get(block)
-        others = [worker for worker in self._fit() if worker != before]
-        if before and others:
-            return {"workers": others, "allow_other_workers": not self._unfit}
-        return {"workers": self._fit()} if self._unfit else {}
-
     def _next(self) -> Answer:
         answer = Answer()
         try:
@@ -318,7 +333,7 @@ class Window:
             del self._flying[key]
         for key in takewhile(lambda key: key != future.key, task.futures):
             self._outrun[key] = task.futures[key]  # so that its worker does not look idle
-        answer = self._answer(future, task.blocks)
+        answer = _answer(future, task.blocks)
         self._heard[answer.worker] = time.monotonic()
         self._pace.learn(answer)
         self._failed_at.update((failure.block, answer.worker) for failure in answer.failures)
@@ -328,25 +343,9 @@ class Window:
             self._leave_out(answer.worker, answer.host, answer.unfit)
         return answer
 
-    def _answer(self, future: Future, blocks: list[int]) -> Answer:
-        if future.status == "finished":
-            try:
-                return future.result(timeout=LEASE)
-            except TimeoutError:
-                pass  # lost, as below, and not computed again in that time
-            except (CancelledError, OSError) as error:
-                raise SchedulerLost(str(error)) from error
-            except Exception as error:  # gone with its worker, computed again, and that failed
-                return _failed(error, blocks)
-        if future.status == "error":
-            return _failed(future.exception(), blocks)
-        if future.status == "cancelled":
-            raise SchedulerLost("its tasks were cancelled")
-        return Answer()  # the worker died between its answer and our asking for it
-
     def _put_back(self, blocks: list[int]) -> None:
         """Put blocks back that are begun, or to be sent again by no fault of theirs."""
-        self._todo.put_back(blocks)
+        self._blocks.put_back(blocks)
         self._copies.update(blocks)
 
     def _verify(self, answer: Answer) -> None:
@@ -385,23 +384,42 @@ class Window:
             raise SchedulerLost(f"the client is {self._client.status}")
 
 
+def _answer(future: Future, blocks: list[int]) -> Answer:
+    """Answer of a task that is over; an empty one where its worker died with it."""
+    error: BaseException | None = None
+    if future.status == "finished":
+        try:
+            return future.result(timeout=LEASE)
+        except TimeoutError:
+            pass  # lost, as below, and not computed again in that time
+        except (CancelledError, OSError) as lost:
+            raise SchedulerLost(str(lost)) from lost
+        except Exception as failed:  # gone with its worker, computed again, and that failed
+            error = failed
+    elif future.status == "error":
+        error = future.exception()
+    elif future.status == "cancelled":
+        raise SchedulerLost("its tasks were cancelled")
+    return _failed(error, blocks) if error is not None else Answer()
+
+
 def _failed(error: BaseException, blocks: list[int]) -> Answer:
     """Answer of a task that raised or killed its workers: any of its blocks may be to blame."""
     from distributed.scheduler import KilledWorker
 
     failures = [failure(block, error) for block in blocks]
     if isinstance(error, KilledWorker):
-        failures = [replace(each, error=_killed(error)) for each in failures]
+        number = error.allowed_failures + 1
+        why = (
+            f"KilledWorker: {number} worker{'s' if number > 1 else ''} died at it: "
+            "out of memory, stuck beyond --block-timeout, or killed"
+        )
+        failures = [replace(each, error=why) for each in failures]
     return Answer(failures=failures)
 
 
-def _killed(error: KilledWorker) -> str:
-    died = f"{error.allowed_failures + 1} worker{'s' if error.allowed_failures else ''} died at it"
-    return f"KilledWorker: {died}: out of memory, stuck beyond --block-timeout, or killed"
-
-
-def task_key(job: Job, blocks: list[int], attempt: int, copy: int = 0) -> str:
+def task_key(job: Job, blocks: list[int], failed: bool, copy: int = 0) -> str:
     """Key of a task: the same work for the same store is the same task, whoever asks."""
-    said = repr((job.path, job.study_id, job.code_version, blocks, attempt, copy)).encode()
+    said = repr((job.path, job.study_id, blocks, failed, copy)).encode()
     digest = hashlib.blake2b(said, digest_size=12).hexdigest()
     return f"blocks-{job.study_id[:8]}-{blocks[0]}-{digest}"
