@@ -1,4 +1,4 @@
-"""What accuracy costs in time: docs/accuracy.md and its figures, from `sweep accuracy` itself.
+"""Cost of accuracy in time: docs/accuracy.md and its figures, from `sweep accuracy` itself.
 
 Run with `make accuracy`, some quarter of an hour. Names of studies below as arguments measure
 those alone and print their sections; --time-limit SECONDS is that of each (180).

@@ -35,7 +35,7 @@ class Unplanned(FlightStudy):
         self._planned, self._selected = planned, {}
 
     def select(self, part, eyepoints, numbers) -> Selected:
-        """What is simulated of shots, planned once."""
+        """Effects simulated at shots, planned once."""
         if (part, numbers[0]) not in self._selected:
             self._selected[part, numbers[0]] = self._planned.select(part, eyepoints, numbers)
         return self._selected[part, numbers[0]]

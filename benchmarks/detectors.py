@@ -39,7 +39,7 @@ TONE, TONES, DECIBELS = 200, 500, np.arange(8, 61, 4.0)
 
 
 def setting(name: str, fft_size: int, **changes: float) -> Setting:
-    """What detectors and estimators are told of noise of variance 1."""
+    """Settings of detectors and estimators in noise of variance 1."""
     w = window(name, LENGTH)
     given = {
         "noise_power": w.energy, "training": TRAINING, "guard": GUARD, "rank": 3 * TRAINING // 4,
@@ -105,7 +105,7 @@ def draw_masking(path: Path) -> None:
 
 
 def masked(s: Setting, apart: float) -> Iterator[np.ndarray]:
-    """Whether each detector flags the weak return's bin, draw by draw; it may lie on a null."""
+    """Flags of each detector in the weak return's bin, draw by draw; it may lie on a null."""
     rng, n = np.random.default_rng(int(apart)), np.arange(LENGTH)
     record = rng.standard_normal((MASKING, LENGTH))
     for decibel, place in ((WEAK, PLACE), (STRONG, PLACE + apart + 0.5)):

@@ -38,7 +38,7 @@ shows where all blocks together take less than a second. Studies with draws take
 
 
 class Variant(NamedTuple):
-    """What a variant of an experiment came to."""
+    """Result of a variant of an experiment."""
 
     seconds: float
     planning: float

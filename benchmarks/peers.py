@@ -1,4 +1,4 @@
-"""What the engine costs beside others': 10,000 points of a millisecond, stored, side by side.
+"""Cost of the engine beside others': 10,000 points of a millisecond, stored, side by side.
 
 Run with `make peers`, some six minutes on a quiet machine. Every contender computes the same three
 numbers at each point of a 100 x 100 grid, taking a millisecond of the processor's time over it,
@@ -263,7 +263,7 @@ CONTENDERS = {
 
 
 class Shares(NamedTuple):
-    """What a contender reaches of the ideal."""
+    """Shares of the ideal that a contender reaches."""
 
     wall: float  # of plain loops right before and after it
     processor: float  # seconds of all points over those that the processor spent in all

@@ -1,4 +1,4 @@
-"""Whether tolerances are kept: 1,000 points of every experiment, at six tolerances.
+"""Test of every tolerance: 1,000 points of every experiment, at six tolerances.
 
 And of as many instruments drawn at random. Run with `make promise`, some twenty minutes; names of
 experiments, or `instruments`, as arguments look at those alone.
@@ -123,7 +123,7 @@ the same while that of asking for these rises.
 
 
 class Row(NamedTuple):
-    """What an experiment came to at a tolerance."""
+    """Result of an experiment at a tolerance."""
 
     tolerance: float
     errors: tuple[np.ndarray, ...]
@@ -169,7 +169,7 @@ def together(trials: Sequence[Trial], share: np.ndarray) -> Trial:
 
 
 class Found(NamedTuple):
-    """What came of an experiment."""
+    """Results of an experiment."""
 
     rows: list[Row]
     rays: list[Row]
@@ -229,7 +229,7 @@ def worst_of(errors: Sequence[np.ndarray]) -> float:
 
 
 def of_rays(number: np.ndarray) -> str:
-    """How many rays shots have, where they have any: the mean, and the most."""
+    """Numbers of rays of shots, where they have any: the mean, and the most."""
     if not np.isfinite(number).any():
         return "nothing seen"
     return f"{np.nanmean(number):,.0f} rays, at most {np.nanmax(number):,.0f}"
@@ -297,7 +297,7 @@ def costs_of(name: str, ratios: Sequence[float]) -> list[str]:
 
 
 def missed(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    """What does not keep its tolerance, in words."""
+    """Quantities that do not keep their tolerance, in words."""
     for row in rows:
         for what, errors in zip(WHAT, row.errors, strict=True):
             there = errors[np.isfinite(errors)]

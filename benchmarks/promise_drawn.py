@@ -53,7 +53,7 @@ COLUMNS = (
 
 
 class Drawn(NamedTuple):
-    """What a study's points came to at a tolerance, seeds one after the other."""
+    """Results of a study's points at a tolerance, seeds one after the other."""
 
     tolerance: float
     error: np.ndarray
@@ -155,7 +155,7 @@ def _once(
 
 
 def verdicts(name: str, rows: Sequence[Drawn], confidence: float) -> Iterator[str]:
-    """What is not kept, in words."""
+    """Tolerances that are not kept, in words."""
     for row in rows:
         within = (row.error <= row.tolerance).all(axis=0).mean()
         if within < confidence:

@@ -36,7 +36,7 @@ SEEN = (
 
 
 class Off(NamedTuple):
-    """How far off points are at a tolerance, (n,) each."""
+    """Errors of points at a tolerance, (n,) each."""
 
     pd: np.ndarray
     """Of a segment or a shot."""
@@ -113,7 +113,7 @@ def _point(rng: np.random.Generator, asked: str) -> dict[str, str]:
 
 
 def off(written: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES) -> list[Off]:
-    """How far off a study's points are at each tolerance."""
+    """Errors of a study's points at each tolerance."""
     spec = loaded(written)
     grid = Grid(spec)
     parameters = DEFAULTS | grid.parameters_at(np.arange(grid.points))
@@ -172,7 +172,7 @@ where it is asked for.
 
 
 def section(number: int, rng: np.random.Generator) -> tuple[list[str], str]:
-    """What is not kept, in words; and the part of the page."""
+    """Tolerances that are not kept, in words; and the part of the page."""
     found = [off(written) for written in studies(number, rng)]
     missed, rows = [], []
     for k, tolerance in enumerate(TOLERANCES):

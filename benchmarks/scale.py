@@ -1,4 +1,4 @@
-"""How far the engine goes: ``make scale`` writes its part of docs/scale.md.
+"""Limits of the engine: ``make scale`` writes its part of docs/scale.md.
 
 Blocks: what a plan, a log and the folders of up to ten million blocks cost to read, each in a
 process of its own. Workers: the engine's window over the real scheduler with a thousand worker
@@ -131,7 +131,7 @@ def block_rows(directory):
 
 
 def nap_for(seconds):
-    """What workers do in place of computing: wait, and answer as for one long block a task."""
+    """Work in place of computing: wait, and answer as for one long block a task."""
 
     def nap(job, blocks):
         from sweep.tasks.journal import Receipt

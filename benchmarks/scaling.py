@@ -1,4 +1,4 @@
-"""What more workers bring: the published range-angle study on one, two, ... workers, in turns.
+"""Gain by more workers: the published range-angle study on one, two, ... workers, in turns.
 
 Run with `make scaling`, five minutes on two cores, on a quiet machine. Workers are up and have
 imported the model before the clock starts: a study long enough to need them has them up for most

@@ -1,4 +1,4 @@
-"""What benchmarks share: experiments with changes, tables, and pages that tables are put into."""
+"""Helpers of the benchmarks: experiments with changes, tables, and pages to put them into."""
 
 import tempfile
 from collections.abc import Iterable, Sequence

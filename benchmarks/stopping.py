@@ -1,4 +1,4 @@
-"""What drawing until a tolerance is met costs in coverage and bias, by simulation.
+"""Coverage and bias of drawing until a tolerance is met, by simulation.
 
 Run with `make stopping`, two minutes on one core: points of known pd, many of each, are drawn
 until their half-width is within the tolerance, by the shipped rule (sweep.model.sampling) and by
@@ -102,7 +102,7 @@ class Trials:
 
 
 class Cell(NamedTuple):
-    """What came of one pd."""
+    """Result of one pd."""
 
     pd: float
     coverage: float

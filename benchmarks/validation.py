@@ -103,7 +103,7 @@ def thresholds():
 
 
 def why(tnr, printed, ours):
-    """What explains a printed false-alarm probability of a bin."""
+    """Explanation of a printed false-alarm probability of a bin."""
     digits = len(f"{printed:e}".partition("e")[0].rstrip("0").replace(".", ""))
     if float(f"{ours:.{digits - 1}e}") == printed:
         return f"the same in {labels.counted(digits, 'digit')}, which is all that is printed"
@@ -269,7 +269,7 @@ def trade_offs():
 
 
 def along_range(part, by, names, said):
-    """What is found along a range, what the thesis says, and the verdict."""
+    """Findings along a range, the thesis's words, and the verdict."""
     reach = [typical_reach(part.isel({by: i})) for i in range(len(names))]
     lost = (part.pd_shot < LOST).mean("cut").values
     told = "; ".join(

@@ -75,7 +75,7 @@ class Setting:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it simulates all that the study asks for: the thesis's effects have no leakage.
+        """True where it simulates all that is asked for: the thesis's effects have no leakage.
 
         They do where leaving it out is no larger an error than those promised.
         """
@@ -156,7 +156,7 @@ class Duel:
 
     @property
     def times_faster(self) -> float:
-        """How many times faster the adaptive one is; inf against nothing."""
+        """Time of the other over that of the adaptive one; inf against nothing."""
         return self.with_besides(0.0)
 
     def with_besides(self, seconds: float) -> float:
@@ -235,7 +235,7 @@ def cheapest_rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
-    """What it comes to, in words."""
+    """Conclusions in words."""
     attributes = dataset.attrs
     found = [_written(dataset, settings)]
     found += _fixed(against_fixed(settings), attributes)

@@ -162,7 +162,7 @@ def _alike(one: Setting, other: Setting) -> bool:
 
 
 def _short(setting: Setting) -> str:
-    """What tells a setting from others of its kind."""
+    """Short name that tells a setting from others of its kind."""
     if setting.kind == of.ADAPTIVE:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == of.THESIS:

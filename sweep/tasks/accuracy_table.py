@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """How well a probability of detection is known; or all, for what a scanner's rays leave."""
+    """Error of a probability of detection, or of all that depends on a scanner's rays."""
 
     name: str
     """Of the probability or the scanner; none for a grid's beamlets, which are counted as rays."""

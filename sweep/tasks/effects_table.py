@@ -1,4 +1,4 @@
-"""Which effects a study calls for, where, how much they may change, and what they cost."""
+"""Effects in a study: where they are called for, how much they may change, their cost."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class EffectsTable:
     looked_at: float  # share of the tiles
 
     def warnings(self) -> Iterator[str]:
-        """What is forced off though it matters."""
+        """Effects that are forced off though they matter."""
         for row in self.rows:
             if row.mode == "off" and row.bound > self.tolerance:
                 yield (

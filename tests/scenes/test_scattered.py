@@ -257,7 +257,7 @@ def lawn(slope=0.0, origin=(0.0, 0.0, 0.0)):
 
 
 def covered(facets, x, y):
-    """Whether vertical lines through (x, y) meet a triangle, by the signs of three areas."""
+    """Mask of vertical lines through (x, y) that meet a triangle, by the signs of three areas."""
     a, b, c = (corner[:, :2] for corner in facets.vertices[facets.faces.T])
     hit = np.zeros(len(x), bool)
     for i in range(len(x)):

@@ -31,7 +31,7 @@ WINDOWS = ("rectangular", "hann", "hamming", "flattop")
 
 
 def of_the_peak(frequency: float, allowed: float, cycles: float = 0.0) -> dict[str, Any]:
-    """What the cases share, given their largest beat [Hz] and, where it counts, S tau^2 / 2."""
+    """Arguments of cases, given their largest beat [Hz] and, where it counts, S tau^2 / 2."""
     place = frequency / RATE * SIZE * np.pi / 2
     phase = f"; chirp phase of {cycles:.0f} cycles" if cycles else ""
     return {

@@ -24,7 +24,7 @@ RATE = 600e6
 
 
 def place(frequency: float, size: int, rate: float = RATE) -> float:
-    """What a beat, rounded, costs over the peak."""
+    """Cost of a beat's rounding over the peak."""
     return (frequency / rate * size * math.pi / 2 + 4) * EPS / 2
 
 

@@ -42,7 +42,7 @@ def si(text: str, unit: str) -> float:
 
 
 def steps(a: float, b: float) -> int:
-    """How many floats lie between two of one sign."""
+    """Number of steps between two floats of one sign."""
     return abs(
         struct.unpack("<q", struct.pack("<d", a))[0] - struct.unpack("<q", struct.pack("<d", b))[0]
     )

@@ -1,4 +1,4 @@
-"""What has no physical meaning is refused by the spec: field, rule, value and remedy are named."""
+"""Values without physical meaning are refused: field, rule, value and remedy are named."""
 
 import numpy as np
 import pytest

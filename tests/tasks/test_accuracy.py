@@ -1,4 +1,4 @@
-"""What accuracy costs: the sample, the ladder, and what trials come to."""
+"""Cost of accuracy: the sample, the ladder, and what trials come to."""
 
 import itertools
 import json
@@ -280,7 +280,7 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
 
 
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
-    """What is computed beside a part takes part in its time, and changes nothing it sees."""
+    """Shots computed beside a part take part in its time, and change nothing that it sees."""
     for module in (flight_bench, flight_study):
         monkeypatch.setattr(module, "TILE_SHOTS", 32)
     bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)

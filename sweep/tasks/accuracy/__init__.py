@@ -1,1 +1,1 @@
-"""What accuracy costs in time: a ladder of settings, tried on some points of a study."""
+"""Cost of accuracy in time: a ladder of settings, tried on some points of a study."""

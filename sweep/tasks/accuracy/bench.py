@@ -42,7 +42,7 @@ AS_WRITTEN = Rung(name="as written", kind=WRITTEN)
 
 
 class Seen(NamedTuple):
-    """What a rung finds at n points; nan for what there is not."""
+    """Results of a rung at n points; nan for those that it lacks."""
 
     pd: np.ndarray
     """(n, 4): probability of detection: up, Doppler, down, shot."""
@@ -114,7 +114,7 @@ class Bench(ABC):
 
     @abstractmethod
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-        """Where the sample's points are: values and attributes by name."""
+        """Coordinates of the sample's points: values and attributes by name."""
 
     @abstractmethod
     def _flags(self, rung: Rung) -> np.ndarray:
@@ -147,7 +147,7 @@ def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
 
 
 def look_of(rung: Rung) -> Look:
-    """What finds a rung's peaks in the spectra."""
+    """Finder of a rung's peaks in the spectra."""
     from sweep.model.shot import find
     from sweep.tasks.accuracy import thesis_grid
 
@@ -169,7 +169,7 @@ def along_axes(
 
 
 def seen_in(outputs: Mapping[str, np.ndarray], counted: int = 0) -> Seen:
-    """What counts of the outputs of points; ``counted``: in so many draws, 0 for means of them."""
+    """Results in the outputs of points; ``counted``: in so many draws, 0 for means of them."""
     names = [f"pd_{name}" for name in (*SEGMENTS, "shot")]
     if counted:
         counts = [outputs[f"n_detected_{name}"].sum(axis=1) for name in (*SEGMENTS, "shot")]
@@ -192,7 +192,7 @@ def seen_in(outputs: Mapping[str, np.ndarray], counted: int = 0) -> Seen:
 
 
 def nothing(points: int) -> Seen:
-    """Points of which nothing is known."""
+    """Results of points of which nothing is known."""
     sizes = ((points, 4), (points, 2), (points, 2), (points, 3), points, points, points)
     return Seen(*(np.full(size, np.nan) for size in sizes))
 

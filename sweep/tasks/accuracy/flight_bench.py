@@ -77,7 +77,7 @@ class Tiles:
 
 
 class Cast(NamedTuple):
-    """What shots see, and the time that casting their rays took [s]."""
+    """Eyepoints of shots, and the time that casting their rays took [s]."""
 
     eyepoints: Eyepoints
     seconds: float
@@ -208,7 +208,7 @@ class FlightBench(Bench):
         return self._studies[rung.name]
 
     def _see(self, rung: Rung, tiles: Tiles) -> Cast:
-        """What shots see: rays are cast once for all rungs of the same geometry."""
+        """Eyepoints of shots: rays are cast once for all rungs of the same geometry."""
         from sweep.scenes.eyepoint_arrays import from_arrays
 
         spec, scanner = self._study(rung).spec, tiles.part.scanner
@@ -232,7 +232,7 @@ class FlightBench(Bench):
         return np.concatenate([each.flags for each, _ in selected])
 
     def _selected(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints) -> tuple[Selected, float]:
-        """What is simulated of shots, planned in their tiles, and the time [s] that it took."""
+        """Effects simulated at shots, planned in their tiles, and the time that this took [s]."""
         if rung.of_lines:
             flag = flags_of(np.array([[name in self.of_lines()] for name in NAMES]))[0]
             flags = np.where(eyepoints.seen, flag, 0).astype(np.uint32)

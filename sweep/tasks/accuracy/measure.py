@@ -201,7 +201,7 @@ def _least(work: Callable[[], object]) -> float:
 
 @dataclass
 class Measured:
-    """What rungs came to, by rung and point of the sample."""
+    """Results of the trials, by rung and point of the sample."""
 
     ladder: Ladder
     seen: list[Seen]
@@ -482,7 +482,7 @@ class Content:
         }
 
     def _truth(self) -> dict[str, Any]:
-        """How far the reference is from the time domain, at the most; at how many points."""
+        """Largest difference between reference and time domain, and the number of points."""
         found = [apart(*pair) for pair in self._measured.truth.values()]
         if not found:
             return {"truth_points": 0}

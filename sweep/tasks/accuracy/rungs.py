@@ -90,17 +90,17 @@ class Rung:
 
     @property
     def of_lines(self) -> bool:
-        """Whether only what the thesis's way can have is simulated: nothing within a record."""
+        """True where nothing is simulated that the thesis's way lacks: effects in a record."""
         return self.kind in (CLOSED_FORM, THESIS, IMPROVED)
 
     @property
     def plans(self) -> bool:
-        """Whether effects are planned, and the time that this takes counts."""
+        """True where effects are planned, and the time that this takes counts."""
         return not self.of_lines and self.kind not in (FIXED, ALL_ON, REFERENCE)
 
     @property
     def counts(self) -> bool:
-        """Whether pd is how many draws were detected, not the mean of each one's probability."""
+        """True where pd is a share of detected draws, not the mean of their probabilities."""
         return self.kind in (COUNTED, IN_NOISE)
 
     def of(self, spec: Declared) -> Declared:
@@ -289,7 +289,7 @@ def _is_flight(spec: Declared) -> bool:
 
 
 def _draws(spec: Declared) -> bool:
-    """Whether probabilities are means over draws: of a flight they are not."""
+    """True where probabilities are means over draws: of a flight they are not."""
     return not _is_flight(spec) and (spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0)
 
 
