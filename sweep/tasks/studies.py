@@ -56,13 +56,7 @@ def _reuse(path: Location, study: GridStudy | FlightStudy) -> Reuse | None:
 
 
 def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
-    """Attributes of a store and the study that it holds.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store, or not one of this program's, or one it can't read.
-    """
+    """Attributes of a store and the study that it holds; StoreError where it can't be read."""
     attributes = opening.read_attributes(path)
     if attributes["kind"] == ACCURACY:
         raise StoreError(f"{path} holds what accuracy costs, no study: sweep figures draws it")
@@ -70,13 +64,7 @@ def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
 
 
 def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
-    """The study that a store's attributes tell of.
-
-    Raises
-    ------
-    StoreError
-        Where this program can't read it.
-    """
+    """The study that a store's attributes tell of; StoreError where it can't be read."""
     recipe = read_recipe(path)
     if attributes["kind"] == "eyepoints":
         if "spec" not in recipe:
