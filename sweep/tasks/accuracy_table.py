@@ -18,7 +18,6 @@ from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.journal import receipted
 from sweep.tasks.summary import done_blocks, pieces
 
 if TYPE_CHECKING:
@@ -100,41 +99,30 @@ def rays_table(store: str | Location) -> list[Row]:
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):
-        return [row] if (row := _of_beamlets(path, study)).missed else []
+        return [row] if (row := _of_rays(path, study)).missed else []
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
     return [row for scanner in study.scanners if (row := _of_rays(path, study, scanner)).points]
 
 
-def _of_beamlets(path: Location, study: GridStudy) -> Row:
+def _of_rays(path: Location, study: GridStudy | FlightStudy, scanner: str = "") -> Row:
+    """The row of a scanner, or of a grid's beamlets."""
+    names = [f"{scanner}/{n}" if scanner else n for n in ("beamlets_error", "beamlets")]
+    tolerance = np.asarray(study.spec.accuracy.tolerance)
+    if not scanner:
+        least = Accuracy.least_rays_tolerance
+        tolerance = np.maximum(Accuracy(_tolerance(study.spec)).for_beamlets, least)
+    tolerance = np.broadcast_to(tolerance, study.layouts[names[0]].shape)
     worst = _Worst()
-    tolerance = np.broadcast_to(_tolerance(study.spec), study.grid.shape)
-    tolerance = np.maximum(Accuracy(tolerance).for_beamlets, Accuracy.least_rays_tolerance)
-    names = "beamlets_error", "beamlets"
     for place, (error, number) in pieces(path, study, names, done_blocks(path, study)):
-        start = tuple(part.start for part in place)
-        worst.add(error, tolerance[place], np.nan_to_num(number), start)
-    return worst.row("", _place(study.spec.axes, worst.index))
-
-
-def _of_rays(path: Location, study: FlightStudy, scanner: str) -> Row:
-    arrays: Any = open_group(path)[scanner]
-    errors, numbers = arrays["beamlets_error"], arrays["beamlets"]
-    stretches, worst = study.scanners[scanner], _Worst()
-    tolerance = float(study.spec.accuracy.tolerance)
-    for block in np.flatnonzero(receipted(path, study)).tolist():
-        own, part = study.part(block)
-        if own is stretches and part.draws == 0:
-            first, stop = stretches.shot_range(part)
-            there = *(slice(i, i + 1) for i in part.axes), slice(first, stop)
-            error = np.asarray(errors[there])
-            number = np.where(np.isfinite(error), np.asarray(numbers[there]), 0)
-            worst.add(error, np.full(error.shape, tolerance), number, (*part.axes, first))
-    where = ""
-    if worst.points:
-        *axes, shot = worst.index
-        where = f"{_place(study.spec.axes, tuple(axes))}, " if axes else ""
-        where += f"time {float(np.asarray(arrays['time'][shot])):.4g} s"
+        number = np.where(np.isfinite(error), np.nan_to_num(number), 0)
+        worst.add(error, tolerance[place], number, tuple(part.start for part in place))
+    where, axes = "", len(study.spec.axes)
+    if worst.points and (axes or not scanner):
+        where = _place(study.spec.axes, worst.index[:axes])
+    if scanner and worst.points:
+        time: Any = open_group(path)[f"{scanner}/time"]
+        where += f"{', ' if where else ''}time {float(np.asarray(time[worst.index[-1]])):.4g} s"
     return worst.row(scanner, where)
 
 

@@ -152,11 +152,11 @@ class GridStudy(GrowingStudy):
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
         results = evaluate_block(self.spec, self.grid, block, selected, known, begun, stop)
-        extent = self.grid.extent(block)
-        for name in self.layouts.keys() - results.keys():  # all points are beyond the model
-            layout = self.layouts[name]
-            room = extent + layout.shape[len(extent) :]
-            results[name] = np.full(room, layout.fill, layout.dtype)
+        if lacking := self.layouts.keys() - results.keys():  # all points are beyond the model
+            regions = self.regions(block)
+            for name in lacking:
+                layout, room = self.layouts[name], [s.stop - s.start for s in regions[name]]
+                results[name] = np.full(room, layout.fill, layout.dtype)
         return results
 
     def _known(self, block: int, selected: Selected) -> Known:

@@ -366,6 +366,18 @@ class Study(Content, ABC):
             if apart.issubset(follows)
         }
 
+    def regions(self, block: int) -> dict[str, tuple[slice, ...]]:
+        """Slices of the arrays that a block writes."""
+        return {
+            name: tuple(
+                slice(at * chunk, min((at + 1) * chunk, size))
+                for at, chunk, size in zip(
+                    position, self.layouts[name].chunks, self.layouts[name].shape, strict=True
+                )
+            )
+            for name, position in self.chunks(block).items()
+        }
+
     def owners(self) -> dict[str, np.ndarray]:
         """Block that writes each chunk, in the shape of the grid of chunks, of every output."""
         grids = {grid.group: (self.first_block(grid.group), grid) for grid in self.grids}

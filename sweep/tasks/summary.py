@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,10 @@ from sweep.storage.opening import open_group
 from sweep.tasks import studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.evaluate import evaluate_points, select, with_few_draws
-from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import receipted
+from sweep.tasks.study import Study
 
 if TYPE_CHECKING:
     from sweep.spec import Axis
@@ -157,20 +158,20 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def done_blocks(store: Location, study: GridStudy) -> np.ndarray:
+def done_blocks(store: Location, study: Study) -> np.ndarray:
     """Numbers of the blocks that have a receipt, rising."""
     return np.flatnonzero(receipted(store, study))
 
 
 def pieces(
-    store: Location, study: GridStudy, names: Sequence[str], blocks: np.ndarray
+    store: Location, study: Study, names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Slices of the grid that each block has, and its values in some arrays."""
+    """Slices of some arrays, all cut alike, that each block has written, and their values."""
     group = open_group(store)
     arrays: list[Any] = [group[name] for name in names]
     for block in blocks:
-        place = study.grid.block(int(block))
-        yield place, [np.asarray(array[place or ...]) for array in arrays]
+        if (place := study.regions(int(block)).get(names[0])) is not None:
+            yield place, [np.asarray(array[place or ...]) for array in arrays]
 
 
 @dataclass
@@ -191,24 +192,19 @@ class SceneRow:
         seen = np.concatenate([*self.chances, np.empty(0)])
         return float(seen.mean()) if seen.size else float("nan")
 
-    def add(self, arrays: Any, blocks: ScannerBlocks, part: Part) -> None:
-        """Count a block."""
+    def add(self, found: Mapping[str, np.ndarray]) -> None:
+        """Count a block, by its part of each array."""
         from sweep.model.navigation import EXCLUDED
         from sweep.model.pairing import TRUE
 
-        shots, cycles, draws = (
-            slice(*edges(part))
-            for edges in (blocks.shot_range, blocks.cycle_range, blocks.draw_range)
-        )
-        flags = np.asarray(arrays["flags"][*part.axes, shots, draws])
+        flags = found["flags"]
         self.shots += flags[..., 0].size
         self.true += int(((flags & TRUE) > 0).any(axis=-1).sum())
         self.false += int(((flags > 0) & ((flags & TRUE) == 0)).sum())
-        if part.draws == 0:
-            chance = np.asarray(arrays["pd_shot"][*part.axes, shots])
-            self.chances.append(chance[np.isfinite(chance)])
-        if blocks.navigates:
-            status = np.asarray(arrays["velocity_status"][*part.axes, cycles, draws])
+        if "pd_shot" in found:  # with the first draws alone
+            self.chances.append(found["pd_shot"][np.isfinite(found["pd_shot"])])
+        if "velocity_status" in found:
+            status = found["velocity_status"]
             self.cycles += status.size
             self.solved += int((status <= EXCLUDED).sum())
 
@@ -234,10 +230,16 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
         for place in (places if apart else [()])
     }
     group: Any = open_group(path)
-    for block in np.flatnonzero(receipted(path, study)).tolist():
-        blocks, part = study.part(block)
-        row = rows[part.scanner, part.axes if apart else ()]
-        row.add(group[part.scanner], blocks, part)
+    for block in done_blocks(path, study).tolist():
+        _, part = study.part(block)
+        regions = study.regions(block)
+        names = (f"{part.scanner}/{name}" for name in ("flags", "pd_shot", "velocity_status"))
+        found = {
+            name.rpartition("/")[2]: np.asarray(group[name][regions[name]])
+            for name in names
+            if name in regions
+        }
+        rows[part.scanner, part.axes if apart else ()].add(found)
     return list(rows.values())
 
 

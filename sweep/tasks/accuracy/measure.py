@@ -169,13 +169,10 @@ def storing(study: Study) -> float:
     Of blocks of zeros, which pack faster than results do: it is no more than what results take.
     """
     block = study.n_blocks // 2
-    layouts = {layout.name: layout for layout in study.arrays()}
-    results = {}
-    for name, position in study.chunks(block).items():
-        layout = layouts[name]
-        sizes = zip(layout.shape, layout.chunks, position, strict=True)
-        extent = [min(cut, n - cut * place) for n, cut, place in sizes]
-        results[name] = np.zeros(extent, layout.dtype)
+    results = {
+        name: np.zeros([s.stop - s.start for s in region], study.layouts[name].dtype)
+        for name, region in study.regions(block).items()
+    }
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.zarr"
 
