@@ -12,7 +12,7 @@ import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.tasks.effect_selection import TILE_SHOTS, EffectSelection
-from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import timed
 
@@ -111,7 +111,7 @@ def _of_flight(study: FlightStudy) -> EffectsTable:
         seen = from_arrays(eyepoints.cast(index), eyepoints.weight)
         for k in np.unique(np.linspace(0, len(places) - 1, FLIGHT_PLACES).astype(int)).tolist():
             shots += len(index)
-            part = Part(eyepoints.scanner, places[k], 0, 0)
+            part = study.scanners[eyepoints.scanner].first_part(places[k])
             planned = study.planned(part, seen, index // TILE_SHOTS)
             if planned is not None:
                 plan, seeing = planned.plan, np.bincount(planned.tile)

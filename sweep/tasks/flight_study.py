@@ -55,12 +55,12 @@ GEOMETRY = SHOTS | CYCLES
 
 
 class Part(NamedTuple):
-    """A block: a stretch of cycles and of draws, at one place along the axes, of one scanner."""
+    """The part of a flight that a block holds, at one place along the axes."""
 
     scanner: str
     axes: tuple[int, ...]
-    draws: int  # number of its stretch of draws
-    cycles: int  # number of its stretch of cycles
+    draws: range
+    cycles: range
 
 
 class ScannerBlocks(Lattice, BlockGrid):
@@ -102,25 +102,12 @@ class ScannerBlocks(Lattice, BlockGrid):
 
     def part(self, number: int) -> Part:
         """A block of this scanner by its number."""
-        *axes, draws, cycles = self.position(number)
-        return Part(self.scanner, tuple(axes), draws, cycles)
+        *axes, draws, cycles = (range(s.start, s.stop) for s in self.block(number))
+        return Part(self.scanner, tuple(along.start for along in axes), draws, cycles)
 
-    def draw_range(self, part: Part) -> tuple[int, int]:
-        """First draw of a block, and the one after its last."""
-        return _range(part.draws, self.block_shape[-2], self.draws)
-
-    def cycle_range(self, part: Part) -> tuple[int, int]:
-        """First cycle of a block, and the one after its last."""
-        return _range(part.cycles, self.block_shape[-1], self.total_cycles)
-
-    def shot_range(self, part: Part) -> tuple[int, int]:
-        """First shot of a block, and the one after its last."""
-        first, stop = self.cycle_range(part)
-        return first * self.shots_a_cycle, stop * self.shots_a_cycle
-
-
-def _range(number: int, each: int, total: int) -> tuple[int, int]:
-    return number * each, min((number + 1) * each, total)
+    def first_part(self, axes: tuple[int, ...]) -> Part:
+        """The first block at a place along the axes."""
+        return self.part(self.number((*axes, 0, 0)))
 
 
 class KnownCloud(NamedTuple):
@@ -169,14 +156,11 @@ class FlightStudy(GrowingStudy):
         blocks = self.scanners[grid.group]
         return blocks, blocks.part(number)
 
-    def block(self, part: Part) -> int:
-        """Number of a block."""
-        number = self.scanners[part.scanner].number((*part.axes, part.draws, part.cycles))
-        return self.first_block(part.scanner) + number
-
     def home(self, block: int) -> int:
         """Block of the first draws of the same shots, with all that no draw changes."""
-        return self.block(self.part(block)[1]._replace(draws=0))
+        grid, number = self.find(block)
+        *axes, _, cycles = grid.position(number)
+        return block - number + grid.number((*axes, 0, cycles))
 
     def attributes(self) -> dict[str, Any]:
         """Title, question, spec, and what the numbers of scanners and surfaces mean."""
@@ -229,7 +213,7 @@ class FlightStudy(GrowingStudy):
         """Point cloud, statistics and navigation of a block."""
         blocks, part = self.part(block)
         numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
-        results = shots | self._read(part.scanner, CYCLES, *blocks.cycle_range(part))
+        results = shots | self._read(part.scanner, CYCLES, part.cycles)
         results |= {EFFECTS: selected.flags, ERROR: selected.error}
         known = self._known(block, selected) if self.earlier else None
         results |= self.look(part, shots, eyepoints, selected, numbers, known)
@@ -243,8 +227,9 @@ class FlightStudy(GrowingStudy):
         """Compile the radiometry and the navigation, on the first cycle of each scanner."""
         for blocks in self.grids:
             part = blocks.part(0)
-            shots, eyepoints = self._seen(part.scanner, 0, blocks.shots_a_cycle)
-            numbers = np.arange(blocks.shots_a_cycle)
+            cycle = range(blocks.shots_a_cycle)
+            shots, eyepoints = self._seen(part.scanner, cycle)
+            numbers = np.array(cycle)
             selected = self.select(part, eyepoints, numbers)
             self.look(part, shots, eyepoints, selected, numbers)
 
@@ -259,11 +244,11 @@ class FlightStudy(GrowingStudy):
 
         Whole tiles are planned, so that this does not depend on the block.
         """
-        first, stop = blocks.shot_range(part)
+        first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
         begin = first // TILE_SHOTS * TILE_SHOTS
         end = -(-stop // TILE_SHOTS) * TILE_SHOTS
         end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
-        shots, eyepoints = self._seen(part.scanner, begin, end)
+        shots, eyepoints = self._seen(part.scanner, range(begin, end))
         own = slice(first - begin, stop - begin)
         selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
         shots = {name: values[own] for name, values in shots.items()}
@@ -303,8 +288,7 @@ class FlightStudy(GrowingStudy):
             Results that need not be computed.
         """
         blocks = self.scanners[part.scanner]
-        begin, end = blocks.draw_range(part)
-        draws, each = end - begin, blocks.shots_a_cycle
+        draws, each = len(part.draws), blocks.shots_a_cycle
         there, results = known or self._nothing_known(blocks, selected.flags.size, draws)
         for rows, some in _gaps(~there):
             for index, found in self._clouds(part, eyepoints, selected, numbers, rows, some):
@@ -359,14 +343,13 @@ class FlightStudy(GrowingStudy):
         from sweep.model.clouds import cloud
         from sweep.model.philox import point_keys
 
-        begin, _ = self.scanners[part.scanner].draw_range(part)
         rows = numbers[:, None].astype(float)
         return cloud(
             eyepoints,
             parameters=self.parameters_at(part),
             surfaces=self.surfaces,
             keys=point_keys(rows, domain=DOMAIN, seed=int(self.spec.seed)),
-            first_draw=begin + draws.start,
+            first_draw=part.draws.start + draws.start,
             draws=draws.stop - draws.start,
             method=self.spec.draws.method,
             returns=int(self.spec.draws.returns),
@@ -417,9 +400,8 @@ class FlightStudy(GrowingStudy):
         """Results of a block that a smaller study has, of shots with the same effects."""
         assert self.earlier is not None
         reuse, (blocks, part) = self.earlier, self.part(block)
-        (begin, end), (first, stop) = blocks.draw_range(part), blocks.cycle_range(part)
-        draws, each = end - begin, blocks.shots_a_cycle
-        there, results = known = self._nothing_known(blocks, selected.flags.size, draws)
+        each = blocks.shots_a_cycle
+        there, results = known = self._nothing_known(blocks, selected.flags.size, len(part.draws))
         for share in reuse.shares(block):
             home, own = (reuse.read(b) for b in (reuse.older.home(share.block), share.block))
             if home is None or own is None:
@@ -431,7 +413,7 @@ class FlightStudy(GrowingStudy):
                 if name not in GEOMETRY
             }
             (draw, cycle), (old_draw, old_cycle) = (
-                np.divmod(share.points, stop - first),
+                np.divmod(share.points, len(part.cycles)),
                 np.divmod(share.place, len(older["flags"]) // each),
             )
             rows, old = (c[:, None] * each + np.arange(each) for c in (cycle, old_cycle))
@@ -487,17 +469,17 @@ class FlightStudy(GrowingStudy):
         arrays: dict[str, Any] = {name: group[name] for name in SHOTS | BEAMLETS | CYCLES}
         return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
 
-    def _read(self, scanner: str, names: Mapping[str, Any], first: int, stop: int) -> Results:
-        """Arrays of a scanner's eyepoints from `first` to before `stop`."""
+    def _read(self, scanner: str, names: Mapping[str, Any], some: range) -> Results:
+        """Arrays of a scanner's eyepoints, of some shots or cycles."""
         arrays = self._eyepoints(scanner)
-        return {name: np.asarray(arrays[name][first:stop]) for name in names}
+        return {name: np.asarray(arrays[name][some.start : some.stop]) for name in names}
 
-    def _seen(self, scanner: str, first: int, stop: int) -> tuple[Results, Eyepoints]:
-        """Arrays of the shots from `first` to before `stop`, and their eyepoints."""
+    def _seen(self, scanner: str, some: range) -> tuple[Results, Eyepoints]:
+        """Arrays of some shots, and their eyepoints."""
         from sweep.scenes.eyepoint_arrays import from_arrays
 
-        shots = self._read(scanner, SHOTS, first, stop)
-        beamlets = self._read(scanner, BEAMLETS, first, stop)
+        shots = self._read(scanner, SHOTS, some)
+        beamlets = self._read(scanner, BEAMLETS, some)
         return shots, from_arrays(shots | beamlets, self._eyepoints(scanner)["weight"])
 
     def eyepoint_studies(self) -> Iterator[EyepointStudy]:

@@ -253,5 +253,5 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         rays=eyepoints.rays,
         is_cast=eyepoints_path(study.path, eyepoints.id).exists(),
         seconds_a_ray=casting / eyepoints.rays_in(found.points),
-        seconds_a_draw=looking / (found.points * blocks.block_shape[-2]),
+        seconds_a_draw=looking / (found.points * len(part.draws)),
     )

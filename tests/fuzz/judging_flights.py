@@ -13,7 +13,7 @@ from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.plan import plan
 from sweep.tasks.study import Results
 
@@ -55,7 +55,7 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
     shots = from_arrays(seen, eyepoints.weight)
     stretches = study.scanners[eyepoints.scanner]
     for *axes, draws in np.ndindex(*stretches.along[:-1]):
-        part = Part(eyepoints.scanner, tuple(axes), draws, 0)
+        part = stretches.part(stretches.number((*axes, draws, 0)))
         selected = study.select(part, shots, np.arange(len(shots.time)))
         assert np.isfinite(selected.error).all() and (selected.error >= 0).all(), "effects_error"
         found = study.look(part, seen, shots, selected, numbers)

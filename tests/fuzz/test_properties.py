@@ -19,7 +19,7 @@ from random_studies import drop, mended, studies
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import SceneSpec, Spec, SpecError, from_stored
-from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 
 SOME = settings(
@@ -200,7 +200,7 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     (eyepoints,) = study.eyepoint_studies()
     numbers = np.arange(eyepoints.points)
     seen = eyepoints.see(numbers)
-    shots, part = from_arrays(seen, eyepoints.weight), Part("cone", (), 0, 0)
+    shots, part = from_arrays(seen, eyepoints.weight), study.scanners["cone"].part(0)
     return seen, study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
 
 

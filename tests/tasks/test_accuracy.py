@@ -303,7 +303,7 @@ def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch
 
 
 def test_shots_are_timed_with_so_many_that_follow_round_the_end():
-    stretch = Tiles(Part("three", (), 0, 0), np.arange(256 * 4 + 100), 1000)
+    stretch = Tiles(Part("three", (), range(1), range(1)), np.arange(256 * 4 + 100), 1000)
     rows = stretch.around(np.arange(768, 1024), 600)
     assert np.array_equal(np.unique(stretch.tile[rows]), [0, 3, 4]) and len(rows) == 612
     assert np.array_equal(stretch.around(np.arange(300, 400), 1), np.arange(256, 512))

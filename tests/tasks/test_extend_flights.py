@@ -16,7 +16,7 @@ from sweep.storage.atomic_replace import beside
 from sweep.tasks import flight_study
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
-from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import read_recipe
 from sweep.tasks.verify import verify
 
@@ -214,8 +214,9 @@ def test_where_the_tolerance_says_how_closely_all_is_computed_anew(here, compute
 
 def chunk(store, name, part, scanner="three"):
     """File of a block's chunk, by its place on the axis, draws and cycles."""
-    block = FlightStudy(flight(), store).block(Part(scanner, (part[0],), *part[1:]))
-    place = FlightStudy(flight(), store).chunks(block)[f"{scanner}/{name}"]
+    study = FlightStudy(flight(), store)
+    block = study.first_block(scanner) + study.scanners[scanner].number(part)
+    place = study.chunks(block)[f"{scanner}/{name}"]
     return store.joinpath(scanner, name, "c", *map(str, place))
 
 
@@ -241,7 +242,7 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, 
     lines = log.read_text().splitlines(keepends=True)[1:7]
     log.write_text("".join(lines))
     older = FlightStudy(flight(), here)
-    useless = older.block(Part("three", (0,), 1, 0))
+    useless = older.first_block("three") + older.scanners["three"].number((0, 1, 0))
     found = {record["block"]: record["points"] for record in map(json.loads, lines)}
     there = sum(found.values()) - found[useless]
     spec = flight(axes={POWER: [*TWO, "3 W"]}, storage=LARGE)

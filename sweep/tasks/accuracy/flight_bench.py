@@ -182,13 +182,13 @@ class FlightBench(Bench):
         """Tiles spread over scanners, axes and flight."""
         found: list[Tiles] = []
         start, scanners = 0, self._study(AS_WRITTEN).scanners
-        for name, stretches in scanners.items():
+        for stretches in scanners.values():
             axes = stretches.axes
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
             wanted = math.ceil(points / TILE_SHOTS / len(scanners) / len(places))
             for place in places:
                 index = _spread_shots(stretches, max(self.most_times // TILE_SHOTS, wanted))
-                part = Part(name, tuple(int(i) for i in place), 0, 0)
+                part = stretches.first_part(tuple(int(i) for i in place))
                 found.append(Tiles(part, index, start))
                 start += len(index)
         return found
