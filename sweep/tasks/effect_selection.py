@@ -15,6 +15,7 @@ import numpy as np
 
 from sweep.model.effects.catalogue import FLAGS_APART, flags_of, names_of
 from sweep.tasks.grid import Grid, Value
+from sweep.tasks.study import BlockGrid
 
 if TYPE_CHECKING:
     from sweep.model.effects.planning import Plan
@@ -85,19 +86,13 @@ class Alike(NamedTuple):
     grid's edge cuts have their last points several times."""
 
 
-class Tiles:
+class Tiles(BlockGrid):
     """Tiles of a grid; points of one tile share every word and every size."""
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
         self._undivided = tuple(self._is_undivided(k) for k in range(len(grid.dims)))
-        self.shape = tile_shape(grid.shape, self._undivided)
-        self.along = tuple(-(-n // s) for n, s in zip(grid.shape, self.shape, strict=True))
-
-    @property
-    def number(self) -> int:
-        """Tiles of the whole grid."""
-        return math.prod(self.along)
+        super().__init__(grid.dims, grid.shape, tile_shape(grid.shape, self._undivided))
 
     def of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
         """Tiles that a block meets, and where each of its points lies among them.
@@ -111,7 +106,7 @@ class Tiles:
         """
         along = [
             np.arange(s.start, s.stop) // side
-            for s, side in zip(self.grid.block(block), self.shape, strict=True)
+            for s, side in zip(self.grid.block(block), self.block_shape, strict=True)
         ]
         mesh = np.ix_(*along) if along else ()
         numbers = np.ravel_multi_index(mesh, self.along) if along else np.zeros((), np.int64)
@@ -136,14 +131,6 @@ class Tiles:
                 parameters |= self._along(k, position[chosen], every)
             yield Alike(int(code), chosen, parameters)
 
-    def points(self, tile: int) -> tuple[slice, ...]:
-        """Slices of a tile along each axis, cut at the edge of the grid."""
-        position = np.unravel_index(tile, self.along) if self.along else ()
-        return tuple(
-            slice(int(p) * side, min((int(p) + 1) * side, size))
-            for p, side, size in zip(position, self.shape, self.grid.shape, strict=True)
-        )
-
     def _is_undivided(self, axis: int) -> bool:
         from sweep.model.shot import SHARED
 
@@ -157,7 +144,7 @@ class Tiles:
         if self._undivided[axis]:
             first = int(position[0])
             return {path: values[first].item() for path, values in members.items()}
-        side, size = self.shape[axis], self.grid.shape[axis]
+        side, size = self.block_shape[axis], self.shape[axis]
         within = np.minimum(position[:, None] * side + np.arange(side), size - 1)
         index = within[:, ::every]
         if every > 1:  # with the largest of each, so that none is missed that is there at all
@@ -217,7 +204,7 @@ class EffectSelection:
         A few of the points are looked at first: where these call for all that there is, the others
         cannot call for more.
         """
-        sides = [side for side in self.tiles.shape if side > 1]
+        sides = [side for side in self.tiles.block_shape if side > 1]
         few = max(int((math.prod(sides) / FEW_POINTS) ** (1 / max(len(sides), 1))), 1)
         rest = np.arange(len(tiles))
         for every in (few, 1) if few > 1 else (1,):

@@ -77,7 +77,7 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
 
 def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
     spec, selection = study.spec, study.selection
-    number = selection.tiles.number
+    number = selection.tiles.n_blocks
     tiles = np.unique(np.linspace(0, number - 1, min(number, MOST_TILES)).astype(np.int64))
     kept = np.empty((len(EFFECTS), len(tiles)), bool)
     change, error = np.empty(kept.shape), np.empty(len(tiles))
@@ -180,7 +180,7 @@ def _times(times: np.ndarray) -> str:
 
 def _region(spec: Spec, selection: EffectSelection, tiles: np.ndarray) -> str:
     """The least box of the grid that holds some tiles, in the user's units."""
-    slices = [selection.tiles.points(tile) for tile in tiles.tolist()]
+    slices = [selection.tiles.block(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):
         first, stop = min(s[k].start for s in slices), max(s[k].stop for s in slices)
@@ -222,7 +222,7 @@ def _cost(spec: Spec, selection: EffectSelection, tiles: np.ndarray, name: str) 
 
 def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:
     """Numbers of the points of a tile, or of some, in C order over the grid."""
-    slices = selection.tiles.points(tile)
+    slices = selection.tiles.block(tile)
     shape = tuple(s.stop - s.start for s in slices)
     size = math.prod(shape)
     few = np.unique(np.linspace(0, size - 1, most or size).astype(np.int64))

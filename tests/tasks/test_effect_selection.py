@@ -72,7 +72,7 @@ def test_every_point_lies_in_one_tile_that_has_its_parameters():
                 here = within[place[within] == own]
                 for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
                     values = np.broadcast_to(
-                        alike.parameters[path], (len(alike.tiles), *tiles.shape)
+                        alike.parameters[path], (len(alike.tiles), *tiles.block_shape)
                     )
                     assert np.isin(points[path][here], values[tile]).all()
 
@@ -85,7 +85,7 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
         accuracy={"tolerance": 1e-2},
     )
     selection = EffectSelection(spec, Grid(spec))
-    tiles = np.arange(selection.tiles.number)
+    tiles = np.arange(selection.tiles.n_blocks)
     kept = np.zeros((len(NAMES), tiles.size), bool)
     for chosen, plan in selection.plans(tiles):
         kept[:, chosen] = plan.kept
@@ -99,9 +99,9 @@ def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
     velocities = [f"{v} m/s" for v in (0, 1, 2, 3, 4, 70, 6, 7, 8, 9, 10, 11)]
     spec = small(axes={**WIDE, "target.radial_velocity": velocities})
     tiles = Tiles(Grid(spec))
-    (few,) = tiles.alike(np.arange(tiles.number), 4)
+    (few,) = tiles.alike(np.arange(tiles.n_blocks), 4)
     found = few.parameters["target.radial_velocity"]
-    assert found.max() == 70 and found.size < len(few.tiles) * tiles.shape[-1]
+    assert found.max() == 70 and found.size < len(few.tiles) * tiles.block_shape[-1]
 
 
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
@@ -175,7 +175,7 @@ def test_a_plan_is_made_once_for_a_tile(monkeypatch):
     monkeypatch.setattr(selection, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
     for block in range(Grid(spec).n_blocks):
         selection.of_block(block)
-    assert sorted(planned) == list(range(selection.tiles.number))
+    assert sorted(planned) == list(range(selection.tiles.n_blocks))
 
 
 def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():

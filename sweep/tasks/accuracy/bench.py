@@ -313,14 +313,12 @@ class GridBench(Bench):
         A plan serves a whole tile, so that a point takes its share.
         """
         tiles = self._selection_of(rung).tiles
-        index = np.unravel_index(numbers, tiles.grid.shape) if tiles.grid.shape else ()
-        along = [i // side for i, side in zip(index, tiles.shape, strict=True)]
-        own = np.ravel_multi_index(along, tiles.along) if along else np.zeros(len(numbers), int)
+        own, _ = tiles.locate(numbers)
         met, where = np.unique(own, return_inverse=True)
         flags = np.empty(len(met), np.uint32)
         begun = thread_time()
         for chosen, plan in self._selection_of(rung).plans(met):
             flags[chosen] = flags_of(plan.kept)
         spent = thread_time() - begun
-        served = sum(math.prod(s.stop - s.start for s in tiles.points(int(tile))) for tile in met)
+        served = sum(tiles.block_size(int(tile)) for tile in met)
         return flags[where], spent / served
