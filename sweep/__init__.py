@@ -24,7 +24,7 @@ _HOMES = {
     "resume": "sweep.tasks.driver",
     "extend": "sweep.tasks.driver",
     "open": "sweep.analysis.opening",
-    "open_scene": "sweep.analysis.scenes.opening",
+    "open_scene": "sweep.analysis.opening",
     "export": "sweep.analysis.export",
 }
 

@@ -32,6 +32,8 @@ PRINTED_DPI = 300
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
     "pdf.fonttype": 42,  # whole outlines, as publishers ask for
     "svg.fonttype": "path",
     "svg.hashsalt": "sweep",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.analysis import labels
-from sweep.analysis.selection import Points
+from sweep.analysis.selection import Points, coordinate_of
 
 if TYPE_CHECKING:
     from sweep.spec import Axis, Member, Spec
@@ -34,14 +34,6 @@ class Cut:
         return found.where(self.held, [self.value]).once() if self.held else found
 
 
-def coordinate_of(spec: Spec, path: str) -> Member | None:
-    """The parameter of a path where it is on an axis."""
-    try:
-        return spec.member(path)
-    except KeyError:
-        return None
-
-
 def cuts(spec: Spec) -> list[Cut]:
     """Cuts that a study makes through range and grazing angle.
 
@@ -53,7 +45,11 @@ def cuts(spec: Spec) -> list[Cut]:
         return whole
     members = {RANGE: ranges, GRAZING_ANGLE: angles}
     zipped = next((axis for axis in spec.axes if {ranges, angles} <= set(axis.members)), None)
-    held = _pieces(zipped) if zipped else _published(spec, members)
+    if zipped is not None:
+        held = _pieces(zipped)
+    else:
+        published = [(members[p], spec.coordinate_value(p, text)) for p, text in PUBLISHED]
+        held = [(m, v) for m, v in published if np.isclose(m.display, float(v)).any()]
     found = [
         Cut(
             labels.quantity(value, member.units).replace("°", " deg"),
@@ -64,12 +60,6 @@ def cuts(spec: Spec) -> list[Cut]:
         for member, value in held
     ]
     return found or whole
-
-
-def _published(spec: Spec, members: dict[str, Member]) -> list[tuple[Member, object]]:
-    """The published cuts that lie on the grid."""
-    pairs = ((members[path], spec.coordinate_value(path, text)) for path, text in PUBLISHED)
-    return [(m, value) for m, value in pairs if np.isclose(m.display, float(value)).any()]
 
 
 def _pieces(axis: Axis) -> list[tuple[Member, object]]:
@@ -99,8 +89,8 @@ def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) 
     if member is None:
         return found
     least = float(spec.coordinate_value(RANGE, distance))
-    ranges = found.column(member.name).values
-    return found.along_axis(member.name, ranges >= least if included else ranges > least)
+    ranges = found.values(member.name)
+    return found.at(found.dim_of(member.name), ranges >= least if included else ranges > least)
 
 
 def bands(spec: Spec, along: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:

@@ -13,9 +13,14 @@ import numpy as np
 
 from sweep.analysis import labels
 from sweep.analysis.scenes.figures import SceneStudy
-from sweep.analysis.scenes.places import Place, place
-from sweep.analysis.scenes.quantities import INTERPOLATED, QUANTISED, QUANTITIES
-from sweep.analysis.scenes.recording import Recording
+from sweep.analysis.scenes.recording import (
+    INTERPOLATED,
+    QUANTISED,
+    QUANTITIES,
+    Place,
+    Recording,
+    place,
+)
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
@@ -75,9 +80,7 @@ class PointTable:
         """Rows (m,) of ROW, stretch by stretch."""
         names = [field.name for field in FIELDS if field.name != "number_of_returns"]
         for part in self.recording.stretches():
-            table = self.recording.points(
-                [*names, "returns"], part, draw=self.draw, ranges=self.ranges
-            )
+            table = self.recording.points([*names, "returns"], part, self.draw, self.ranges)
             rows = np.zeros(table["x"].size, ROW)
             for name in names:
                 rows[name] = table[name]
@@ -98,7 +101,7 @@ class PointTable:
         """Lowest and highest coordinates, (3,) each [m]; infinite without a point."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self.recording.stretches():
-            table = self.recording.points("xyz", part, draw=self.draw, ranges=self.ranges)
+            table = self.recording.points("xyz", part, self.draw, self.ranges)
             places = np.array([table[axis] for axis in "xyz"]) + self.origin[:, None]
             low = np.minimum(low, places.min(axis=1, initial=np.inf))
             high = np.maximum(high, places.max(axis=1, initial=-np.inf))

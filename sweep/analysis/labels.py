@@ -41,6 +41,11 @@ def quantity(value: object, units: str = "") -> str:
     return text + symbol if symbol == "°" else f"{text} {symbol}"
 
 
+def valued(name: str, value: object, units: str = "") -> str:
+    """A coordinate with a value of it: ``grazing angle 15°``."""
+    return f"{coordinate(name)} {quantity(value, units)}"
+
+
 def prefixed(value: float, units: str) -> str:
     """A value in SI units with the prefix that suits it: ``25 mm``, ``50 µrad``, ``2 km``."""
     if units in _UNITLESS or units not in _TAKE_PREFIXES or value == 0:
@@ -74,3 +79,12 @@ def joined(parts: list[str]) -> str:
 def is_words(values: np.ndarray) -> bool:
     """Whether a coordinate's values are words."""
     return values.dtype.kind not in "fiu"
+
+
+def extent(values: np.ndarray) -> str:
+    """Lowest, median and highest of values."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "no value is known"
+    low, middle, high = (f"{q:.3g}" for q in np.quantile(finite, [0, 0.5, 1]))
+    return f"lowest {low}, median {middle}, highest {high}"

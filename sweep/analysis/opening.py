@@ -1,4 +1,4 @@
-"""A store as an xarray Dataset, with how much of it is there."""
+"""Stores as xarray Datasets and DataTrees, with how much of them is there."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ BATCH = "batch"
 PIECE = 2**20
 """Values of an array that are read at a time: few enough for any memory, and enough that Dask's
 list of what is to be read stays short (some 7 kB a piece; a piece of floats has 8 MB)."""
+
+STRETCH = 8192
+"""Shots, times draws, that are read at a time."""
 
 NOT_COUNTED = -1
 """What a count holds where its block is not computed."""
@@ -68,12 +71,69 @@ def open(path: str | Location) -> xr.Dataset:
     refuse_lost(path)
     dataset = xr.open_zarr(readable(path, study["study_id"]), chunks=None, **CHECKED)
     points = dataset["effects"]
-    blocks = map(math.ceil, np.divide(points.shape, points.encoding["chunks"]))
+    blocks = _blocks(points)
     dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
     dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
-    return dataset.assign_attrs(progress(path, points.size, math.prod(blocks)))
+    return dataset.assign_attrs(progress(path, points.size, blocks))
+
+
+def open_scene(path: str | Location) -> xr.DataTree:
+    """The store of a scene's point clouds as a tree: a group for each scanner.
+
+    Arrays are read when they are needed, as Dask arrays in the chunks of the store. What is not
+    computed yet is nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
+
+    Parameters
+    ----------
+    path
+        The store, complete or not.
+
+    Returns
+    -------
+    xarray.DataTree
+        Its attributes are the store's and: `started`, `finished` (UTC; empty where there is
+        nothing to tell), `points`, `points_committed` (shots times draws), `blocks` and
+        `blocks_committed`.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a scene.
+    """
+    return opened(located(path), chunks={})
+
+
+def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
+    """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
+    attributes = read_attributes(path, SCENE)
+    refuse_lost(path)
+    store = readable(path, attributes["study_id"])
+    tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **CHECKED)
+    tree.encoding["source"] = str(path)
+    flags = [tree[scanner].to_dataset()["flags"] for scanner in attributes["scanners"]]
+    points = sum(int(own.size) // own.sizes["return_number"] for own in flags)
+    blocks = sum(_blocks(own) for own in flags)
+    tree.attrs |= progress(path, points, blocks)
+    return tree
+
+
+def _blocks(array: xr.DataArray) -> int:
+    """Number of chunks that an array is stored in."""
+    return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
+
+
+def chunk(array: xr.DataArray, dim: str) -> int:
+    """Length along a dimension of the chunks that an array is stored in."""
+    return int(array.encoding.get("preferred_chunks", {}).get(dim, array.sizes[dim]))
+
+
+def stretches(array: xr.DataArray, dim: str, size: int = STRETCH) -> list[slice]:
+    """Slices along a dimension: whole chunks of the array in each, and few of them."""
+    number, cut = array.sizes[dim], chunk(array, dim)
+    step = cut * max(1, size // cut)
+    return [slice(first, min(first + step, number)) for first in range(0, number, step)]
 
 
 def refuse_lost(path: Location) -> None:
@@ -105,14 +165,7 @@ def refuse_lost(path: Location) -> None:
 
 
 def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:
-    """Attributes of a store that is as this program writes stores.
-
-    Parameters
-    ----------
-    path
-        The store.
-    kind
-        What it must hold, ``grid`` or ``scene``; any by default.
+    """Attributes of a store, which must hold a ``grid`` or a ``scene`` where that is asked for.
 
     Raises
     ------
@@ -152,15 +205,7 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def progress(path: Location, points: int, blocks: int) -> dict[str, Any]:
-    """Times and amount of what is committed, as attributes.
-
-    Parameters
-    ----------
-    path
-        The store.
-    points, blocks
-        How many there are in all: points of a grid, or shots times draws of a flight.
-    """
+    """Times and amount of what is committed of all points and blocks, as attributes."""
     receipts = read_receipts(path, blocks)
     sessions = read_lines(path / JOURNAL / "sessions.jsonl")
     started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]

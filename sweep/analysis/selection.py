@@ -2,12 +2,13 @@
 
 A figure asks for values over some coordinates, whether these are dimensions of their own or vary
 together along a zipped axis. Chosen are places along axes, which are few however many points there
-are: nothing of the arrays is read before their values are asked for.
+are: nothing of the arrays is read before their values are asked for. Arrays of any size are reduced
+to as many cells as a picture or a page can hold, chunk by chunk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,186 +16,213 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.cells import Side, reduced
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
+    from sweep.spec import Member, Spec
+
+MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
+_METHODS = {MEAN: "mean", LOWEST: "min", HIGHEST: "max"}
 
 
 @dataclass(frozen=True)
-class Column:
-    """A coordinate at every place along an axis (n,), in its units."""
+class Side:
+    """A dimension as a figure runs along it.
 
-    values: np.ndarray
-    units: str
-    index: bool = False
-    """Whether it is the place along a zipped axis, which the axis's parameters say better."""
+    Attributes
+    ----------
+    dim
+        The dimension.
+    positions : (n,) int ndarray
+        Places along it, in the order of rising values.
+    values : (n,) ndarray
+        The coordinate there.
+    """
 
-
-@dataclass(frozen=True)
-class Places:
-    """Places along an axis (n,), in rising order, and its coordinates there."""
-
+    dim: str
     positions: np.ndarray
-    coordinates: Mapping[str, Column]
+    values: np.ndarray
 
-    def at(self, chosen: np.ndarray | slice) -> Places:
-        """Those of the given indices, or where the given mask is true."""
-        columns = {n: replace(c, values=c.values[chosen]) for n, c in self.coordinates.items()}
-        return Places(self.positions[chosen], columns)
+    def together(self, most: int) -> int:
+        """Number of neighbours in a cell, so that there are `most` cells or fewer."""
+        return 1 if labels.is_words(self.values) else -(-self.values.size // most)
 
-    def varying(self) -> list[str]:
-        """Coordinates with more than one value."""
-        return [
-            name
-            for name, c in self.coordinates.items()
-            if not c.index and (c.values != c.values[:1]).any()
-        ]
+    def middles(self, most: int) -> np.ndarray:
+        """Mean value of the coordinate in each cell."""
+        by = self.together(most)
+        if by == 1:
+            return self.values
+        starts = np.arange(0, self.values.size, by)
+        sums = np.add.reduceat(self.values, starts)
+        return sums / np.diff(starts, append=self.values.size)
 
-    def further(self, names: Sequence[str]) -> list[str]:
-        """As :meth:`Points.further` of one axis."""
-        names = [name for name in names if name in self.coordinates]
-        code = np.zeros(self.positions.size, np.int64)
-        number, needed = 0, []
-        for name in [*names, *(n for n in self.varying() if n not in names)]:
-            values, group = np.unique(self.coordinates[name].values, return_inverse=True)
-            found, code_with = np.unique(code * values.size + group.ravel(), return_inverse=True)
-            if name in names or found.size > number:
-                number, code = found.size, code_with.ravel()
-                needed += [] if name in names else [name]
-        return needed
 
-    def apart(self, name: str) -> list[tuple[object, Places]]:
-        """Places of each value of a coordinate, in the order in which the values first appear."""
-        column = self.coordinates[name].values
-        values, first, group = np.unique(column, return_index=True, return_inverse=True)
-        order = np.argsort(group.ravel(), kind="stable")
-        members = np.split(order, np.cumsum(np.bincount(group.ravel(), minlength=values.size))[:-1])
-        return [(values[i], self.at(members[i])) for i in np.argsort(first)]
+def known(array: xr.DataArray) -> xr.DataArray:
+    """An array as floats; nan where a count is not made yet."""
+    return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
-    def once(self) -> Places:
-        """The first of those that have all coordinates alike."""
-        columns = [c.values for c in self.coordinates.values() if not c.index]
-        if not columns:
-            return self
-        codes = np.stack([np.unique(c, return_inverse=True)[1].ravel() for c in columns])
-        return self.at(np.sort(np.unique(codes, axis=1, return_index=True)[1]))
+
+def coarsened(
+    array: xr.DataArray, sides: Sequence[tuple[Side, int]], at: Mapping[str, int], kind: str
+) -> xr.DataArray:
+    """An array in cells along some sides, at one place along its other dimensions; not computed.
+
+    Parameters
+    ----------
+    array
+        Of a store, in its chunks; or in memory.
+    sides
+        Each with the largest number of its cells.
+    at
+        Places along the other dimensions.
+    kind
+        ``mean``, ``lowest`` or ``highest`` of the values in a cell; nan only where all are.
+    """
+    array = array.isel(dict(at))
+    for side, _ in sides:
+        if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
+            array = array.isel({side.dim: side.positions})
+    array = known(array).transpose(*(side.dim for side, _ in sides))
+    by = {side.dim: side.together(most) for side, most in sides}
+    if max(by.values()) == 1:
+        return array
+    cells = array.drop_vars(list(array.coords)).coarsen(by, boundary="pad")
+    return getattr(cells, _METHODS[kind])()
 
 
 @dataclass(frozen=True)
 class Points:
-    """Points of a dataset: all combinations of some places along its dimensions."""
+    """Points of a dataset: all combinations of some places, in rising order, along its dimensions.
+
+    A coordinate is any of the dataset's that has one dimension; a dimension without one of its
+    name, as a zipped axis is, has the number of the place for it.
+    """
 
     dataset: xr.Dataset
-    axes: Mapping[str, Places]
+    positions: Mapping[str, np.ndarray]
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Points:
         """All points of a dataset."""
         largest = max(dataset.data_vars.values(), key=lambda array: array.ndim)
-        return cls(dataset, {str(dim): _places(dataset, str(dim)) for dim in largest.dims})
+        return cls(dataset, {str(dim): np.arange(dataset.sizes[dim]) for dim in largest.dims})
 
     @property
     def size(self) -> int:
         """Number of points."""
-        sizes = [places.positions.size for places in self.axes.values()]
-        return int(np.prod(sizes, dtype=np.int64))
+        return int(np.prod([own.size for own in self.positions.values()], dtype=np.int64))
 
-    def axis_of(self, name: str) -> str:
-        """The axis that has a coordinate."""
-        return next(dim for dim, places in self.axes.items() if name in places.coordinates)
+    def dim_of(self, name: str) -> str:
+        """The dimension of a coordinate."""
+        return str(self.dataset.coords[name].dims[0]) if name in self.dataset.coords else name
 
-    def column(self, name: str) -> Column:
-        """A coordinate along its axis."""
-        return self.axes[self.axis_of(name)].coordinates[name]
+    def values(self, name: str) -> np.ndarray:
+        """A coordinate at each place along its dimension."""
+        positions = self.positions[self.dim_of(name)]
+        if name not in self.dataset.coords:
+            return positions
+        return np.asarray(self.dataset.coords[name].values)[positions]
 
-    def along_axis(self, name: str, chosen: np.ndarray | Callable[[Places], Places]) -> Points:
-        """With some of the places along the axis of a coordinate."""
-        dim = self.axis_of(name)
-        places = self.axes[dim]
-        new = chosen(places) if callable(chosen) else places.at(chosen)
-        return replace(self, axes={**self.axes, dim: new})
+    def units(self, name: str) -> str:
+        """Units of a coordinate."""
+        coordinate = self.dataset.coords.get(name)
+        return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
-    def where(self, name: str, values: list[object]) -> Points:
+    def parameters(self, dim: str) -> list[str]:
+        """Coordinates along a dimension."""
+        return [str(name) for name, c in self.dataset.coords.items() if c.dims == (dim,)]
+
+    def at(self, dim: str, chosen: np.ndarray | slice) -> Points:
+        """Points at some of the places along a dimension, by their indices or a mask."""
+        return replace(self, positions={**self.positions, dim: self.positions[dim][chosen]})
+
+    def where(self, name: str, wanted: list[object]) -> Points:
         """Points at which a coordinate has one of the values."""
-        return self.along_axis(name, is_any(self.column(name).values, values))
+        return self.at(self.dim_of(name), is_any(self.values(name), wanted))
 
     def once(self) -> Points:
         """Points without repetition of all their coordinates."""
-        return replace(self, axes={dim: places.once() for dim, places in self.axes.items()})
+        found = self
+        for dim in self.positions:
+            if names := self.parameters(dim):
+                codes = [np.unique(self.values(n), return_inverse=True)[1].ravel() for n in names]
+                first = np.unique(np.stack(codes), axis=1, return_index=True)[1]
+                found = found.at(dim, np.sort(first))
+        return found
 
     def distinct(self, name: str) -> list[object]:
         """Values of a coordinate, in the order in which they first appear."""
-        values, first = np.unique(self.column(name).values, return_index=True)
+        values, first = np.unique(self.values(name), return_index=True)
         return list(values[np.argsort(first)])
 
     def varying(self) -> list[str]:
         """Coordinates with more than one value."""
-        return [name for places in self.axes.values() for name in places.varying()]
+        every = [name for dim in self.positions for name in self.parameters(dim)]
+        return [name for name in every if (self.values(name) != self.values(name)[:1]).any()]
 
     def further(self, names: Sequence[str]) -> list[str]:
         """Coordinates that tell points apart which those named leave together, as few as will do.
 
         Parameters that vary along a zipped axis with one that is named are none of them.
         """
-        return [name for places in self.axes.values() for name in places.further(names)]
+        return [name for dim in self.positions for name in self.further_along(dim, names)]
+
+    def further_along(self, dim: str, names: Sequence[str]) -> list[str]:
+        """Those of :meth:`further` that lie along a dimension."""
+        named = [name for name in names if self.dim_of(name) == dim]
+        others = [n for n in self.varying() if self.dim_of(n) == dim and n not in named]
+        code = np.zeros(self.positions[dim].size, np.int64)
+        number, needed = 0, []
+        for name in [*named, *others]:
+            values, group = np.unique(self.values(name), return_inverse=True)
+            found, code_with = np.unique(code * values.size + group.ravel(), return_inverse=True)
+            if name in named or found.size > number:
+                number, code = found.size, code_with.ravel()
+                needed += [] if name in named else [name]
+        return needed
 
     def apart(self, name: str) -> list[tuple[object, Points]]:
         """Points of each value of a coordinate, in the order in which the values first appear."""
-        dim = self.axis_of(name)
-        return [
-            (value, replace(self, axes={**self.axes, dim: places}))
-            for value, places in self.axes[dim].apart(name)
-        ]
+        values, first, group = np.unique(self.values(name), return_index=True, return_inverse=True)
+        order = np.argsort(group.ravel(), kind="stable")
+        ends = np.cumsum(np.bincount(group.ravel(), minlength=values.size))
+        members = np.split(order, ends[:-1])
+        dim = self.dim_of(name)
+        return [(values[i], self.at(dim, members[i])) for i in np.argsort(first)]
 
     def within(self, block: Mapping[str, tuple[int, int]]) -> Points:
-        """Those of places from a first to before a last one along each axis."""
-        axes = {}
-        for dim, places in self.axes.items():
-            first, last = np.searchsorted(places.positions, block[dim])
-            axes[dim] = places.at(slice(int(first), int(last)))
-        return replace(self, axes=axes)
+        """Points at places from a first to before a last one along each dimension."""
+        found = self
+        for dim, positions in self.positions.items():
+            first, last = np.searchsorted(positions, block[dim])
+            found = found.at(dim, slice(int(first), int(last)))
+        return found
 
     def spread(self, name: str) -> np.ndarray:
         """A coordinate at every point, (n,)."""
-        dim = self.axis_of(name)
-        shape = [places.positions.size for places in self.axes.values()]
-        along = [size if own == dim else 1 for own, size in zip(self.axes, shape, strict=True)]
-        return np.broadcast_to(self.column(name).values.reshape(along), shape).ravel()
+        shape = [own.size for own in self.positions.values()]
+        along = [n if d == self.dim_of(name) else 1
+                 for d, n in zip(self.positions, shape, strict=True)]  # fmt: skip
+        return np.broadcast_to(self.values(name).reshape(along), shape).ravel()
 
     def side(self, name: str) -> Side:
         """Places along a coordinate, in rising order, each value of the coordinate once."""
-        dim = self.axis_of(name)
-        values, first = np.unique(self.column(name).values, return_index=True)
-        return Side(dim, self.axes[dim].positions[first], values)
+        values, first = np.unique(self.values(name), return_index=True)
+        dim = self.dim_of(name)
+        return Side(dim, self.positions[dim][first], values)
 
     def first(self, *sides: Side) -> dict[str, int]:
-        """The first place along every axis but those of some sides."""
+        """The first place along every dimension but those of some sides."""
         shown = {side.dim for side in sides}
-        return {
-            dim: int(places.positions[0]) for dim, places in self.axes.items() if dim not in shown
-        }
+        return {dim: int(own[0]) for dim, own in self.positions.items() if dim not in shown}
 
     def cells(self, variable: str, sides: Sequence[tuple[Side, int]], kind: str) -> xr.DataArray:
-        """A variable in cells along some sides, as :func:`.cells.reduced` makes them."""
+        """A variable in cells along some sides, as :func:`coarsened` makes them."""
         at = self.first(*(side for side, _ in sides))
-        return reduced(self.dataset[variable], sides, at, kind)
-
-
-def _places(dataset: xr.Dataset, dim: str) -> Places:
-    """All places along a dimension."""
-    columns = {
-        str(name): Column(np.asarray(c.values), str(c.attrs.get("units", "")))
-        for name, c in dataset.coords.items()
-        if c.dims == (dim,)
-    }
-    if dim not in columns:
-        columns[dim] = Column(np.arange(dataset.sizes[dim]), "", index=True)
-    return Places(np.arange(dataset.sizes[dim]), columns)
+        return coarsened(self.dataset[variable], sides, at, kind)
 
 
 def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:
-    """Whether each value is one of those wanted, to the last digits of a float."""
+    """Mask of the values that are among those wanted, to the last digits of a float."""
     if values.dtype.kind not in "fiu":
         return np.isin([str(v) for v in values], [str(w) for w in wanted])
     matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted]  # type: ignore[arg-type]
@@ -202,21 +230,12 @@ def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:
 
 
 def confined(found: Points, spec: Spec, where: Mapping[str, object]) -> Points:
-    """Points at which coordinates have the values that a figure is confined to.
-
-    Parameters
-    ----------
-    found, spec
-        Points of a study, and the study.
-    where
-        Values as written in the study: one, or several, of each coordinate.
-    """
+    """Points at which coordinates have one of some values, as written in the study."""
     for name, written in where.items():
         several = list(written) if isinstance(written, tuple | list) else [written]
-        if found.column(name).index:
-            found = found.where(name, several)
-        else:
-            found = found.where(name, [spec.coordinate_value(name, value) for value in several])
+        if name in found.dataset.coords:
+            several = [spec.coordinate_value(name, value) for value in several]
+        found = found.where(name, several)
     return found
 
 
@@ -232,9 +251,9 @@ def split(found: Points, names: Sequence[str], most: int) -> tuple[list[tuple[st
     """
     parts = [("", found)]
     for name in names:
-        units = found.column(name).units
+        units = found.units(name)
         parts = [
-            (", ".join(filter(None, [text, _named(name, value, units)])), piece)
+            (", ".join(filter(None, [text, labels.valued(name, value, units)])), piece)
             for text, part in parts
             for value, piece in part.apart(name)
         ]
@@ -248,5 +267,9 @@ def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, 
     return [parts[round(i * (len(parts) - 1) / (most - 1))] for i in range(most)], len(parts) - most
 
 
-def _named(name: str, value: object, units: str) -> str:
-    return f"{labels.coordinate(name)} {labels.quantity(value, units)}"
+def coordinate_of(spec: Spec, path: str) -> Member | None:
+    """The parameter of a path where it is on an axis."""
+    try:
+        return spec.member(path)
+    except KeyError:
+        return None

@@ -1,22 +1,210 @@
-"""One shot of a study, drawn and reported."""
+"""One shot of a grid or of a scene: its spectra drawn, and its report in tables."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
 
-from sweep.analysis import canvas, labels, shot_drawing
+from sweep.analysis import canvas, labels
 from sweep.analysis.cuts import GRAZING_ANGLE
-from sweep.analysis.shot_spectra import Parameters, Segment, Shot, simulated
-from sweep.analysis.tabular import Block, Cell, Page, percent
+from sweep.analysis.shot_spectra import Parameters, Segment, Shot, quantity_at, simulated
+from sweep.analysis.tabular import Block, Page, percent
+from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.eyepoints import Eyepoints
 from sweep.model.threshold import WAYS
 from sweep.spec import Spec
 from sweep.spec.fields import parameter_rules
+
+SPECTRUM, THRESHOLD, NOISE, DETECTION = canvas.LINES[0], canvas.LINES[2], canvas.LINES[1], "black"
+MARGIN_BELOW, MARGIN_ABOVE = 25.0, 12.0
+"""Decibels shown below the noise level, and above the strongest bin."""
+
+NARROWEST = 12
+"""Least half-width of the view around the peak, in bins."""
+
+ROOM = 8
+"""Bins shown beside the outermost detections, at least."""
+
+REACH = 0.05
+"""Distance from the strongest peak up to which detections are in the same view, of the band."""
+
+
+def spectra_sheet(
+    shots: Sequence[Shot], *, title: str, note: str, detections: bool = False
+) -> Sheet:
+    """Spectra of shots side by side: a row a segment, the whole band and around the peak.
+
+    Parameters
+    ----------
+    shots
+        What to draw.
+    title, note
+        What stands over the sheet and at its foot.
+    detections
+        Whether the view around the peak shows all detections that are near.
+    """
+    rows, columns = len(shots[0].segments), 2 * len(shots)
+    width = 5.4 if len(shots) == 1 else 4.2
+    sheet, axes = canvas.panels(width * columns, 3.1 * rows + 1.2, rows, columns)
+    limits = _limits(shots)
+    for j, shot in enumerate(shots):
+        for i, segment in enumerate(shot.segments):
+            whole, close = axes[i * columns + 2 * j], axes[i * columns + 2 * j + 1]
+            _lines(whole, shot, segment, slice(None), 0.5)
+            near = around_detections(segment) if detections else around_peak(segment.signal)
+            _lines(close, shot, segment, near, 1.0)
+            _explain(close, shot, segment)
+            for panel in (whole, close):
+                panel.set_ylim(*limits)
+                panel.grid(True)
+            if not segment.groups:
+                whole.text(
+                    0.02, 0.95, "no detection", transform=whole.transAxes, color=DETECTION,
+                    va="top", size=9,
+                )  # fmt: skip
+            whole.set_title(", ".join(filter(None, [segment.name, shot.label])), size=10)
+            if j == 0:
+                whole.set_ylabel("amplitude (dB re 1 V)")
+    axes[0].legend(fontsize=7.5, loc="upper right", framealpha=0.9, ncols=3)
+    for panel in axes[(rows - 1) * columns :]:
+        panel.set_xlabel("frequency (MHz)")
+    canvas.title(sheet, title)
+    canvas.caption(sheet, note)
+    return sheet
+
+
+def _limits(shots: Sequence[Shot]) -> tuple[float, float]:
+    """Decibels that show all of the noise and of the peaks."""
+    low = min(float(shot.dbv(shot.noise_level)) for shot in shots) - MARGIN_BELOW
+    high = max(
+        float(shot.dbv(max(segment.magnitude.max(), shot.threshold)))
+        for shot in shots
+        for segment in shot.segments
+    )
+    return low, high + MARGIN_ABOVE
+
+
+def _lines(axes: Axes, shot: Shot, segment: Segment, chosen: slice, width: float) -> None:
+    """Spectrum, threshold, noise level and detections."""
+    mhz = segment.frequency[chosen] / 1e6
+    level = np.maximum(shot.dbv(segment.magnitude[chosen]), -500.0)
+    marker = "." if mhz.size <= 200 else ""
+    axes.plot(mhz, level, color=SPECTRUM, linewidth=width, marker=marker, markersize=4)
+    for value, colour, dash, words in (
+        (shot.threshold, THRESHOLD, "--", "threshold"),
+        (shot.noise_level, NOISE, "-.", "noise (rms)"),
+    ):
+        height = float(shot.dbv(value))
+        axes.axhline(height, color=colour, linestyle=dash, linewidth=1.2, label=words)
+    peaks = np.array([group.peak for group in segment.groups], dtype=int)
+    axes.plot(
+        segment.frequency[peaks] / 1e6, shot.dbv(segment.magnitude[peaks]), linestyle="",
+        marker="v", markersize=7, color=DETECTION, markeredgecolor="white", label="detection",
+    )  # fmt: skip
+    axes.set_xlim(float(mhz[0]), float(mhz[-1]))
+
+
+def _explain(axes: Axes, shot: Shot, segment: Segment) -> None:
+    """Signal-to-noise ratio and pd in a corner, range or velocity of the frequencies on top."""
+    told = [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
+    axes.text(
+        0.98, 0.95, "\n".join([*told, f"pd {segment.pd:.4g}"]), transform=axes.transAxes,
+        size=8, color=DETECTION, ha="right", va="top",
+    )  # fmt: skip
+    first, second = (float(q) for q in quantity_at(shot, segment, np.array([0.0, 1e6])))
+
+    def meaning(mhz: Any) -> Any:
+        return first + (second - first) * mhz
+
+    def frequency(value: Any) -> Any:
+        return (value - first) / (second - first)
+
+    top = axes.secondary_xaxis("top", functions=(meaning, frequency))
+    top.set_xlabel("range (m)" if segment.sign else "radial velocity (m/s)", size=8, labelpad=4)
+    top.tick_params(labelsize=8)
+    top.ticklabel_format(axis="x", useOffset=False)
+    axes.ticklabel_format(axis="x", useOffset=False)
+
+
+def around_peak(magnitude: np.ndarray) -> slice:
+    """Bins that show the peak and what spreads around it, down to a tenth of its height."""
+    peak = int(np.argmax(magnitude))
+    strong = np.flatnonzero(magnitude >= 0.1 * magnitude[peak])
+    near = strong[np.abs(strong - peak) < magnitude.size // 8]
+    half = max(NARROWEST, int(1.5 * max(peak - near[0], near[-1] - peak)))
+    return slice(max(peak - half, 0), min(peak + half + 1, magnitude.size))
+
+
+def around_detections(segment: Segment) -> slice:
+    """Bins that show all detections near to the strongest peak, and what spreads around it."""
+    view, size = around_peak(segment.signal), segment.signal.size
+    peak = int(np.argmax(segment.signal))
+    near = [group for group in segment.groups if abs(group.peak - peak) <= REACH * size]
+    if not near:
+        return view
+    first, last = min(g.first for g in near), max(g.last for g in near)
+    room = max(ROOM, (last - first) // 6)
+    return slice(max(min(view.start, first - room), 0), min(max(view.stop, last + room + 1), size))
+
+
+def scene_shot_sheet(
+    shot: Shot,
+    eyepoints: Eyepoints,
+    surfaces: Sequence[str],
+    *,
+    title: str,
+    remarks: Sequence[str],
+) -> Sheet:
+    """Spectra of a shot of a scene, and where its beamlets' lines are.
+
+    Parameters
+    ----------
+    shot, eyepoints
+        The shot, and its geometry.
+    surfaces
+        Names of surfaces by number.
+    title, remarks
+        What stands over the sheet and what is to be said at its foot.
+    """
+    notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
+    sheet = spectra_sheet([shot], title=title, note=labels.joined(notes), detections=True)
+    hit = eyepoints.surface[0] >= 0
+    for i, segment in enumerate(shot.segments):
+        places = _beamlet_lines(shot, segment, eyepoints)[hit] / 1e6
+        close = sheet.axes[2 * i + 1]
+        marks = [
+            close.plot(
+                own, np.full(own.size, 0.02), "|", transform=close.get_xaxis_transform(),
+                color=canvas.LINES[k % 8], markersize=9, scalex=False, scaley=False,
+                label=surfaces[number],
+            )[0]
+            for k, number in enumerate(np.unique(eyepoints.surface[0, hit]))
+            for own in [places[eyepoints.surface[0, hit] == number]]
+        ]  # fmt: skip
+        if i == 0:
+            close.legend(handles=marks, fontsize=7.5, loc="upper left", framealpha=0.9)
+    return sheet
+
+
+def _beamlet_lines(shot: Shot, segment: Segment, eyepoints: Eyepoints) -> np.ndarray:
+    """Frequency at which each beamlet's line appears in a segment (b,) [Hz], 0 to half the rate."""
+    rate = float(shot.prepared.sample_rate[0])
+    beat = waveform.beat_frequency(
+        segment.sign,
+        carrier=np.asarray(segment.carrier),
+        chirp_rate=np.asarray(shot.prepared.chirp_rate),
+        range=eyepoints.range[0] + eyepoints.offset[0],
+        radial_velocity=eyepoints.radial_velocity[0] + eyepoints.velocity_offset[0],
+    )
+    return np.asarray(np.abs(beat / rate - np.rint(beat / rate)) * rate)
 
 
 def blocks(shot: Shot) -> list[Block]:
@@ -26,16 +214,14 @@ def blocks(shot: Shot) -> list[Block]:
 
 def _noise(shot: Shot) -> Block:
     """Noise at the ADC by source, in volts and shares of the variance."""
-    sources = {
-        name: float(np.asarray(value).item()) for name, value in shot.prepared.noise_sources.items()
-    }
+    sources = {n: float(np.asarray(v).item()) for n, v in shot.prepared.noise_sources.items()}
     total = sum(sources.values())
-    rows: list[list[Cell]] = [
-        [name.replace("_", " "), f"{math.sqrt(value):.4e}", percent(value / total, ".4g")]
+    rows = [
+        (name.replace("_", " "), f"{math.sqrt(value):.4e}", percent(value / total, ".4g"))
         for name, value in sorted(sources.items(), key=lambda item: -item[1])
         if value > 0
     ]
-    rows.append(["total", f"{math.sqrt(total):.4e}", percent(1.0, ".4g")])
+    rows.append(("total", f"{math.sqrt(total):.4e}", percent(1.0, ".4g")))
     return Block("Noise at the ADC", ("source", "V rms", "share"), rows)
 
 
@@ -48,48 +234,41 @@ def _segments(shot: Shot) -> Block:
         f"Segments (noise of a bin {shot.dbv(shot.noise_level):.1f} dBV rms, threshold "
         f"{shot.dbv(shot.threshold):.1f} dBV)"
     )
-    return Block(heading, columns, [_segment_row(shot, segment) for segment in shot.segments])
-
-
-def _segment_row(shot: Shot, segment: Segment) -> list[Cell]:
-    peak = segment.peak
-    return [
-        segment.name,
-        f"{segment.beat / 1e6:+.6f}",
-        f"{segment.frequency[peak] / 1e6:.6f}",
-        peak,
-        f"{shot.dbv(segment.magnitude[peak]):.1f}",
-        f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
-        f"{segment.pd:.6g}",
-        len(segment.groups),
-    ]
+    rows = [
+        (
+            segment.name, f"{segment.beat / 1e6:+.6f}",
+            f"{segment.frequency[segment.peak] / 1e6:.6f}", segment.peak,
+            f"{shot.dbv(segment.magnitude[segment.peak]):.1f}",
+            f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
+            f"{segment.pd:.6g}", len(segment.groups),
+        )
+        for segment in shot.segments
+    ]  # fmt: skip
+    return Block(heading, columns, rows)
 
 
 def _report(shot: Shot) -> Block:
     """Range and radial velocity: true, reported, and the error in the units of a bin."""
     p = shot.prepared
-    true = float(p.range[0]), float(p.radial_velocity[0])
     rows = [
-        ["range (m)", f"{true[0]:.4f}", f"{shot.range:.4f}", f"{shot.range - true[0]:+.4f}"],
-        [
-            "radial velocity (m/s)", f"{true[1]:.5f}", f"{shot.radial_velocity:.5f}",
-            f"{shot.radial_velocity - true[1]:+.5f}",
-        ],
-    ]  # fmt: skip
+        (name, f"{true:.{digits}f}", f"{found:.{digits}f}", f"{found - true:+.{digits}f}")
+        for name, digits, true, found in (
+            ("range (m)", 4, float(p.range[0]), shot.range),
+            ("radial velocity (m/s)", 5, float(p.radial_velocity[0]), shot.radial_velocity),
+        )
+    ]
     verdict = "detected" if shot.detected else "NOT detected: read off the strongest bins"
     return Block(f"Report ({verdict})", ("", "true", "reported", "error"), rows)
 
 
 def _false_alarms(shot: Shot) -> Block:
-    o = shot.outputs
-    rows = [
-        ["one bin, noise", f"{o['pfa_bin']:.4e}"],
-        ["up-chirp segment, noise", f"{o['pfa_segment']:.4e}"],
-        ["both chirp segments, noise", f"{o['pfa_both_chirps']:.4e}"],
-        ["any segment, noise", f"{o['pfa_shot']:.4e}"],
-        ["up-chirp segment, leakage", f"{o['p_leakage_up']:.4e}"],
-        ["down-chirp segment, leakage", f"{o['p_leakage_down']:.4e}"],
-    ]
+    words = {
+        "pfa_bin": "one bin, noise", "pfa_segment": "up-chirp segment, noise",
+        "pfa_both_chirps": "both chirp segments, noise", "pfa_shot": "any segment, noise",
+        "p_leakage_up": "up-chirp segment, leakage",
+        "p_leakage_down": "down-chirp segment, leakage",
+    }  # fmt: skip
+    rows = [(told, f"{shot.outputs[name]:.4e}") for name, told in words.items()]
     return Block("False alarms", ("", "probability"), rows)
 
 
@@ -150,9 +329,7 @@ def report(
     directory, stem = Path(directory), _stem(at)
     remark = f"noise drawn with seed {seed}" if noise else "the signal alone, no noise drawn"
     with canvas.style():
-        sheet = shot_drawing.draw(
-            shots, title=spec.title, note=labels.joined([remark, _held(shots)])
-        )
+        sheet = spectra_sheet(shots, title=spec.title, note=labels.joined([remark, _held(shots)]))
         files = [canvas.save(sheet, directory / f"{stem}.{form}"), directory / f"{stem}.txt"]
     page = Page(spec.title, _blocks(shots), [f"Spectra: {remark}."], [])
     files[1].write_text(page.text(), encoding="utf-8")
@@ -173,10 +350,7 @@ def chosen(spec: Spec, at: Mapping[str, str]) -> list[tuple[str, Parameters]]:
     axis = spec.axes[0]
     return [
         (
-            ", ".join(
-                f"{labels.coordinate(m.name)} {labels.quantity(m.display[i], m.units)}"
-                for m in axis.members
-            ),
+            ", ".join(labels.valued(m.name, m.display[i], m.units) for m in axis.members),
             spec.parameters_at(_position(spec, [i])),
         )
         for i in range(axis.size)

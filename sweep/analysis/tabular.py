@@ -1,4 +1,4 @@
-"""Tables as plain text and as CSV."""
+"""Tables as plain text and as CSV; of any variable, averaged over all but rows and columns."""
 
 from __future__ import annotations
 
@@ -7,6 +7,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from sweep.analysis import labels
+from sweep.analysis.cuts import beyond
+from sweep.analysis.selection import Points, confined
+from sweep.analysis.tallies import Tally, medians, tallied
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+    from sweep.spec import Table as Asked
 
 Cell = str | float | int
 
@@ -82,3 +94,98 @@ def _numeric(cell: Cell) -> bool:
     except ValueError:
         return False
     return True
+
+
+def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -> Page:
+    """A variable's mean and median over all but rows and columns.
+
+    Parameters
+    ----------
+    found, spec
+        Points with the variable, and the study.
+    asked
+        What the spec asks for.
+    units, title
+        Of the variable; what stands over the page.
+    """
+    found = confined(found, spec, asked.where)
+    if asked.minimum_range:
+        found = beyond(found, spec, f"{asked.minimum_range!r} m", included=True)
+    columns = found.distinct(asked.columns) if asked.columns else [None]
+    named = [
+        (row, column, of_row.where(asked.columns, [column]) if asked.columns else of_row)
+        for row, of_row in found.apart(asked.rows)
+        for column in columns
+    ]
+    parts = [part for _, _, part in named]
+    tallies = tallied(parts, asked.variable)
+    middles = medians(parts, asked.variable, [tally.number for tally in tallies])
+    records = [
+        {
+            "row": labels.quantity(row, found.units(asked.rows)),
+            "column": _column(found, asked.columns, column),
+            **_statistics(tally, middle, _published(asked.printed, *divmod(k, len(columns)))),
+        }
+        for k, ((row, column, _), tally, middle) in enumerate(
+            zip(named, tallies, middles, strict=True)
+        )
+    ]
+    names = list(dict.fromkeys(str(r["column"]) for r in records))
+    of = f"of {asked.variable}" + (f" [{units}]" if units not in ("", "1") else "")
+    blocks = [
+        _matrix(f"{heading} {of}", labels.coordinate(asked.rows), key, records, names)
+        for key, heading in (("mean", "Mean"), ("median", "Median"), ("printed", "Printed value"),
+                             ("printed_over_mean", "Printed over mean"))
+        if any(r[key] == r[key] for r in records)
+    ]  # fmt: skip
+    return Page(title, blocks, [], records)
+
+
+def _column(found: Points, name: str, value: object) -> str:
+    return labels.valued(name, value, found.units(name)) if name else "all"
+
+
+def _published(printed: Any, row: int, column: int) -> float:
+    """The printed figure of a row and column; of one row of numbers, that of the row."""
+    if row >= len(printed):
+        return math.nan
+    values = printed[row] if isinstance(printed[row], tuple | list) else (printed[row],)
+    return float(values[column]) if column < len(values) else math.nan
+
+
+def _statistics(tally: Tally, middle: float, printed: float) -> dict[str, Cell]:
+    return {
+        "points": tally.number,
+        "mean": tally.mean,
+        "median": middle,
+        "lowest": tally.least if tally.number else math.nan,
+        "highest": tally.largest if tally.number else math.nan,
+        "printed": printed,
+        "printed_over_mean": printed / tally.mean if tally.mean else math.nan,
+    }
+
+
+def _matrix(
+    heading: str, corner: str, key: str, records: list[dict[str, Cell]], names: list[str]
+) -> Block:
+    """One figure of every record, rows down and columns across."""
+    rows: dict[str, list[Cell]] = {}
+    for record in records:
+        rows.setdefault(str(record["row"]), []).append(record[key])
+    return Block(heading, (corner, *names), [(name, *cells) for name, cells in rows.items()])
+
+
+def outputs_page(dataset: xr.Dataset) -> Page:
+    """Every variable of a study of a single point."""
+    records: list[dict[str, Cell]] = [
+        {
+            "variable": str(name),
+            "value": float(array.values),
+            "units": str(array.attrs.get("units", "")),
+            "meaning": str(array.attrs.get("long_name", "")),
+        }
+        for name, array in sorted(dataset.data_vars.items())
+    ]
+    columns = ("variable", "value", "units", "meaning")
+    block = Block("Outputs of the point", columns, [tuple(r.values()) for r in records])
+    return Page(str(dataset.attrs.get("title", "")), [block], [], records)

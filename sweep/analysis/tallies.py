@@ -14,8 +14,7 @@ from itertools import pairwise, product
 import dask
 import numpy as np
 
-from sweep.analysis.cells import known
-from sweep.analysis.selection import Points
+from sweep.analysis.selection import Points, known
 
 DIGIT = 13
 """Bits of a value that a reading finds."""
@@ -49,7 +48,7 @@ def pieces(
         at = {dim: slice(*ends) for dim, ends in block.items()}
         read = dask.compute(*(known(dataset[v].transpose(*block).isel(at)).data for v in variables))
         for number, part in inside:
-            local = np.ix_(*(part.axes[dim].positions - first for dim, (first, _) in block.items()))
+            local = np.ix_(*(part.positions[dim] - first for dim, (first, _) in block.items()))
             values = zip(variables, (np.asarray(own)[local].ravel() for own in read), strict=True)
             yield number, part, dict(values)
 
@@ -190,3 +189,16 @@ def median(found: Search) -> float:
     """The median that a search for it has found; nan where there are no values."""
     low, high = found.values or (math.nan, math.nan)
     return (low + high) / 2
+
+
+def medians(groups: Sequence[Points], variable: str, numbers: Sequence[int]) -> list[float]:
+    """Median of a variable over the points of each group, of which so many are finite."""
+    searches = [for_median(number) for number in numbers]
+
+    def read() -> Iterator[tuple[Search, np.ndarray, None]]:
+        for number, _, values in pieces(groups, [variable]):
+            own = values[variable]
+            yield searches[number], own[np.isfinite(own)], None
+
+    search(searches, read)
+    return [median(found) for found in searches]

@@ -282,9 +282,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
             "largest at",
         )
     if figure is not None:
-        from sweep.analysis.answers import comparison_figure
-
-        click.echo(comparison_figure.save(compared, figure))
+        click.echo(comparison_table.save_figure(compared, figure))
     verdict, words = comparison_table.verdict(compared.values())
     click.echo(words)
     if code := {"different": DIFFERENT, "nothing": INCOMPLETE}.get(verdict, 0):
@@ -293,8 +291,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 def _opened(path: Location) -> Store:
     """A store of a grid as a dataset, of a flight as a tree."""
-    from sweep.analysis.opening import SCENE, read_attributes
+    from sweep.analysis.opening import SCENE, open_scene, read_attributes
     from sweep.analysis.opening import open as open_grid
-    from sweep.analysis.scenes.opening import open_scene
 
     return open_scene(path) if read_attributes(path)["kind"] == SCENE else open_grid(path)

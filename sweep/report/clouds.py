@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
 from sweep.analysis import labels
-from sweep.analysis.scenes.cloud import AXES
+from sweep.analysis.charts import not_shown
+from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
 from sweep.analysis.scenes.figures import SceneStudy
-from sweep.analysis.scenes.places import Place, place
-from sweep.analysis.scenes.quantities import INTERPOLATED, label, shown
-from sweep.analysis.scenes.recording import Recording, Table, Thinned
-from sweep.analysis.scenes.terrain import Ground
-from sweep.model.pairing import TRUE
-from sweep.report import looks, wording
-from sweep.report.page import Chart, Control, when
+from sweep.analysis.scenes.recording import INTERPOLATED, Place, Recording, label, place, shown
+from sweep.report.interactive import COLOUR_BAR, Control, Plot, layout, sentences, title, when
 
 COLOURS = ("range", "radial_velocity", "snr")
 """Quantities that points can be coloured by."""
 
-MOST_POINTS, MOST_PATH = 36_000, 1500
-"""Points of all clouds of a page together, and of a flight path."""
+MOST_POINTS = 36_000
+"""Points of all clouds of a page together."""
 
 MOST_CLOUDS = 8
 """Scanners times places along the study's axes."""
@@ -51,6 +48,9 @@ VIEWS = {
 }
 """Where the eye is, in the lengths that the library counts in."""
 
+CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
+"""Where the eye looks."""
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -59,29 +59,6 @@ class Seen:
     words: str
     recording: Recording
     at: Place
-
-
-@dataclass(frozen=True)
-class _Cloud:
-    """Points of a picture, thinned, with the flight path."""
-
-    seen: Seen
-    points: Table
-    path: Table
-    total: int
-    every: int
-    outside: int
-
-    @property
-    def true(self) -> np.ndarray:
-        """Which points are true."""
-        return np.asarray((self.points["flags"] & TRUE) > 0)
-
-    @property
-    def true_points(self) -> Table:
-        """The true points; all where none is true."""
-        true = self.true
-        return {n: v[true] if true.any() else v for n, v in self.points.items()}
 
 
 def recordings(study: SceneStudy) -> tuple[list[Seen], int]:
@@ -103,42 +80,53 @@ def _place(study: SceneStudy, index: tuple[int, ...]) -> Place:
     where: dict[str, object] = {}
     for axis, number in zip(study.spec.axes, index, strict=True):
         member = axis.members[0]
-        units = f" {member.units}" if member.units else ""
-        written = f"{member.display[number]}{units}"
+        written = f"{member.display[number]} {member.units}".strip()
         where |= {axis.name: number} if axis.zipped else {member.name: written}
     return place(study.spec, where)
 
 
-def chart(study: SceneStudy, found: list[Seen], fewer: int) -> Chart | None:
+def solid(study: SceneStudy, found: Sequence[Seen], fewer: int) -> Plot | None:
     """All clouds, one at a time; none where there is no point at all."""
-    clouds = [
-        cloud for seen in found if (cloud := _gathered(seen, MOST_POINTS // len(found))) is not None
-    ]
+    most = MOST_POINTS // len(found)
+    every = {
+        seen.words: gathered(
+            seen.recording, [*COLOURS, "pd"], ranges=INTERPOLATED, path=True, most=most
+        )
+        for seen in found
+    }
+    clouds = {words: cloud for words, cloud in every.items() if cloud is not None}
     if not clouds:
         return None
     ground = Ground.of(study.tree)
-    traces = [trace for cloud in clouds for trace in _traces(cloud, ground)]
-    points = clouds[0].points
-    heights = wording.spread(points["z"])
-    return Chart(
+    traces = [trace for words, cloud in clouds.items() for trace in _traces(words, cloud, ground)]
+    first = next(iter(clouds.values()))
+    draws = found[0].recording.dataset.sizes["draw"]
+    counted = [f"{words}: {', '.join(cloud.remarks)}" if words else ", ".join(cloud.remarks)
+               for words, cloud in clouds.items()]  # fmt: skip
+    return Plot(
         heading="Points, flight path and terrain",
         alt=(
-            f"Point cloud in three dimensions of {clouds[0].total:,} points, heights in metres: "
-            f"{heights}; ranges: {wording.spread(points['range'])}; with the flight path"
-            f"{' over the terrain' if ground else ''}."
+            f"Point cloud in three dimensions of {first.total:,} points, heights in metres: "
+            f"{labels.extent(first.points['z'])}; ranges: {labels.extent(first.points['range'])}; "
+            f"with the flight path{' over the terrain' if ground else ''}."
         ),
-        caption=wording.sentences(
-            [*(_counted(cloud) for cloud in clouds), _meaning(clouds), wording.left_out(fewer)]
+        caption=sentences(
+            [*counted,
+             f"Draw 0 of {draws}" if draws > 1 else "",
+             "Ranges interpolated between bins; terrain shaded, and drawn a little below itself "
+             "so that points show",
+             not_shown(fewer)]
         ),
         figure=go.Figure(traces, _layout()),
         controls=[
-            Control("cloud", "Shown for", [cloud.seen.words for cloud in clouds]),
+            Control("cloud", "Shown for", list(clouds)),
             Control("colour", "Colour", [_option(name) for name in COLOURS],
-                    {_option(name): {"title": looks.title(label(name))} for name in COLOURS}),
+                    {_option(name): {"title": title(label(name))} for name in COLOURS}),
             Control("view", "View", list(VIEWS),
                     {name: {"scene.camera": _camera(name)} | _hidden(name) for name in VIEWS}),
             Control("frame", "Frame", ["whole flight", "ground"],
-                    {"whole flight": _frame(clouds, path=True), "ground": _frame(clouds)}),
+                    {"whole flight": _frame(list(clouds.values()), path=True),
+                     "ground": _frame(list(clouds.values()))}),
             Control("ground", "Terrain", ["shown", "hidden"] if ground else ["none"]),
         ],
         tall=True,
@@ -149,64 +137,42 @@ def _option(name: str) -> str:
     return {"snr": "signal-to-noise ratio"}.get(name, labels.coordinate(name))
 
 
-def _gathered(seen: Seen, most: int) -> _Cloud | None:
-    """Points of the first draw, and the path, read stretch by stretch."""
-    found, track = Thinned(most), Thinned(MOST_PATH)
-    names = [*AXES, "flags", *COLOURS, "pd"]
-    for part in seen.recording.stretches():
-        found.add(seen.recording.points(names, part, ranges=INTERPOLATED))
-        position = seen.recording.read("platform_position", part)
-        track.add(dict(zip(AXES, position[np.isfinite(position[:, 0])].T, strict=True)))
-    if not found.total:
-        return None
-    rows, path = found.rows(), track.rows()
-    true = (rows["flags"] & TRUE) > 0
-    inside = np.ones(true.size, bool)
-    for axis in AXES if true.any() else ():
-        known = np.concatenate([rows[axis][true], path[axis]])
-        room = 0.05 * (np.ptp(known) + 1.0)
-        inside &= (rows[axis] >= known.min() - room) & (rows[axis] <= known.max() + room)
-    kept = {name: values[inside] for name, values in rows.items()}
-    return _Cloud(seen, kept, path, found.total, found.every, int((~inside).sum()) * found.every)
+def _columns(table: dict[str, np.ndarray], chosen: np.ndarray | slice) -> dict[str, np.ndarray]:
+    return {axis: table[axis][chosen].astype(np.float32) for axis in AXES}
 
 
-def _traces(cloud: _Cloud, ground: Ground | None) -> Iterator[go.Scatter3d | go.Surface]:
+def _traces(words: str, cloud: Cloud, ground: Ground | None) -> Iterator[go.Scatter3d | go.Surface]:
     """Terrain, path, and points in each colour."""
     if ground is not None:
-        yield from _terrain(cloud, ground)
+        yield from _terrain(words, cloud, ground)
     yield go.Scatter3d(
-        **{axis: cloud.path[axis].astype(np.float32) for axis in AXES}, mode="lines",
-        line={"width": 5}, name="flight path", meta=when(0, cloud=cloud.seen.words),
-        hoverinfo="name",
+        **_columns(cloud.path, slice(None)), mode="lines", line={"width": 5}, name="flight path",
+        meta=when(0, cloud=words), hoverinfo="name",
     )  # fmt: skip
     true = cloud.true
     for name in COLOURS:
         values = shown(name, cloud.points[name])
-        low, high = _ends(values[true] if true.any() else values)
+        known = values[true] if true.any() else values
+        known = known[np.isfinite(known)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
         for kind, chosen in (("true points", true), ("false points", ~true)):
             if chosen.any():
+                colour = values[chosen].astype(np.float32)
+                of_true = kind == "true points"
                 yield go.Scatter3d(
-                    **{a: cloud.points[a][chosen].astype(np.float32) for a in AXES},
-                    mode="markers", name=kind, text=None,
-                    meta=when(cloud=cloud.seen.words, colour=_option(name)) | {"scaled": True},
-                    customdata=values[chosen].astype(np.float32),
+                    **_columns(cloud.points, chosen), mode="markers", name=kind, customdata=colour,
+                    meta=when(cloud=words, colour=_option(name)) | {"scaled": True},
                     hovertemplate=f"{label(name)}: %{{customdata:.5g}}<extra>{kind}</extra>",
                     marker={
-                        "size": 3 if kind == "true points" else 4,
-                        "symbol": "circle" if kind == "true points" else "diamond-open",
-                        "color": values[chosen].astype(np.float32), "cmin": low, "cmax": high,
-                        "showscale": kind == "true points" or not true.any(),
-                        "colorbar": looks.COLOUR_BAR,
+                        "size": 3 if of_true else 4,
+                        "symbol": "circle" if of_true else "diamond-open",
+                        "color": colour, "cmin": low, "cmax": high,
+                        "showscale": of_true or not true.any(), "colorbar": COLOUR_BAR,
                     },
                 )  # fmt: skip
 
 
-def _ends(values: np.ndarray) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-
-
-def _terrain(cloud: _Cloud, ground: Ground) -> Iterator[go.Surface]:
+def _terrain(words: str, cloud: Cloud, ground: Ground) -> Iterator[go.Surface]:
     """The ground around what is seen of it, shaded, just below itself."""
     around = {}
     for axis in ("x", "y"):
@@ -222,12 +188,8 @@ def _terrain(cloud: _Cloud, ground: Ground) -> Iterator[go.Surface]:
         z=(part.height - SUNK * size).astype(np.float32),
         surfacecolor=part.shade().astype(np.float32), cmin=0, cmax=1, showscale=False,
         lighting={"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}, hoverinfo="skip",
-        name="terrain", meta=when(cloud=cloud.seen.words, ground="shown") | {"ground": True},
+        name="terrain", meta=when(cloud=words, ground="shown") | {"ground": True},
     )  # fmt: skip
-
-
-CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
-"""Where the eye looks."""
 
 
 def _camera(view: str) -> dict[str, dict[str, float]]:
@@ -267,14 +229,13 @@ def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:
     return bool((off <= ROOM * math.tan(FIELD_OF_VIEW / 2) * depth).all())
 
 
-def _frame(clouds: list[_Cloud], *, path: bool = False) -> dict[str, object]:
+def _frame(clouds: Sequence[Cloud], *, path: bool = False) -> dict[str, Any]:
     """Limits around the true points of all clouds, and their paths, to one scale."""
-    sides: dict[str, object] = {}
+    sides: dict[str, Any] = {}
     lengths = {}
     for axis in AXES:
-        parts = [cloud.true_points[axis] for cloud in clouds]
-        parts += [cloud.path[axis] for cloud in clouds if path]
-        values = np.concatenate(parts)
+        parts = [c.points[axis][c.true if c.true.any() else slice(None)] for c in clouds]
+        values = np.concatenate([*parts, *(cloud.path[axis] for cloud in clouds if path)])
         room = 0.06 * np.ptp(values) + 2.0
         sides[f"scene.{axis}axis.range"] = [values.min() - room, values.max() + room]
         lengths[axis] = np.ptp(values) + 2 * room
@@ -283,33 +244,13 @@ def _frame(clouds: list[_Cloud], *, path: bool = False) -> dict[str, object]:
     return sides | {"scene.aspectratio": dict(zip(AXES, shown.tolist(), strict=True))}
 
 
-def _layout() -> dict[str, object]:
+def _layout() -> dict[str, Any]:
     plain = {"showbackground": False, "showspikes": False, "nticks": 5}
-    return looks.layout(
+    return layout(
         scene={
             "aspectmode": "manual",
             **{f"{axis}axis": {"title": {"text": f"{axis} (m)"}} | plain for axis in AXES},
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
         margin={"l": 0, "r": 0, "t": 88, "b": 40},
-    )
-
-
-def _counted(cloud: _Cloud) -> str:
-    """How many points there are, and how many of them the page shows."""
-    said = f"{cloud.seen.words}: " if cloud.seen.words else ""
-    said += labels.counted(cloud.total, "point")
-    if cloud.every > 1:
-        said += f", one in {cloud.every} of them shown: reduced for this page"
-    if cloud.outside:
-        said += f"; {labels.counted(cloud.outside, 'false point')} outside of the picture"
-    return said
-
-
-def _meaning(clouds: list[_Cloud]) -> str:
-    draws = clouds[0].seen.recording.dataset.sizes["draw"]
-    first = f"Draw 0 of {draws}, r" if draws > 1 else "R"
-    return (
-        f"{first}anges interpolated between bins; terrain shaded, and drawn a little below itself "
-        "so that points show"
     )

@@ -1,29 +1,30 @@
-"""What the detector trades: receiver operating characteristic, noise by source, false alarms."""
+"""Charts of the detector: characteristic, noise by source, false alarms, maximum range."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
+import pandas
 import xarray as xr
 
-from sweep.analysis import along, labels, noise_only
-from sweep.analysis.answers import alarms
+from sweep.analysis import charts, labels, noise_only
+from sweep.analysis.answers import probability
 from sweep.analysis.answers.physical import parameter
-from sweep.analysis.cells import Side
-from sweep.analysis.cuts import RANGE, coordinate_of
+from sweep.analysis.charts import CHANCE, LINEAR, LOG, Axis, Chart, Line, Panel, Ruler
+from sweep.analysis.cuts import GRAZING_ANGLE, RANGE
 from sweep.analysis.figures import Study
-from sweep.analysis.selection import Points
+from sweep.analysis.selection import Points, Side, coordinate_of, split, spread
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS, tnr_of
-from sweep.report import lines, looks, wording
-from sweep.report.choosing import parts
-from sweep.report.page import Chart, Control, when
+from sweep.report.page import Table
 from sweep.spec import Spec
+
+MOST_PARTS = 6
+"""Values that a chart offers to choose from, at the most."""
 
 PLACES = 24
 """Places along a coordinate at which the noise is told by source."""
@@ -59,7 +60,13 @@ class Track:
 
     words: str
     part: Points
+    name: str
     side: Side | None
+
+    @property
+    def ruler(self) -> Ruler:
+        """The main coordinate along an axis."""
+        return Ruler.of(self.part, self.name)
 
     def places(self, most: int) -> np.ndarray:
         """Some of its places, spread over all."""
@@ -74,6 +81,14 @@ class Track:
             return self.part.first()
         return self.part.first(self.side) | {self.side.dim: int(self.side.positions[place])}
 
+    def values(self, variable: str, places: np.ndarray) -> np.ndarray:
+        """A variable at some of its places."""
+        array = self.part.dataset[variable]
+        if self.side is None:
+            return np.ravel(array.isel(self.part.first()).values)
+        array = array.isel(self.part.first(self.side))
+        return np.ravel(array.isel({self.side.dim: self.side.positions[places]}).values)
+
 
 def main_coordinate(spec: Spec) -> str:
     """Range where it varies, else the longest of the numeric coordinates; empty where none is."""
@@ -87,77 +102,33 @@ def main_coordinate(spec: Spec) -> str:
 def tracks(study: Study) -> tuple[list[Track], int]:
     """Tracks along the main coordinate, and how many are left out."""
     name = main_coordinate(study.spec)
-    found, fewer = parts(study, [name] if name else [], {})
-    return [Track(words, p, p.side(name) if name else None) for words, p in found], fewer
+    found, fewer = charts.facets_of(study.points, [name] if name else [], MOST_PARTS)
+    return [Track(words, p, name, p.side(name) if name else None) for words, p in found], fewer
 
 
-def parameters_at(spec: Spec, position: Mapping[str, int]) -> dict[str, Any]:
-    """SI values of all parameters at a position along the axes."""
-    return spec.parameters() | {
-        member.path: np.asarray(member.values)[position[axis.name]].item()
-        for axis in spec.axes
-        for member in axis.members
-    }
-
-
-def effects_at(study: Study, track: Track, places: np.ndarray) -> list[list[str]]:
-    """Effects that were simulated at places along a track, but for random ones."""
-    flags = np.ravel(_values_at(study, "effects", track, places))
-    return [[n for n in names_of(int(flag)) if n not in _RANDOM] for flag in flags]
-
-
-def _values_at(study: Study, variable: str, track: Track, places: np.ndarray) -> np.ndarray:
-    """A variable at places along a track."""
-    if track.side is None:
-        return np.asarray(study.dataset[variable].isel(track.part.first()).values)
-    array = study.dataset[variable].isel(track.part.first(track.side))
-    return np.asarray(array.isel({track.side.dim: track.side.positions[places]}).values)
-
-
-def roc(study: Study, found: list[Track], fewer: int) -> Chart | None:
-    """Probability of detection over that of a false alarm, as the threshold moves.
-
-    None where detectors look at whole spectra, which have no one threshold.
-    """
-    if study.spec.draws.whole_spectra:
-        return None
-    traces: list[go.Scatter] = []
-    told: list[str] = []
-    for track in found:
-        for number, place in enumerate(_places_of_interest(study, track)):
-            name = _named(study, track, place)
-            point = study.dataset.isel(track.position(place))
-            traces += _roc_traces(track, name, number, point.compute())
-            if track is found[0]:
-                told.append(name)
+def roc(study: Study, found: Sequence[Track], fewer: int) -> Chart:
+    """Probability of detection over that of a false alarm, as the threshold moves."""
+    panels = [panel for track in found for panel in _characteristics(study, track)]
+    told = [line.name for line in panels[0].layers if isinstance(line, Line) and line.name]
     return Chart(
         heading="Receiver operating characteristic",
         alt=(
             "Lines of the probability of detection of a shot over the probability of a false "
             f"alarm, as the threshold moves, {'; '.join(told) or 'at the point'}."
         ),
-        caption=wording.sentences(
-            ["From the stored signal-to-noise ratio; where that alone does not give the stored "
-             "probability of detection, simulated for this page with the effects that the study "
-             "simulates at the point" + (f", in {DRAWS} draws" if study.spec.draws.any else ""),
-             "False alarms of noise alone, in all bins that are counted",
-             "Dots: the study's own threshold",
-             "Points: those whose probability of detection comes nearest to "
-             + ", ".join(f"{chance:g}" for chance in CHANCES),
-             wording.left_out(fewer)]
-        ),
-        figure=go.Figure(
-            traces,
-            looks.layout(
-                xaxis=looks.axis("probability of a false alarm", type="log"),
-                yaxis=looks.upright("probability of detection, shot", range=[-0.03, 1.03]),
-            ),
-        ),
-        controls=[
-            Control("part", "Shown for", [track.words for track in found]),
-            Control("alarm", "False alarm", list(_ALARM_OF)),
+        caption=[
+            "From the stored signal-to-noise ratio; where that alone does not give the stored "
+            "probability of detection, simulated for this page with the effects that the study "
+            "simulates at the point" + (f", in {DRAWS} draws" if study.spec.draws.any else ""),
+            "False alarms of noise alone, in all bins that are counted",
+            "Dots: the study's own threshold",
+            "Points: those whose probability of detection comes nearest to "
+            + ", ".join(f"{chance:g}" for chance in CHANCES),
+            charts.not_shown(fewer),
         ],
-    )  # fmt: skip
+        panels=panels,
+        facets={"part": "Shown for", "alarm": "False alarm"},
+    )
 
 
 _ALARM_OF = {
@@ -168,178 +139,263 @@ _ALARM_OF = {
 """Probability of a false alarm from that in a bin, and the number of bins that are counted."""
 
 
-def _named(study: Study, track: Track, place: int) -> str:
+def _characteristics(study: Study, track: Track) -> list[Panel]:
+    """A panel for each kind of false alarm: line and dot of some points."""
+    layers: dict[str, list[Line]] = {alarm: [] for alarm in _ALARM_OF}
+    for number, place in enumerate(_places_of_interest(track)):
+        point = study.dataset.isel(track.position(place)).compute()
+        curve = point.sweep.roc(IN_A_BIN, draws=DRAWS)
+        parameters = study.spec.parameters() | {
+            str(c.attrs["path"]): parameter(point, str(c.attrs["path"]), study.spec).values.item()
+            for c in point.coords.values()
+            if "path" in c.attrs
+        }
+        pfa, own = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
+        bins, own_bins = (noise_only.bins_counted(parameters, p) for p in (IN_A_BIN, pfa))
+        told = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
+        for alarm, of in _ALARM_OF.items():
+            x = np.asarray(of(IN_A_BIN, bins))
+            line = Line(x, curve["pd"].values, _named(track, place), number, told=told)
+            dot = Line(
+                np.atleast_1d(of(pfa, own_bins)), np.atleast_1d(own), number=number, look="dots"
+            )
+            layers[alarm] += [line, dot]
+    across = Axis("probability of a false alarm", LOG)
+    up = Axis("probability of detection, shot", limits=CHANCE)
+    return [Panel({"part": track.words, "alarm": alarm}, across, up, lines)
+            for alarm, lines in layers.items()]  # fmt: skip
+
+
+def _named(track: Track, place: int) -> str:
     if track.side is None:
         return ""
-    name = main_coordinate(study.spec)
-    ruler = wording.Ruler.of(study, name, track.side.values)
-    value = ruler.shown(track.side.values[place : place + 1])[0]
-    return f"{labels.coordinate(name)} {labels.quantity(value, ruler.units)}"
+    value = track.ruler.shown(track.side.values[place : place + 1])[0]
+    return labels.valued(track.name, value, track.ruler.units)
 
 
-def _places_of_interest(study: Study, track: Track) -> np.ndarray:
+def _places_of_interest(track: Track) -> np.ndarray:
     """Places along a track whose probability of detection is near to those looked for."""
-    chosen = track.places(4 * along.STRETCHES)
-    pd = np.ravel(_values_at(study, "pd_shot", track, chosen))
+    chosen = track.places(4 * charts.STRETCHES)
+    pd = track.values("pd_shot", chosen)
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
     nearest = [int(chosen[np.nanargmin(np.abs(pd - chance))]) for chance in CHANCES]
     return np.unique(nearest)
 
 
-def _roc_traces(track: Track, name: str, number: int, point: xr.Dataset) -> list[go.Scatter]:
-    """Line and dot of one point, for each kind of false alarm."""
-    curve = point.sweep.roc(IN_A_BIN, draws=DRAWS)
-    spec = point.sweep.spec
-    parameters = spec.parameters() | {
-        str(c.attrs["path"]): parameter(point, str(c.attrs["path"]), spec).values.item()
-        for c in point.coords.values()
-        if "path" in c.attrs
-    }
-    pfa = 10.0 ** point["log10_pfa_bin"].values
-    bins, own_bins = (noise_only.bins_counted(parameters, p) for p in (IN_A_BIN, pfa))
-    traces = []
-    for alarm, of in _ALARM_OF.items():
-        meta = when(number, part=track.words, alarm=alarm)
-        line = {"dash": looks.DASHES[number % len(looks.DASHES)], "width": 2}
-        own = of(pfa, own_bins)
-        traces += [
-            go.Scatter(
-                x=of(IN_A_BIN, bins).astype(np.float32), y=curve["pd"].values.astype(np.float32),
-                text=[f"TNR {t:.3g}" for t in curve["curve_tnr"].values],
-                name=name, legendgroup=name, showlegend=bool(name), meta=meta, line=line,
-                mode="lines",
-            ),
-            go.Scatter(
-                x=[own], y=[point["pd_shot"].values], name=f"{name}, as studied", legendgroup=name,
-                showlegend=False, meta=meta, mode="markers", marker={"size": 9},
-            ),
-        ]  # fmt: skip
-    return traces
-
-
-def noise_budget(study: Study, found: list[Track], fewer: int) -> Chart:
+def noise_budget(study: Study, found: Sequence[Track], fewer: int) -> Chart:
     """Share of each source in the noise at the ADC, along the main coordinate."""
-    traces: list[go.Bar | go.Scatter] = []
-    told = ""
+    panels = []
     for track in found:
         places = track.places(PLACES)
-        budgets = [
-            _sources(study, track.position(place), own)
-            for place, own in zip(places, effects_at(study, track, places), strict=True)
-        ]
-        names = sorted({n for b in budgets for n in b}, key=lambda n: -budgets[0].get(n, 0.0))
-        total = np.array([sum(budget.values()) for budget in budgets])
-        told = told or _budget_words(budgets[0])
-        for number, name in enumerate(names):
-            variance = np.array([budget.get(name, 0.0) for budget in budgets])
-            traces.append(_source_trace(study, track, places, number, name, variance, total))
-    name = main_coordinate(study.spec)
-    across = looks.axis("") if not name else wording.Ruler.of(study, name, _values(found)).axis
-    return Chart(
-        heading="Noise by source",
-        alt=f"Shares of noise sources in the noise variance at the ADC. {told}.",
-        caption=wording.sentences(
-            ["Shares of the variance at the ADC, simulated for this page with the effects that the "
-             "study simulates at each point; the standard deviation is shown on hovering",
-             wording.left_out(fewer)]
-        ),
-        figure=go.Figure(
-            traces,
-            looks.layout(
-                xaxis=across,
-                yaxis=looks.upright("share of the noise variance (%)", range=[0, 100]),
-                barmode="stack", hovermode="x unified" if name else "closest",
-            ),
-        ),
-        controls=[Control("part", "Shown for", [track.words for track in found])],
+        budgets = []
+        for place, flags in zip(places, track.values("effects", places), strict=True):
+            position = track.position(place)
+            parameters = study.spec.parameters() | {
+                member.path: np.asarray(member.values)[position[axis.name]].item()
+                for axis in study.spec.axes
+                for member in axis.members
+            }
+            effects = [name for name in names_of(int(flags)) if name not in _RANDOM]
+            ((_, shots),) = prepare(parameters, effects)
+            budgets.append(shots.noise_sources)
+        if track.side is None:
+            across, x = Axis(), places
+        else:
+            across, x = track.ruler.axis, track.ruler.shown(track.side.values[places])
+        panels.append(budget_panel({"part": track.words}, across, x, budgets))
+    return budget_chart(
+        panels,
+        ["Shares of the variance at the ADC, simulated for this page with the effects that the "
+         "study simulates at each point; the standard deviation is shown on hovering",
+         charts.not_shown(fewer)],
     )  # fmt: skip
 
 
-def _values(found: list[Track]) -> np.ndarray:
-    return max((t.side.values for t in found if t.side), key=np.size)
+def budget_panel(
+    when: Mapping[str, str], across: Axis, x: np.ndarray, budgets: Sequence[Mapping[str, Any]]
+) -> Panel:
+    """Share of each source of noise at some places, the largest at first at the bottom.
+
+    Parameters
+    ----------
+    when, across, x
+        Choices, axis and places.
+    budgets
+        Variance of each source at the ADC [V^2] at each place.
+    """
+    every = [{n: float(np.ravel(v)[0]) for n, v in budget.items()} for budget in budgets]
+    names = list(dict.fromkeys(n for own in every for n, v in own.items() if v > 0))
+    names.sort(key=lambda name: -every[0].get(name, 0.0))
+    total = np.array([sum(own.values()) for own in every])
+    lines = []
+    for number, name in enumerate(names):
+        variance = np.array([own.get(name, 0.0) for own in every])
+        lines.append(
+            Line(
+                x, 100 * variance / np.where(total > 0, total, 1.0), name.replace("_", " "), number,
+                look="area", told=[f"{1e3 * np.sqrt(v):.3g} mV rms" for v in variance],
+            )
+        )  # fmt: skip
+    return Panel(when, across, Axis("share of the noise variance (%)", limits=(0, 100)), lines)
 
 
-def _sources(study: Study, position: Mapping[str, int], effects: list[str]) -> dict[str, float]:
-    """Variance of each source of noise at the ADC [V^2], those that make any."""
-    parameters = parameters_at(study.spec, position)
-    ((_, shots),) = prepare(parameters, effects)
-    found = {name: float(np.ravel(v)[0]) for name, v in shots.noise_sources.items()}
-    return {name.replace("_", " "): value for name, value in found.items() if value > 0}
+def budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
+    """Shares of sources of noise, a panel at a time."""
+    told = ", ".join(f"{line.name} {line.y[0]:.3g} % at first" for line in panels[0].layers
+                     if isinstance(line, Line))  # fmt: skip
+    alt = f"Shares of noise sources in the noise variance at the ADC. {told}."
+    return Chart("Noise by source", alt, caption, panels, {"part": "Shown for"})
 
 
-def _budget_words(budget: Mapping[str, float]) -> str:
-    total = sum(budget.values())
-    largest = sorted(budget.items(), key=lambda item: -item[1])
-    return ", ".join(f"{name} {100 * value / total:.3g} %" for name, value in largest)
-
-
-def _source_trace(
-    study: Study, track: Track, places: np.ndarray, number: int, name: str,
-    variance: np.ndarray, total: np.ndarray,
-) -> go.Bar | go.Scatter:  # fmt: skip
-    """One source: an area along a coordinate, a bar where there is a single point or words."""
-    share = 100 * variance / np.where(total > 0, total, 1.0)
-    told = [f"{1e3 * np.sqrt(v):.3g} mV rms" for v in variance]
-    common: dict[str, Any] = {
-        "y": share, "name": name, "text": told, "meta": when(number, part=track.words),
-        "hovertemplate": "%{y:.3g} %, %{text}",
-    }  # fmt: skip
-    if track.side is None:
-        return go.Bar(x=["the point"], textposition="none", **common)
-    coordinate = main_coordinate(study.spec)
-    ruler = wording.Ruler.of(study, coordinate, track.side.values)
-    return go.Scatter(
-        x=ruler.shown(track.side.values[places]), stackgroup=track.words or "all", mode="lines",
-        **common,
-    )  # fmt: skip
-
-
-def false_alarms(study: Study, found: list[Track], fewer: int) -> Chart | None:
+def false_alarms(study: Study, found: Sequence[Track], fewer: int) -> Chart | None:
     """False alarms of noise and of leakage along the main coordinate; none without one."""
     if found[0].side is None:
         return None
-    name = main_coordinate(study.spec)
-    whole = alarms.of_a_shot(study.dataset, leakage=True)
+    name = found[0].name
+    whole = probability.of_a_shot(study.dataset, leakage=True)
     chances = study.dataset[[v for v in _SHORT if v != WITH_LEAKAGE]].assign({WITH_LEAKAGE: whole})
-    named: list[lines.Named] = []
-    made: list[along.Line] = []
-    for number, (variable, words) in enumerate(_SHORT.items()):
-        own = [lines.Named(t.words, words, number, replace(t.part, dataset=chances)) for t in found]
+    named: list[charts.Named] = []
+    drawn: list[Line] = []
+    remarks: list[str] = []
+    for variable, words in _SHORT.items():
+        own = [(track.words, words, replace(track.part, dataset=chances)) for track in found]
         # a reading each: together their chunks would wait for each other in memory
-        made += along.lines([(line.points, variable) for line in own], name)
+        lines, remarks = charts.along([(points, variable) for _, _, points in own], name)
+        drawn += lines
         named += own
-    ruler = wording.Ruler.of(study, name, _values(found))
+    ruler = Ruler.of(study.points, name)
+    panels = charts.panels_of(named, drawn, ruler, Axis("probability", LOG))
     # The same for all points where no axis moves it, and no number of bins.
     one = set(WAYS[:3]) & study.spec.parameters_off_axes().keys()
     closed = noise_only.bin_probability(float(tnr_of(study.spec.parameters())))
     return Chart(
-        heading="False alarms",
-        alt=lines.alternative(
-            "probabilities of false alarms and leakage", ruler.words, named, made
+        "False alarms",
+        charts.alternative(
+            "probabilities of false alarms and leakage", ruler.axis.words, panels[0]
         ),
-        caption=wording.sentences(
-            [f"A bin of noise alone crosses with probability {closed:.3g} in closed form"
-             if one else "",
-             *lines.remarks(made),
-             "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
-             "Either: by noise or by leakage; both: in the up- and in the down-chirp of a shot",
-             wording.left_out(fewer)]
-        ),
-        figure=go.Figure(
-            [t for own, line in zip(named, made, strict=True)
-             for t in lines.traces(own, _above_zero(line), ruler)],
-            looks.layout(xaxis=ruler.axis, yaxis=looks.upright("probability", type="log")),
-        ),
-        controls=[Control("part", "Shown for", [track.words for track in found])],
+        [f"A bin of noise alone crosses with probability {closed:.3g} in closed form"
+         if one else "",
+         *remarks,
+         "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
+         "Either: by noise or by leakage; both: in the up- and in the down-chirp of a shot",
+         charts.not_shown(fewer)],
+        panels,
+        {"part": "Shown for"},
     )  # fmt: skip
 
 
-def _above_zero(line: along.Line) -> along.Line:
-    """The line where it is above zero, which an axis of decades has no place for."""
+PD = 0.9
 
-    def above(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else np.where(values > 0, values, np.nan)
+KEPT = "kept all the way"
+ANSWERS = {KEPT: "unbroken", "reached at all": "farthest"}
+"""Answers of :func:`.limits.limit` by what is chosen of them."""
 
-    mean = np.where(line.mean > 0, line.mean, np.nan)
-    return replace(line, mean=mean, low=above(line.low), high=above(line.high))
+ENDS = {"low": "lower end", "high": "upper end"}
+
+MAXIMUM_RANGE = f"Maximum range at a pd of {PD:g}"
+
+TOLD = [
+    f"Kept all the way: up to here the probability of detection of a shot is {PD:g} or more at "
+    "every range of the study; reached at all: the farthest range at which it is.",
+    "Between ranges it is interpolated in its normal deviate.",
+    f"There is none where it is below {PD:g} from the first range on, not below it at the last, or "
+    "not computed.",
+]
+
+
+def maximum_range(study: Study) -> Chart | Table | None:
+    """Maximum range along another coordinate; a table where there is none to go along.
+
+    None where range does not vary.
+    """
+    member = coordinate_of(study.spec, RANGE)
+    if member is None:
+        return None
+    found = study.points
+    ruler = Ruler.of(found, member.name)
+    beside = found.further_along(found.dim_of(member.name), [member.name])
+    apart, _ = split(found, beside, found.size)
+    several = [(words, own) for words, own in apart if len(own.distinct(member.name)) > 1]
+    pieces, fewer = spread(several, MOST_PARTS)
+    reaches = [(words, _reach(piece, member.name, ruler.factor)) for words, piece in pieces]
+    if not reaches:
+        return None
+    words = labels.with_units("maximum range", ruler.units)
+    x = _along(study, reaches[0][1])
+    return _reach_chart(reaches, x, words, fewer) if x else _reach_table(reaches, words)
+
+
+def _reach(piece: Points, name: str, factor: float) -> Points:
+    """The maximum range in the units shown, with what it varies over; not computed."""
+    dim = piece.dim_of(name)
+    positions = np.sort(piece.side(name).positions)
+    dataset = piece.dataset
+    if positions.size < dataset.sizes[dim]:
+        dataset = dataset.isel({dim: positions})
+    reach = dataset.sweep.maximum_range(PD)
+    in_units = {
+        str(own): (array * factor).assign_attrs(array.attrs)
+        for own, array in reach.data_vars.items()
+        if not str(own).endswith("reason")
+    }
+    return Points.of(reach.assign(in_units))
+
+
+def _along(study: Study, found: Points) -> str:
+    """The grazing angle where it varies, else the longest coordinate of numbers; empty for none."""
+    varying = found.varying()
+    angle = coordinate_of(study.spec, GRAZING_ANGLE)
+    if angle is not None and angle.name in varying:
+        return angle.name
+    numbers = [name for name in varying if not labels.is_words(found.values(name))]
+    return max(numbers or varying, key=lambda name: len(found.distinct(name)), default="")
+
+
+def _reach_chart(reaches: Sequence[tuple[str, Points]], x: str, words: str, fewer: int) -> Chart:
+    """Both answers of every part, a line for each value of what has few."""
+    first = reaches[0][1]
+    by = [n for n in first.further([x]) if len(first.distinct(n)) <= charts.MOST_LINES][:1]
+    parts: list[tuple[str, Points]] = []
+    for name, reach in reaches:
+        own, lacking = split(reach, reach.further([x, *by]), MOST_PARTS)
+        parts += [(", ".join(filter(None, (name, told))), part) for told, part in own]
+        fewer += lacking
+    fewer += max(0, len(parts) - MOST_PARTS)
+    named, _ = charts.lines_of(parts[:MOST_PARTS], by)
+    pairs = [(own, answer) for answer in ANSWERS.values() for _, _, own in named]
+    both, remarks = charts.along(pairs, x)
+    ruler = Ruler.of(first, x)
+    up = Axis(words, LINEAR, (0.0, None))
+    panels = [
+        panel
+        for choice, drawn in zip(ANSWERS, (both[: len(named)], both[len(named) :]), strict=True)
+        for panel in charts.panels_of(named, drawn, ruler, up, answer=choice)
+    ]
+    span = ruler.span(np.unique(first.values(x)))
+    return Chart(
+        MAXIMUM_RANGE,
+        charts.alternative(f"{words} at a probability of detection of {PD:g}", span, panels[0]),
+        [*TOLD, *remarks, charts.not_shown(fewer)],
+        panels,
+        {"part": "Shown for", "answer": f"A pd of {PD:g}"},
+    )
+
+
+def _reach_table(reaches: Sequence[tuple[str, Points]], words: str) -> Table:
+    """Both answers of each part, with their intervals or why there are none."""
+    rows = []
+    for part, found in reaches:
+        reach: xr.Dataset = found.dataset.isel(found.first()).compute()
+        meanings = str(reach["unbroken_reason"].attrs["flag_meanings"]).split()
+        for choice, answer in ANSWERS.items():
+            ends = {f"{answer}_{end}": told for end, told in ENDS.items()}
+            rows.append(
+                {"for": part, f"a pd of {PD:g}": choice, words: reach[answer].item()}
+                | {told: reach[name].item() for name, told in ends.items() if name in reach}
+                | {"which is": meanings[int(reach[f"{answer}_reason"])].replace("_", " ")}
+            )
+    frame = pandas.DataFrame(rows)
+    if not any(part for part, _ in reaches):
+        frame = frame.drop(columns="for")
+    return Table(MAXIMUM_RANGE, TOLD, frame, "maximum_range")

@@ -1,62 +1,22 @@
-"""What a page is made of: sections with charts, tables and facts."""
+"""Pages: sections with plots, tables and texts, and the one file that they become."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import itables.options
+import jinja2
 import pandas
-import plotly.graph_objects as go
+from itables import to_html_datatable
+from itables.javascript import generate_init_offline_itables_html
+from markupsafe import Markup
+from plotly.io.json import to_json_plotly
+from plotly.offline import get_plotlyjs
 
-
-@dataclass(frozen=True)
-class Control:
-    """A choice that a chart offers.
-
-    Attributes
-    ----------
-    name, label
-        What traces call it (see :func:`when`), and what stands beside it.
-    options
-        What can be chosen, the first at the start.
-    relayout
-        What an option changes of the chart's layout, by option; nothing by default.
-    """
-
-    name: str
-    label: str
-    options: Sequence[str]
-    relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Chart:
-    """An interactive figure.
-
-    Attributes
-    ----------
-    heading, alt
-        What stands over it; what it shows, in words, for those who do not see it.
-    caption
-        Sentences under it.
-    figure
-        Traces and layout; `meta` of a trace says when it is shown and which colour it takes.
-    controls
-        Choices; one with a single option is left out.
-    cut
-        Whether the first heat map that is shown can be cut along either of its sides.
-    tall
-        Whether it needs the height of a solid view.
-    """
-
-    heading: str
-    alt: str
-    caption: Sequence[str]
-    figure: go.Figure
-    controls: Sequence[Control] = ()
-    cut: bool = False
-    tall: bool = False
+from sweep.report.interactive import Plot, themes
 
 
 @dataclass(frozen=True)
@@ -99,6 +59,9 @@ class Text:
     file: str = ""
 
 
+Item = Plot | Table | Text
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of the page.
@@ -116,7 +79,7 @@ class Section:
     anchor: str
     title: str
     words: Sequence[str] = ()
-    items: Sequence[Chart | Table | Text] = ()
+    items: Sequence[Item] = ()
 
 
 @dataclass(frozen=True)
@@ -142,6 +105,72 @@ class Page:
     sections: Sequence[Section]
 
 
-def when(series: int | None = None, **choices: str) -> dict[str, Any]:
-    """`meta` of a trace: at which choices it is shown, and which colour of the palette it takes."""
-    return {"when": choices} | ({} if series is None else {"series": series})
+ROWS = 10
+"""Rows of a table that are shown at a time."""
+
+
+LONG = 40
+"""Characters from which on a cell holds a sentence."""
+
+
+def rendered(page: Page) -> str:
+    """The page as the text of a file."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sweep.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals |= {"table": _table, "chart_json": _chart_json, "download": _download}
+    environment.tests |= {
+        "chart": lambda item: isinstance(item, Plot),
+        "sheet": lambda item: isinstance(item, Table),
+        "text": lambda item: isinstance(item, Text),
+    }
+    return environment.get_template("report.html").render(
+        page=page,
+        plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        tables=Markup(generate_init_offline_itables_html(itables.options.dt_bundle)),
+        themes=_in_script(to_json_plotly(themes())),
+    )
+
+
+def _in_script(json_text: str) -> Markup:
+    """JSON that can stand in a page, whatever words it holds."""
+    return Markup(json_text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
+def _chart_json(plot: Plot) -> Markup:
+    """What the page's script needs of a plot."""
+    relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
+    return _in_script(
+        to_json_plotly({"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.cut})
+    )
+
+
+def _table(table: Table, number: int) -> Markup:
+    """A table with its sorting, searching and downloading."""
+    csv = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
+    with pandas.option_context("display.float_format", "{:.6g}".format):
+        made = to_html_datatable(
+            table.frame, connected=False, table_id=f"table-{number}", showIndex=False, maxBytes=0,
+            maxColumns=0, classes="display compact", style="width:100%",
+            columnDefs=[{"targets": _long(table.frame), "className": "long"}],
+            buttons=[csv, "copyHtml5"], pageLength=ROWS, display_logo_when_loading=False,
+        )  # fmt: skip
+    return Markup(str(made))
+
+
+def _long(frame: pandas.DataFrame) -> list[int]:
+    """Columns of sentences, which need some width."""
+    return [
+        i
+        for i, name in enumerate(frame.columns)
+        if frame[name].map(lambda cell: len(str(cell))).max() > LONG
+    ]
+
+
+def _download(text: Text) -> str:
+    """A text as an address that can be saved."""
+    return f"data:text/plain;charset=utf-8;base64,{b64encode(text.text.encode()).decode()}"

@@ -1,13 +1,14 @@
 """A store goes through memory piece by piece; `benchmarks/big_store.py` does it with 10 GB."""
 
 import tracemalloc
+from dataclasses import replace
 
 import big_store
 import pytest
 from zarr.storage import LocalStore
 
 import sweep
-from sweep.analysis import along, canvas, opening, surface
+from sweep.analysis import canvas, charts, opening
 from sweep.analysis.figures import draw
 
 FIGURES = [
@@ -59,8 +60,8 @@ def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
-    monkeypatch.setattr(surface, "MOST_COLUMNS", 20)
-    monkeypatch.setattr(along, "STRETCHES", 5)
+    monkeypatch.setattr(charts, "SHEET", replace(charts.SHEET, columns=20))
+    monkeypatch.setattr(charts, "STRETCHES", 5)
     monkeypatch.setattr(canvas, "save", lambda sheet, path: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37

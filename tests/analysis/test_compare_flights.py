@@ -8,7 +8,7 @@ from drawn_scenes import MAPPING, cut_short, flown
 from drawn_studies import stored
 
 import sweep
-from sweep.analysis.scenes.opening import open_scene
+from sweep.analysis.opening import open_scene
 from sweep.cli import main
 
 SQUARE = MAPPING["scanners"]["square"]

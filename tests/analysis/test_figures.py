@@ -1,16 +1,12 @@
 import numpy as np
 import pytest
-import xarray as xr
 from drawn_files import shows
 from drawn_studies import POWERS, SURFACE, stored, study
-from matplotlib.collections import PolyCollection
 from matplotlib.text import Text
 
-from sweep.analysis import canvas, slices
-from sweep.analysis.defaults import default_figures
-from sweep.analysis.figures import draw
+from sweep.analysis import canvas
+from sweep.analysis.figures import default_figures, draw
 from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.selection import Points
 
 ASKED = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -126,45 +122,6 @@ def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):
 def test_the_default_surface_has_range_across_and_angle_up():
     turned = dict(reversed(SURFACE.items()))
     assert [(f.x, f.y) for f in default_figures(study(turned))] == [("range", "grazing_angle")] * 2
-
-
-def line_points(values, **by):
-    values = np.asarray(values, float)
-    coordinates = {"range": ("range", np.arange(1.0, values.shape[-1] + 1), {"units": "m"})}
-    coordinates |= {name: (name, along, {"units": "W"}) for name, along in by.items()}
-    return Points.of(xr.Dataset({"pd_shot": ([*by, "range"], values)}, coordinates))
-
-
-def sliced(found, by=""):
-    return slices.draw(
-        found, x="range", by=by, variable="pd_shot", long_name="pd", title="", note=""
-    )
-
-
-def test_a_line_of_few_points_goes_through_each_of_them():
-    (panel,) = sliced(line_points([1.0, 0.2, 0.9])).axes
-    assert panel.lines[0].get_ydata().tolist() == [1.0, 0.2, 0.9]
-
-
-def test_one_dip_in_ten_thousand_points_of_a_line_reaches_down_in_its_band():
-    values = np.ones(10_000)
-    values[6_173] = 0.0
-    (panel,) = sliced(line_points(values)).axes
-    (band,) = [c for c in panel.collections if isinstance(c, PolyCollection)]
-    corners = band.get_paths()[0].vertices
-    low = corners[corners[:, 1] < 0.5]
-    assert corners[:, 1].min() == 0.0
-    # 20 points share a stretch, of which range is shown in km
-    assert 6.1 < low[:, 0].min() <= low[:, 0].max() < 6.25
-    assert panel.lines[0].get_ydata().min() == pytest.approx(0.95)
-
-
-def test_each_value_of_by_has_its_line_in_the_order_of_the_study():
-    three = line_points(np.outer([1.0, 0.5, 0.1], [1.0, 0.5, 0.25]), power=[5, 1, 3])
-    (panel,) = sliced(three, by="power").axes
-    texts = [text.get_text() for text in panel.get_legend().get_texts()]
-    assert texts == ["power 5 W", "power 1 W", "power 3 W"]
-    assert [line.get_ydata()[0] for line in panel.lines] == [1.0, 0.5, 0.1]
 
 
 @pytest.mark.parametrize("text", [r"$\frac{1}{$", "costs $5 or $6"])

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sweep.analysis.scenes.errors_over_altitude import Tally, merge, tally
+from sweep.analysis.scenes.navigation import Tally, merge, tally
 from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
 

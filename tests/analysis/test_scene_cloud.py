@@ -8,12 +8,11 @@ import xarray as xr
 from drawn_scenes import SLOPE, cut_short, scene
 from mpl_toolkits.mplot3d import proj3d
 
-from sweep.analysis.scenes import cloud, cloud_figure, colours
-from sweep.analysis.scenes.cloud import AXES, gathered
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import place
-from sweep.analysis.scenes.recording import Interval
-from sweep.analysis.scenes.terrain import Ground
+from sweep.analysis import canvas
+from sweep.analysis.opening import opened
+from sweep.analysis.scenes import clouds, colours, pictures
+from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
+from sweep.analysis.scenes.recording import Interval, place
 from sweep.model.pairing import FLAGS, TRUE
 
 
@@ -42,7 +41,7 @@ def drawn(found, tree, **options):
         "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "ground": None,
         "title": "A cloud", "remarks": [],
     }  # fmt: skip
-    sheet = cloud_figure.draw(found, **(wanted | options))
+    sheet = pictures.cloud_sheet(found, **(wanted | options))
     sheet.canvas.draw()
     return sheet
 
@@ -51,17 +50,17 @@ def small_cloud(points, **changes):
     """A cloud of points given as columns x, y, z, all true."""
     table = dict(zip(AXES, np.asarray(points, float), strict=True))
     number = table["x"].size
-    table |= {"colour": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
+    table |= {"range": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
     box = {axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in AXES}
     parts = {
         "points": table, "dropouts": {}, "path": {}, "total": number, "total_dropouts": 0,
         "outside": 0, "every": 1, "every_dropout": 1, "box": box,
     }  # fmt: skip
-    return cloud.Cloud(**(parts | changes))
+    return Cloud(**(parts | changes))
 
 
 def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, arrays):
-    found = gathered(weak, colour="range", ranges="quantised", draw=1, dropouts=True)
+    found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert 20 < none.sum() < none.size - 20
     assert found.total_dropouts == none.sum()
@@ -78,7 +77,7 @@ def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, array
 def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path, arrays, geometry):
     short = opened(cut_short(scene_store, tmp_path, geometry=geometry))
     weak = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    found = gathered(weak, colour="range", ranges="quantised", draw=1, dropouts=True)
+    found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert found.total_dropouts == none[:256].sum() > 0
 
@@ -89,7 +88,7 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
 ):
     at = place(spec, {"power": power})
     found = gathered(
-        at.recording(tree, "pair"), colour="snr", ranges="interpolated", draw=1, dropouts=True,
+        at.recording(tree, "pair"), ["snr"], ranges="interpolated", draw=1, dropouts=True,
         path=True,
     )  # fmt: skip
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.index, draw=1)
@@ -109,22 +108,21 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
     crops = {"x": Interval(-30.0, 25.0), "time": Interval(1.0, 5.0)}
-    found = gathered(weak, colour="range", ranges="quantised", crops=crops, dropouts=True)
-    every = gathered(weak, colour="range", ranges="quantised", dropouts=True)
+    found = gathered(weak, ["range"], ranges="quantised", crops=crops, dropouts=True)
+    every = gathered(weak, ["range"], ranges="quantised", dropouts=True)
     assert 0 < found.total < every.total and 0 < found.total_dropouts < every.total_dropouts
     for table in (found.points, found.dropouts):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
-    room = max(high - low for low, high in found.box.values()) * cloud.MARGIN
+    room = max(high - low for low, high in found.box.values()) * clouds.MARGIN
     assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
-    assert gathered(weak, colour="range", ranges="quantised", crops={"x": Interval(1e5)}) is None
+    assert gathered(weak, ["range"], ranges="quantised", crops={"x": Interval(1e5)}) is None
 
 
-def test_many_points_are_thinned_and_the_foot_says_so(weak, tree, monkeypatch):
-    whole = gathered(weak, colour="shot", ranges="quantised")
-    monkeypatch.setattr(cloud, "MOST_POINTS", 50)
-    found = gathered(weak, colour="shot", ranges="quantised")
+def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
+    whole = gathered(weak, ["shot"], ranges="quantised")
+    found = gathered(weak, ["shot"], ranges="quantised", most=50)
     assert found.every == 2 ** int(np.ceil(np.log2(whole.total / 50)))
-    said = drawn(found, tree).get_supxlabel()
+    said = drawn(found, tree, quantity="shot").get_supxlabel()
     assert f"{whole.total:,} points, one in {found.every} of them shown" in said
 
 
@@ -132,11 +130,11 @@ def test_many_points_are_thinned_and_the_foot_says_so(weak, tree, monkeypatch):
     ("view", "axes"), [("above", ("x", "y")), ("side", ("x", "z")), ("front", ("y", "z"))]
 )
 def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
-    found = gathered(weak, colour="range", ranges="quantised", dropouts=True, path=True)
+    found = gathered(weak, ["range"], ranges="quantised", dropouts=True, path=True)
     sheet = drawn(found, tree, view=view, ground=Ground.of(tree))
     picture = sheet.axes[0]
     true = (found.points["flags"] & TRUE) > 0
-    shown = picture.collections[-3].get_offsets()
+    (shown,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
     expected = np.column_stack([found.points[axis][true] for axis in axes])
     assert np.array_equal(np.sort(shown, axis=0), np.sort(expected, axis=0))
     pixels = picture.transData.transform([[0, 0], [1, 0], [0, 1]])
@@ -146,7 +144,7 @@ def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, a
 
 def test_the_nearest_points_lie_on_top():
     found = small_cloud([[0, 0, 0], [0, 0, 0], [5.0, 9.0, 1.0]])
-    scale = colours.chosen("range", found.points["colour"], trusted=np.ones(3, bool), surfaces=[])
+    scale = colours.chosen("range", found.points["range"], trusted=np.ones(3, bool), surfaces=[])
     colour = drawn(found, None).axes[0].collections[0].get_facecolors()
     assert np.allclose(colour, scale.of(np.array([2.0, 0.0, 1.0])))
 
@@ -206,15 +204,14 @@ def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
     assert names.names == {-1: "none", 0: "ground", 1: "block"}
     paint = names.of(values)
     assert len(np.unique(paint, axis=0)) == 3 and np.array_equal(paint[1], paint[3])
-    assert len(set(colours.canvas.LINES)) == len(colours.canvas.LINES)
+    assert len(set(canvas.LINES)) == len(canvas.LINES)
     kinds = colours.chosen("flags", np.array([0, 4.0]), trusted=np.ones(2, bool), surfaces=[])
     assert list(kinds.names.values()) == ["true", "sidelobe"]
 
 
 def test_a_legend_tells_false_points_dropouts_and_path():
     found = small_cloud([[0, 9.0], [0, 9.0], [0, 1.0]])
-    found.points["flags"][1] = found.points["colour"][1] = FLAGS["sidelobe"]
-    found.points["colour"][0] = TRUE
+    found.points["flags"][1] = FLAGS["sidelobe"]
     places = {axis: np.array([4.0]) for axis in AXES}
     for options, more in (
         ({}, set()),
@@ -235,10 +232,13 @@ def test_far_off_coordinates_are_read_against_a_round_number():
 
 
 def test_the_ground_of_the_store_is_the_slope_with_the_block(tree):
-    ground = Ground.of(tree)
-    heights = ground.at(np.array([-60.0, -20.0, 20.0, 30.0]), np.array([20.0, -20.0, 0.0, 10.0]))
-    assert heights == pytest.approx([-60 * SLOPE, -20 * SLOPE, 20.0, 20.0], abs=1e-6)
-    assert np.isnan(ground.at(np.array([1e4]), np.array([0.0]))).all()
+    for x, y, height in (
+        (-60.0, 20.0, -60 * SLOPE),
+        (-20.0, -20.0, -20 * SLOPE),
+        (20.0, 0.0, 20.0),
+    ):
+        part = Ground.of(tree).cropped((x - 0.5, x + 0.5), (y - 0.5, y + 0.5), most=3)
+        assert part.height[1, 1] == pytest.approx(height, abs=1e-6)
 
 
 def test_cropped_ground_of_even_slope_is_that_slope_at_every_node():

@@ -10,8 +10,7 @@ import xarray as xr
 from drawn_scenes import FAR, cut_short, flown
 
 from sweep.analysis.export import FIELDS, PointTable, export, write_las
-from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.scenes.opening import opened
+from sweep.analysis.opening import NotAStoreError, opened
 from sweep.analysis.scenes.recording import Recording
 from sweep.model.pairing import TRUE
 from sweep.spec import SpecError

@@ -9,12 +9,10 @@ from drawn_scenes import cut_short, flown, scene
 from PIL import Image
 
 from sweep.analysis.figures import draw
-from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.scenes import figures, scatter_figure
+from sweep.analysis.opening import NotAStoreError, opened
+from sweep.analysis.scenes import figures, pictures
 from sweep.analysis.scenes.figures import SceneStudy, default_figures
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import place
-from sweep.analysis.scenes.recording import Interval
+from sweep.analysis.scenes.recording import Interval, place
 from sweep.model.pairing import TRUE
 
 ASKED = [
@@ -106,16 +104,16 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
     weak = place(spec, {"power": "0.3 mW"}).recording(opened(scene_store), "pair")
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
     options = {"draw": 0, "ranges": "quantised", "time": None}
-    shots = scatter_figure.gathered(weak, ["time", "pd_shot", "beam"], **options)
+    shots = pictures.scattered(weak, ["time", "pd_shot", "beam"], **options)
     assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values)
-    points = scatter_figure.gathered(weak, ["time", "radial_velocity", "beam"], **options)
+    points = pictures.scattered(weak, ["time", "radial_velocity", "beam"], **options)
     there = arrays.flags.values > 0
     assert np.array_equal(points.rows()["radial_velocity"], arrays.radial_velocity.values[there])
     short = opened(cut_short(scene_store, tmp_path, geometry=False))
     less = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    shots = scatter_figure.gathered(less, ["time", "pd_shot", "beam"], **options)
+    shots = pictures.scattered(less, ["time", "pd_shot", "beam"], **options)
     assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values[:256])
-    some = scatter_figure.gathered(
+    some = pictures.scattered(
         weak, ["time", "pd_shot", "beam"], **(options | {"time": Interval(2.0, 3.0)})
     )
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
@@ -124,10 +122,10 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
 
 def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
     strong = place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
-    found = scatter_figure.gathered(
+    found = pictures.scattered(
         strong, ["time", "range", "snr"], draw=0, ranges="interpolated", time=None
     )
-    sheet = scatter_figure.draw(
+    sheet = pictures.scatter_sheet(
         found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )
     table, axes = found.rows(), sheet.axes[0]

@@ -7,10 +7,11 @@ import pytest
 import xarray as xr
 from drawn_scenes import MAPPING, cut_short, flown, scene
 
-from sweep.analysis.scenes import errors_over_altitude, figures, navigation_figure
-from sweep.analysis.scenes.errors_over_altitude import curves
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import place
+from sweep.analysis.drawing import sheet_of
+from sweep.analysis.opening import opened
+from sweep.analysis.scenes import navigation
+from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
+from sweep.analysis.scenes.recording import place
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,9 @@ def spec(tmp_path_factory):
 
 def recordings(store, spec, power):
     at, tree = place(spec, {"power": power}), opened(store)
-    return [at.recording(tree, name) for name in ("pair", "square") if name in tree.children]
+    return [
+        (name, at.recording(tree, name)) for name in ("pair", "square") if name in tree.children
+    ]
 
 
 @pytest.mark.parametrize("power", ["0.3 mW", "1 W"])
@@ -71,7 +74,7 @@ def test_results_are_the_same_bits_every_time_and_the_same_numbers_in_other_chun
     own = recordings(scene_store, spec, "0.3 mW")
     (first,), (again,) = (curves(own, quantity="velocity", bins=5) for _ in range(2))
     assert np.array_equal(first.rmse, again.rmse, equal_nan=True)
-    monkeypatch.setattr(errors_over_altitude, "STRETCH", 1)  # a tally for each chunk
+    monkeypatch.setattr(navigation, "STRETCH", 1)  # a tally for each chunk
     square = {"square": MAPPING["scanners"]["square"]}
     other = flown(tmp_path, scanners=square, storage={"block_shots": 80, "block_draws": 1})
     (apart,) = curves(recordings(other, spec, "0.3 mW"), quantity="velocity", bins=5)
@@ -102,12 +105,10 @@ def test_a_level_flight_has_one_bin_and_a_scanner_of_two_beams_no_curve(
 
 def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_store, spec):
     (curve,) = curves(recordings(scene_store, spec, "1 W"), quantity="velocity", bins=4)
-    sheet = navigation_figure.draw(
-        [curve, curve], quantity="velocity", show="all", title="T", remarks=["note"]
-    )
-    panels = {axes.get_title(): axes for axes in sheet.axes if axes.get_visible()}
+    sheet = sheet_of(navigation_chart([curve, curve], "all"), title="T", note="note")
+    panels = {axes.get_title(loc="left"): axes for axes in sheet.axes if axes.get_visible()}
     assert list(panels) == [
-        "velocity available", "RMS error of the velocity vector", "bias of the velocity, x",
+        "velocity available", "RMS error of the velocity, vector", "bias of the velocity, x",
         "bias of the velocity, y", "bias of the velocity, z", "RMS error of the velocity, x",
         "RMS error of the velocity, y", "RMS error of the velocity, z",
     ]  # fmt: skip
@@ -119,17 +120,12 @@ def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_s
     available = panels["velocity available"].lines[0]
     assert np.array_equal(available.get_ydata(), 100 * curve.tally.availability)
     for show, number in (("availability", 1), ("bias", 3), ("rmse", 4)):
-        sheet = navigation_figure.draw(
-            [curve], quantity="velocity", show=show, title="", remarks=[]
-        )
-        assert sum(axes.get_visible() for axes in sheet.axes) == number
+        assert len(navigation_chart([curve], show).panels) == number
 
 
 def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp_path):
     (curve,) = curves(recordings(scene_store, spec, "1 W"), quantity="altitude", bins=3)
-    page = figures.navigation_page(
-        [curve], quantity="altitude", show="all", title="T", remarks=["a note"]
-    )
+    page = navigation_page([curve], show="all", title="T", remarks=["a note"])
     text, table = page.save(tmp_path, "navigation")
     rows = list(csv.DictReader(table.open()))
     assert [float(row["rmse"]) for row in rows] == curve.rmse[:, 0].tolist()
@@ -138,5 +134,5 @@ def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp
     assert sum(int(row["cycles"]) for row in rows) == curve.tally.attempts.sum()
     said = text.read_text()
     assert "square: altitude" in said and "in m;" in said and "a note" in said
-    only = figures.navigation_page([curve], quantity="altitude", show="bias", title="", remarks=[])
+    only = navigation_page([curve], show="bias", title="", remarks=[])
     assert "rmse" not in only.records[0] and "bias" in only.records[0]

@@ -9,10 +9,9 @@ import xarray as xr
 from drawn_scenes import scene
 from drawn_studies import stored
 
-from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.opening import NotAStoreError, open_scene, stretches
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
-from sweep.analysis.scenes.opening import open_scene, stretches
+from sweep.analysis.scenes.recording import eyepoints_of, read_eyepoints
 from sweep.model.eyepoints import observe
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 

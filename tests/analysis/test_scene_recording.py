@@ -7,10 +7,17 @@ import pytest
 import xarray as xr
 from drawn_scenes import SLOPE, cut_short, scene
 
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import place
-from sweep.analysis.scenes.quantities import KINDS, QUANTITIES, kinds, shown
-from sweep.analysis.scenes.recording import Interval, Thinned, confined
+from sweep.analysis.opening import opened
+from sweep.analysis.scenes.recording import (
+    KINDS,
+    QUANTITIES,
+    Interval,
+    Thinned,
+    confined,
+    kinds,
+    place,
+    shown,
+)
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import SpecError
 from sweep.spec.figures import QUANTITIES as OF_SPECS

@@ -5,12 +5,13 @@ import pytest
 import xarray as xr
 from drawn_scenes import scene
 
-from sweep.analysis.scenes import shot_figure
-from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import place
+from sweep.analysis import shot_figure
+from sweep.analysis.opening import opened
+from sweep.analysis.scenes.recording import eyepoints_of, place, read_eyepoints, several_surfaces
+from sweep.analysis.shot_spectra import Group, Segment, simulated_shot
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import names_of
+from sweep.model.eyepoints import prepare_eyepoints
 from sweep.model.pairing import TRUE
 
 
@@ -33,8 +34,8 @@ def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(eyepoints_of(scene_store, recording.dataset), np.array([number]))
     parameters = place(spec, {"power": "1 W"}).parameters(spec)
     effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
-    surfaces = spec.surfaces()
-    return eyepoints, shot_figure.simulated(eyepoints, parameters, surfaces, effects, seed=seed)
+    prepared = prepare_eyepoints(eyepoints, parameters, spec.surfaces(), effects)
+    return eyepoints, simulated_shot(prepared, parameters, seed=seed)
 
 
 def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recording, arrays):
@@ -53,7 +54,7 @@ def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recor
                 }
             ) == 2
         )  # fmt: skip
-        assert shot_figure.several_surfaces(recording, draw) == first
+        assert several_surfaces(recording, draw) == first
 
 
 def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store, spec):
@@ -62,9 +63,9 @@ def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store,
     alike = square.dataset.assign(surface=xr.zeros_like(values.surface))
     seen = type(square)("square", alike)
     expected = int(np.flatnonzero(values.surfaces_seen.values >= 2)[0])
-    assert shot_figure.several_surfaces(seen) == expected
+    assert several_surfaces(seen) == expected
     none = alike.assign(surfaces_seen=xr.zeros_like(values.surfaces_seen))
-    assert shot_figure.several_surfaces(type(square)("square", none)) is None
+    assert several_surfaces(type(square)("square", none)) is None
 
 
 @pytest.mark.parametrize("number", [5, 120, 250])
@@ -77,9 +78,11 @@ def test_a_shot_drawn_again_has_the_statistics_that_the_store_holds(
 
 
 def test_two_surfaces_have_a_peak_each_where_their_own_range_beats(scene_store, spec, recording):
-    number = shot_figure.several_surfaces(recording)
+    number = several_surfaces(recording)
     eyepoints, shot = one(scene_store, spec, recording, number)
-    sheet = shot_figure.draw(shot, eyepoints, ["ground", "block"], title="T", remarks=["told"])
+    sheet = shot_figure.scene_shot_sheet(
+        shot, eyepoints, ["ground", "block"], title="T", remarks=["told"]
+    )
     up, close = shot.segments[0], sheet.axes[1]
     marks = {line.get_label(): line for line in close.lines if line.get_marker() == "|"}
     assert set(marks) == {"ground", "block"}
@@ -102,12 +105,10 @@ def test_two_surfaces_have_a_peak_each_where_their_own_range_beats(scene_store, 
 
 
 def test_views_reach_over_all_detections_but_not_to_those_far_away():
-    from sweep.analysis.scenes.shot_figure import around_detections
-    from sweep.analysis.shot_spectra import Group, Segment
 
     signal = np.full(4000, 1e-9)
     signal[1000] = 1.0
     groups = tuple(Group(k, k, k) for k in (950, 1000, 1140, 3900))
     segment = Segment("up-chirp", 1, np.arange(4000.0), signal, signal, 0.0, 0.0, groups, 1.0, 1.0)
-    view = around_detections(segment)
+    view = shot_figure.around_detections(segment)
     assert 900 < view.start < 950 and 1140 < view.stop < 1200

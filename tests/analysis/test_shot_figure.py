@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from drawn_studies import INSTRUMENT, SURFACE, TARGET, study
 
-from sweep.analysis import shot_drawing, shot_figure, shot_spectra
+from sweep.analysis import shot_figure, shot_spectra
 from sweep.model import shot as model
 from sweep.spec import SpecError
 
@@ -141,9 +141,9 @@ def test_what_the_shot_reports_is_what_the_model_reports_without_noise(one):
 def test_the_view_around_the_peak_holds_all_that_the_footprint_spreads():
     magnitude = np.full(4000, 1e-6)
     magnitude[2000:2100] = 1.0
-    view = shot_drawing.around_peak(magnitude)
+    view = shot_figure.around_peak(magnitude)
     assert view.start < 2000 and view.stop > 2100
-    assert shot_drawing.around_peak(np.eye(1, 4000, 3)[0]).start == 0
+    assert shot_figure.around_peak(np.eye(1, 4000, 3)[0]).start == 0
 
 
 def test_a_shot_too_weak_is_reported_as_not_detected(tmp_path):

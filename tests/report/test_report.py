@@ -15,14 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reported import EXPERIMENTS, GRID
 
-from sweep.analysis.cells import HIGHEST, LOWEST, MEAN, Side, reduced
+from sweep.analysis.charts import facets_of
 from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, coarsened, confined
 from sweep.cli import main
 from sweep.model.shot import evaluate
 from sweep.model.threshold import TNR
 from sweep.report import detector
-from sweep.report.choosing import parts
 from sweep.report.writing import write
 from sweep.spec import Spec
 from sweep.tasks import driver
@@ -43,7 +43,7 @@ def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, 
     values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
     array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
     sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
-    found = reduced(array, list(zip(sides, most, strict=True)), {}, kind).values
+    found = coarsened(array, list(zip(sides, most, strict=True)), {}, kind).values
     up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
     assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
     assert all(size <= number for size, number in zip(found.shape, most, strict=True))
@@ -68,14 +68,18 @@ def test_parts_of_zipped_axes_are_told_apart():
         for axis in spec.axes
         for member in axis.members
     }
-    study = Study(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates), spec)
-    found, left_out = parts(study, ["range", "power"], {})
+    points = Points.of(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates))
+
+    def parts(shown, where):
+        return facets_of(confined(points, spec, where), shown, 6)
+
+    found, left_out = parts(["range", "power"], {})
     assert left_out == 0
     assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
     assert found[1][1].side("range").positions.tolist() == [3, 4, 5]
-    ((_, held),), _ = parts(study, ["range", "power"], {"grazing_angle": "85 deg"})
+    ((_, held),), _ = parts(["range", "power"], {"grazing_angle": "85 deg"})
     assert held.side("range").values.tolist() == [1, 2, 3]
-    assert parts(study, ["range"], {"grazing_angle": "86 deg"}) == ([], 0)
+    assert parts(["range"], {"grazing_angle": "86 deg"}) == ([], 0)
 
 
 def _spec_in(page):
@@ -158,14 +162,15 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     study = Study.of(grid_store)
     (track, *_), _ = detector.tracks(study)
     chart = detector.roc(study, [track], 0)
-    (place, *_) = detector._places_of_interest(study, track)
+    (place, *_) = detector._places_of_interest(track)
     point = study.dataset.isel(track.position(place))
     curve = point.sweep.roc(detector.IN_A_BIN)
-    by_alarm = {t.meta["when"]["alarm"]: t for t in chart.figure.data[:6] if t.mode == "lines"}
+    by_alarm = {panel.when["alarm"]: panel.layers[0] for panel in chart.panels}
     for line in by_alarm.values():
         np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
-    parameters = detector.parameters_at(study.spec, track.position(place))
-    of_model = evaluate(parameters | {TNR: curve["curve_tnr"].values}, [])
+    position = track.position(place)
+    at = {m.path: m.values[position[axis.name]] for axis in study.spec.axes for m in axis.members}
+    of_model = evaluate(study.spec.parameters() | at | {TNR: curve["curve_tnr"].values}, [])
     for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
                         ("in both chirps", "pfa_both_chirps")):  # fmt: skip
         # the model leaves out the few bins in which the target lies

@@ -5,8 +5,9 @@ import pytest
 from reported import EXPERIMENTS, GRID
 
 from sweep.analysis import labels
+from sweep.analysis.charts import SHEET
 from sweep.analysis.figures import Study
-from sweep.report import detector, lines, writing
+from sweep.report import detector
 from sweep.report.page import Table
 from sweep.spec import Slices, Spec
 from sweep.tasks import driver
@@ -35,47 +36,34 @@ def drawn(tmp_path_factory):
 
 
 def drawn_lines(chart, **choices):
-    """Lines of a chart that are shown at some choices, without bands, by name."""
-    return {
-        trace.name: trace
-        for trace in chart.figure.data
-        if "band" not in trace.meta
-        and all(trace.meta["when"].get(name, value) == value for name, value in choices.items())
-    }
+    """Lines of a chart that are shown at some choices, by name."""
+    (panel, *_) = (p for p in chart.panels if choices.items() <= p.when.items())
+    return {line.name: line for line in panel.layers}
 
 
-def band(chart, line):
-    """Upper and lower ends of the band about a line."""
-    own = [t for t in chart.figure.data if "band" in t.meta and t.meta["when"] == line.meta["when"]
-           and t.meta["series"] == line.meta["series"]]  # fmt: skip
-    (trace,) = own
-    high, low = np.split(np.asarray(trace.y), 2)
-    return low[::-1], high
-
-
-@pytest.mark.parametrize("choice,answer", writing.ANSWERS.items())
+@pytest.mark.parametrize("choice,answer", detector.ANSWERS.items())
 def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, choice, answer):
     study = Study.of(grid_store)
-    chart = writing.chart(study)
-    expected = study.dataset.sweep.maximum_range(writing.PD)[answer].compute() / 1000
+    chart = detector.maximum_range(study)
+    expected = study.dataset.sweep.maximum_range(detector.PD)[answer].compute() / 1000
     assert expected.notnull().any()
     for power in (1, 3):
         line = drawn_lines(chart, answer=choice)[f"power {power} W"]
         assert list(line.x) == [20, 50, 80]
         np.testing.assert_allclose(line.y, expected.sel(power=power), rtol=1e-6)
-    assert chart.figure.layout.yaxis.title.text == "maximum range (km)"
-    assert f"pd of {writing.PD:g}" in chart.heading
+    assert {panel.y.words for panel in chart.panels} == {"maximum range (km)"}
+    assert f"pd of {detector.PD:g}" in chart.heading
 
 
 def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     axes = {"target.range": {"step": ["500 m", "12 km", "500 m"]}}
     target = GRID["target"] | {"grazing_angle": "50 deg"}
     study = made(tmp_path, GRID | {"axes": axes, "target": target, "figures": []})
-    table = writing.chart(study)
+    table = detector.maximum_range(study)
     assert isinstance(table, Table)
-    answer = study.dataset.sweep.maximum_range(writing.PD).compute()
+    answer = study.dataset.sweep.maximum_range(detector.PD).compute()
     assert list(table.frame["maximum range (km)"] * 1000) == [
-        pytest.approx(float(answer[name])) for name in writing.ANSWERS.values()
+        pytest.approx(float(answer[name])) for name in detector.ANSWERS.values()
     ]
     assert set(table.frame["which is"]) == {"found"}
 
@@ -89,44 +77,42 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
     study = made(tmp_path, GRID | {"axes": axes, "figures": []})
-    chart = writing.chart(study)
-    options = [control.options for control in chart.controls if control.name == "part"]
-    assert options == [["grazing angle 30°", "grazing angle 85°"]]
+    chart = detector.maximum_range(study)
+    parts = list(dict.fromkeys(panel.when["part"] for panel in chart.panels))
+    assert parts == ["grazing angle 30°", "grazing angle 85°"]
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
-    expected = steep.sweep.maximum_range(writing.PD).unbroken / 1000
-    (line,) = drawn_lines(chart, part="grazing angle 85°", answer=writing.KEPT).values()
+    expected = steep.sweep.maximum_range(detector.PD).unbroken / 1000
+    (line,) = drawn_lines(chart, part="grazing angle 85°", answer=detector.KEPT).values()
     np.testing.assert_allclose(line.y, expected, rtol=1e-6)
     target = GRID["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
     power = {"instrument.laser.power": ["1 W", "3 W"]}
     (tmp_path / "powers").mkdir()
     powers = made(tmp_path / "powers", GRID | {"axes": power, "target": target, "figures": []})
-    assert writing.chart(powers) is None
+    assert detector.maximum_range(powers) is None
 
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
     figure = Slices(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
-    chart = lines.chart(drawn, figure)
+    chart = drawn.chart(figure, SHEET)
     told = drawn.dataset.sweep.detection_probability("shot").compute()
     for angle in (30, 90):
         line = drawn_lines(chart)[f"grazing angle {labels.quantity(angle, 'deg')}"]
-        low, high = band(chart, line)
         own = told.sel(grazing_angle=angle)
         assert (own.high - own.low).max() > 0.05
         np.testing.assert_allclose(line.y, own.pd, atol=1e-6)
-        np.testing.assert_allclose(low, own.low, atol=1e-6)
-        np.testing.assert_allclose(high, own.high, atol=1e-6)
+        np.testing.assert_allclose(line.low, own.low, atol=1e-6)
+        np.testing.assert_allclose(line.high, own.high, atol=1e-6)
     assert "interval of each point of a confidence of 0.95" in " ".join(chart.caption)
 
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
-    chart = writing.chart(drawn)
-    expected = drawn.dataset.sweep.maximum_range(writing.PD).compute() / 1000
-    (line,) = drawn_lines(chart, answer=writing.KEPT).values()
-    low, high = band(chart, line)
+    chart = detector.maximum_range(drawn)
+    expected = drawn.dataset.sweep.maximum_range(detector.PD).compute() / 1000
+    (line,) = drawn_lines(chart, answer=detector.KEPT).values()
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()
-    np.testing.assert_allclose(low, expected.unbroken_low[known], rtol=1e-6)
-    np.testing.assert_allclose(high, expected.unbroken_high[known], rtol=1e-6)
+    np.testing.assert_allclose(line.low[known], expected.unbroken_low[known], rtol=1e-6)
+    np.testing.assert_allclose(line.high[known], expected.unbroken_high[known], rtol=1e-6)
     assert "confidence of 0.95" in " ".join(chart.caption)
 
 
@@ -142,6 +128,5 @@ def test_false_alarms_of_a_shot_are_those_that_are_told_a_second(grid_store):
         means = np.add.reduceat(a_second.values, np.arange(0, a_second.size, together))
         first = means[:-1] / together
         np.testing.assert_allclose(shown[name].y[:-1], first, rtol=1e-6)
-        low, high = band(chart, shown[name])
-        assert (low <= shown[name].y * (1 + 1e-6)).all()
-        assert high.max() == pytest.approx(a_second.values.max(), rel=1e-6)
+        assert (shown[name].low <= shown[name].y * (1 + 1e-6)).all()
+        assert shown[name].high.max() == pytest.approx(a_second.values.max(), rel=1e-6)

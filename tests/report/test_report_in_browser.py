@@ -47,7 +47,9 @@ def test_a_grid_s_page_draws_and_its_controls_act(grid):
     power = grid.locator(surface).get_by_label("Shown for")
     assert redrawn(grid, surface, lambda: power.select_option("power 3 W")) == ["power 3 W"]
     kind = grid.locator(surface).get_by_label("Each cell shows the")
-    assert redrawn(grid, surface, lambda: kind.select_option("lowest")) == ["power 3 W"]
+    assert redrawn(grid, surface, lambda: kind.select_option("lowest of each cell")) == [
+        "power 3 W"
+    ]
     shown = "document.querySelector('{} .plot').data.findIndex((t) => t.visible === true)"
     assert grid.evaluate(shown.format(surface)) == 3
 

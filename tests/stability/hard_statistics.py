@@ -10,7 +10,7 @@ import numpy as np
 from cases import EPS, Family
 from table_shots import parameters
 
-from sweep.analysis.scenes.errors_over_altitude import Tally, merge
+from sweep.analysis.scenes.navigation import Tally, merge
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import OUTPUTS
 from sweep.model.realisations import Means

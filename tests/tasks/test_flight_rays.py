@@ -10,12 +10,12 @@ from click.testing import CliRunner
 from small import quiet, tree
 from small_flights import SCENE
 
-from sweep.analysis.answers.flight_comparison import compare
-from sweep.analysis.scenes.opening import open_scene
+from sweep.analysis.answers.comparison import compare_flights as compare
+from sweep.analysis.opening import open_scene
 from sweep.cli import main
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
-from sweep.report.asked import accuracy
+from sweep.report.provenance import accuracy
 from sweep.spec import SceneSpec
 from sweep.tasks import eyepoint_study
 from sweep.tasks.accuracy_table import rays_table

@@ -9,7 +9,7 @@ from small_flights import small_scene
 from zarr.storage import LocalStore, WrapperStore
 
 import sweep
-from sweep.analysis.scenes.places import place
+from sweep.analysis.scenes.recording import place
 from sweep.cli import main
 from sweep.storage.locations import files_below
 from sweep.tasks import packing

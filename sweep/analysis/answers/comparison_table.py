@@ -1,14 +1,17 @@
-"""Two studies compared, in a table and in a sentence."""
+"""Two studies compared: in a table, in a figure and in a sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import labels
-from sweep.analysis.answers.flight_comparison import DETECTED
+from sweep.analysis import canvas, labels
+from sweep.analysis.answers.comparison import DETECTED
+from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel
+from sweep.analysis.drawing import sheet_of
 from sweep.model.outputs import PROMISED
 
 COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
@@ -111,3 +114,65 @@ def verdict(parts: Iterable[xr.Dataset]) -> tuple[str, str]:
         return "same", f"Probabilities of detection {told}{counted}."
     told = f"differ at {apart:,} of {labels.counted(number, thing)}"
     return "different", f"Probabilities of detection {told}{counted}."
+
+
+LEAST = 1e-16
+"""Differences below it stand at the left edge of a figure."""
+
+
+def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
+    """For each probability of detection, the share of points that differ by more than some amount.
+
+    Parameters
+    ----------
+    found
+        As :func:`compared` gives it: each scanner has a colour.
+    path
+        Where to; its suffix names the format.
+    """
+    with canvas.style():
+        chart = figure(found)
+        if chart is None:
+            return canvas.save(canvas.empty("Nothing that both stores have is computed yet"), path)
+        return canvas.save(sheet_of(chart, title=chart.heading, note=""), path)
+
+
+def figure(found: Mapping[str, xr.Dataset]) -> Chart | None:
+    """The chart of the differences; none where nothing that both have is computed."""
+    parts = list(found.values())
+    names = [n for n in PROMISED if any(n in part and part[n].notnull().any() for part in parts)]
+    if not names:
+        return None
+    thing = "shot" if any("shot" in part.dims for part in parts) else "point"
+    number = sum(int(part[names[0]].notnull().sum()) for part in parts)
+    up = Axis(f"share of {thing}s beyond (%)", limits=(-3, 103))
+    across = Axis("difference of pd, either way", LOG, (LEAST, 1.0))
+    return Chart(
+        f"{parts[0].attrs['other']}\nless {parts[0].attrs['ours']}",
+        f"Shares of {thing}s that differ by more than some amount, of {', '.join(names)}.",
+        [f"{number:,} {thing}s that both studies have"],
+        [
+            Panel({"probability": name}, across, up, [
+                line for i, (scanner, part) in enumerate(found.items())
+                for line in _shares(part, name, scanner, i)
+            ])
+            for name in names
+        ],
+        rows=[2] * (len(names) // 2) + [1] * (len(names) % 2),
+    )  # fmt: skip
+
+
+def _shares(found: xr.Dataset, name: str, scanner: str, number: int) -> list[Line]:
+    """Shares of points beyond each difference that is, and beyond each that is allowed."""
+    known = np.isfinite(found[name].values)
+    lines = []
+    for values, words, look in (
+        (np.abs(found[name].values), "found", "line"),
+        (found[f"{name}_allowed"].values, "allowed", "stated"),
+    ):
+        ordered = np.sort(np.maximum(np.broadcast_to(values, known.shape)[known], LEAST))
+        share = 100 * (1 - np.arange(ordered.size + 1) / max(ordered.size, 1))
+        x = np.repeat([LEAST, *ordered, 1.0], 2)[1:-1]
+        y = np.repeat(share, 2)
+        lines.append(Line(x, y, f"{scanner} {words}".strip(), number, look=look))
+    return lines if known.any() else []

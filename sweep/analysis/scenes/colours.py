@@ -1,21 +1,25 @@
-"""Colours of points: a scale for amounts, a colour for each name."""
+"""Sheets of points: colours for amounts and names, marks, legends and ticks."""
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normalize, to_rgba
-from matplotlib.figure import Figure as Sheet
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
+from scipy.spatial import cKDTree
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.scenes.quantities import CATEGORIES, KINDS, SIGNED, WIDE, label
+from sweep.analysis.scenes.recording import CATEGORIES, KINDS, SIGNED, WIDE, label
 
 BOTH_SIGNS = LinearSegmentedColormap.from_list(
     "both_signs",
@@ -29,13 +33,12 @@ Small values have their sign's colour already; larger ones are paler.
 NOTHING = "0.6"
 """Colour of what has no value or name."""
 
-
 LONELY = 0.25
 """Share of a scale's length by which a few values may lie beyond the others and still be on it."""
 
 
 @dataclass(frozen=True)
-class Scale:
+class Amounts:
     """Colours of amounts."""
 
     cmap: Colormap
@@ -49,14 +52,6 @@ class Scale:
         colours = np.asarray(self.cmap(self.norm(np.where(known, values, 1.0))))
         colours[~known] = to_rgba(NOTHING)
         return colours
-
-    def bar(self, sheet: Sheet, axes: Axes) -> None:
-        """A colour bar that fills the axes."""
-        bar = sheet.colorbar(ScalarMappable(self.norm, self.cmap), cax=axes, extend=self.extend)
-        bar.set_label(self.label, fontsize=9)
-        bar.ax.tick_params(labelsize=8)
-        if not isinstance(self.norm, LogNorm):
-            bar.ax.ticklabel_format(useOffset=False)
 
 
 @dataclass(frozen=True)
@@ -80,19 +75,26 @@ class Names:
         return found
 
     def handles(self) -> list[Line2D]:
-        """What a legend shows."""
+        """Entries of a legend."""
         return [
-            Line2D(
-                [], [], linestyle="", marker="o", markersize=6, label=name,
-                color=self.colours.get(number, NOTHING),
-            )
+            mark("o", name, color=self.colours.get(number, NOTHING))
             for number, name in self.names.items()
-        ]  # fmt: skip
+        ]
+
+
+def mark(marker: str, words: str, **look: Any) -> Line2D:
+    """A legend's entry for a mark."""
+    return Line2D([], [], linestyle="", marker=marker, label=words, **{"markersize": 6} | look)
+
+
+def false_point() -> Line2D:
+    """A legend's entry for false points."""
+    return mark("x", "false point", color="0.2", markersize=5)
 
 
 def chosen(
     quantity: str, values: np.ndarray, *, trusted: np.ndarray, surfaces: Sequence[str]
-) -> Scale | Names:
+) -> Amounts | Names:
     """Colours for values of a quantity.
 
     Parameters
@@ -100,7 +102,7 @@ def chosen(
     quantity
         Name of the quantity.
     values : (n,) ndarray
-        Of every point, as :func:`sweep.analysis.scenes.quantities.shown` gives them.
+        Of every point, as :func:`sweep.analysis.scenes.recording.shown` gives them.
     trusted : (n,) ndarray of bool
         Points from which the ends of a scale are taken, if there are any; others may lie beyond.
     surfaces
@@ -114,7 +116,7 @@ def chosen(
             named = dict(enumerate(surfaces)) if quantity == "surface" else {}
             every = {n: named.get(n, "none" if n < 0 else f"{n}") for n in numbers}
             return Names(labels.coordinate(quantity), every)
-    return _scale(quantity, values, trusted)
+    return _amounts(quantity, values, trusted)
 
 
 def _ends(known: np.ndarray) -> tuple[float, float]:
@@ -126,22 +128,155 @@ def _ends(known: np.ndarray) -> tuple[float, float]:
     return (bottom if bottom - low > far else low), (top if high - top > far else high)
 
 
-def _scale(quantity: str, values: np.ndarray, trusted: np.ndarray) -> Scale:
+def _amounts(quantity: str, values: np.ndarray, trusted: np.ndarray) -> Amounts:
     finite = values[np.isfinite(values)]
     known = values[trusted & np.isfinite(values)]
     known = known if known.size else finite
     wide = quantity in WIDE
-    known = known[known > 0] if wide else known
-    low, high = _ends(known)
+    low, high = _ends(known[known > 0] if wide else known)
     cmap = colormaps[canvas.SCALE]
     if quantity in SIGNED and low < 0 < high:
         cmap, low, high = BOTH_SIGNS, -max(-low, high), max(-low, high)
     if high <= low:
         low, high = (low / 2, high * 2) if wide else (low - 0.5, high + 0.5)
     below, above = bool((finite < low).any()), bool((finite > high).any())
-    return Scale(
+    return Amounts(
         cmap,
         LogNorm(low, high) if wide else Normalize(low, high),
         textwrap.fill(label(quantity), 44),
         {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above],
     )
+
+
+COLUMN = 1.75
+"""Width of what stands at the right [inches]."""
+
+HEAD, FOOT, LINE = 0.75, 0.55, 0.17
+"""Heights of the title and of the small print's first line and of each further one [inches]."""
+
+
+class Stage:
+    """A sheet with a picture of a given size, and what its colours and marks mean at its right.
+
+    Parameters
+    ----------
+    width, height : float
+        Size of the picture, its labels included [inches].
+    title, note : str
+        What stands over the sheet, and at its foot.
+    """
+
+    def __init__(self, width: float, height: float, *, title: str, note: str) -> None:
+        self.width, self.height = width, height
+        head = HEAD + 0.18 * title.count("\n")
+        total = width + COLUMN
+        self.foot = FOOT + LINE * (len(note) // int(15 * total))
+        self.sheet = canvas.sheet(total, height + head + self.foot)
+        self.sheet.set_layout_engine("none")
+        canvas.title(self.sheet, title)
+        canvas.caption(self.sheet, note)
+
+    def rectangle(
+        self, left: float, bottom: float, width: float, height: float
+    ) -> tuple[float, float, float, float]:
+        """A rectangle in inches from the picture's lower left corner, in shares of the sheet."""
+        across, up = self.sheet.get_size_inches()
+        return left / across, (self.foot + bottom) / up, width / across, height / up
+
+    def axes(self, *at: float, **options: Any) -> Axes:
+        """Axes in a rectangle in inches from the picture's lower left corner."""
+        return self.sheet.add_axes(self.rectangle(*at), **options)
+
+    def explain(self, scale: Amounts | Names, handles: Sequence[Artist]) -> None:
+        """The colours' scale or names, and the marks' meaning."""
+        if isinstance(scale, Amounts):
+            tall = min(0.72 * self.height, 4.2)
+            axes = self.axes(self.width + 0.15, (self.height - tall) * 0.62, 0.17, tall)
+            bar = self.sheet.colorbar(
+                ScalarMappable(scale.norm, scale.cmap), cax=axes, extend=scale.extend
+            )
+            bar.set_label(scale.label, fontsize=9)
+            bar.ax.tick_params(labelsize=8)
+            if not isinstance(scale.norm, LogNorm):
+                bar.ax.ticklabel_format(useOffset=False)
+        elif scale.names:
+            self._legend(scale.handles(), 0.86 * self.height, scale.title, "upper left")
+        if handles:
+            self._legend(handles, 0.0, "", "lower left")
+
+    def _legend(self, handles: Sequence[Artist], bottom: float, title: str, loc: Any) -> None:
+        x, y, *_ = self.rectangle(self.width + 0.02, bottom, 0, 0)
+        self.sheet.legend(
+            handles=list(handles), title=title or None, loc=loc, bbox_to_anchor=(x, y),
+            frameon=False, fontsize=8, handletextpad=0.5, borderaxespad=0.0,
+        )  # fmt: skip
+
+
+LARGEST = 24.0
+"""Area of the largest marks of points [square points]."""
+
+READABLE = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
+"""Areas below which marks of so many points are not made [square points]."""
+
+ACROSS, UP = 0.42, 0.25
+"""Distances of ticks that can still be read, on level and on upright axes [inches]."""
+
+FAR = 1e5
+"""Coordinates [m] from which on axes show them relative to a round number."""
+
+
+def mark_size(places: np.ndarray, width: float, height: float) -> float:
+    """Area of a mark that leaves points (2, n) apart on a picture, if it can [square points].
+
+    Places, width and height of the picture are in inches.
+    """
+    number = places.shape[1]
+    if number < 2:
+        return LARGEST
+    nearest = cKDTree(places.T).query(places.T[:: max(1, number // 1000)], k=2)[0][:, 1]
+    apart = (0.85 * 72 * float(np.median(nearest))) ** 2
+    share = 0.1 * 72 * 72 * width * height / number
+    least = next(size for most, size in READABLE if number <= most)
+    return min(max(min(apart, share), least), LARGEST)
+
+
+def false_marks(size: float) -> dict[str, Any]:
+    """Look of false points beside true ones of a size."""
+    return {"marker": "x", "s": max(1.2 * size, 9.0), "linewidths": 0.7}
+
+
+def lengths(
+    axis: Any, name: str, limits: tuple[float, float], inches: float, apart: float = ACROSS
+) -> None:
+    """Name, units and ticks of an axis of metres; far-off ones relative to a round number.
+
+    Parameters
+    ----------
+    axis, name, limits
+        The axis, what it is called, and its ends [m].
+    inches, apart
+        Its length on the picture, and the least distance of ticks.
+    """
+    low, high = limits
+    shift = 0.0
+    if max(abs(low), abs(high)) > FAR:
+        unit = 10.0 ** max(math.ceil(math.log10(high - low)), 0)
+        shift = unit * round((low + high) / 2 / unit)
+    axis.set_major_locator(FixedLocator(_ticks(low, high, inches / apart)))
+    if shift:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value - shift:g}"))
+        name = f"{name} {'-' if shift > 0 else '+'} {abs(shift):.0f}"
+    axis.set_label_text(labels.with_units(name, "m"))
+    axis.label.set_size(9)
+    axis.set_tick_params(labelsize=8)
+
+
+def _ticks(low: float, high: float, room: float) -> list[float]:
+    """Round values on an axis, with at most so many steps between them."""
+    found: list[float] = []
+    for number in range(max(2, min(int(room), 8)), 0, -1):
+        ticks = MaxNLocator(number, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+        found = [float(tick) for tick in ticks if low <= tick <= high] or found
+        if len(found) - 1 <= room:
+            return found
+    return found[len(found) // 2 :][:1]

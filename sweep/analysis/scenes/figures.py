@@ -11,24 +11,26 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.scenes import (
-    cloud,
-    cloud_figure,
-    errors_over_altitude,
-    navigation_figure,
-    scatter_figure,
-    shot_figure,
+from sweep.analysis.drawing import sheet_of
+from sweep.analysis.figures import source
+from sweep.analysis.opening import opened
+from sweep.analysis.scenes import pictures
+from sweep.analysis.scenes.clouds import AXES, Ground, gathered
+from sweep.analysis.scenes.navigation import Curve, curves, navigation_chart, navigation_page
+from sweep.analysis.scenes.recording import (
+    QUANTITIES,
+    Interval,
+    Place,
+    Recording,
+    eyepoints_of,
+    place,
+    read_eyepoints,
+    several_surfaces,
 )
-from sweep.analysis.scenes.errors_over_altitude import Curve
-from sweep.analysis.scenes.eyepoints import eyepoints_of, read_eyepoints
-from sweep.analysis.scenes.navigation_figure import AVAILABILITY, BIAS, COMPONENTS, RMSE, UNITS
-from sweep.analysis.scenes.opening import opened
-from sweep.analysis.scenes.places import Place, place
-from sweep.analysis.scenes.quantities import QUANTITIES
-from sweep.analysis.scenes.recording import Interval, Recording
-from sweep.analysis.scenes.terrain import Ground
-from sweep.analysis.tabular import Block, Cell, Page
+from sweep.analysis.shot_figure import scene_shot_sheet
+from sweep.analysis.shot_spectra import simulated_shot
 from sweep.model.effects.catalogue import names_of
+from sweep.model.eyepoints import prepare_eyepoints
 from sweep.spec import SceneSpec
 from sweep.spec.figures import (
     CloudFigure,
@@ -39,63 +41,6 @@ from sweep.spec.figures import (
     ShotSpectra,
 )
 from sweep.storage.locations import Location, located
-
-LENGTH = "vector"
-
-
-def navigation_page(
-    curves: Sequence[Curve], *, quantity: str, show: str, title: str, remarks: Sequence[str]
-) -> Page:
-    """A block for each scanner, a row for each bin of altitude.
-
-    Parameters
-    ----------
-    curves
-        Errors of each scanner.
-    quantity, show
-        ``velocity`` or ``altitude``; ``availability``, ``bias``, ``rmse`` or ``all``.
-    title, remarks
-        What stands over the page and under it.
-    """
-    shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
-    blocks, records = [], []
-    for curve in curves:
-        own = [_record(curve, i, quantity, shown) for i in range(curve.edges.size - 1)]
-        columns = [name for name in own[0] if name != "scanner"]
-        rows = [[record[name] for name in columns] for record in own]
-        blocks.append(Block(f"{labels.coordinate(curve.scanner)}: {quantity}", columns, rows))
-        records += own
-    notes = [
-        "from, to: true altitude above ground [m]; cycles: measurement cycles times draws.",
-        f"bias, rmse, stated: in {UNITS[quantity]}; stated: root of the mean variance that",
-        "  solutions give for themselves; error of bias: its standard error.",
-        *remarks,
-    ]
-    return Page(title, blocks, notes, records)
-
-
-def _record(curve: Curve, i: int, quantity: str, shown: Sequence[str]) -> dict[str, Cell]:
-    """One line of the CSV file."""
-    record: dict[str, Cell] = {
-        "scanner": curve.scanner,
-        "from": float(curve.edges[i]),
-        "to": float(curve.edges[i + 1]),
-        "cycles": int(curve.tally.attempts[i]),
-        "solved": int(curve.tally.count[i]),
-    }
-    names = COMPONENTS[quantity]
-    if AVAILABILITY in shown:
-        record["available"] = float(curve.tally.availability[i])
-    if BIAS in shown:
-        for k, name in enumerate(names):
-            record[f"bias {name}".strip()] = float(curve.bias[i, k])
-            record[f"error of bias {name}".strip()] = float(curve.bias_error[i, k])
-    if RMSE in shown:
-        for k, name in enumerate((*names, LENGTH) if len(names) > 1 else names):
-            record[f"rmse {name}".strip()] = float(curve.rmse[i, k])
-            record[f"stated {name}".strip()] = float(curve.predicted[i, k])
-    return record
-
 
 COLOURS = ("range", "radial_velocity")
 
@@ -142,14 +87,8 @@ class SceneStudy:
 
     @property
     def note(self) -> str:
-        """What a picture's foot says of where it comes from."""
-        attributes = self.tree.attrs
-        note = (
-            f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
-            f"model {attributes['model_version']}"
-        )
-        done, number = attributes["blocks_committed"], attributes["blocks"]
-        return note if done >= number else f"{note}: {done:,} of {number:,} blocks computed"
+        """Words at a picture's foot."""
+        return source(self.tree.attrs, "blocks")
 
     def titled(self, figure: SceneFigure, otherwise: str) -> str:
         """What stands over a figure."""
@@ -157,27 +96,7 @@ class SceneStudy:
 
 
 def draw(store_path: str | Location, directory: Path, form: str = "png") -> list[Path]:
-    """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
-
-    Parameters
-    ----------
-    store_path
-        The store, complete or not.
-    directory
-        Where to.
-    form
-        ``png``, ``pdf`` or ``svg``.
-
-    Returns
-    -------
-    list of Path
-        The files written: pictures of figures, TXT and CSV of tables.
-
-    Raises
-    ------
-    NotAStoreError
-        Where there is no store of a scene, or the eyepoints that a figure needs are gone.
-    """
+    """Files of every figure and table that a store's spec asks for; of a usual set by default."""
     study = SceneStudy.of(store_path)
     figures: Sequence[SceneFigure] = study.spec.figures or default_figures(study.tree)
     return [path for figure in figures for path in _made(study, figure, directory, form)]
@@ -187,20 +106,24 @@ def _made(study: SceneStudy, figure: SceneFigure, directory: Path, form: str) ->
     """Files of one figure."""
     at = place(study.spec, figure.where)
     if isinstance(figure, NavigationTable):
-        curves = _curves(study, figure, at)
         page = navigation_page(
-            curves, quantity=figure.quantity, show=figure.show,
-            title=figure.title or study.spec.title, remarks=[labels.joined([at.words, study.note])],
+            _curves(study, figure, at), show=figure.show, title=figure.title or study.spec.title,
+            remarks=[labels.joined([at.words, study.note])],
         )  # fmt: skip
         return page.save(directory, figure.stem)
-    makers: dict[type, Callable[[SceneStudy, Any, Place], canvas.Sheet]] = {
+    makers: dict[type, Callable[[SceneStudy, Any, Place], canvas.Sheet | str]] = {
         CloudFigure: _cloud,
         Scatter: _scatter,
         ShotSpectra: _shot,
         NavigationFigure: _navigation,
     }
     sheet = makers[type(figure)](study, figure, at)
+    if isinstance(sheet, str):
+        sheet = canvas.empty(f"{study.spec.title}: {sheet}")
     return [canvas.save(sheet, directory / f"{figure.stem}.{form}")]
+
+
+NO_POINT = "there is no point within the figure's limits"
 
 
 def _recording(
@@ -225,12 +148,12 @@ def _remarks(study: SceneStudy, recording: Recording, at: Place, figure: Any) ->
     return [", ".join([*said, *filter(None, [at.words])]), study.note]
 
 
-def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet:
+def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet | str:
     recording = _recording(study, figure, at)
-    asked = {name: _interval(getattr(figure, name)) for name in ("x", "y", "z", "time")}
-    found = cloud.gathered(
+    asked = {name: _interval(getattr(figure, name)) for name in (*AXES, "time")}
+    found = gathered(
         recording,
-        colour=figure.colour,
+        [figure.colour],
         ranges=figure.ranges,
         draw=figure.draw,
         crops={name: crop for name, crop in asked.items() if crop is not None},
@@ -238,13 +161,13 @@ def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet:
         path=figure.path,
     )
     if found is None:
-        return canvas.empty(f"{study.spec.title}: there is no point within the figure's limits")
-    view: cloud_figure.View = (
+        return NO_POINT
+    view: str | tuple[float, float] = (
         figure.view
         if isinstance(figure.view, str)
         else (np.degrees(figure.view["azimuth"]), np.degrees(figure.view["elevation"]))
     )
-    return cloud_figure.draw(
+    return pictures.cloud_sheet(
         found,
         quantity=figure.colour,
         surfaces=study.surfaces,
@@ -255,53 +178,46 @@ def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet:
     )
 
 
-def _scatter(study: SceneStudy, figure: Scatter, at: Place) -> canvas.Sheet:
+def _scatter(study: SceneStudy, figure: Scatter, at: Place) -> canvas.Sheet | str:
     recording = _recording(study, figure, at)
-    found = scatter_figure.gathered(
+    found = pictures.scattered(
         recording, [figure.x, figure.y, figure.colour], draw=figure.draw, ranges=figure.ranges,
         time=_interval(figure.time),
     )  # fmt: skip
     if not found.total:
-        return canvas.empty(f"{study.spec.title}: there is no point within the figure's limits")
-    return scatter_figure.draw(
+        return NO_POINT
+    words = f"{QUANTITIES[figure.y].words} over {QUANTITIES[figure.x].words}"
+    return pictures.scatter_sheet(
         found,
         x=figure.x,
         y=figure.y,
         colour=figure.colour,
         surfaces=study.surfaces,
-        title=study.titled(
-            figure, f"{QUANTITIES[figure.y].words} over {QUANTITIES[figure.x].words}".capitalize()
-        ),
+        title=study.titled(figure, words.capitalize()),
         remarks=_remarks(study, recording, at, figure),
     )
 
 
-def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet:
+def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | str:
     recording = _recording(study, figure, at)
-    if isinstance(figure.shot, int):
-        number: int | None = figure.shot
-    else:
-        number = shot_figure.several_surfaces(recording, figure.draw)
-    if number is None or number >= recording.shots:
-        why = "no shot tells several surfaces apart" if number is None else f"no shot {number}"
-        return canvas.empty(f"{study.spec.title}: there is {why}")
+    asked = figure.shot
+    number = asked if isinstance(asked, int) else several_surfaces(recording, figure.draw)
+    if number is None:
+        return "no shot tells several surfaces apart"
+    if number >= recording.shots:
+        return f"there is no shot {number}"
     eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), np.array([number]))
     if not eyepoints.seen.all():
-        return canvas.empty(f"{study.spec.title}: shot {number} sees nothing")
-    simulated = recording.read("effects", slice(number, number + 1))
-    shot = shot_figure.simulated(
-        eyepoints,
-        at.parameters(study.spec),
-        study.spec.surfaces(),
-        names_of(int(simulated[0])),
-        seed=study.spec.seed,
-    )
+        return f"shot {number} sees nothing"
+    parameters = at.parameters(study.spec)
+    effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
+    prepared = prepare_eyepoints(eyepoints, parameters, study.spec.surfaces(), effects)
     told = (
         f"shot {number:,} of {recording.shots:,} at {eyepoints.time[0]:.6g} s, "
         f"beam {eyepoints.beam[0]}, noise drawn for the picture"
     )
-    return shot_figure.draw(
-        shot,
+    return scene_shot_sheet(
+        simulated_shot(prepared, parameters, seed=study.spec.seed),
         eyepoints,
         study.surfaces,
         title=study.titled(figure, "Spectra of one shot"),
@@ -313,18 +229,16 @@ def _curves(
     study: SceneStudy, figure: NavigationFigure | NavigationTable, at: Place
 ) -> list[Curve]:
     scanners = figure.scanners or study.scanners
-    recordings = [at.recording(study.tree, scanner) for scanner in scanners]
-    return errors_over_altitude.curves(recordings, quantity=figure.quantity, bins=figure.bins)
+    named = [(scanner, at.recording(study.tree, scanner)) for scanner in scanners]
+    return curves(named, quantity=figure.quantity, bins=figure.bins)
 
 
-def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canvas.Sheet:
-    curves = _curves(study, figure, at)
-    if not curves:
-        return canvas.empty(f"{study.spec.title}: no measurement cycle of three shots or more")
-    return navigation_figure.draw(
-        curves,
-        quantity=figure.quantity,
-        show=figure.show,
+def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canvas.Sheet | str:
+    found = _curves(study, figure, at)
+    if not found:
+        return "no measurement cycle of three shots or more"
+    return sheet_of(
+        navigation_chart(found, figure.show),
         title=study.titled(figure, f"Navigation: {figure.quantity}"),
-        remarks=[at.words, study.note],
+        note=labels.joined([at.words, study.note]),
     )

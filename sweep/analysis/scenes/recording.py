@@ -1,16 +1,117 @@
-"""What one scanner recorded on its flight: shots and points, read stretch by stretch."""
+"""Recordings of scanners: quantities of shots and points, read stretch by stretch; eyepoints."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.scenes.opening import chunk, stretches
-from sweep.analysis.scenes.quantities import QUANTISED, QUANTITIES, stored_name
-from sweep.storage.locations import Location
+from sweep.analysis import labels
+from sweep.analysis.opening import chunk, read_attributes, stretches
+from sweep.analysis.selection import is_any
+from sweep.model.eyepoints import Eyepoints
+from sweep.model.outputs import BEAMLETS, CYCLES, POINTS, SHOTS, STATISTICS, XYZ
+from sweep.model.pairing import FLAGS, TRUE
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import Mistake, SpecError
+from sweep.spec.mistakes import near_miss
+from sweep.storage.atomic_replace import real
+from sweep.storage.locations import PACKED, Location, located, zarr_store
+from sweep.storage.opening import CHECKED, NotAStoreError
+from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec
+
+QUANTISED, INTERPOLATED = "quantised", "interpolated"
+
+_BY_RANGES = {
+    f"{name}{error}": f"{name}_interpolated{error}"
+    for name in ("range", "radial_velocity")
+    for error in ("", "_standard_error")
+}
+
+CATEGORIES = ("beam", "surface", "flags")
+"""Quantities whose values are names rather than amounts."""
+
+SIGNED = ("radial_velocity", "beam_radial_velocity", "true_radial_velocity")
+"""Velocities, whose sign is shown."""
+
+DECIBELS = ("snr", "snr_up")
+"""Ratios of powers, which are shown in decibels."""
+
+WIDE = ("pfa_up", "pfa_down")
+"""Quantities that go over orders of magnitude, and are above 0."""
+
+KINDS = {name: bit for name, bit in FLAGS.items() if name != "unconfirmed"}
+"""Flags of which a point has exactly one."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of each shot or of each point."""
+
+    name: str
+    words: str
+    units: str
+    of_points: bool
+
+
+def _listed() -> dict[str, Quantity]:
+    found = {}
+    for table, of_points in ((SHOTS, False), (STATISTICS, False), (POINTS, True)):
+        for name, output in table.items():
+            if XYZ not in output.dims:
+                found[name] = Quantity(name, output.long_name, output.units, of_points)
+    plain = {
+        "range": "range", "radial_velocity": "radial velocity", "snr": "signal-to-noise ratio",
+        "pd": "probability of detection", "time": "time", "beam": "beam", "surface": "surface",
+    }  # fmt: skip
+    for name, words in plain.items():
+        found[name] = Quantity(name, words, found[name].units, found[name].of_points)
+    altitude = CYCLES["true_altitude"]
+    derived = [Quantity("altitude", "altitude above ground", altitude.units, False)]
+    derived += [Quantity(axis, axis, "m", True) for axis in "xyz"]
+    derived += [Quantity("shot", "number of the shot", "1", False)]
+    return found | {quantity.name: quantity for quantity in derived}
+
+
+QUANTITIES = _listed()
+"""Every quantity by its name."""
+
+
+def stored_name(name: str, ranges: str) -> str:
+    """Array that holds a quantity by whole bins, or interpolated between them."""
+    return _BY_RANGES.get(name, name) if ranges == INTERPOLATED else name
+
+
+def label(name: str) -> str:
+    """A quantity in words with the units in which it is shown."""
+    about = QUANTITIES[name]
+    return labels.with_units(about.words, "dB" if name in DECIBELS else about.units)
+
+
+def shown(name: str, values: np.ndarray) -> np.ndarray:
+    """Values as they are shown: decibels of ratios, and of flags which kind of point they say."""
+    values = np.asarray(values)
+    if name == "flags":
+        return np.asarray(kinds(values.astype(int)), float)
+    if name in DECIBELS:
+        known = values > 0
+        return np.where(known, 10 * np.log10(np.where(known, values, 1.0)), np.nan)
+    return values.astype(float)
+
+
+def kinds(flags: np.ndarray) -> np.ndarray:
+    """Which of KINDS each point's flags say, as an index; -1 where there is no point."""
+    found = np.full(np.shape(flags), -1)
+    for i, bit in enumerate(KINDS.values()):
+        found[(flags & bit) > 0] = i
+    return found
+
 
 Table = dict[str, np.ndarray]
 
@@ -50,11 +151,6 @@ class Recording:
         """Number of shots."""
         return int(self.dataset.sizes["shot"])
 
-    @property
-    def shots_a_cycle(self) -> int:
-        """Shots of a measurement cycle."""
-        return int(self.dataset.attrs["shots_a_cycle"])
-
     def stretches(self, time: Interval | None = None) -> Iterator[slice]:
         """Stretches of shots, without those that are not computed or lie outside of an interval."""
         for part in stretches(self.dataset["flags"], "shot"):
@@ -85,7 +181,7 @@ class Recording:
         return np.asarray((array if draw is None else array.isel(draw=draw)).values)
 
     def points(
-        self, names: Sequence[str], part: slice, *, draw: int = 0, ranges: str = QUANTISED
+        self, names: Sequence[str], part: slice, draw: int = 0, ranges: str = QUANTISED
     ) -> Table:
         """Quantities of every point of a stretch, (m,) each, in the order of shots and returns.
 
@@ -133,7 +229,7 @@ class Recording:
         if name == "shot":
             return np.arange(part.start, part.stop)
         if name == "altitude":
-            cycle = np.arange(part.start, part.stop) // self.shots_a_cycle
+            cycle = np.arange(part.start, part.stop) // int(self.dataset.attrs["shots_a_cycle"])
             heights = self.dataset["true_altitude"].isel(cycle=slice(cycle[0], cycle[-1] + 1))
             return np.asarray(heights.values)[cycle - cycle[0]]
         return self.read(name, part)
@@ -143,6 +239,29 @@ class Recording:
         reach = self.read("beam_range", part)
         reach = np.where(np.isfinite(reach), reach, np.nan)[:, None]
         return self.read("platform_position", part) + reach * self.read("beam_direction", part)
+
+
+def several_surfaces(recording: Recording, draw: int = 0) -> int | None:
+    """Number of the first shot that tells surfaces apart.
+
+    The first with true points of two surfaces in a draw; where there is none, the first with two
+    groups of bins above the threshold; none where there is none of those either.
+    """
+    fallback = None
+    for part in recording.stretches():
+        seen = np.where(
+            (recording.read("flags", part, draw) & TRUE) > 0,
+            recording.read("surface", part, draw).astype(float), np.nan,
+        )  # fmt: skip
+        low = np.where(np.isnan(seen), np.inf, seen).min(axis=1)
+        high = np.where(np.isnan(seen), -np.inf, seen).max(axis=1)
+        apart = np.flatnonzero(high > low)
+        if apart.size:
+            return part.start + int(apart[0])
+        if fallback is None:
+            groups = np.flatnonzero(recording.read("surfaces_seen", part) >= 2)
+            fallback = part.start + int(groups[0]) if groups.size else None
+    return fallback
 
 
 def confined(tables: Table, crops: Mapping[str, Interval]) -> Table:
@@ -190,3 +309,152 @@ class Thinned:
         if not self._parts:
             return {}
         return {n: np.concatenate([part[n] for part in self._parts]) for n in self._parts[0]}
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place along the axes of a study.
+
+    Attributes
+    ----------
+    index : dict
+        Number of the value along each axis, by the axis's name.
+    words : str
+        Values of the axes that have several, for a reader; empty where none has.
+    left_open : tuple of str
+        Axes along which other values would do as well.
+    """
+
+    index: dict[str, int]
+    words: str
+    left_open: tuple[str, ...]
+
+    def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
+        """What a scanner recorded there."""
+        group = tree.children[scanner].to_dataset(inherit=False)
+        if PACKED in tree.attrs:
+            return Recording(scanner, group.isel(self.index))
+        points = located(str(tree.encoding["source"])) / scanner / "flags" / "c"
+        return Recording(
+            scanner, group.isel(self.index), points.joinpath(*map(str, self.index.values()))
+        )
+
+    def parameters(self, spec: SceneSpec) -> dict[str, float | int | str]:
+        """SI values of all parameters there, by dotted path."""
+        parameters = dict(spec.parameters())
+        for axis in spec.axes:
+            for member in axis.members:
+                value = member.values[self.index[axis.name]]
+                parameters[member.path] = value.item() if isinstance(value, np.generic) else value
+        return parameters
+
+
+def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
+    """The first place at which coordinates have the values asked for.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    where
+        Value, or values, of coordinates, as written in a spec; of an axis with a name of its
+        own, the number along it.
+
+    Raises
+    ------
+    SpecError
+        For a coordinate that the study lacks, or a value that cannot be read or that it lacks.
+    """
+    fits = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
+    mistakes = []
+    for name, written in where.items():
+        several = list(written) if isinstance(written, tuple | list) else [written]
+        try:
+            axis, found = _fitting(spec, name, several)
+        except QuantityError as error:
+            mistakes.append(Mistake(f"where.{name}", error.rule, f"{written}", error.suggestion))
+            continue
+        except KeyError:
+            known = [member.name for axis in spec.axes for member in axis.members]
+            otherwise = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
+            remedy = near_miss(name, known, otherwise=otherwise)
+            mistakes.append(
+                Mistake(f"where.{name}", "is no coordinate of this study", f"{written}", remedy)
+            )
+            continue
+        fits[axis] &= found
+        if not fits[axis].any():
+            rule, remedy = "is no value of this study", _values(spec, name)
+            mistakes.append(Mistake(f"where.{name}", rule, f"{written}", remedy))
+    if mistakes:
+        raise SpecError(mistakes)
+    index = {name: int(np.argmax(found)) for name, found in fits.items()}
+    left_open = tuple(name for name, found in fits.items() if found.sum() > 1)
+    return Place(index, _words(spec, index), left_open)
+
+
+def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray]:
+    """The axis of a coordinate, and which of its values are among those asked for."""
+    for axis in spec.axes:
+        if name in [member.name for member in axis.members]:
+            wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
+            return axis.name, is_any(np.asarray(spec.member(name).display), wanted)
+        if name == axis.name:
+            return axis.name, np.isin(np.arange(axis.size), [int(str(v)) for v in several])
+    raise KeyError(name)
+
+
+def _values(spec: SceneSpec, name: str) -> str:
+    """The values that there are, in words."""
+    for axis in spec.axes:
+        for member in axis.members:
+            if name == member.name:
+                shown = [labels.quantity(value, member.units) for value in member.display[:8]]
+                return f"it has {', '.join(shown)}" + (", ..." if axis.size > 8 else "")
+    return f"they are numbered 0 to {next(a.size for a in spec.axes if a.name == name) - 1}"
+
+
+def _words(spec: SceneSpec, index: Mapping[str, int]) -> str:
+    return ", ".join(
+        f"{labels.coordinate(member.name)} "
+        f"{labels.quantity(member.display[index[axis.name]], member.units)}"
+        for axis in spec.axes
+        if axis.size > 1
+        for member in axis.members
+    )
+
+
+FOLDER = "eyepoints"
+"""Folder of the eyepoints of all studies whose stores lie beside it."""
+
+
+def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
+    """Store of the eyepoints that a scanner's clouds were made of."""
+    return real(store_path).parent / FOLDER / f"{scanner.attrs['geometry_id']}.zarr"
+
+
+def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
+    """Eyepoints of some shots.
+
+    Parameters
+    ----------
+    path
+        Store of the eyepoints.
+    index : (n,) int ndarray
+        Numbers of the shots.
+
+    Raises
+    ------
+    NotAStoreError
+        Where the store is not there.
+    """
+    if not path.exists():
+        raise NotAStoreError(
+            f"the eyepoints of the study are not at {path}: they are kept beside its store; "
+            "running the study again casts them anew"
+        )
+    read_attributes(path, "eyepoints")
+    dataset = xr.open_zarr(zarr_store(path), chunks=None, **CHECKED)
+    chosen = dataset.isel(shot=np.asarray(index))
+    arrays = {name: np.asarray(chosen[name].values) for name in (*SHOTS, *BEAMLETS)}
+    return from_arrays(arrays, np.asarray(dataset["weight"].values))

@@ -1,4 +1,4 @@
-"""Errors of navigation by altitude: how often there is a solution, its bias and its scatter."""
+"""Errors of navigation by altitude: availability, bias and scatter; their chart and table."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from itertools import product
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.scenes.opening import chunk, stretches
+from sweep.analysis import labels
+from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Map, Panel
+from sweep.analysis.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
+from sweep.analysis.tabular import Block, Cell, Page
 from sweep.model.navigation import EXCLUDED, SOLVED
 
 VELOCITY, ALTITUDE = "velocity", "altitude"
@@ -95,8 +98,8 @@ class Curve:
 
     Attributes
     ----------
-    scanner, words : str
-        Its name, and what else tells the curve from others.
+    scanner, quantity : str
+        Its name; ``velocity`` or ``altitude``.
     edges : (bins + 1,) ndarray
         Altitudes between the bins [m], rising.
     tally : Tally
@@ -104,8 +107,14 @@ class Curve:
     """
 
     scanner: str
+    quantity: str
     edges: np.ndarray
     tally: Tally
+
+    @property
+    def words(self) -> str:
+        """Name for a reader."""
+        return labels.coordinate(self.scanner) or "measured"
 
     @property
     def middle(self) -> np.ndarray:
@@ -142,12 +151,7 @@ def _with_length(parts: np.ndarray) -> np.ndarray:
     return np.concatenate([parts, np.linalg.norm(parts, axis=-1, keepdims=True)], axis=-1)
 
 
-def navigates(recording: Recording) -> bool:
-    """Whether a scanner has solutions: its cycles have three shots or more."""
-    return "velocity_status" in recording.dataset
-
-
-def curves(recordings: Sequence[Recording], *, quantity: str, bins: int) -> list[Curve]:
+def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) -> list[Curve]:
     """Errors of scanners that navigate, all over the same bins of altitude.
 
     Solutions are read chunk by chunk; each stretch has a tally of its own, and the tallies are
@@ -155,28 +159,28 @@ def curves(recordings: Sequence[Recording], *, quantity: str, bins: int) -> list
 
     Parameters
     ----------
-    recordings
-        What the scanners recorded.
+    named
+        Names of scanners, and what they recorded.
     quantity
         ``velocity`` or ``altitude``.
     bins
         Number of bins, of one width, from the lowest altitude to the highest.
     """
-    able = [recording for recording in recordings if navigates(recording)]
-    edges = _edges(able, bins)
+    able = [(name, own.dataset) for name, own in named if "velocity_status" in own.dataset]
+    edges = _edges([dataset for _, dataset in able], bins)
     if edges is None:
         return []
     return [
-        Curve(recording.scanner, edges, merge(list(_tallies(recording.dataset, quantity, edges))))
-        for recording in able
+        Curve(name, quantity, edges, merge(list(_tallies(dataset, quantity, edges))))
+        for name, dataset in able
     ]
 
 
-def _edges(recordings: Sequence[Recording], bins: int) -> np.ndarray | None:
+def _edges(datasets: Sequence[xr.Dataset], bins: int) -> np.ndarray | None:
     """Edges of the bins; none where no cycle's altitude is known."""
     lows, highs = [], []
-    for recording in recordings:
-        altitude = recording.dataset["true_altitude"]
+    for dataset in datasets:
+        altitude = dataset["true_altitude"]
         for part in stretches(altitude, "cycle", STRETCH):
             known = np.asarray(altitude.isel(cycle=part).values)
             known = known[np.isfinite(known)]
@@ -281,3 +285,144 @@ def _add_up(values: np.ndarray, cell: np.ndarray, size: int) -> np.ndarray:
 def _over(total: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Quotient, nan where the number is not positive."""
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
+COMPONENTS = {VELOCITY: ("x", "y", "z"), ALTITUDE: ("",)}
+UNITS = {VELOCITY: "m/s", ALTITUDE: "m"}
+LENGTH = "vector"
+
+Statistic = tuple[str, int]
+"""A statistic, and the number of the component that it is of; one past the last is the length."""
+
+
+def navigation_chart(curves: Sequence[Curve], show: str) -> Chart:
+    """Errors over altitude, a panel for each statistic and a line for each curve.
+
+    Parameters
+    ----------
+    curves
+        Errors of each scanner, at least one, of one quantity or of several.
+    show
+        ``availability``, ``bias``, ``rmse`` or ``all``.
+    """
+    panels, rows = [], []
+    for quantity in dict.fromkeys(curve.quantity for curve in curves):
+        own = [curve for curve in curves if curve.quantity == quantity]
+        every = _rows(quantity, show)
+        rows += [len(row) for row in every]
+        panels += [_panel(own, quantity, *statistic) for row in every for statistic in row]
+    titles = [panel.title for panel in panels]
+    caption = [f"{curves[0].edges.size - 1} bins of altitude, over all draws"]
+    if any("bias" in title for title in titles):
+        caption[0] += "; bars: standard error of the bias"
+    if any("error" in title for title in titles):
+        caption.append("as stated: root of the mean variance that solutions give for themselves")
+    return Chart(
+        "Navigation", f"Lines of navigation's errors over altitude: {', '.join(titles)}.", caption,
+        panels, {"statistic": "Shown"}, rows=rows,
+    )  # fmt: skip
+
+
+def _rows(quantity: str, show: str) -> list[list[Statistic]]:
+    """Panels row by row: what there is over all components first, then component by component."""
+    number = len(COMPONENTS[quantity])
+    parts = list(range(number))
+    if number == 1:
+        asked = [AVAILABILITY, BIAS, RMSE] if show == "all" else [show]
+        return [[(statistic, 0) for statistic in asked]]
+    if show == "all":
+        first = [(AVAILABILITY, 0), (RMSE, number)]
+        return [first, [(BIAS, i) for i in parts], [(RMSE, i) for i in parts]]
+    if show == RMSE:
+        return [[(RMSE, number), (RMSE, 0)], [(RMSE, i) for i in parts[1:]]]
+    return [[(show, i) for i in (parts if show == BIAS else [0])]]
+
+
+def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) -> Panel:
+    names = COMPONENTS[quantity]
+    component = names[part] if part < len(names) else LENGTH
+    of = f"of the {quantity}" + (f", {component}" if len(names) > 1 else "")
+    units, middle = UNITS[quantity], curves[0].middle
+    lines: list[Line | Map] = []
+    if statistic == AVAILABILITY:
+        title, up = f"{quantity} available", Axis("share of cycles (%)", limits=(-4, 104))
+        lines += [Line(middle, 100 * curve.tally.availability, curve.words, k)
+                  for k, curve in enumerate(curves)]  # fmt: skip
+    elif statistic == BIAS:
+        title, up = f"bias {of}", Axis(f"bias ({units})")
+        lines.append(Line(middle[[0, -1]], np.zeros(2), look="level"))
+        for k, curve in enumerate(curves):
+            bias, error = curve.bias[:, part], curve.bias_error[:, part]
+            lines.append(
+                Line(middle, bias, curve.words, k, low=bias - error, high=bias + error,
+                     look="bars")
+            )  # fmt: skip
+    else:
+        every = np.concatenate([c[:, part] for k in curves for c in (k.rmse, k.predicted)])
+        known = every[np.isfinite(every) & (every > 0)]
+        wide = known.size > 0 and known.max() > 4 * known.min()
+        title = f"RMS error {of}"
+        up = Axis(f"error ({units})", LOG if wide else LINEAR, None if wide else (0.0, None))
+        for k, curve in enumerate(curves):
+            lines.append(Line(middle, curve.rmse[:, part], curve.words, k))
+            name = f"{curve.words}, as stated"
+            lines.append(Line(middle, curve.predicted[:, part], name, k, look="stated"))
+    if statistic != AVAILABILITY and not any(curve.tally.count.any() for curve in curves):
+        title += ": no solution"
+    return Panel({"statistic": title}, Axis("altitude above ground (m)"), up, lines)
+
+
+def navigation_page(
+    curves: Sequence[Curve], *, show: str, title: str, remarks: Sequence[str]
+) -> Page:
+    """A block for each curve of a quantity, a row for each bin of altitude.
+
+    Parameters
+    ----------
+    curves
+        Errors of each scanner.
+    show
+        ``availability``, ``bias``, ``rmse`` or ``all``.
+    title, remarks
+        What stands over the page and under it.
+    """
+    shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
+    blocks, records = [], []
+    for curve in curves:
+        own = [_record(curve, i, shown) for i in range(curve.edges.size - 1)]
+        columns = [name for name in own[0] if name != "scanner"]
+        rows = [[record[name] for name in columns] for record in own]
+        blocks.append(Block(f"{curve.words}: {curve.quantity}", columns, rows))
+        records += own
+    units = ", ".join(dict.fromkeys(UNITS[curve.quantity] for curve in curves))
+    notes = [
+        "from, to: true altitude above ground [m]; cycles: measurement cycles times draws.",
+        f"bias, rmse, stated: in {units}; stated: root of the mean variance that",
+        "  solutions give for themselves; error of bias: its standard error.",
+        *remarks,
+    ]
+    return Page(title, blocks, notes, records)
+
+
+def _record(curve: Curve, i: int, shown: Sequence[str]) -> dict[str, Cell]:
+    """One line of the CSV file."""
+    record: dict[str, Cell] = {
+        "scanner": curve.scanner,
+        "from": float(curve.edges[i]),
+        "to": float(curve.edges[i + 1]),
+        "cycles": int(curve.tally.attempts[i]),
+        "solved": int(curve.tally.count[i]),
+    }
+    names = COMPONENTS[curve.quantity]
+    if AVAILABILITY in shown:
+        record["available"] = float(curve.tally.availability[i])
+    if BIAS in shown:
+        for k, name in enumerate(names):
+            record[f"bias {name}".strip()] = float(curve.bias[i, k])
+            record[f"error of bias {name}".strip()] = float(curve.bias_error[i, k])
+    if RMSE in shown:
+        for k, name in enumerate((*names, LENGTH) if len(names) > 1 else names):
+            record[f"rmse {name}".strip()] = float(curve.rmse[i, k])
+            record[f"stated {name}".strip()] = float(curve.predicted[i, k])
+    return record

@@ -1,0 +1,179 @@
+"""Errors of range and radial velocity beside the Cramer-Rao bounds on any estimate of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import CubicSpline
+
+from sweep.analysis.answers.physical import parameter, spec_of
+from sweep.model import estimators, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.window import transform, window
+
+_NAMES = ("up", "doppler", "down")
+_INSTRUMENT = "instrument."
+_PARAMETERS = {
+    "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
+    "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
+    "duration": "chirp.duration", "sample_rate": "processing.sample_rate",
+    "fft_size": "processing.fft_size", "window": "processing.window",
+    "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
+    "line_shape": "laser.line_shape",
+}  # fmt: skip
+
+
+def range_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported range, and the Cramer-Rao bound on any unbiased estimate of it.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or a part of it.
+
+    Returns
+    -------
+    xarray.Dataset
+        [m], lazy: `reported`, reported less true range without noise, from whole bins;
+        `resolution`, the spread that whole bins make on the average, a bin over sqrt(24) as
+        two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
+        SNR in the three segments together (:mod:`sweep.model.estimators`). Where noise is
+        taken for signal, below the threshold, no estimate comes near it.
+        Of a study that draws whole spectra instead what it stores: `bias`, `rmse` and `bound`.
+    """
+    return _errors(dataset, "range", "range_error", lambda found: found.range)
+
+
+def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported radial velocity, and the Cramer-Rao bound.
+
+    Parameters and results as of :func:`range_error`, in m/s.
+    """
+    return _errors(
+        dataset, "radial velocity", "radial_velocity_error", lambda found: found.radial_velocity
+    )
+
+
+def _errors(
+    dataset: xr.Dataset,
+    words: str,
+    stored: str,
+    which: Callable[[estimators.Deviation], np.ndarray],
+) -> xr.Dataset:
+    quantity = stored.removesuffix("_error")
+    if f"{quantity}_rmse" in dataset:
+        kinds = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
+        return xr.Dataset(kinds).assign_attrs(dataset.attrs)
+    spec = spec_of(dataset)
+    values = {n: parameter(dataset, _INSTRUMENT + p, spec) for n, p in _PARAMETERS.items()}
+    values |= {
+        name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
+    }
+    values["walks"] = _simulates(dataset, "range_walk")
+    values["moves"] = _simulates(dataset, "segment_motion")
+    snr = [dataset[f"snr_{name}"] for name in _NAMES]
+
+    def bound(*arrays: np.ndarray) -> np.ndarray:
+        names = dict(zip(values, arrays[3:], strict=True))
+        return which(_bounds(arrays[:3], names))
+
+    bounds = xr.apply_ufunc(
+        bound, *snr, *values.values(), dask="parallelized", output_dtypes=[float]
+    ).transpose(*snr[0].dims)
+    width = values["sample_rate"] / values["fft_size"]
+    bins = (
+        SPEED_OF_LIGHT / 2 * values["duration"] / values["bandwidth"] * width
+        if stored == "range_error"
+        else values["wavelength"] / 2 * width
+    )
+    # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
+    result = xr.Dataset({
+        "reported": dataset[stored],
+        "resolution": bins / np.sqrt(24.0) + xr.zeros_like(bounds),
+        "bound": bounds,
+    })  # fmt: skip
+    units = str(dataset[stored].attrs.get("units", ""))
+    for name, text in (
+        ("resolution", f"standard deviation that whole bins give to the {words}"),
+        ("bound", f"Cramer-Rao bound on the standard deviation of the {words}"),
+    ):
+        result[name].attrs = {"units": units, "long_name": text}
+    return result.assign_attrs(dataset.attrs)
+
+
+def _simulates(dataset: xr.Dataset, effect: str) -> xr.DataArray:
+    """Mask of points at which an effect is simulated, as those that move peaks off their beats."""
+    attributes = dataset["effects"].attrs
+    masks = dict(zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True))
+    return (dataset["effects"] & int(masks[effect])) > 0
+
+
+def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators.Deviation:
+    """Bounds of points that share no more than their order; words and sizes one by one."""
+    shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
+    flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
+    seen = [np.broadcast_to(a, shape).ravel() for a in snr]
+    kinds = list(zip(flat["architecture"], flat["window"], flat["fft_size"], flat["duration"],
+                     flat["delay"], flat["sample_rate"], strict=True))  # fmt: skip
+    spread = np.empty((2, len(kinds)))
+    for kind in dict.fromkeys(kinds):
+        mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
+        part = {name: a[mask] for name, a in flat.items()}
+        spread[:, mask] = _alike([s[mask] for s in seen], part)
+    return estimators.Deviation(*spread.reshape(2, *shape))
+
+
+def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviation:
+    """Bounds of points of one architecture, window and record."""
+    size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
+    length = int(waveform.record_length(
+        fft_size=p["fft_size"][:1], duration=p["duration"][:1], acquisition_delay=p["delay"][:1],
+        sample_rate=p["sample_rate"][:1],
+    )[0])  # fmt: skip
+    shape = window(str(p["window"][0]), length)
+    carriers = waveform.carrier_frequencies(
+        str(p["architecture"][0]), wavelength=p["wavelength"],
+        start_frequency=p["start_frequency"], bandwidth=p["bandwidth"],
+    )  # fmt: skip
+    chirp_rate = p["bandwidth"] / p["duration"]
+    deviations = []
+    for segment, sign in enumerate(waveform.SIGNS):
+        carrier, seen = carriers[segment], snr[segment]
+        moved = np.where(p["moves"], segment * p["radial_velocity"] * p["duration"], 0.0)
+        beat = waveform.beat_frequency(
+            sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
+            radial_velocity=p["radial_velocity"],
+        )  # fmt: skip
+        # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
+        walk = sign * chirp_rate * (2 * p["radial_velocity"] / SPEED_OF_LIGHT) * length / rate
+        beat = np.where(p["walks"], beat + walk, beat)
+        place = waveform.fold(beat, p["sample_rate"]) / rate * size
+        # in bins of fs/L: a padded FFT's bins are finer than the window's
+        offset = (place - np.rint(place)) * length / size
+        cnr = estimators.carrier_to_noise_ratio(
+            snr=seen / main_lobe(shape.name, length)(np.abs(offset)) ** 2, window=shape
+        )
+        deviation = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
+        walked = estimators.phase_deviation(
+            line_width=np.where(p["line_shape"] == "lorentzian", p["line_width"], 0.0),
+            delay=2 * p["range"] / SPEED_OF_LIGHT, duration=length / rate,
+        )  # fmt: skip
+        deviation = np.hypot(deviation, walked)
+        deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
+    up, doppler, down = deviations
+    found = estimators.resolved_deviation(
+        up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
+        range=p["range"], radial_velocity=p["radial_velocity"],
+    )  # fmt: skip
+    dark = np.isnan(snr[0]) | np.isnan(snr[2])
+    return estimators.Deviation(*(np.where(dark, np.nan, b) for b in found))
+
+
+@lru_cache(maxsize=32)
+def main_lobe(name: str, length: int) -> CubicSpline:
+    """|W(delta)| / W(0) over delta from 0 to half a bin of fs/L, to 1e-8."""
+    shape, places = window(name, length), np.linspace(0.0, 0.5, 33)
+    return CubicSpline(places, np.abs(transform(shape, places)) / shape.sum)

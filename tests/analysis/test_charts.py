@@ -1,0 +1,191 @@
+"""Charts of grids: their cells, lines, axes and words, and that sheets draw them."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm
+
+from sweep.analysis import charts, drawing
+from sweep.analysis.selection import Points, Side, coarsened
+
+UNITS = {"range": "m", "grazing_angle": "deg", "power": "W"}
+
+
+def points_of(values, **axes):
+    """Points with values over coordinates: each a name, or a zipped axis with several."""
+    coordinates = {}
+    for dim, along in axes.items():
+        members = along if isinstance(along, dict) else {dim: along}
+        for name, column in members.items():
+            coordinates[name] = (dim, np.asarray(column), {"units": UNITS.get(name, "")})
+    variables = {"pd_shot": (list(axes), np.asarray(values, float))}
+    return Points.of(xr.Dataset(variables, coordinates))
+
+
+def points_on(x, y, values):
+    """Points on the grid of x and y, values (len(y), len(x))."""
+    return points_of(values, grazing_angle=y, range=x)
+
+
+def surface(found, **changes):
+    options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "words": "pd"}
+    return charts.surface(found, **(options | changes))
+
+
+def slices(found, by=""):
+    return charts.slices(found, x="range", by=by, variable="pd_shot", words="pd")
+
+
+def sheet(chart):
+    return drawing.sheet_of(chart, title="", note="")
+
+
+def map_of(found):
+    (panel,) = surface(found).panels
+    return panel.layers[0]
+
+
+def painted(chart, value):
+    """Number of pixels of the colour of a value between 0 and 1."""
+    drawn = sheet(chart)
+    drawn.canvas.draw()
+    pixels = np.asarray(drawn.canvas.buffer_rgba())[..., :3].astype(int)
+    colour = np.round(np.array(drawing.colours()(value)[:3]) * 255).astype(int)
+    return int((np.abs(pixels - colour).max(axis=-1) <= 2).sum())
+
+
+def test_a_grid_is_put_together_whatever_the_order_of_its_points():
+    order = np.array([2, 0, 1])
+    found = points_on(np.array([1.0, 2.0, 4.0])[order], [20.0, 10.0], [[6, 4, 5], [3, 1, 2]])
+    assert map_of(found).x.tolist() == [1, 2, 4]
+    assert map_of(found).values.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_coordinates_that_vary_together_span_a_plane_with_holes():
+    pairs = {"range": [1.0, 2.0, 2.0], "grazing_angle": [10.0, 10.0, 20.0]}
+    found = map_of(points_of([1, 2, 4], pairs=pairs))
+    assert (found.x.tolist(), found.y.tolist()) == ([1, 2], [10, 20])
+    assert np.isnan(found.values[1, 0]) and found.values[0].tolist() == [1, 2]
+    assert found.values[1, 1] == 4
+
+
+def along(values, kind, most):
+    """Values in cells along an axis."""
+    size = len(values)
+    side = Side("x", np.arange(size), np.arange(float(size)))
+    found = coarsened(xr.DataArray(values, dims="x"), [(side, most)], {}, kind)
+    return found.values.tolist(), side.middles(most).tolist()
+
+
+@pytest.mark.parametrize("kind,expected", [("mean", 0.9), ("lowest", 0.0), ("highest", 1.0)])
+def test_points_that_share_a_cell_have_their_mean_lowest_or_highest(kind, expected):
+    values = np.ones(1000)
+    values[437] = 0.0
+    cells, middles = along(values, kind, 100)
+    assert cells[43] == pytest.approx(expected) and middles[43] == pytest.approx(434.5)
+    assert np.delete(cells, 43).tolist() == [1.0] * 99
+
+
+def test_a_last_cell_of_fewer_points_has_the_mean_of_those():
+    assert along(np.arange(7.0), "mean", 3) == ([1.0, 4.0, 6.0], [1.0, 4.0, 6.0])
+
+
+@pytest.mark.parametrize("kind", ["mean", "lowest", "highest"])
+def test_a_cell_is_grey_only_where_none_of_its_points_is_computed(kind):
+    values, _ = along(np.array([np.nan, np.nan, np.nan, 2.0]), kind, 2)
+    assert np.isnan(values[0]) and values[1] == 2.0
+
+
+def test_one_dip_in_ten_thousand_ranges_is_seen_in_the_picture():
+    x, y = np.arange(1.0, 10_001.0), np.arange(1.0, 91.0)
+    values = np.ones((90, 10_000))
+    bar_alone = painted(surface(points_on(x, y, values)), 0.0)
+    values[44, 6_173] = 0.0
+    assert painted(surface(points_on(x, y, values)), 0.0) >= bar_alone + 4
+
+
+def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
+    x, y = np.arange(1.0, 10_001.0), np.arange(1.0, 91.0)
+    values = np.ones((90, 10_000))
+    values[:, ::10] = 0.0
+    drawn = sheet(surface(points_on(x, y, values)))
+    heights = [axes.get_title() for axes in drawn.axes[:2]]
+    assert heights == ["mean of each cell", "lowest of each cell"]
+    assert "each cell stands for 10 neighbouring points" in drawn.get_supxlabel().lower()
+
+
+def test_what_else_varies_has_a_panel_for_each_value():
+    both = points_of(np.ones((2, 2, 2)), tnr=[1, 10], grazing_angle=[10.0, 20.0], range=[1.0, 2.0])
+    titles = [axes.get_title() for axes in sheet(surface(both)).axes]
+    assert titles[:2] == ["TNR 1", "TNR 10"]
+
+
+def test_long_ranges_are_in_kilometres_and_angles_in_degrees():
+    found = points_on([1000.0, 9000.0], [10.0, 20.0], [[1, 2], [3, 4]])
+    panel = sheet(surface(found)).axes[0]
+    assert panel.get_xlabel() == "range (km)" and panel.get_ylabel() == "grazing angle (°)"
+    assert panel.get_xlim() == (-3.0, 13.0)
+
+
+def test_cells_meet_half_way_between_points_and_in_the_logarithm_where_points_do():
+    assert drawing.edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
+    expected = np.array([0.1, 1.0, 10.0, 100.0]) * np.sqrt(10)
+    assert drawing.edges(np.array([1.0, 10.0, 100.0]), True) == pytest.approx(expected)
+    assert charts.is_geometric(np.geomspace(1, 1e4, 30))
+    assert not charts.is_geometric(np.linspace(1, 1e4, 30))
+
+
+def test_probabilities_of_detection_span_0_to_1_and_tiny_chances_a_logarithm():
+    chance = drawing.norm_of(charts.scale_of("pd_shot", "pd", [np.array([0.4, 0.6])]))
+    assert (chance.vmin, chance.vmax) == (0.0, 1.0)
+    tiny = charts.scale_of("p_leakage_up", "leakage", [np.geomspace(1e-12, 0.1, 40)])
+    assert isinstance(drawing.norm_of(tiny), LogNorm)
+
+
+def test_words_stand_one_after_the_other_along_an_axis():
+    found = points_of(
+        np.linspace(0, 1, 4).reshape(2, 2), grazing_angle=[10.0, 20.0], window=["hann", "hamming"]
+    )
+    panel = sheet(surface(found, x="window")).axes[0]
+    assert [label.get_text() for label in panel.get_xticklabels()] == ["hamming", "hann"]
+
+
+def test_parameters_that_vary_together_make_no_panels_and_others_do():
+    found = points_of(np.ones((2, 2)), tnr=[5, 10], pairs={"range": [1.0, 2.0], "power": [1, 3]})
+    assert found.further(["range"]) == ["tnr"]
+    assert found.further(["range", "tnr"]) == []
+    assert found.further(["tnr"]) == ["range"]
+
+
+def line_points(values, **by):
+    values = np.asarray(values, float)
+    return points_of(values, **by, range=np.arange(1.0, values.shape[-1] + 1))
+
+
+def test_a_line_of_few_points_goes_through_each_of_them():
+    (panel,) = sheet(slices(line_points([1.0, 0.2, 0.9]))).axes
+    assert panel.lines[0].get_ydata().tolist() == [1.0, 0.2, 0.9]
+
+
+def test_one_dip_in_ten_thousand_points_of_a_line_reaches_down_in_its_band():
+    values = np.ones(10_000)
+    values[6_173] = 0.0
+    (panel,) = sheet(slices(line_points(values))).axes
+    (band,) = [c for c in panel.collections if isinstance(c, PolyCollection)]
+    corners = band.get_paths()[0].vertices
+    low = corners[corners[:, 1] < 0.5]
+    assert corners[:, 1].min() == 0.0
+    # 20 points share a stretch, of which range is shown in km
+    assert 6.1 < low[:, 0].min() <= low[:, 0].max() < 6.25
+    assert panel.lines[0].get_ydata().min() == pytest.approx(0.95)
+
+
+def test_each_value_of_by_has_its_line_in_the_order_of_the_study():
+    three = line_points(np.outer([1.0, 0.5, 0.1], [1.0, 0.5, 0.25]), power=[5, 1, 3])
+    drawn = sheet(slices(three, by="power"))
+    (legend,) = drawn.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts == ["power 5 W", "power 1 W", "power 3 W"]
+    (panel,) = drawn.axes
+    assert [line.get_ydata()[0] for line in panel.lines] == [1.0, 0.5, 0.1]
