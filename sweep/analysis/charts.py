@@ -225,16 +225,7 @@ def worst(variable: str) -> str:
 def facets_of(
     found: Points, shown: Sequence[str], most: int
 ) -> tuple[list[tuple[str, Points]], int]:
-    """Parts of points of which a panel shows one, and how many are left out.
-
-    Parameters
-    ----------
-    found, shown
-        Points, and coordinates that a panel has many values of: along its sides and lines. Parts
-        with a single value of these are none where others have several, as along zipped axes.
-    most
-        Most parts.
-    """
+    """Parts of points of which a panel shows one, and how many are left out."""
     if not found.size:
         return [], 0
     every, _ = split(found, found.further(shown), found.size)
@@ -252,17 +243,7 @@ def not_shown(number: int) -> str:
 def surface(
     found: Points, *, x: str, y: str, variable: str, words: str, room: Room = SHEET
 ) -> Chart:
-    """A variable over two coordinates, a panel for each value of what else varies.
-
-    Parameters
-    ----------
-    found
-        The points, with the variable.
-    x, y, variable, words
-        Coordinates, and the variable with its name in words.
-    room
-        Room for it.
-    """
+    """A variable over two coordinates, a panel for each value of what else varies."""
     parts, left_out = facets_of(found, [x, y], room.parts)
     planes = [_plane(part, variable, x, y) for _, part in parts]
     kinds = [MEAN, worst(variable)] if worst(variable) else [MEAN]
@@ -339,17 +320,7 @@ def _reduction(each: int, sides: Sequence[Side], kinds: Sequence[str]) -> str:
 
 
 def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: int = 6) -> Chart:
-    """A variable along a coordinate, a line for each value of another.
-
-    Parameters
-    ----------
-    found
-        The points, with the variable.
-    x, by, variable, words
-        Coordinates (no other line where `by` is empty), and the variable with its name in words.
-    most
-        Most panels.
-    """
+    """A variable along a coordinate, a line for each value of another."""
     lines_by = [by] if by else []
     parts, left_out = facets_of(found, [x, *lines_by], most)
     named, lacking = lines_of(parts, lines_by)

@@ -61,15 +61,7 @@ ROW = np.dtype([(field.name, field.dtype) for field in FIELDS])
 
 @dataclass(frozen=True)
 class PointTable:
-    """Points of one draw of a recording.
-
-    Attributes
-    ----------
-    recording, draw, ranges
-        Whose points; which draw; `quantised` or `interpolated`.
-    origin : (3,) ndarray
-        What is added to the scene's coordinates [m].
-    """
+    """Points of one draw of a recording; the origin (3,) is added to their coordinates [m]."""
 
     recording: Recording
     draw: int
@@ -281,10 +273,8 @@ def export(
         Where the file can't be written.
     """
     study, file = SceneStudy.of(store), Path(file)
-    mistakes = _mistakes(study, file, scanner, draw, ranges)
     at = place(study.spec, where or {})
-    mistakes += _open_axes(study, at)
-    if mistakes:
+    if mistakes := _mistakes(study, file, scanner, draw, ranges, at):
         raise SpecError(mistakes)
     recording = at.recording(study.tree, scanner or study.scanners[0])
     origin = np.asarray(study.tree.attrs.get("origin", np.zeros(3)), float)
@@ -300,7 +290,7 @@ def export(
 
 
 def _mistakes(
-    study: SceneStudy, file: Path, scanner: str | None, draw: int, ranges: str
+    study: SceneStudy, file: Path, scanner: str | None, draw: int, ranges: str, at: Place
 ) -> list[Mistake]:
     """What is wrong with what is asked for."""
     found = []
@@ -321,21 +311,14 @@ def _mistakes(
         rule = f"must be {INTERPOLATED} or {QUANTISED}"
         remedy = near_miss(ranges, (INTERPOLATED, QUANTISED))
         found.append(Mistake("ranges", rule, ranges, remedy))
-    return found
-
-
-def _open_axes(study: SceneStudy, at: Place) -> list[Mistake]:
-    """Axes along which there are several values, and none is chosen."""
-    mistakes = []
     for axis in study.spec.axes:
-        if axis.name in at.left_open:
+        if axis.name in at.left_open:  # several values, and none is chosen
             member = axis.members[0]
             shown = ", ".join(labels.quantity(v, member.units) for v in member.display[:5])
-            more = ", ..." if axis.size > 5 else ""
             rule = f"has {axis.size} values, and a file holds the points of one"
-            remedy = f"choose {member.name} from {shown}{more}"
-            mistakes.append(Mistake(f"where.{member.name}", rule, "", remedy))
-    return mistakes
+            remedy = f"choose {member.name} from {shown}{', ...' if axis.size > 5 else ''}"
+            found.append(Mistake(f"where.{member.name}", rule, "", remedy))
+    return found
 
 
 def _remarks(study: SceneStudy, table: PointTable, at: Place) -> list[str]:

@@ -137,13 +137,7 @@ def stretches(array: xr.DataArray, dim: str, size: int = STRETCH) -> list[slice]
 
 
 def refuse_lost(path: Location) -> None:
-    """Refuse a store with other coordinates than it was made with; of a lost one Zarr reads zeros.
-
-    Raises
-    ------
-    NotAStoreError
-        With what is lost.
-    """
+    """Refuse a store whose coordinates are lost or changed; of a lost one Zarr reads zeros."""
     document = opening.read_document(path)
     nodes = {"": document, **document["consolidated_metadata"]["metadata"]}
     names = set()
@@ -165,13 +159,7 @@ def refuse_lost(path: Location) -> None:
 
 
 def read_attributes(path: Location, kind: str = "") -> dict[str, Any]:
-    """Attributes of a store, which must hold a ``grid`` or a ``scene`` where that is asked for.
-
-    Raises
-    ------
-    NotAStoreError
-        Where there is none, with the stores that are near, or one of another kind.
-    """
+    """Attributes of a store, which must hold a ``grid`` or a ``scene`` where that is asked for."""
     attributes = opening.read_attributes(path)
     if kind and attributes["kind"] != kind:
         raise NotAStoreError(f"{path} holds {_HOLDS[attributes['kind']]}")

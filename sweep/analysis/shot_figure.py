@@ -40,17 +40,7 @@ REACH = 0.05
 def spectra_sheet(
     shots: Sequence[Shot], *, title: str, note: str, detections: bool = False
 ) -> Sheet:
-    """Spectra of shots side by side: a row a segment, the whole band and around the peak.
-
-    Parameters
-    ----------
-    shots
-        What to draw.
-    title, note
-        What stands over the sheet and at its foot.
-    detections
-        Whether the view around the peak shows all detections that are near.
-    """
+    """Spectra of shots side by side: a row a segment, the whole band and around the peak."""
     rows, columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
     sheet, axes = canvas.panels(width * columns, 3.1 * rows + 1.2, rows, columns)
@@ -163,17 +153,7 @@ def scene_shot_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Spectra of a shot of a scene, and where its beamlets' lines are.
-
-    Parameters
-    ----------
-    shot, eyepoints
-        The shot, and its geometry.
-    surfaces
-        Names of surfaces by number.
-    title, remarks
-        What stands over the sheet and what is to be said at its foot.
-    """
+    """Spectra of a shot of a scene, and where its beamlets' lines are."""
     notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
     sheet = spectra_sheet([shot], title=title, note=labels.joined(notes), detections=True)
     hit = eyepoints.surface[0] >= 0
@@ -337,13 +317,7 @@ def report(
 
 
 def chosen(spec: Spec, at: Mapping[str, str]) -> list[tuple[str, Parameters]]:
-    """Parameters of the shots to draw, each with its label.
-
-    Raises
-    ------
-    SpecError
-        For names and values in `at` that cannot be read.
-    """
+    """Parameters of the shots to draw, each with its label."""
     written = {_path(spec, name): value for name, value in at.items()}
     if at or len(spec.axes) != 1 or spec.axes[0].size > MOST_SHOTS:
         return [("", spec.parameters_at(_position(spec, [0] * len(spec.axes)) | written))]

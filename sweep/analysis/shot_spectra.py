@@ -110,19 +110,7 @@ def simulated(
     label: str = "",
     seed: int | None = None,
 ) -> Shot:
-    """One shot on a flat plane.
-
-    Parameters
-    ----------
-    parameters
-        SI values of every parameter by dotted path.
-    effects
-        Names of the effects that are simulated.
-    label
-        What to call it.
-    seed
-        Seed of its noise; without one, spectra are the signal's alone.
-    """
+    """One shot on a flat plane."""
     ((_, prepared),) = prepare(parameters, effects)
     return simulated_shot(prepared, parameters, label=label, seed=seed)
 
@@ -130,15 +118,7 @@ def simulated(
 def simulated_shot(
     prepared: model.Shots, parameters: Parameters, *, label: str = "", seed: int | None = None
 ) -> Shot:
-    """One shot that is prepared already, whatever it looks at.
-
-    Parameters
-    ----------
-    prepared
-        The shot, alone.
-    parameters, label, seed
-        As for :func:`simulated`.
-    """
+    """One shot that is prepared already, whatever it looks at."""
     found = model.find(prepared)
     segments = tuple(
         _segment(prepared, found[k, :, 0], k, seed) for k in range(3) if prepared.segments[k]

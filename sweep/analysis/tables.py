@@ -109,13 +109,6 @@ def leakage(groups: Sequence[tuple[Points, str]], spec: Spec) -> list[Leakage]:
 
     A shot's figure is the probability that noise or leakage raises an extra group in the
     up-chirp and in the down-chirp segment.
-
-    Parameters
-    ----------
-    groups
-        Points, and the coordinate along which the origin is told; empty for none.
-    spec
-        The study.
     """
     accounts = [_Account() for _ in groups]
     for number, values in _read(groups):
@@ -183,15 +176,7 @@ class Entry:
 
 
 def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
-    """Noise alone, in closed form and by the model with a target that reflects nothing.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    setting
-        SI values by dotted path that differ from the study's own.
-    """
+    """Noise alone, in closed form and by the model with a target that reflects nothing."""
     first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
     parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
@@ -220,17 +205,7 @@ def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, An
 def entries(
     found: Points, spec: Spec, *, by: str, printed: Sequence[Sequence[float]] = ()
 ) -> list[Entry]:
-    """Every row and column of a table of false alarms.
-
-    Parameters
-    ----------
-    found, spec
-        Points of a study, and the study.
-    by
-        Coordinate of the rows.
-    printed
-        Published figures, a row for each row and a column for each cut.
-    """
+    """Every row and column of a table of false alarms."""
     settled = settings(found, spec, by)
     alone = [reference(spec, setting) for _, setting, _ in settled]
     places = [(i, j) for i in range(len(settled)) for j in range(len(cuts(spec)))]
@@ -275,19 +250,7 @@ _THRESHOLDS = {
 
 
 def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
-    """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate.
-
-    Parameters
-    ----------
-    found, spec
-        Points, and the study.
-    by
-        Coordinate of the rows.
-    printed
-        Published figures, a row for each row and a column for each cut.
-    title
-        What stands over the page.
-    """
+    """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate."""
     every = entries(found, spec, by=by, printed=printed)
     records = [_record(entry) for entry in every]
     published = any(entry.printed == entry.printed for entry in every)
@@ -312,15 +275,7 @@ def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), t
 
 
 def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
-    """Table 4.2: false alarms of a bin, a row for each threshold.
-
-    Parameters
-    ----------
-    found, spec
-        Points, and the study.
-    by, printed, title
-        Coordinate of the rows; published figures, one for each; what stands over the page.
-    """
+    """Table 4.2: false alarms of a bin, a row for each threshold."""
     records: list[dict[str, Cell]] = []
     settled = settings(found, spec, by)
     means = tallied([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")

@@ -97,17 +97,7 @@ def _numeric(cell: Cell) -> bool:
 
 
 def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -> Page:
-    """A variable's mean and median over all but rows and columns.
-
-    Parameters
-    ----------
-    found, spec
-        Points with the variable, and the study.
-    asked
-        What the spec asks for.
-    units, title
-        Of the variable; what stands over the page.
-    """
+    """A variable's mean and median over all but rows and columns."""
     found = confined(found, spec, asked.where)
     if asked.minimum_range:
         found = beyond(found, spec, f"{asked.minimum_range!r} m", included=True)

@@ -203,13 +203,7 @@ def _hidden(view: str) -> dict[str, bool]:
 
 
 def _longest(sides: np.ndarray) -> float:
-    """Longest side at which all of a box is seen from every view, in the library's lengths.
-
-    Parameters
-    ----------
-    sides : (3,) ndarray
-        Of the box, in its longest.
-    """
+    """Longest side at which all of a box is seen from every view, in the library's lengths."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * sides
     eyes = [np.array([view[axis] for axis in AXES]) for view in VIEWS.values()]
     sizes = np.linspace(2.0, 0.1, 191)

@@ -215,15 +215,7 @@ def noise_budget(study: Study, found: Sequence[Track], fewer: int) -> Chart:
 def budget_panel(
     when: Mapping[str, str], across: Axis, x: np.ndarray, budgets: Sequence[Mapping[str, Any]]
 ) -> Panel:
-    """Share of each source of noise at some places, the largest at first at the bottom.
-
-    Parameters
-    ----------
-    when, across, x
-        Choices, axis and places.
-    budgets
-        Variance of each source at the ADC [V^2] at each place.
-    """
+    """Shares of sources of noise from their variances [V^2] at some places, the largest first."""
     every = [{n: float(np.ravel(v)[0]) for n, v in budget.items()} for budget in budgets]
     names = list(dict.fromkeys(n for own in every for n, v in own.items() if v > 0))
     names.sort(key=lambda name: -every[0].get(name, 0.0))

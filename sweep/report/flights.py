@@ -14,7 +14,6 @@ from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.navigation import curves, navigation_chart
 from sweep.analysis.scenes.recording import (
     KINDS,
-    Thinned,
     eyepoints_of,
     kinds,
     label,
@@ -43,7 +42,7 @@ def along(found: Sequence[Seen]) -> Chart | None:
     every = 1
     quantities = [name for name in SHOTS if name in found[0].recording.dataset]
     for seen in found:
-        rows = _thinned(seen, quantities, MOST_SHOTS // len(found))
+        rows = seen.recording.rows([*quantities, "beam"], MOST_SHOTS // len(found))
         every = max(every, rows.every)
         table = rows.rows()
         for name in quantities if table else ():
@@ -76,15 +75,6 @@ def _by_beam(table: dict[str, np.ndarray], name: str) -> list[Line]:
         for number, beam in enumerate(beams)
         for own in [table["beam"] == beam]
     ]
-
-
-def _thinned(seen: Seen, names: Sequence[str], most: int) -> Thinned:
-    rows = Thinned(most)
-    for part in seen.recording.stretches():
-        table = {name: seen.recording.read(name, part) for name in (*names, "time", "beam")}
-        known = np.isfinite(table["time"])
-        rows.add({name: values[known] for name, values in table.items()})
-    return rows
 
 
 def returns(found: Sequence[Seen]) -> Table:

@@ -21,19 +21,7 @@ from sweep.report.interactive import Plot, themes
 
 @dataclass(frozen=True)
 class Table:
-    """Rows that can be sorted, searched and downloaded.
-
-    Attributes
-    ----------
-    heading
-        What stands over it.
-    caption
-        Sentences under it.
-    frame
-        Columns and rows.
-    file
-        Name of the file that it is downloaded as, without its ending.
-    """
+    """Rows that can be sorted, searched and downloaded as `file`.csv, under some sentences."""
 
     heading: str
     caption: Sequence[str]
@@ -43,15 +31,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Text:
-    """Text that keeps its lines, such as a spec, to read, copy or download.
-
-    Attributes
-    ----------
-    heading, caption, text
-        What stands over it, sentences under that, and the text.
-    file
-        Name of the file that it is downloaded as; empty where it is only to be copied.
-    """
+    """Text that keeps its lines, to read, copy or download as `file` (empty: not to download)."""
 
     heading: str
     caption: Sequence[str]
@@ -64,17 +44,7 @@ Item = Plot | Table | Text
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page.
-
-    Attributes
-    ----------
-    anchor, title
-        Its name in addresses, and for readers.
-    words
-        Paragraphs at its head.
-    items
-        Charts, tables and texts.
-    """
+    """A part of the page, with paragraphs at its head; the anchor is its name in addresses."""
 
     anchor: str
     title: str
@@ -84,19 +54,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report.
-
-    Attributes
-    ----------
-    title, question
-        Of the study.
-    facts
-        What a reader wants to know first: name and value of each.
-    remarks
-        What must not be overlooked, such as that the study is not complete.
-    sections
-        In the order of the page.
-    """
+    """A whole report: facts to know first, remarks not to be overlooked, sections in order."""
 
     title: str
     question: str

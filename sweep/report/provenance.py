@@ -69,17 +69,7 @@ def _values(values: np.ndarray, units: str) -> str:
 
 
 def effects(arrays: list[xr.DataArray], modes: Mapping[str, str], coordinates: Any) -> Table:
-    """Effects that were simulated: at how many points, and in which part of the study.
-
-    Parameters
-    ----------
-    arrays
-        Flags of what was simulated: of a grid, or of each scanner's shots.
-    modes
-        What the spec says of each effect.
-    coordinates
-        Of the arrays' dimensions, by name, to tell the part; those that are numbers.
-    """
+    """Effects that were simulated: at how many points, and in which part of the study."""
     size = sum(array.size for array in arrays)
     met = [_met(array) for array in arrays]
     counts = [

@@ -16,7 +16,7 @@ from sweep.analysis.charts import Chart, Room
 from sweep.analysis.figures import Study, held
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
 from sweep.analysis.scenes.figures import SceneStudy
-from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, Thinned, shown
+from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
 from sweep.analysis.tabular import Page as TablePage
 from sweep.analysis.tabular import outputs_page
@@ -270,9 +270,7 @@ def _cloud_points(found: list[Seen]) -> Table:
     """Points of clouds of the first draw, with what a reader wants of each."""
     frames, total = [], 0
     for seen in found:
-        rows = Thinned(MOST_ROWS // len(found))
-        for part in seen.recording.stretches():
-            rows.add(seen.recording.points(list(OF_POINTS), part, ranges=INTERPOLATED))
+        rows = seen.recording.rows(OF_POINTS, MOST_ROWS // len(found), ranges=INTERPOLATED)
         total += rows.total
         if rows.total:
             table = rows.rows()

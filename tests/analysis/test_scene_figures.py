@@ -104,27 +104,24 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
     weak = place(spec, {"power": "0.3 mW"}).recording(opened(scene_store), "pair")
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
     options = {"draw": 0, "ranges": "quantised", "time": None}
-    shots = pictures.scattered(weak, ["time", "pd_shot", "beam"], **options)
+    shots = weak.rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values)
-    points = pictures.scattered(weak, ["time", "radial_velocity", "beam"], **options)
+    points = weak.rows(["time", "radial_velocity", "beam"], 10**6, **options)
     there = arrays.flags.values > 0
     assert np.array_equal(points.rows()["radial_velocity"], arrays.radial_velocity.values[there])
     short = opened(cut_short(scene_store, tmp_path, geometry=False))
     less = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    shots = pictures.scattered(less, ["time", "pd_shot", "beam"], **options)
+    shots = less.rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values[:256])
-    some = pictures.scattered(
-        weak, ["time", "pd_shot", "beam"], **(options | {"time": Interval(2.0, 3.0)})
-    )
+    interval = Interval(2.0, 3.0)
+    some = weak.rows(["time", "pd_shot", "beam"], 10**6, **(options | {"time": interval}))
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
     assert np.array_equal(some.rows()["pd_shot"], arrays.pd_shot.values[inside])
 
 
 def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
     strong = place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
-    found = pictures.scattered(
-        strong, ["time", "range", "snr"], draw=0, ranges="interpolated", time=None
-    )
+    found = strong.rows(["time", "range", "snr"], 10**6, ranges="interpolated")
     sheet = pictures.scatter_sheet(
         found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )

@@ -27,13 +27,7 @@ SHOWN = (
 
 
 def compared(ours: Store, other: Store) -> dict[str, xr.Dataset]:
-    """Differences of what a table shows, computed: by scanner, or of a grid under no name.
-
-    Raises
-    ------
-    ValueError
-        Of a grid and a flight; of studies that share no point, or no shot.
-    """
+    """Differences of what a table shows, computed: by scanner, or of a grid under no name."""
     found = ours.sweep.compare(other)
     parts = {"": found} if isinstance(found, xr.Dataset) else _groups(found)
     return {part: _shown(dataset).compute() for part, dataset in parts.items()}
@@ -121,15 +115,7 @@ LEAST = 1e-16
 
 
 def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
-    """For each probability of detection, the share of points that differ by more than some amount.
-
-    Parameters
-    ----------
-    found
-        As :func:`compared` gives it: each scanner has a colour.
-    path
-        Where to; its suffix names the format.
-    """
+    """Draw the shares of points that differ by more than some amount, a colour a scanner."""
     with canvas.style():
         chart = figure(found)
         if chart is None:

@@ -18,13 +18,7 @@ CLOSE = 1e-9
 
 
 def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
-    """The study that a dataset, or a flight's tree, comes from.
-
-    Raises
-    ------
-    ValueError
-        It has lost its attributes, or is none of sweep's.
-    """
+    """The study that a dataset, or a flight's tree, comes from."""
     text = dataset.attrs.get("spec")
     if not text:
         raise ValueError("the dataset lacks the attribute 'spec': take one that sweep.open gave")
@@ -32,13 +26,7 @@ def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
 
 
 def spec_of(dataset: xr.Dataset) -> Spec:
-    """The study of a grid that a dataset comes from.
-
-    Raises
-    ------
-    ValueError
-        As :func:`study_of`; or it is a flight's.
-    """
+    """The study of a grid that a dataset comes from."""
     study = study_of(dataset)
     if not isinstance(study, Spec):
         raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
@@ -46,13 +34,7 @@ def spec_of(dataset: xr.Dataset) -> Spec:
 
 
 def quantity(written: object, *, si_unit: str, name: str) -> float:
-    """SI value of ``"20 Hz"``, or of a number, which is SI already.
-
-    Raises
-    ------
-    ValueError
-        It cannot be read, or is of another dimension.
-    """
+    """SI value of ``"20 Hz"``, or of a number, which is SI already; ValueError for others."""
     if isinstance(written, int | float) and not isinstance(written, bool):
         return float(written)
     try:
@@ -63,13 +45,7 @@ def quantity(written: object, *, si_unit: str, name: str) -> float:
 
 
 def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """A coordinate by its name or by the dotted path of its parameter.
-
-    Raises
-    ------
-    ValueError
-        There is none, with those that are.
-    """
+    """A coordinate by its name or by the dotted path of its parameter."""
     for known, array in dataset.coords.items():
         if name in (known, array.attrs.get("path")):
             return array
@@ -78,13 +54,7 @@ def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def shown(array: xr.DataArray, written: object) -> float | str:
-    """A written value in the units of a coordinate; a number without a unit is in them already.
-
-    Raises
-    ------
-    ValueError
-        It cannot be read, or is of another dimension.
-    """
+    """A written value in the units of a coordinate; a number without a unit is in them already."""
     rule = parameter_rules().get(array.attrs.get("path", ""))
     if isinstance(written, int | float | np.number) and not isinstance(written, bool):
         return float(written)
@@ -119,17 +89,7 @@ def si(array: xr.DataArray) -> xr.DataArray:
 
 
 def parameter(dataset: xr.Dataset, path: str, spec: Spec | SceneSpec | None = None) -> xr.DataArray:
-    """SI value of a parameter at each point: along its axis, or one value for all.
-
-    Parameters
-    ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
-    path
-        Dotted path, as in a spec.
-    spec
-        The dataset's study, if that is known.
-    """
+    """SI value of a parameter at each point: along its axis, or one value for all."""
     for array in dataset.coords.values():
         if array.attrs.get("path") == path:
             return si(array).drop_vars(list(array.coords), errors="ignore").assign_coords(

@@ -13,13 +13,7 @@ SEGMENTS = ("up", "doppler", "down", "shot")
 
 
 def named(quantity: str, segment: str) -> str:
-    """Name of a variable of a segment, or of a shot.
-
-    Raises
-    ------
-    ValueError
-        There is no such segment.
-    """
+    """Name of a variable of a segment, or of a shot."""
     if segment not in SEGMENTS:
         raise ValueError(f"there is no segment '{segment}': take one of {', '.join(SEGMENTS)}")
     return f"{quantity}_{segment}"
@@ -152,13 +146,7 @@ def false_alarms_per_kilometre(
 
 
 def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Probability of a false alarm in both chirp segments; where spectra are drawn their number.
-
-    Parameters
-    ----------
-    dataset, leakage
-        As of :func:`false_alarms_per_second`.
-    """
+    """Probability of a false alarm in both chirp segments; where spectra are drawn their number."""
     if "pfa_both_chirps" not in dataset:
         # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
         return dataset["false_alarms"]

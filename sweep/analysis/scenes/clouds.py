@@ -86,21 +86,7 @@ def gathered(
     path: bool = False,
     most: int = MOST_POINTS,
 ) -> Cloud | None:
-    """Points within limits; none where there is none.
-
-    Parameters
-    ----------
-    recording
-        Shots and points of a scanner.
-    names, ranges, draw
-        Quantities of the points; `quantised` or `interpolated`; number of the draw.
-    crops
-        Intervals of `x`, `y`, `z` [m] and `time` [s].
-    dropouts, path
-        Whether to gather what shots without a point aimed at, and where the platform was.
-    most
-        Most points.
-    """
+    """Points within limits; none where there is none."""
     crops = dict(crops or {})
     places = {name: crop for name, crop in crops.items() if name in AXES}
     kept = list(dict.fromkeys([*AXES, "flags", *names]))

@@ -95,19 +95,7 @@ def false_point() -> Line2D:
 def chosen(
     quantity: str, values: np.ndarray, *, trusted: np.ndarray, surfaces: Sequence[str]
 ) -> Amounts | Names:
-    """Colours for values of a quantity.
-
-    Parameters
-    ----------
-    quantity
-        Name of the quantity.
-    values : (n,) ndarray
-        Of every point, as :func:`sweep.analysis.scenes.recording.shown` gives them.
-    trusted : (n,) ndarray of bool
-        Points from which the ends of a scale are taken, if there are any; others may lie beyond.
-    surfaces
-        Names of surfaces by number.
-    """
+    """Colours for values of a quantity."""
     if quantity in CATEGORIES:
         numbers = [int(n) for n in np.unique(values[np.isfinite(values)])]
         if quantity == "flags":
@@ -156,15 +144,7 @@ HEAD, FOOT, LINE = 0.75, 0.55, 0.17
 
 
 class Stage:
-    """A sheet with a picture of a given size, and what its colours and marks mean at its right.
-
-    Parameters
-    ----------
-    width, height : float
-        Size of the picture, its labels included [inches].
-    title, note : str
-        What stands over the sheet, and at its foot.
-    """
+    """A sheet with a picture of a given size, and what its colours and marks mean at its right."""
 
     def __init__(self, width: float, height: float, *, title: str, note: str) -> None:
         self.width, self.height = width, height
@@ -248,15 +228,7 @@ def false_marks(size: float) -> dict[str, Any]:
 def lengths(
     axis: Any, name: str, limits: tuple[float, float], inches: float, apart: float = ACROSS
 ) -> None:
-    """Name, units and ticks of an axis of metres; far-off ones relative to a round number.
-
-    Parameters
-    ----------
-    axis, name, limits
-        The axis, what it is called, and its ends [m].
-    inches, apart
-        Its length on the picture, and the least distance of ticks.
-    """
+    """Name, units and ticks of an axis of metres; far-off ones relative to a round number."""
     low, high = limits
     shift = 0.0
     if max(abs(low), abs(high)) > FAR:

@@ -156,15 +156,6 @@ def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) 
 
     Solutions are read chunk by chunk; each stretch has a tally of its own, and the tallies are
     merged in the order of the stretches, so that the result is the same to the last bit.
-
-    Parameters
-    ----------
-    named
-        Names of scanners, and what they recorded.
-    quantity
-        ``velocity`` or ``altitude``.
-    bins
-        Number of bins, of one width, from the lowest altitude to the highest.
     """
     able = [(name, own.dataset) for name, own in named if "velocity_status" in own.dataset]
     edges = _edges([dataset for _, dataset in able], bins)
@@ -260,11 +251,6 @@ def merge(tallies: Sequence[Tally]) -> Tally:
 
     The tree depends on the number of tallies alone, so the same tallies in the same order give
     the same bits, and rounding grows with the logarithm of their number.
-
-    Raises
-    ------
-    ValueError
-        There is none.
     """
     if not tallies:
         raise ValueError("there is no tally to merge")
@@ -297,15 +283,7 @@ Statistic = tuple[str, int]
 
 
 def navigation_chart(curves: Sequence[Curve], show: str) -> Chart:
-    """Errors over altitude, a panel for each statistic and a line for each curve.
-
-    Parameters
-    ----------
-    curves
-        Errors of each scanner, at least one, of one quantity or of several.
-    show
-        ``availability``, ``bias``, ``rmse`` or ``all``.
-    """
+    """Errors over altitude, a panel for each statistic and a line for each curve."""
     panels, rows = [], []
     for quantity in dict.fromkeys(curve.quantity for curve in curves):
         own = [curve for curve in curves if curve.quantity == quantity]
@@ -376,17 +354,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
 def navigation_page(
     curves: Sequence[Curve], *, show: str, title: str, remarks: Sequence[str]
 ) -> Page:
-    """A block for each curve of a quantity, a row for each bin of altitude.
-
-    Parameters
-    ----------
-    curves
-        Errors of each scanner.
-    show
-        ``availability``, ``bias``, ``rmse`` or ``all``.
-    title, remarks
-        What stands over the page and under it.
-    """
+    """A block for each curve of a quantity, a row for each bin of altitude."""
     shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     blocks, records = [], []
     for curve in curves:

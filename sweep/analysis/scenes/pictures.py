@@ -22,14 +22,11 @@ from sweep.analysis.scenes.clouds import AXES, Cloud, Ground
 from sweep.analysis.scenes.colours import Stage
 from sweep.analysis.scenes.recording import (
     CATEGORIES,
-    QUANTITIES,
     SIGNED,
     WIDE,
     Interval,
-    Recording,
     Table,
     Thinned,
-    confined,
     label,
     shown,
 )
@@ -307,21 +304,7 @@ def cloud_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """A cloud, coloured by a quantity.
-
-    Parameters
-    ----------
-    cloud, quantity
-        What to show, and the name of the quantity that colours the points.
-    surfaces
-        Names of surfaces by number.
-    view
-        ``oblique``, ``above``, ``side`` or ``front``; or azimuth and elevation of the eye [deg].
-    ground
-        Map of the scene to draw under the cloud; none where it is not wanted.
-    title, remarks
-        What stands over the sheet, and what is to be said at its foot.
-    """
+    """A cloud, coloured by a quantity."""
     values = shown(quantity, cloud.points[quantity])
     scale = colours.chosen(quantity, values, trusted=cloud.true, surfaces=surfaces)
     note = labels.joined([*cloud.remarks, *remarks])
@@ -352,41 +335,8 @@ def _handles(cloud: Cloud, *, ground: bool) -> list[Any]:
     return found
 
 
-MOST = 200_000
-"""Points that a scatter still shows apart; more is thinned."""
-
 SIZE = 7.6, 4.6
 """Size of a scatter [inches]."""
-
-
-def scattered(
-    recording: Recording, names: Sequence[str], *, draw: int, ranges: str, time: Interval | None
-) -> Thinned:
-    """Quantities of every point, or of every shot where all of them are a shot's.
-
-    Parameters
-    ----------
-    recording, names
-        Shots and points of a scanner, and the quantities.
-    draw, ranges, time
-        Number of the draw; `quantised` or `interpolated`; part of the flight [s], all by default.
-    """
-    of_points = any(QUANTITIES[name].of_points for name in names)
-    crops = {"time": time} if time else {}
-    found = Thinned(MOST)
-    for part in recording.stretches(time):
-        if of_points:
-            table = recording.points(
-                list(dict.fromkeys([*names, "flags", "time"])), part, draw, ranges
-            )
-        else:
-            known = recording.computed(part)
-            table = {
-                name: recording.of_shots(name, part)[known]
-                for name in dict.fromkeys([*names, "time"])
-            }
-        found.add(confined(table, crops))
-    return found
 
 
 def scatter_sheet(
@@ -399,19 +349,7 @@ def scatter_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """A quantity over another.
-
-    Parameters
-    ----------
-    found
-        The quantities.
-    x, y, colour
-        Those along the axes, and the one that colours the points.
-    surfaces
-        Names of surfaces by number.
-    title, remarks
-        What stands over the sheet, and what is to be said at its foot.
-    """
+    """A quantity over another."""
     table = found.rows()
     true = (table["flags"] & TRUE) > 0 if "flags" in table else np.ones(len(table[x]), bool)
     values = shown(colour, table[colour])

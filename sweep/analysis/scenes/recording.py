@@ -214,6 +214,33 @@ class Recording:
                 table[name] = self.of_shots(name, part)[shot]
         return {name: table[name] for name in names}
 
+    def rows(
+        self,
+        names: Sequence[str],
+        most: int,
+        *,
+        draw: int = 0,
+        ranges: str = QUANTISED,
+        time: Interval | None = None,
+    ) -> Thinned:
+        """Quantities of every point, or of every computed shot where all of them are a shot's.
+
+        Thinned to `most` of them; of a part of the flight [s] where an interval is given.
+        """
+        of_points = any(QUANTITIES[name].of_points for name in names)
+        crops = {"time": time} if time else {}
+        found = Thinned(most)
+        for part in self.stretches(time):
+            if of_points:
+                every = list(dict.fromkeys([*names, "flags", "time"]))
+                table = self.points(every, part, draw, ranges)
+            else:
+                known = self.computed(part)
+                every = list(dict.fromkeys([*names, "time"]))
+                table = {name: self.of_shots(name, part)[known] for name in every}
+            found.add(confined(table, crops))
+        return found
+
     def _positions(
         self, part: slice, present: np.ndarray, shot: np.ndarray, draw: int, ranges: str
     ) -> np.ndarray:
@@ -434,20 +461,7 @@ def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
 
 
 def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
-    """Eyepoints of some shots.
-
-    Parameters
-    ----------
-    path
-        Store of the eyepoints.
-    index : (n,) int ndarray
-        Numbers of the shots.
-
-    Raises
-    ------
-    NotAStoreError
-        Where the store is not there.
-    """
+    """Eyepoints of some shots."""
     if not path.exists():
         raise NotAStoreError(
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
