@@ -1,13 +1,19 @@
 """Charts of grids: their cells, lines, axes and words, and that sheets draw them."""
 
+import dask.array
 import numpy as np
 import pytest
 import xarray as xr
+from drawn_studies import study
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
 
 from sweep.analysis import charts, drawing
-from sweep.analysis.selection import Points, Side, coarsened
+from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, coarsened, confined
+
+BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
 
 UNITS = {"range": "m", "grazing_angle": "deg", "power": "W"}
 
@@ -70,31 +76,55 @@ def test_coordinates_that_vary_together_span_a_plane_with_holes():
     assert found.values[1, 1] == 4
 
 
-def along(values, kind, most):
-    """Values in cells along an axis."""
-    size = len(values)
-    side = Side("x", np.arange(size), np.arange(float(size)))
-    found = coarsened(xr.DataArray(values, dims="x"), [(side, most)], {}, kind)
-    return found.values.tolist(), side.middles(most).tolist()
+@settings(max_examples=40)
+@given(
+    shape=st.tuples(st.integers(1, 40), st.integers(1, 90)),
+    most=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    chunks=st.integers(1, 30),
+    kind=st.sampled_from(list(BY_HAND)),
+    seed=st.integers(0, 99),
+)
+def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, seed):
+    rng = np.random.default_rng(seed)
+    values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
+    array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
+    sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
+    found = coarsened(array, list(zip(sides, most, strict=True)), {}, kind).values
+    up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
+    assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
+    assert all(size <= number for size, number in zip(found.shape, most, strict=True))
+    for (i, j), cell in np.ndenumerate(found):
+        own = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
+        own = own[np.isfinite(own)]
+        assert cell == pytest.approx(BY_HAND[kind](own), rel=1e-14) if own.size else np.isnan(cell)
+    middle = np.mean(sides[1].values[:across])
+    assert sides[1].middles(most[1])[0] == pytest.approx(middle, rel=1e-14)
 
 
-@pytest.mark.parametrize("kind,expected", [("mean", 0.9), ("lowest", 0.0), ("highest", 1.0)])
-def test_points_that_share_a_cell_have_their_mean_lowest_or_highest(kind, expected):
-    values = np.ones(1000)
-    values[437] = 0.0
-    cells, middles = along(values, kind, 100)
-    assert cells[43] == pytest.approx(expected) and middles[43] == pytest.approx(434.5)
-    assert np.delete(cells, 43).tolist() == [1.0] * 99
+def test_parts_of_zipped_axes_are_told_apart():
+    cut = {"zip": [
+        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "15 deg"},
+        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
+        {"target.range": "3 km", "target.grazing_angle": ["30 deg", "50 deg", "70 deg"]},
+    ]}  # fmt: skip
+    spec = study({"instrument.laser.power": ["1 W", "3 W"], "cut": cut})
+    coordinates = {
+        member.name: (axis.name, member.display, {"units": member.units})
+        for axis in spec.axes
+        for member in axis.members
+    }
+    points = Points.of(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates))
 
+    def parts(shown, where):
+        return charts.facets_of(confined(points, spec, where), shown, 6)
 
-def test_a_last_cell_of_fewer_points_has_the_mean_of_those():
-    assert along(np.arange(7.0), "mean", 3) == ([1.0, 4.0, 6.0], [1.0, 4.0, 6.0])
-
-
-@pytest.mark.parametrize("kind", ["mean", "lowest", "highest"])
-def test_a_cell_is_grey_only_where_none_of_its_points_is_computed(kind):
-    values, _ = along(np.array([np.nan, np.nan, np.nan, 2.0]), kind, 2)
-    assert np.isnan(values[0]) and values[1] == 2.0
+    found, left_out = parts(["range", "power"], {})
+    assert left_out == 0
+    assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
+    assert found[1][1].side("range").positions.tolist() == [3, 4, 5]
+    ((_, held),), _ = parts(["range", "power"], {"grazing_angle": "85 deg"})
+    assert held.side("range").values.tolist() == [1, 2, 3]
+    assert parts(["range"], {"grazing_angle": "86 deg"}) == ([], 0)
 
 
 def test_one_dip_in_ten_thousand_ranges_is_seen_in_the_picture():

@@ -1,14 +1,31 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
 import xarray as xr
+from drawn_scenes import scene
 from drawn_studies import POWERS, SURFACE, stored, study
 
 import sweep
-from sweep.analysis.opening import NotAStoreError, merged
+from sweep.analysis.opening import NotAStoreError, merged, open_scene, stretches
 from sweep.analysis.opening import open as open_store
-from sweep.model.outputs import OUTPUTS
+from sweep.analysis.scenes.recording import eyepoints_of, read_eyepoints
+from sweep.model.eyepoints import observe
+from sweep.model.outputs import (
+    CYCLES,
+    NAVIGATION,
+    OUTPUTS,
+    POINTS,
+    SHOTS,
+    SIMULATED,
+    STATISTICS,
+)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return scene(tmp_path_factory.mktemp("spec"))
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +52,23 @@ def test_a_finished_store_says_when_and_that_it_is_whole(surface):
     assert attributes["study_id"] == study(SURFACE).id
 
 
-def test_a_store_cut_short_counts_what_is_committed_and_is_not_finished(tmp_path):
-    path = stored(tmp_path, SURFACE, storage={"block_points": 50})
+@pytest.mark.parametrize("kind", ["grid", "flight"])
+def test_a_store_cut_short_counts_what_is_committed_and_is_not_finished(
+    kind, tmp_path, scene_store
+):
+    if kind == "grid":
+        path = stored(tmp_path, SURFACE, storage={"block_points": 50})
+    else:
+        path = shutil.copytree(scene_store, tmp_path / "short.zarr")
     log = path / ".sweep" / "receipts.jsonl"
     lines = log.read_text().splitlines(keepends=True)
     # the first receipt twice, and a line cut short by a crash
-    log.write_text(lines[0] + lines[0] + lines[1] + lines[2][:20])
-    attributes = open_store(path).attrs
+    log.write_text(lines[0] + lines[0] + lines[1] + lines[2][:15])
+    attributes = (open_store if kind == "grid" else open_scene)(path).attrs
     first, second = (json.loads(line)["points"] for line in lines[:2])
     assert attributes["blocks"] == len(lines)
     assert attributes["blocks_committed"] == 2
-    assert attributes["points_committed"] == first + second
+    assert attributes["points_committed"] == first + second < attributes["points"]
     assert attributes["finished"] == ""
 
 
@@ -76,11 +99,90 @@ def test_a_store_of_draws_opens_with_their_sums(tmp_path):
     assert ((dataset.n_detected_shot >= 0) & (dataset.n_detected_shot <= 25)).all()
 
 
-def test_what_is_no_store_is_refused_in_words_that_name_the_stores_nearby(surface, tmp_path):
+@pytest.mark.parametrize("open_it", [open_store, open_scene])
+def test_what_is_no_store_is_refused_in_words_that_name_the_stores_nearby(
+    open_it, surface, tmp_path
+):
     with pytest.raises(NotAStoreError, match=r"no store at .*; stores near it: .*study\.zarr"):
-        open_store(surface.with_name("stduy.zarr"))
+        open_it(surface.with_name("stduy.zarr"))
     with pytest.raises(NotAStoreError, match="is not a Zarr store"):
-        open_store(tmp_path)
+        open_it(tmp_path)
     (tmp_path / "zarr.json").write_text('{"attributes": {"title": "something else"}}')
     with pytest.raises(NotAStoreError, match="not one that sweep made"):
-        open_store(tmp_path)
+        open_it(tmp_path)
+
+
+def test_each_kind_of_store_is_refused_where_another_is_asked_for(surface, scene_store):
+    with pytest.raises(NotAStoreError, match=r"scene's point clouds: sweep\.open_scene\(\)"):
+        open_store(scene_store)
+    with pytest.raises(NotAStoreError, match=r"grid of points: sweep\.open\(\)"):
+        open_scene(surface)
+    eyepoints = next((scene_store.parent / "eyepoints").glob("*.zarr"))
+    with pytest.raises(NotAStoreError, match="holds the eyepoints of a flight"):
+        open_scene(eyepoints)
+
+
+def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_store):
+    tree = open_scene(scene_store)
+    assert set(tree.children) == {"square", "pair"}
+    for name, navigates in (("square", True), ("pair", False)):
+        group = tree.children[name].to_dataset(inherit=False)
+        outputs = (
+            SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS | (NAVIGATION if navigates else {})
+        )
+        assert set(group.data_vars) == set(outputs)
+        for output, described in outputs.items():
+            along = ("power",) if output not in SHOTS | CYCLES else ()
+            assert group[output].dims == along + described.dims
+            assert group[output].attrs["units"] == described.units
+            assert group[output].dtype == described.dtype
+        assert group.power.attrs["units"] == "mW" and group.power.values.tolist() == [0.3, 1000.0]
+
+
+def test_arrays_are_read_in_chunks_when_they_are_needed(scene_store):
+    flags = open_scene(scene_store)["square"]["flags"]
+    assert flags.chunks is not None and flags.chunks[1][0] == 64
+
+
+def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scene_store, spec):
+    attributes = open_scene(scene_store).attrs
+    shots = sum(spec.cycles(name) * spec.shots_a_cycle(name) for name in spec.scanners)
+    assert attributes["points"] == attributes["points_committed"] == shots * 3 * 2
+    assert attributes["blocks"] == attributes["blocks_committed"] == 2 * 2 * (5 + 5)
+    assert attributes["started"] <= attributes["finished"] != ""
+
+
+@pytest.mark.parametrize(("size", "most"), [(1, 7), (20, 14), (1000, 100)])
+def test_stretches_are_whole_chunks_and_cover_all_once(size, most):
+    array = xr.DataArray(np.zeros((2, 100)), dims=("power", "shot"))
+    array.encoding["preferred_chunks"] = {"power": 1, "shot": 7}
+    parts = stretches(array, "shot", size)
+    covered = np.concatenate([np.arange(100)[part] for part in parts])
+    assert covered.tolist() == list(range(100))
+    assert all(part.start % 7 == 0 for part in parts)
+    assert max(part.stop - part.start for part in parts) == most
+
+
+def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
+    world, tree = spec.world(), open_scene(scene_store)
+    index = np.array([3, 77, 130, 311])
+    for name in spec.scanners:
+        found = read_eyepoints(eyepoints_of(scene_store, tree[name].to_dataset()), index)
+        cast = observe(
+            index,
+            flight=spec.flight(),
+            scanner=spec.scan(name),
+            caster=world.caster,
+            beam_divergence=spec.instrument.laser.beam_divergence,
+            number=spec.footprint.beamlets,
+            pattern=spec.pattern,
+            bodies=world.bodies,
+        )
+        for field, array in cast._asdict().items():
+            equal_nan = array.dtype.kind == "f"
+            assert np.array_equal(getattr(found, field), array, equal_nan=equal_nan), field
+
+
+def test_eyepoints_that_are_gone_are_told_with_a_remedy(tmp_path):
+    with pytest.raises(NotAStoreError, match="running the study again casts them anew"):
+        read_eyepoints(tmp_path / "none.zarr", np.array([0]))

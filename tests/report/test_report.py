@@ -5,20 +5,14 @@ import re
 import subprocess
 import sys
 
-import dask.array
 import numpy as np
 import pytest
-import xarray as xr
 import yaml
 from click.testing import CliRunner
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from reported import EXPERIMENTS, GRID
 
-from sweep.analysis.charts import facets_of
 from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, coarsened, confined
 from sweep.cli import main
 from sweep.model.shot import evaluate
 from sweep.model.threshold import TNR
@@ -26,60 +20,6 @@ from sweep.report import detector
 from sweep.report.writing import write
 from sweep.spec import Spec
 from sweep.tasks import driver
-
-BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
-
-
-@settings(max_examples=40)
-@given(
-    shape=st.tuples(st.integers(1, 40), st.integers(1, 90)),
-    most=st.tuples(st.integers(1, 50), st.integers(1, 50)),
-    chunks=st.integers(1, 30),
-    kind=st.sampled_from(list(BY_HAND)),
-    seed=st.integers(0, 99),
-)
-def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, seed):
-    rng = np.random.default_rng(seed)
-    values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
-    array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
-    sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
-    found = coarsened(array, list(zip(sides, most, strict=True)), {}, kind).values
-    up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
-    assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
-    assert all(size <= number for size, number in zip(found.shape, most, strict=True))
-    for (i, j), cell in np.ndenumerate(found):
-        own = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
-        own = own[np.isfinite(own)]
-        assert cell == pytest.approx(BY_HAND[kind](own), rel=1e-14) if own.size else np.isnan(cell)
-    middle = np.mean(sides[1].values[:across])
-    assert sides[1].middles(most[1])[0] == pytest.approx(middle, rel=1e-14)
-
-
-def test_parts_of_zipped_axes_are_told_apart():
-    cut = {"zip": [
-        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "15 deg"},
-        {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
-        {"target.range": "3 km", "target.grazing_angle": ["30 deg", "50 deg", "70 deg"]},
-    ]}  # fmt: skip
-    axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
-    spec = Spec.from_mapping(GRID | {"axes": axes, "figures": []}, base=EXPERIMENTS)
-    coordinates = {
-        member.name: (axis.name, member.display, {"units": member.units})
-        for axis in spec.axes
-        for member in axis.members
-    }
-    points = Points.of(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates))
-
-    def parts(shown, where):
-        return facets_of(confined(points, spec, where), shown, 6)
-
-    found, left_out = parts(["range", "power"], {})
-    assert left_out == 0
-    assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
-    assert found[1][1].side("range").positions.tolist() == [3, 4, 5]
-    ((_, held),), _ = parts(["range", "power"], {"grazing_angle": "85 deg"})
-    assert held.side("range").values.tolist() == [1, 2, 3]
-    assert parts(["range"], {"grazing_angle": "86 deg"}) == ([], 0)
 
 
 def _spec_in(page):
