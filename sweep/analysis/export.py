@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,37 +27,22 @@ from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
 from sweep.storage.locations import Location
 
-
-@dataclass(frozen=True)
-class Field:
-    """A column: its name, type, units ("1" where it has none) and what it is."""
-
-    name: str
-    dtype: str
-    units: str
-    words: str
-
-
-def _of(name: str, dtype: str) -> Field:
-    about = QUANTITIES[name]
-    return Field(name, dtype, about.units, about.words)
-
-
-FIELDS = (
-    *(_of(name, "<f8") for name in (
-        "x", "y", "z", "time", "range", "radial_velocity", "range_standard_error",
-        "radial_velocity_standard_error", "snr", "pd", "true_range", "true_radial_velocity",
-    )),
-    _of("surface", "<i2"),
-    _of("flags", "|u1"),
-    _of("beam", "<i4"),
-    _of("shot", "<u4"),
-    Field("return_number", "|u1", "1", "number of the return, from 1"),
-    Field("number_of_returns", "|u1", "1", "points of the same shot and draw"),
+ROW = np.dtype(
+    [
+        *((name, "<f8") for name in (
+            "x", "y", "z", "time", "range", "radial_velocity", "range_standard_error",
+            "radial_velocity_standard_error", "snr", "pd", "true_range", "true_radial_velocity",
+        )),
+        ("surface", "<i2"), ("flags", "|u1"), ("beam", "<i4"), ("shot", "<u4"),
+        ("return_number", "|u1"), ("number_of_returns", "|u1"),
+    ]
 )  # fmt: skip
-"""Every column, in the order of files."""
+"""Every column, in the order of files; returns of a shot and draw are numbered from 1."""
 
-ROW = np.dtype([(field.name, field.dtype) for field in FIELDS])
+COLUMNS: tuple[str, ...] = ROW.names or ()
+UNITS = {name: QUANTITIES[name].units for name in COLUMNS if name in QUANTITIES}
+UNITS = {name: units for name, units in UNITS.items() if units != "1"}
+"""Units of the columns that have any."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +56,7 @@ class PointTable:
 
     def parts(self) -> Iterator[np.ndarray]:
         """Rows (m,) of ROW, stretch by stretch."""
-        names = [field.name for field in FIELDS if field.name != "number_of_returns"]
+        names = [name for name in COLUMNS if name != "number_of_returns"]
         for part in self.recording.stretches():
             table = self.recording.points([*names, "returns"], part, self.draw, self.ranges)
             rows = np.zeros(table["x"].size, ROW)
@@ -110,17 +96,15 @@ _PLY_TYPES = {
 def write_ply(table: PointTable, path: Path, remarks: Remarks) -> int:
     """A binary PLY file of vertices whose properties are the columns; how many there are."""
     number = table.number()
-    units: dict[str, list[str]] = {}
-    for field in FIELDS:
-        units.setdefault(field.units, []).append(field.name)
-    units.pop("1")
-    comments = [*remarks, *(f"{' '.join(names)} in {unit}" for unit, names in units.items())]
+    comments = list(remarks)
+    for unit in dict.fromkeys(UNITS.values()):
+        comments.append(f"{' '.join(n for n, own in UNITS.items() if own == unit)} in {unit}")
     header = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {' '.join(text.split())}" for text in comments),
         f"element vertex {number}",
-        *(f"property {_PLY_TYPES[field.dtype]} {field.name}" for field in FIELDS),
+        *(f"property {_PLY_TYPES[ROW[name].str]} {name}" for name in COLUMNS),
         "end_header",
     ]
     with path.open("wb") as file:
@@ -135,10 +119,7 @@ def write_csv(table: PointTable, path: Path, remarks: Remarks) -> int:
     number = 0
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            field.name if field.units == "1" else f"{field.name} [{field.units}]"
-            for field in FIELDS
-        )
+        writer.writerow(f"{n} [{UNITS[n]}]" if n in UNITS else n for n in COLUMNS)
         for rows in table.parts():
             writer.writerows(rows.tolist())
             number += rows.size
@@ -167,16 +148,10 @@ def write_las(table: PointTable, path: Path, remarks: Remarks, *, compressed: bo
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=6)
-    extra = [field for field in FIELDS if field.name not in _STANDARD]
+    extra = [name for name in COLUMNS if name not in _STANDARD]
     header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(
-                name=field.name, type=np.dtype(field.dtype),
-                description=field.units if field.units != "1" else "",
-            )
-            for field in extra
-        ]
-    )  # fmt: skip
+        [laspy.ExtraBytesParams(n, ROW[n], description=UNITS.get(n, "")) for n in extra]
+    )
     low, high = table.limits()
     found = bool(np.isfinite(low).all())
     header.global_encoding.wkt = True  # as the format asks of these points
@@ -187,7 +162,7 @@ def write_las(table: PointTable, path: Path, remarks: Remarks, *, compressed: bo
     number = 0
     with laspy.open(path, mode="w", header=header, do_compress=compressed) as writer:
         for rows in table.parts():
-            writer.write_points(_las_points(rows, header, [field.name for field in extra]))
+            writer.write_points(_las_points(rows, header, extra))
             number += rows.size
     return number
 
@@ -214,14 +189,10 @@ def _las_points(rows: np.ndarray, header, extra: Sequence[str]):  # type: ignore
     return points
 
 
-def _write_laz(table: PointTable, path: Path, remarks: Remarks) -> int:
-    return write_las(table, path, remarks, compressed=True)
-
-
 WRITERS: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
     ".ply": write_ply,
     ".las": write_las,
-    ".laz": _write_laz,
+    ".laz": partial(write_las, compressed=True),
     ".csv": write_csv,
 }
 """How to write each kind of file, by its suffix."""
@@ -280,12 +251,12 @@ def export(
     origin = np.asarray(study.tree.attrs.get("origin", np.zeros(3)), float)
     table = PointTable(recording, draw, ranges, origin)
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
+    unfinished = file.with_name(f".{file.name}.{os.getpid()}.partial")
     try:
-        number = WRITERS[file.suffix.lower()](table, partial, _remarks(study, table, at))
-        os.replace(partial, file)
+        number = WRITERS[file.suffix.lower()](table, unfinished, _remarks(study, table, at))
+        os.replace(unfinished, file)
     finally:
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
     return number
 
 

@@ -10,11 +10,10 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import canvas, charts, labels, tables, tabular
-from sweep.analysis.cuts import GRAZING_ANGLE, RANGE, cuts
 from sweep.analysis.drawing import sheet_of
 from sweep.analysis.opening import ACCURACY, SCENE, read_attributes
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.selection import Points, confined
+from sweep.analysis.selection import GRAZING_ANGLE, RANGE, Points, confined, cuts
 from sweep.spec import (
     Axis,
     FalseAlarmTable,

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.cuts import GRAZING_ANGLE
+from sweep.analysis.selection import GRAZING_ANGLE
 from sweep.analysis.shot_spectra import Parameters, Segment, Shot, quantity_at, simulated
 from sweep.analysis.tabular import Block, Page, percent
 from sweep.model import waveform

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.analysis import labels, noise_only
-from sweep.analysis.cuts import NEAREST, bands, beyond, cuts, si_value
-from sweep.analysis.selection import Points, split
+from sweep.analysis.selection import NEAREST, Points, bands, beyond, cuts, si_value, split
 from sweep.analysis.tabular import Block, Cell, Page, percent
 from sweep.analysis.tallies import Search, Tally, for_median, median, pieces, search, tallied
 from sweep.model.shot import evaluate

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.cuts import beyond
-from sweep.analysis.selection import Points, confined
+from sweep.analysis.selection import Points, beyond, confined
 from sweep.analysis.tallies import Tally, medians, tallied
 
 if TYPE_CHECKING:

@@ -14,9 +14,16 @@ from sweep.analysis import charts, labels, noise_only
 from sweep.analysis.answers import probability
 from sweep.analysis.answers.physical import parameter
 from sweep.analysis.charts import CHANCE, LINEAR, LOG, Axis, Chart, Line, Panel, Ruler
-from sweep.analysis.cuts import GRAZING_ANGLE, RANGE
 from sweep.analysis.figures import Study
-from sweep.analysis.selection import Points, Side, coordinate_of, split, spread
+from sweep.analysis.selection import (
+    GRAZING_ANGLE,
+    RANGE,
+    Points,
+    Side,
+    coordinate_of,
+    split,
+    spread,
+)
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS, tnr_of

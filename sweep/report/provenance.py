@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import dask
@@ -68,22 +68,23 @@ def _values(values: np.ndarray, units: str) -> str:
     return ", ".join(labels.quantity(v, units) for v in values)
 
 
-def effects(arrays: list[xr.DataArray], modes: Mapping[str, str], coordinates: Any) -> Table:
+def effects(arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> Table:
     """Effects that were simulated: at how many points, and in which part of the study."""
+    lazy = []
+    for array in arrays:
+        masks = xr.Dataset({e.name: ((array >> k) & 1) > 0 for k, e in enumerate(EFFECTS)})
+        along = [masks.any([d for d in array.dims if d != dim]) for dim in array.dims]
+        lazy.append((masks.sum(), along))
+    found = dask.compute(*lazy)
     size = sum(array.size for array in arrays)
-    met = [_met(array) for array in arrays]
-    counts = [
-        dask.compute(*[((array.data >> k) & 1).sum() for k in range(len(EFFECTS))])
-        for array in arrays
-    ]
     rows = []
-    for k, effect in enumerate(EFFECTS):
-        number = sum(int(own[k]) for own in counts)
-        where = _where(met, k, coordinates) if 0 < number < size else ""
-        rows.append(
-            (effect.name.replace("_", " "), modes[effect.name], round(100 * number / size, 2),
-             "everywhere" if number == size else where, effect.about)
-        )  # fmt: skip
+    for effect in EFFECTS:
+        name = effect.name
+        number = sum(int(counts[name]) for counts, _ in found)
+        spans = [_span(masks[name]) for _, along in found for masks in along]
+        where = ", ".join(dict.fromkeys(filter(None, spans))) if number < size else "everywhere"
+        rows.append((name.replace("_", " "), modes[name], round(100 * number / size, 2), where,
+                     effect.about))  # fmt: skip
     rows.sort(key=lambda row: -row[2])
     names = ["effect", "asked", "% of points", "within", "what it is"]
     caption = [
@@ -94,38 +95,17 @@ def effects(arrays: list[xr.DataArray], modes: Mapping[str, str], coordinates: A
     return Table("Effects", caption, pandas.DataFrame(rows, columns=names), "effects")
 
 
-def _met(array: xr.DataArray) -> dict[str, np.ndarray]:
-    """Flags that occur anywhere at each place along each dimension."""
-    lazy = {}
-    for number, dim in enumerate(map(str, array.dims)):
-        others = tuple(i for i in range(array.ndim) if i != number)
-        lazy[dim] = _any(array.data, others) if others else array.data
-    return dict(zip(lazy, dask.compute(*lazy.values()), strict=True))
-
-
-def _any(flags: Any, others: tuple[int, ...]) -> Any:
-    """Bitwise or over some dimensions, chunk by chunk."""
-
-    def over(chunk: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
-        return np.asarray(np.bitwise_or.reduce(chunk, axis=axis, keepdims=keepdims))  # type: ignore[call-overload]
-
-    return dask.array.reduction(flags, chunk=over, aggregate=over, axis=others, dtype=flags.dtype)
-
-
-def _where(met: list[dict[str, np.ndarray]], k: int, coordinates: Any) -> str:
-    """Spans of the coordinates that hold an effect."""
+def _span(present: xr.DataArray) -> str:
+    """Ends of the coordinates along a dimension between which an effect is present."""
     told = []
-    for own in met:
-        for dim, flags in own.items():
-            present = (np.asarray(flags) >> k) & 1 > 0
-            for name in [n for n, c in coordinates.items() if c.dims == (dim,)]:
-                values, units = coordinates[name].values, coordinates[name].attrs.get("units", "")
-                if present.all() or not present.any() or values.dtype.kind not in "fiu":
-                    continue
-                chosen = values[present]
-                ends = [labels.quantity(v, units) for v in (chosen.min(), chosen.max())]
-                told.append(f"{labels.coordinate(name)} {ends[0]} to {ends[1]}")
-    return ", ".join(dict.fromkeys(told))
+    for name, coordinate in present.coords.items():
+        if present.all() or not present.any() or labels.is_words(coordinate.values):
+            continue
+        chosen = coordinate.values[present.values]
+        units = coordinate.attrs.get("units", "")
+        ends = [labels.quantity(v, units) for v in (chosen.min(), chosen.max())]
+        told.append(f"{labels.coordinate(str(name))} {ends[0]} to {ends[1]}")
+    return ", ".join(told)
 
 
 def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:

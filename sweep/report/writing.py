@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas
+import xarray as xr
 
 from sweep.analysis import labels
 from sweep.analysis.charts import Chart, Room
@@ -24,7 +25,7 @@ from sweep.report import clouds, detector, flights, provenance
 from sweep.report.clouds import Seen
 from sweep.report.interactive import plot
 from sweep.report.page import Item, Page, Section, Table, Text, rendered
-from sweep.spec import Slices, Surface
+from sweep.spec import SceneSpec, Slices, Spec, Surface
 from sweep.storage.locations import Location, located
 
 PAGE = Room(parts=detector.MOST_PARTS, columns=500, rows=180, cells=400_000, abreast=1)
@@ -105,26 +106,52 @@ def _grid_page(store: Location, say: Say) -> Page:
     if not spec.draws.whole_spectra:  # of what looks at those there are no closed forms
         trades = [detector.roc(study, *found), detector.false_alarms(study, *found), *trades]
     say("effects and accuracy")
-    effects = provenance.effects([dataset["effects"]], spec.modes(), dataset.coords)
-    told = provenance.accuracy(dataset, spec)
+    asked = _asked(spec, [dataset["effects"]], dataset)
     say("points")
-    points = _grid_points(study)
     sizes = [f"{axis.size:,} {labels.coordinate(axis.name)}" for axis in spec.axes]
+    facts = [("points", f"{dataset.attrs['points']:,}"),
+             ("grid", " x ".join(sizes) or "a single point")]  # fmt: skip
+    sections = [
+        _section("figures", "Figures", figures),
+        _section("detector", "Detection and noise", trades),
+        asked,
+        _section("tables", "Tables", [*tables, _grid_points(study)]),
+    ]
+    return _page(spec, dataset.attrs, "points", facts, sections, store)
+
+
+def _asked(spec: Spec | SceneSpec, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
+    """What was asked and simulated, and how far the results may be off."""
+    made = [provenance.axes(spec), provenance.effects(flags, spec.modes()),
+            provenance.fields(spec)]  # fmt: skip
+    told = provenance.accuracy(dataset, spec)
+    return _section("asked", "What was asked and simulated", made, told)
+
+
+def _page(
+    spec: Spec | SceneSpec, attributes: Mapping[Any, Any], unit: str,
+    counted: Sequence[tuple[str, str]], sections: Sequence[Section], store: Location,
+) -> Page:  # fmt: skip
+    """The page: what a reader wants to know first, its sections, and how to make it again."""
+    facts = [
+        *counted,
+        ("study", attributes["study_id"][:8]),
+        ("model", str(attributes["model_version"])),
+        ("sweep", attributes["software"]["sweep"]),
+        ("finished", str(attributes["finished"])[:16].replace("T", " ")),
+    ]
+    done, number = attributes[f"{unit}_committed"], attributes[unit]
+    remark = (
+        f"The study is not complete: {done:,} of {number:,} {unit} are computed. "
+        "sweep resume goes on."
+    )
     return Page(
         spec.title,
         spec.question,
-        _facts(dataset.attrs, ("points", f"{dataset.attrs['points']:,}"),
-               ("grid", " x ".join(sizes) or "a single point")),
-        _incomplete(dataset.attrs, "points"),
-        [
-            _section("figures", "Figures", figures),
-            _section("detector", "Detection and noise", trades),
-            _section("asked", "What was asked and simulated", [provenance.axes(spec), effects,
-                                                               provenance.fields(spec)], told),
-            _section("tables", "Tables", [*tables, points]),
-            provenance.reproduction(dataset.attrs, spec, str(store)),
-        ],
-    )  # fmt: skip
+        [(name, value) for name, value in facts if value],
+        [remark] if done < number else [],
+        [*sections, provenance.reproduction(attributes, spec, str(store))],
+    )
 
 
 def _figures(study: Study, say: Say) -> Iterator[Made]:
@@ -174,57 +201,23 @@ def _scene_page(store: Location, say: Say) -> Page:
     ]  # fmt: skip
     say("effects and accuracy")
     groups = [study.tree[name].to_dataset() for name in study.scanners]
-    effects = provenance.effects([g["effects"].chunk() for g in groups], spec.modes(), {})
-    told = provenance.accuracy(groups[0], spec)
+    asked = _asked(spec, [g["effects"].chunk() for g in groups], groups[0])
     say("points")
-    came = flights.returns(seen)
-    points = _cloud_points(seen)
-    without = [] if cloud else ["No shot has brought back a point."]
-    return Page(
-        spec.title,
-        spec.question,
-        _facts(
-            attributes,
-            ("shots times draws", f"{attributes['points']:,}"),
-            ("scanners", ", ".join(map(labels.coordinate, study.scanners))),
-        ),
-        _incomplete(attributes, "blocks"),
-        [
-            _section("cloud", "Point cloud", [cloud], without),
-            _section("flight", "Along the flight", flight),
-            _section("asked", "What was asked and simulated", [provenance.axes(spec), effects,
-                                                               provenance.fields(spec)], told),
-            _section("tables", "Tables", [came, points]),
-            provenance.reproduction(attributes, spec, str(store)),
-        ],
-    )  # fmt: skip
+    facts = [("shots times draws", f"{attributes['points']:,}"),
+             ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
+    sections = [
+        _section("cloud", "Point cloud", [cloud],
+                 [] if cloud else ["No shot has brought back a point."]),
+        _section("flight", "Along the flight", flight),
+        asked,
+        _section("tables", "Tables", [flights.returns(seen), _cloud_points(seen)]),
+    ]  # fmt: skip
+    return _page(spec, attributes, "blocks", facts, sections, store)
 
 
 def _section(anchor: str, title: str, items: Sequence[Made], words: Sequence[str] = ()) -> Section:
     made = [plot(item) if isinstance(item, Chart) else item for item in items]
     return Section(anchor, title, words, [item for item in made if item is not None])
-
-
-def _facts(attributes: Mapping[Any, Any], *counted: tuple[str, str]) -> list[tuple[str, str]]:
-    """What a reader wants to know first."""
-    facts = [
-        *counted,
-        ("study", attributes["study_id"][:8]),
-        ("model", str(attributes["model_version"])),
-        ("sweep", attributes["software"]["sweep"]),
-        ("finished", str(attributes["finished"])[:16].replace("T", " ")),
-    ]
-    return [(name, value) for name, value in facts if value]
-
-
-def _incomplete(attributes: Mapping[Any, Any], unit: str) -> list[str]:
-    done, number = attributes[f"{unit}_committed"], attributes[unit]
-    if done >= number:
-        return []
-    return [
-        f"The study is not complete: {done:,} of {number:,} {unit} are computed. "
-        "sweep resume goes on."
-    ]
 
 
 def _grid_points(study: Study) -> Table | None:

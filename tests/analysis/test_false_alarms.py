@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
 
-from sweep.analysis import cuts, tables
+from sweep.analysis import tables
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.selection import Points
+from sweep.analysis.selection import Points, beyond, cuts
 
 PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4.62e-9, 4.45e-9))
 
@@ -138,11 +138,11 @@ def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and
             "target.grazing_angle": ["15 deg", "30 deg"],
         }
     )
-    assert [(c.name, c.along) for c in cuts.cuts(grid)] == [
+    assert [(c.name, c.along) for c in cuts(grid)] == [
         ("15 deg", "range"),
         ("3.5 km", "grazing_angle"),
     ]
-    assert [c.name for c in cuts.cuts(study({"instrument.laser.power": ["1 W"]}))] == ["all"]
+    assert [c.name for c in cuts(study({"instrument.laser.power": ["1 W"]}))] == ["all"]
 
 
 def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
@@ -195,6 +195,6 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
     dataset = open_store(stored(tmp_path, SURFACE))
     found = Points.of(dataset)
-    near = cuts.beyond(found, study(SURFACE), "10 m")
+    near = beyond(found, study(SURFACE), "10 m")
     assert near.size == 23 * 9
-    assert cuts.beyond(found, study(SURFACE), "10 m", included=True).size == 24 * 9
+    assert beyond(found, study(SURFACE), "10 m", included=True).size == 24 * 9
