@@ -82,6 +82,17 @@ class Study:
         make = tables.threshold_page if threshold else tables.false_alarm_page
         return make(self.points, self.spec, by=figure.by, printed=figure.printed, title=title)
 
+    def made(self, figure: Figure) -> canvas.Sheet | tabular.Page | str:
+        """The sheet or the page of a figure; why there is none."""
+        if not isinstance(figure, Surface | Slices):
+            return self.page(figure)
+        chart = self.chart(figure, charts.SHEET)
+        if chart is None:
+            return f"no point of the study has {held(figure)}"
+        title = "\n".join(filter(None, [self.spec.title, figure.title]))
+        note = labels.joined([held(figure), source(self.dataset.attrs, "points")])
+        return sheet_of(chart, title=title, note=note)
+
 
 def source(attributes: dict[Any, Any], unit: str) -> str:
     """Words at a picture's foot: its study, and how much of that is computed."""
@@ -144,27 +155,22 @@ def _drawn(store_path: Location, directory: str | Path | None, form: str) -> lis
     stem = store_path.name.removesuffix(".zarr")
     directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
     if kind == SCENE:
-        from sweep.analysis.scenes import figures as of_scenes
+        from sweep.analysis.scenes.figures import SceneStudy
 
-        return of_scenes.draw(store_path, directory, form)
-    study = Study.of(store_path)
-    if not study.figures:
-        return tabular.outputs_page(study.dataset).save(directory, "outputs")
-    return [path for figure in study.figures for path in _made(study, figure, directory, form)]
-
-
-def _made(study: Study, figure: Figure, directory: Path, form: str) -> list[Path]:
-    """Files of one figure."""
-    if not isinstance(figure, Surface | Slices):
-        return study.page(figure).save(directory, figure.stem)
-    chart = study.chart(figure, charts.SHEET)
-    if chart is None:
-        sheet = canvas.empty(f"{study.spec.title}: no point of the study has {held(figure)}")
+        study: Any = SceneStudy.of(store_path)
     else:
-        title = "\n".join(filter(None, [study.spec.title, figure.title]))
-        note = labels.joined([held(figure), source(study.dataset.attrs, "points")])
-        sheet = sheet_of(chart, title=title, note=note)
-    return [canvas.save(sheet, directory / f"{figure.stem}.{form}")]
+        study = Study.of(store_path)
+        if not study.figures:
+            return tabular.outputs_page(study.dataset).save(directory, "outputs")
+    files = []
+    for figure in study.figures:
+        made = study.made(figure)
+        if isinstance(made, tabular.Page):
+            files += made.save(directory, figure.stem)
+        else:
+            sheet = canvas.empty(f"{study.spec.title}: {made}") if isinstance(made, str) else made
+            files.append(canvas.save(sheet, directory / f"{figure.stem}.{form}"))
+    return files
 
 
 def default_figures(spec: Spec) -> list[Figure]:

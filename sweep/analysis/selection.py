@@ -27,17 +27,7 @@ _METHODS = {MEAN: "mean", LOWEST: "min", HIGHEST: "max"}
 
 @dataclass(frozen=True)
 class Side:
-    """A dimension as a figure runs along it.
-
-    Attributes
-    ----------
-    dim
-        The dimension.
-    positions : (n,) int ndarray
-        Places along it, in the order of rising values.
-    values : (n,) ndarray
-        The coordinate there.
-    """
+    """A dimension as a figure runs along it: places in rising order of a coordinate's values."""
 
     dim: str
     positions: np.ndarray

@@ -29,19 +29,10 @@ Box = dict[str, tuple[float, float]]
 class Cloud:
     """Points of a picture, and what else is in it.
 
-    Attributes
-    ----------
-    points : dict of (n,) ndarray
-        `x`, `y`, `z`, `flags` and the quantities asked for.
-    dropouts, path : dict of (k,) ndarray
-        `x`, `y`, `z` of what shots without a point aimed at, and of the platform; empty where
-        they are not asked for. A shot that aims at nothing has no place.
-    total, total_dropouts, outside : int
-        Points and dropouts within the limits; false points that lie outside of the box.
-    every, every_dropout : int
-        Of how many points one is shown, and of how many dropouts.
-    box : dict
-        What the picture shows, [m].
+    Points have `x`, `y`, `z`, `flags` and the quantities asked for; dropouts (what shots without a
+    point aimed at) and the path of the platform `x`, `y`, `z`, empty where not asked for. Total
+    numbers are those within the limits, one of `every` is shown; false points `outside` of the box
+    of the picture [m] are left out.
     """
 
     points: Table

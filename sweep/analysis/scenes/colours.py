@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import cKDTree
 
 from sweep.analysis import canvas, labels
@@ -234,21 +234,11 @@ def lengths(
     if max(abs(low), abs(high)) > FAR:
         unit = 10.0 ** max(math.ceil(math.log10(high - low)), 0)
         shift = unit * round((low + high) / 2 / unit)
-    axis.set_major_locator(FixedLocator(_ticks(low, high, inches / apart)))
+    number = min(max(int(inches / apart), 1), 8)
+    axis.set_major_locator(MaxNLocator(number, steps=[1, 2, 2.5, 5, 10], min_n_ticks=1))
     if shift:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value - shift:g}"))
         name = f"{name} {'-' if shift > 0 else '+'} {abs(shift):.0f}"
     axis.set_label_text(labels.with_units(name, "m"))
     axis.label.set_size(9)
     axis.set_tick_params(labelsize=8)
-
-
-def _ticks(low: float, high: float, room: float) -> list[float]:
-    """Round values on an axis, with at most so many steps between them."""
-    found: list[float] = []
-    for number in range(max(2, min(int(room), 8)), 0, -1):
-        ticks = MaxNLocator(number, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-        found = [float(tick) for tick in ticks if low <= tick <= high] or found
-        if len(found) - 1 <= room:
-            return found
-    return found[len(found) // 2 :][:1]

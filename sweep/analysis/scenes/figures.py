@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from sweep.analysis.scenes.recording import (
 )
 from sweep.analysis.shot_figure import scene_shot_sheet
 from sweep.analysis.shot_spectra import simulated_shot
+from sweep.analysis.tabular import Page
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.spec import SceneSpec
@@ -90,37 +90,25 @@ class SceneStudy:
         """Words at a picture's foot."""
         return source(self.tree.attrs, "blocks")
 
+    @property
+    def figures(self) -> list[SceneFigure]:
+        """The figures that it asks for; a usual set where it asks for none."""
+        return list(self.spec.figures) or default_figures(self.tree)
+
+    def made(self, figure: SceneFigure) -> canvas.Sheet | Page | str:
+        """The sheet or the page of a figure; why there is none."""
+        makers: dict[type, Callable[[SceneStudy, Any, Place], canvas.Sheet | Page | str]] = {
+            CloudFigure: _cloud,
+            Scatter: _scatter,
+            ShotSpectra: _shot,
+            NavigationFigure: _navigation,
+            NavigationTable: _navigation_table,
+        }
+        return makers[type(figure)](self, figure, place(self.spec, figure.where))
+
     def titled(self, figure: SceneFigure, otherwise: str) -> str:
         """What stands over a figure."""
         return "\n".join([self.spec.title, figure.title or otherwise])
-
-
-def draw(store_path: str | Location, directory: Path, form: str = "png") -> list[Path]:
-    """Files of every figure and table that a store's spec asks for; of a usual set by default."""
-    study = SceneStudy.of(store_path)
-    figures: Sequence[SceneFigure] = study.spec.figures or default_figures(study.tree)
-    return [path for figure in figures for path in _made(study, figure, directory, form)]
-
-
-def _made(study: SceneStudy, figure: SceneFigure, directory: Path, form: str) -> list[Path]:
-    """Files of one figure."""
-    at = place(study.spec, figure.where)
-    if isinstance(figure, NavigationTable):
-        page = navigation_page(
-            _curves(study, figure, at), show=figure.show, title=figure.title or study.spec.title,
-            remarks=[labels.joined([at.words, study.note])],
-        )  # fmt: skip
-        return page.save(directory, figure.stem)
-    makers: dict[type, Callable[[SceneStudy, Any, Place], canvas.Sheet | str]] = {
-        CloudFigure: _cloud,
-        Scatter: _scatter,
-        ShotSpectra: _shot,
-        NavigationFigure: _navigation,
-    }
-    sheet = makers[type(figure)](study, figure, at)
-    if isinstance(sheet, str):
-        sheet = canvas.empty(f"{study.spec.title}: {sheet}")
-    return [canvas.save(sheet, directory / f"{figure.stem}.{form}")]
 
 
 MOST_SCATTERED = 200_000
@@ -245,3 +233,10 @@ def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canva
         title=study.titled(figure, f"Navigation: {figure.quantity}"),
         note=labels.joined([at.words, study.note]),
     )
+
+
+def _navigation_table(study: SceneStudy, figure: NavigationTable, at: Place) -> Page:
+    return navigation_page(
+        _curves(study, figure, at), show=figure.show, title=figure.title or study.spec.title,
+        remarks=[labels.joined([at.words, study.note])],
+    )  # fmt: skip

@@ -25,21 +25,11 @@ STRETCH = 65_536
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Errors of a vector of m components, by bin of altitude: counts, means, squared deviations.
+    """Errors of a vector of m components, by bin of altitude; parts add up to the whole.
 
-    Tallies of parts add up to that of the whole. Sums of floats depend on their order: see
-    :func:`merge`.
-
-    Parameters
-    ----------
-    attempts, count : (...,) int64 ndarray
-        Solutions asked for, and those that there were.
-    mean : (..., m) ndarray
-        Mean error; 0 where there was none.
-    deviation : (..., m, m) ndarray
-        Sum of the products of deviations from the mean.
-    predicted : (..., m, m) ndarray
-        Mean of the covariances that the solutions came with; 0 where there was none.
+    Solutions asked for, and those that there were (bins,); their mean error (bins, m), sums of
+    products of deviations from it (bins, m, m), and mean of the covariances that they came with.
+    Sums of floats depend on their order: see :func:`merge`.
     """
 
     attempts: np.ndarray
@@ -94,17 +84,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Curve:
-    """Errors of one scanner's solutions, by bins of true altitude.
-
-    Attributes
-    ----------
-    scanner, quantity : str
-        Its name; ``velocity`` or ``altitude``.
-    edges : (bins + 1,) ndarray
-        Altitudes between the bins [m], rising.
-    tally : Tally
-        Errors by bin, of three components or one.
-    """
+    """Errors of one scanner's velocity or altitude, by bins between edges of true altitude [m]."""
 
     scanner: str
     quantity: str
@@ -219,18 +199,8 @@ def tally(
 ) -> Tally:
     """Tally of n solutions by cell, in two passes for the digits' sake.
 
-    Parameters
-    ----------
-    error : (n, m) ndarray
-        Solution less truth; ignored where not available.
-    covariance : (n, m, m) ndarray
-        Covariance that each solution states.
-    available : (n,) bool ndarray
-        Mask of the solutions that exist.
-    cell : (n,) int ndarray
-        Cell of each, 0..cells - 1; a solution elsewhere is left out.
-    cells : int
-        Number of cells.
+    Of each its error (n, m), ignored where not available; the covariance that it states (n, m, m);
+    and its cell, 0..cells - 1: a solution elsewhere is left out.
     """
     inside = (cell >= 0) & (cell < cells)
     attempts = np.bincount(cell[inside], minlength=cells)

@@ -132,14 +132,7 @@ class Interval:
 class Recording:
     """Shots and points of one scanner, at one place along the study's axes.
 
-    Attributes
-    ----------
-    scanner : str
-        Its name.
-    dataset : xarray.Dataset
-        Arrays of the scanner's group, without the study's axes.
-    chunks : Location or None
-        Folder of the chunks of its flags; none where all is computed whose time is known.
+    Chunks of its flags are in a folder; without it all is computed whose time is known.
     """
 
     scanner: str
@@ -185,16 +178,8 @@ class Recording:
     ) -> Table:
         """Quantities of every point of a stretch, (m,) each, in the order of shots and returns.
 
-        Parameters
-        ----------
-        names
-            Names of :data:`QUANTITIES`, and ``return_number``, ``returns`` (points of the same
-            shot).
-        part, draw
-            Stretch of shots; number of the draw.
-        ranges
-            ``quantised`` or ``interpolated``: which ranges and velocities to take, and which
-            positions follow from them.
+        Names are those of :data:`QUANTITIES`, ``return_number``, and ``returns`` (points of the
+        same shot). Positions follow from the ranges taken, quantised or interpolated.
         """
         present = self.read("flags", part, draw) > 0
         shot, place = np.nonzero(present)
@@ -340,16 +325,9 @@ class Thinned:
 
 @dataclass(frozen=True)
 class Place:
-    """A place along the axes of a study.
+    """A place along the axes of a study: the number of the value along each.
 
-    Attributes
-    ----------
-    index : dict
-        Number of the value along each axis, by the axis's name.
-    words : str
-        Values of the axes that have several, for a reader; empty where none has.
-    left_open : tuple of str
-        Axes along which other values would do as well.
+    In words the values of axes that have several; axes left open have others that would do as well.
     """
 
     index: dict[str, int]
@@ -379,18 +357,8 @@ class Place:
 def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     """The first place at which coordinates have the values asked for.
 
-    Parameters
-    ----------
-    spec
-        The study.
-    where
-        Value, or values, of coordinates, as written in a spec; of an axis with a name of its
-        own, the number along it.
-
-    Raises
-    ------
-    SpecError
-        For a coordinate that the study lacks, or a value that cannot be read or that it lacks.
+    Values are written as in a spec, one or several of each coordinate; of an axis with a name of
+    its own, the number along it. SpecError tells of all that are no coordinate or value of it.
     """
     fits = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
     mistakes = []
