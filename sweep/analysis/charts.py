@@ -1,6 +1,6 @@
 """Charts as data, and those of grids: a variable over two coordinates, or along one.
 
-Files of them are drawn by :mod:`sweep.analysis.drawing`, pages by :mod:`sweep.report.interactive`.
+Files of them are drawn by :mod:`sweep.analysis.drawing`, pages by :mod:`sweep.report.page`.
 
 A chart has panels, each for one choice of every facet: a sheet shows them side by side, a page one
 at a time::

@@ -15,7 +15,7 @@ from sweep.cli.telling import INCOMPLETE, in_bytes, print_table, tell_accuracy
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
-    from sweep.analysis.answers.comparison_table import Store
+    from sweep.analysis.answers.comparison import Store
     from sweep.tasks.verify import Report
 
 DAMAGED, DIFFERENT = 1, 4
@@ -260,30 +260,30 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
         raise click.BadParameter(
             f"{figure} ends in none of {', '.join(FORMATS)}", param_hint="--figure"
         )
-    from sweep.analysis.answers import comparison_table
+    from sweep.analysis.answers import comparison
     from sweep.spec import difference
     from sweep.tasks.progress import working
 
     left, right = _opened(a), _opened(b)
     try:
         with working("comparing"):
-            compared = comparison_table.compared(left, right)
+            compared = comparison.compared(left, right)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
         click.echo(line)
     for scanner, found in compared.items():
         if scanner:
-            click.echo(f"{scanner}: {comparison_table.met(found)}")
+            click.echo(f"{scanner}: {comparison.met(found)}")
         print_table(
             f"{b.name} less {a.name}{scanner and ', '}{scanner}",
-            list(comparison_table.COLUMNS),
-            comparison_table.rows(found),
+            list(comparison.COLUMNS),
+            comparison.rows(found),
             "largest at",
         )
     if figure is not None:
-        click.echo(comparison_table.save_figure(compared, figure))
-    verdict, words = comparison_table.verdict(compared.values())
+        click.echo(comparison.save_figure(compared, figure))
+    verdict, words = comparison.verdict(compared.values())
     click.echo(words)
     if code := {"different": DIFFERENT, "nothing": INCOMPLETE}.get(verdict, 0):
         sys.exit(code)

@@ -1,30 +1,271 @@
-"""Charts along a flight: shots over time, navigation, noise on the way; and what came back."""
+"""Charts of a flight: its point clouds to turn, shots over time, navigation and noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas
+import plotly.graph_objects as go
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.charts import CHANCE, Axis, Chart, Line, Panel
+from sweep.analysis.charts import CHANCE, Axis, Chart, Line, Panel, not_shown
 from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.navigation import curves, navigation_chart
 from sweep.analysis.scenes.recording import (
+    INTERPOLATED,
     KINDS,
+    Place,
+    Recording,
     eyepoints_of,
     kinds,
     label,
+    place,
     read_eyepoints,
     shown,
 )
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
-from sweep.report.clouds import Seen
 from sweep.report.detector import PLACES, budget_chart, budget_panel
-from sweep.report.page import Table
+from sweep.report.page import COLOUR_BAR, Control, Plot, Table, layout, sentences, title, when
+
+COLOURS = ("range", "radial_velocity", "snr")
+"""Quantities that points can be coloured by."""
+
+MOST_POINTS = 36_000
+"""Points of all clouds of a page together."""
+
+MOST_CLOUDS = 8
+"""Scanners times places along the study's axes."""
+
+NODES = 90
+"""Nodes of the terrain along a side."""
+
+SUNK = 0.012
+"""How far the terrain is drawn below itself, of the picture's size: points lie on it, not in it."""
+
+FIELD_OF_VIEW = math.radians(45)
+"""Angle from the lower to the upper edge of what the library shows of a scene."""
+
+ROOM, WIDER = 0.88, 1.2
+"""Share of the field of view that the picture takes, so that its labels have room; width of the
+narrowest sheets, a phone's, over their height."""
+
+VIEWS = {
+    "at an angle": {"x": 1.1, "y": -1.3, "z": 0.6},
+    "from above": {"x": 0.0, "y": -0.01, "z": 1.8},
+    "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
+    "from the east": {"x": 1.8, "y": 0.0, "z": 0.1},
+}
+"""Where the eye is, in the lengths that the library counts in."""
+
+CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
+"""Where the eye looks."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one scanner recorded at one place along the study's axes."""
+
+    words: str
+    recording: Recording
+    at: Place
+
+
+def recordings(study: SceneStudy) -> tuple[list[Seen], int]:
+    """Scanners at places along the axes, as many as a page shows, and how many are left out."""
+    places = product(*(range(axis.size) for axis in study.spec.axes))
+    every = list(product(study.scanners, places))
+    chosen = np.unique(np.linspace(0, len(every) - 1, min(MOST_CLOUDS, len(every))).round())
+    made = []
+    for scanner, index in (every[int(i)] for i in chosen):
+        at = _place(study, index)
+        named = labels.coordinate(scanner) if len(study.scanners) > 1 else ""
+        words = ", ".join(filter(None, [named, at.words]))
+        made.append(Seen(words, at.recording(study.tree, scanner), at))
+    return made, len(every) - len(made)
+
+
+def _place(study: SceneStudy, index: tuple[int, ...]) -> Place:
+    """A place along the axes by its numbers."""
+    where: dict[str, object] = {}
+    for axis, number in zip(study.spec.axes, index, strict=True):
+        member = axis.members[0]
+        written = f"{member.display[number]} {member.units}".strip()
+        where |= {axis.name: number} if axis.zipped else {member.name: written}
+    return place(study.spec, where)
+
+
+def solid(study: SceneStudy, found: Sequence[Seen], fewer: int) -> Plot | None:
+    """All clouds, one at a time; none where there is no point at all."""
+    most = MOST_POINTS // len(found)
+    every = {
+        seen.words: gathered(
+            seen.recording, [*COLOURS, "pd"], ranges=INTERPOLATED, path=True, most=most
+        )
+        for seen in found
+    }
+    clouds = {words: cloud for words, cloud in every.items() if cloud is not None}
+    if not clouds:
+        return None
+    ground = Ground.of(study.tree)
+    traces = [trace for words, cloud in clouds.items() for trace in _traces(words, cloud, ground)]
+    first = next(iter(clouds.values()))
+    draws = found[0].recording.dataset.sizes["draw"]
+    counted = [f"{words}: {', '.join(cloud.remarks)}" if words else ", ".join(cloud.remarks)
+               for words, cloud in clouds.items()]  # fmt: skip
+    return Plot(
+        heading="Points, flight path and terrain",
+        alt=(
+            f"Point cloud in three dimensions of {first.total:,} points, heights in metres: "
+            f"{labels.extent(first.points['z'])}; ranges: {labels.extent(first.points['range'])}; "
+            f"with the flight path{' over the terrain' if ground else ''}."
+        ),
+        caption=sentences(
+            [*counted,
+             f"Draw 0 of {draws}" if draws > 1 else "",
+             "Ranges interpolated between bins; terrain shaded, and drawn a little below itself "
+             "so that points show",
+             not_shown(fewer)]
+        ),
+        figure=go.Figure(traces, _layout()),
+        controls=[
+            Control("cloud", "Shown for", list(clouds)),
+            Control("colour", "Colour", [_option(name) for name in COLOURS],
+                    {_option(name): {"title": title(label(name))} for name in COLOURS}),
+            Control("view", "View", list(VIEWS),
+                    {name: {"scene.camera": _camera(name)} | _hidden(name) for name in VIEWS}),
+            Control("frame", "Frame", ["whole flight", "ground"],
+                    {"whole flight": _frame(list(clouds.values()), path=True),
+                     "ground": _frame(list(clouds.values()))}),
+            Control("ground", "Terrain", ["shown", "hidden"] if ground else ["none"]),
+        ],
+        tall=True,
+    )  # fmt: skip
+
+
+def _option(name: str) -> str:
+    return {"snr": "signal-to-noise ratio"}.get(name, labels.coordinate(name))
+
+
+def _columns(table: dict[str, np.ndarray], chosen: np.ndarray | slice) -> dict[str, np.ndarray]:
+    return {axis: table[axis][chosen].astype(np.float32) for axis in AXES}
+
+
+def _traces(words: str, cloud: Cloud, ground: Ground | None) -> Iterator[go.Scatter3d | go.Surface]:
+    """Terrain, path, and points in each colour."""
+    if ground is not None:
+        yield from _terrain(words, cloud, ground)
+    yield go.Scatter3d(
+        **_columns(cloud.path, slice(None)), mode="lines", line={"width": 5}, name="flight path",
+        meta=when(0, cloud=words), hoverinfo="name",
+    )  # fmt: skip
+    true = cloud.true
+    for name in COLOURS:
+        values = shown(name, cloud.points[name])
+        known = values[true] if true.any() else values
+        known = known[np.isfinite(known)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+        for kind, chosen in (("true points", true), ("false points", ~true)):
+            if chosen.any():
+                colour = values[chosen].astype(np.float32)
+                of_true = kind == "true points"
+                yield go.Scatter3d(
+                    **_columns(cloud.points, chosen), mode="markers", name=kind, customdata=colour,
+                    meta=when(cloud=words, colour=_option(name)) | {"scaled": True},
+                    hovertemplate=f"{label(name)}: %{{customdata:.5g}}<extra>{kind}</extra>",
+                    marker={
+                        "size": 3 if of_true else 4,
+                        "symbol": "circle" if of_true else "diamond-open",
+                        "color": colour, "cmin": low, "cmax": high,
+                        "showscale": of_true or not true.any(), "colorbar": COLOUR_BAR,
+                    },
+                )  # fmt: skip
+
+
+def _terrain(words: str, cloud: Cloud, ground: Ground) -> Iterator[go.Surface]:
+    """The ground around what is seen of it, shaded, just below itself."""
+    around = {}
+    for axis in ("x", "y"):
+        values = np.concatenate([cloud.points[axis], cloud.path[axis]])
+        room = 0.1 * (np.ptp(values) + 1.0)
+        around[axis] = float(values.min() - room), float(values.max() + room)
+    part = ground.cropped(around["x"], around["y"], NODES)
+    if part is None:
+        return
+    size = max(high - low for low, high in around.values())
+    yield go.Surface(
+        x=part.x.astype(np.float32), y=part.y.astype(np.float32),
+        z=(part.height - SUNK * size).astype(np.float32),
+        surfacecolor=part.shade().astype(np.float32), cmin=0, cmax=1, showscale=False,
+        lighting={"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}, hoverinfo="skip",
+        name="terrain", meta=when(cloud=words, ground="shown") | {"ground": True},
+    )  # fmt: skip
+
+
+def _camera(view: str) -> dict[str, dict[str, float]]:
+    return {"eye": VIEWS[view], "up": {"x": 0.0, "y": 0.0, "z": 1.0}, "center": CENTRE}
+
+
+def _hidden(view: str) -> dict[str, bool]:
+    """The axis that a view looks along, whose labels would lie over each other, is not drawn."""
+    low, _, high = sorted(AXES, key=lambda axis: abs(VIEWS[view][axis]))
+    return {f"scene.{high}axis.visible": False} if VIEWS[view][low] == 0 else {}
+
+
+def _longest(sides: np.ndarray) -> float:
+    """Longest side at which all of a box is seen from every view, in the library's lengths."""
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * sides
+    eyes = [np.array([view[axis] for axis in AXES]) for view in VIEWS.values()]
+    sizes = np.linspace(2.0, 0.1, 191)
+    fits = np.all([[_seen(size * corners, eye) for eye in eyes] for size in sizes], axis=1)
+    return float(sizes[np.argmax(fits)])
+
+
+def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:
+    """Whether an eye has (n, 3) corners within its field of view."""
+    ahead = np.array([CENTRE[axis] for axis in AXES]) - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = corners - eye
+    depth = away @ ahead
+    off = np.maximum(np.abs(away @ right) / WIDER, np.abs(away @ np.cross(right, ahead)))
+    return bool((off <= ROOM * math.tan(FIELD_OF_VIEW / 2) * depth).all())
+
+
+def _frame(clouds: Sequence[Cloud], *, path: bool = False) -> dict[str, Any]:
+    """Limits around the true points of all clouds, and their paths, to one scale."""
+    sides: dict[str, Any] = {}
+    lengths = {}
+    for axis in AXES:
+        parts = [c.points[axis][c.true if c.true.any() else slice(None)] for c in clouds]
+        values = np.concatenate([*parts, *(cloud.path[axis] for cloud in clouds if path)])
+        room = 0.06 * np.ptp(values) + 2.0
+        sides[f"scene.{axis}axis.range"] = [values.min() - room, values.max() + room]
+        lengths[axis] = np.ptp(values) + 2 * room
+    shares = np.array([lengths[axis] for axis in AXES]) / max(lengths.values())
+    shown = _longest(shares) * shares
+    return sides | {"scene.aspectratio": dict(zip(AXES, shown.tolist(), strict=True))}
+
+
+def _layout() -> dict[str, Any]:
+    plain = {"showbackground": False, "showspikes": False, "nticks": 5}
+    return layout(
+        scene={
+            "aspectmode": "manual",
+            **{f"{axis}axis": {"title": {"text": f"{axis} (m)"}} | plain for axis in AXES},
+        },
+        legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
+        margin={"l": 0, "r": 0, "t": 88, "b": 40},
+    )
+
 
 SHOTS = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
 """Quantities of shots that are shown over time."""

@@ -1,22 +1,308 @@
-"""Pages: sections with plots, tables and texts, and the one file that they become."""
+"""Pages: charts drawn by plotly with their choices, tables, texts, and the one file of all."""
 
 from __future__ import annotations
 
+import textwrap
 from base64 import b64encode
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import itables.options
 import jinja2
+import numpy as np
 import pandas
+import plotly.graph_objects as go
+import plotly.io
 from itables import to_html_datatable
 from itables.javascript import generate_init_offline_itables_html
 from markupsafe import Markup
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 from plotly.io.json import to_json_plotly
 from plotly.offline import get_plotlyjs
 
-from sweep.report.interactive import Plot, themes
+from sweep.analysis import canvas, labels
+from sweep.analysis.charts import LOG, Axis, Chart, Line, Map, Panel, Scale
+from sweep.analysis.drawing import MARKED
+
+LINES = {
+    "light": ("#0072B2", "#C44E00", "#005A4B", "#A51E78", "#78784B", "#003CD2", "#000000",
+              "#784B2D"),
+    "dark": ("#56B4E9", "#FF9A4D", "#3CF0C3", "#FF4BB4", "#F0E442", "#6987FF", "#FFFFFF",
+             "#B4875A"),
+}  # fmt: skip
+"""At a contrast of 4.5 or more to the page, and at a CIEDE2000 of 10 or more from each other for
+every eye (the first four 12): found from the colours of Okabe and Ito (2008)."""
+
+DASHES = (
+    "solid", "dash", "dashdot", "dot", "longdash", "longdashdot", "5px 2px 1px 2px", "2px 6px",
+)  # fmt: skip
+"""Lines differ in these as well, so that colour is not all that tells them apart."""
+
+_ENDS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
+"""Parts of the colour scale that stand out from the page."""
+
+_GROUND = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
+
+COLOUR_BAR: dict[str, Any] = {
+    "orientation": "h", "x": 0.5, "yref": "container", "y": 0.91, "yanchor": "top", "len": 1.0,
+    "thickness": 12,
+}  # fmt: skip
+"""A colour bar over the chart, as wide as it is, which suits narrow screens too."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A choice that a plot offers.
+
+    Attributes
+    ----------
+    name, label
+        What traces call it (see :func:`when`), and what stands beside it.
+    options
+        What can be chosen, the first at the start.
+    relayout
+        What an option changes of the plot's layout, by option; nothing by default.
+    """
+
+    name: str
+    label: str
+    options: Sequence[str]
+    relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A chart as a page shows it.
+
+    Attributes
+    ----------
+    heading, alt
+        What stands over it; what it shows, in words, for those who do not see it.
+    caption
+        Sentences under it.
+    figure
+        Traces and layout; `meta` of a trace says when it is shown and which colour it takes.
+    controls
+        Choices; one with a single option is left out.
+    cut
+        Whether the first heat map that is shown can be cut along either of its sides.
+    tall
+        Whether it needs the height of a solid view.
+    """
+
+    heading: str
+    alt: str
+    caption: Sequence[str]
+    figure: go.Figure
+    controls: Sequence[Control] = ()
+    cut: bool = False
+    tall: bool = False
+
+
+def when(series: int | None = None, **choices: str) -> dict[str, Any]:
+    """`meta` of a trace: at which choices it is shown, and which colour of the palette it takes."""
+    return {"when": choices} | ({} if series is None else {"series": series})
+
+
+def sentences(parts: Sequence[str]) -> list[str]:
+    """Parts as sentences, empty ones left out."""
+    return [labels.joined([part]) for part in parts if part]
+
+
+def plot(chart: Chart) -> Plot:
+    """A chart to choose from, hover and zoom."""
+    first = chart.panels[0]
+    further: dict[str, Any] = {}
+    areas = [line for line in first.layers if isinstance(line, Line) and line.look == "area"]
+    if areas:
+        further = {"barmode": "stack"}
+        further["hovermode"] = "x unified" if areas[0].x.size > 1 else "closest"
+    if chart.scale is not None:
+        further |= {"margin": {"l": 10, "r": 16, "t": 88, "b": 55}}
+        further |= {"title": title(_words(chart.scale))}
+    return Plot(
+        chart.heading,
+        chart.alt,
+        sentences(chart.caption),
+        go.Figure(
+            [trace for panel in chart.panels for trace in _traces(panel, chart.scale)],
+            layout(xaxis=_axis(first.x), yaxis=_axis(first.y, automargin=True), **further),
+        ),
+        [_control(chart.panels, name, label) for name, label in chart.facets.items()],
+        cut=chart.scale is not None,
+    )
+
+
+def _control(panels: Sequence[Panel], name: str, label: str) -> Control:
+    """The choice of a facet's options; it changes the upright axis where that depends on it."""
+    axes: dict[str, set[Axis]] = {}
+    for panel in panels:
+        axes.setdefault(panel.when[name], set()).add(panel.y)
+    relayout = {}
+    if all(len(own) == 1 for own in axes.values()) and len(set().union(*axes.values())) > 1:
+        relayout = {option: _relaid(*own) for option, own in axes.items()}
+    return Control(name, label, list(axes), relayout)
+
+
+def _relaid(axis: Axis) -> dict[str, Any]:
+    """Changes of a layout for another upright axis."""
+    made = _axis(axis)
+    changes = {f"yaxis.{key}": made[key] for key in ("type", "range", "rangemode") if key in made}
+    return changes | {"yaxis.title.text": broken(axis.words, 36)}
+
+
+def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
+    """Traces of a panel's lines, or of its map."""
+    for layer in panel.layers:
+        if isinstance(layer, Map):
+            assert scale is not None
+            yield _heat_map(panel, layer, scale)
+        else:
+            yield from _line(panel, layer)
+
+
+def _heat_map(panel: Panel, layer: Map, scale: Scale) -> go.Heatmap:
+    values, ends = layer.values, (scale.low, scale.high)
+    if scale.decades:
+        values, ends = np.log10(np.where(values > 0, values, np.nan)), tuple(np.log10(ends))
+    return go.Heatmap(
+        x=_short(layer.x), y=_short(layer.y), z=_short(values), zmin=ends[0], zmax=ends[1],
+        colorscale="Viridis", colorbar=COLOUR_BAR, name=panel.when["part"],
+        meta=when(None, **panel.when),
+    )  # fmt: skip
+
+
+def _words(scale: Scale) -> str:
+    return f"log10 of {scale.words}" if scale.decades else scale.words
+
+
+def _short(values: np.ndarray) -> np.ndarray:
+    """Numbers in the digits that a screen can show."""
+    return values.astype(np.float32) if values.dtype.kind == "f" else values
+
+
+def _line(panel: Panel, line: Line) -> Iterator[go.Scatter | go.Bar]:
+    """The line, over its band where it has one."""
+    meta = when(line.number, **panel.when)
+    if panel.y.kind == LOG:
+        line = _above_zero(line)
+    x, y, low, high = line.x, line.y, line.low, line.high
+    common: dict[str, Any] = {
+        "x": _short(x), "y": _short(y), "name": line.name, "meta": meta,
+        "legendgroup": f"{line.number}", "showlegend": bool(line.name),
+    }  # fmt: skip
+    if line.told:
+        common |= {"text": list(line.told)}
+    dash = DASHES[line.number % len(DASHES)]
+    mode = "lines+markers" if x.size <= MARKED else "lines"
+    if line.look == "area":
+        hover = "%{y:.3g} %" + ", %{text}" * bool(line.told)
+        if x.size == 1:
+            yield go.Bar(textposition="none", hovertemplate=hover, **common | {"x": ["the point"]})
+        else:
+            group = panel.title or "all"
+            yield go.Scatter(mode="lines", stackgroup=group, hovertemplate=hover, **common)
+    elif line.look == "dots":
+        marker = {"size": 9 if x.size <= MARKED else 5, "symbol": line.number % 8}
+        yield go.Scatter(mode="markers", marker=marker, **common)
+    elif line.look == "level":
+        yield go.Scatter(
+            mode="lines", line={"width": 1, "color": "#888"}, hoverinfo="skip",
+            **common | {"meta": when(None, **panel.when)},
+        )  # fmt: skip
+    else:
+        if low is not None and high is not None:
+            if line.look == "bars":
+                common |= {"error_y": {"array": _short(high - y), "width": 2}}
+            else:
+                yield _band(line, x, low, high, meta)
+        stated = line.look == "stated"
+        look = {"dash": "dot" if stated else dash, "width": 2}
+        gaps = line.look in ("stated", "bars")
+        yield go.Scatter(mode=mode, line=look, connectgaps=gaps, **common)
+
+
+def _above_zero(line: Line) -> Line:
+    """The line where it is above zero, which an axis of decades has no place for."""
+    ends: dict[str, Any] = {
+        name: np.where(values > 0, values, np.nan)
+        for name, values in (("y", line.y), ("low", line.low), ("high", line.high))
+        if values is not None
+    }
+    return replace(line, **ends)
+
+
+def _band(
+    line: Line, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
+) -> go.Scatter:
+    """The area between the ends of a line's band."""
+    known = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
+    back = known[::-1]
+    return go.Scatter(
+        x=_short(np.concatenate([x[known], x[back]])),
+        y=_short(np.concatenate([high[known], low[back]])), fill="toself", mode="none",
+        hoverinfo="skip", showlegend=False, legendgroup=f"{line.number}",
+        meta=meta | {"band": True},
+    )  # fmt: skip
+
+
+def themes() -> dict[str, Any]:
+    """Palette, scales and template of each colour scheme, for the page's script."""
+    return {
+        scheme: {
+            "lines": LINES[scheme],
+            "scale": _sampled(*_ENDS[scheme]),
+            "ground": [[0, _GROUND[scheme][0]], [1, _GROUND[scheme][1]]],
+            "template": plotly.io.templates[template].to_plotly_json(),
+        }
+        for scheme, template in (("light", "plotly_white"), ("dark", "plotly_dark"))
+    }
+
+
+def _sampled(low: float, high: float) -> list[list[Any]]:
+    """Part of the colour scale as stops."""
+    stops = np.linspace(0, 1, 11)
+    colours = colormaps[canvas.SCALE](low + (high - low) * stops)
+    return [[float(s), to_hex(c)] for s, c in zip(stops, colours, strict=True)]
+
+
+def layout(**further: Any) -> dict[str, Any]:
+    """Layout of a plot: legend above, no title (the page has it), room for labels."""
+    common: dict[str, Any] = {
+        "margin": {"l": 10, "r": 16, "t": 30, "b": 55},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom",
+                   "itemsizing": "constant", "font": {"size": 11}},
+        "hovermode": "closest",
+        "uirevision": "kept",
+        "font": {"size": 13},
+    }  # fmt: skip
+    return common | further
+
+
+def broken(words: str, width: int = 44) -> str:
+    """Words in lines that fit beside a plot."""
+    return "<br>".join(textwrap.wrap(words, width, break_on_hyphens=False))
+
+
+def _axis(axis: Axis, **further: Any) -> dict[str, Any]:
+    """An axis with its name, kind and ends."""
+    words = broken(axis.words) if further else axis.words
+    made = {"title": {"text": words, "standoff": 12}, "zeroline": False, "type": axis.kind}
+    if axis.limits is not None:
+        made |= {"rangemode": "tozero"} if None in axis.limits else {"range": list(axis.limits)}
+    return made | {"exponentformat": "power"} | further
+
+
+def title(words: str) -> dict[str, Any]:
+    """What colours mean, over their bar."""
+    return {
+        "text": broken(words, 48), "x": 0.5, "xanchor": "center", "yref": "container", "y": 1,
+        "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

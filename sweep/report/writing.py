@@ -21,10 +21,9 @@ from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
 from sweep.analysis.tabular import Page as TablePage
 from sweep.analysis.tabular import outputs_page
-from sweep.report import clouds, detector, flights, provenance
-from sweep.report.clouds import Seen
-from sweep.report.interactive import plot
-from sweep.report.page import Item, Page, Section, Table, Text, rendered
+from sweep.report import detector, flights, provenance
+from sweep.report.flights import Seen
+from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
 from sweep.storage.locations import Location, located
 
@@ -192,9 +191,9 @@ def _sheets(page: TablePage, stem: str) -> Iterator[Table]:
 def _scene_page(store: Location, say: Say) -> Page:
     study = SceneStudy.of(store)
     spec, attributes = study.spec, study.tree.attrs
-    seen, fewer = clouds.recordings(study)
+    seen, fewer = flights.recordings(study)
     say("point clouds")
-    cloud = clouds.solid(study, seen, fewer)
+    cloud = flights.solid(study, seen, fewer)
     say("the flight")
     flight: list[Made] = [
         flights.along(seen), flights.navigation(seen), flights.noise_budget(study, seen),

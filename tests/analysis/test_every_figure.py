@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 
 import sweep
 from sweep.analysis import canvas, shot_figure
-from sweep.analysis.answers import comparison_table
+from sweep.analysis.answers import comparison
 from sweep.analysis.drawing import sheet_of
 from sweep.analysis.figures import draw
 from sweep.report import writing
-from sweep.report.interactive import Plot
+from sweep.report.page import Plot
 
 GOLDEN = Path(__file__).with_name("every_figure.json")
 WRITES = os.environ.get("SWEEP_GOLDEN") == "write"
@@ -85,7 +85,7 @@ def pictures(tmp_path_factory):
     with canvas.style():
         opened = sweep.open(stores["powers"])
         less = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
-        chart = comparison_table.figure(comparison_table.compared(opened, less))
+        chart = comparison.figure(comparison.compared(opened, less))
         sheets["comparison"] = sheet_of(chart, title="T", note="")
     for name, page in (("grid", writing._grid_page), ("scene", writing._scene_page)):
         items = (i for s in page(stores[name], lambda text: None).sections for i in s.items)

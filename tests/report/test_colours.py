@@ -5,12 +5,12 @@ import pytest
 from colour_vision import SIGHT, apart, contrast, difference, lab, linear
 
 from sweep.analysis import canvas
-from sweep.report import interactive
+from sweep.report import page
 
 PALETTES = {
     "print": (canvas.LINES, "#ffffff", 2.2),  # Okabe's orange and sky blue; dashes differ as well
-    "light page": (interactive.LINES["light"], "#ffffff", 4.5),
-    "dark page": (interactive.LINES["dark"], "#111417", 4.5),
+    "light page": (page.LINES["light"], "#ffffff", 4.5),
+    "dark page": (page.LINES["dark"], "#111417", 4.5),
 }
 
 AT_A_GLANCE, FIRST_FOUR = 10.0, 12.0
@@ -56,7 +56,7 @@ def test_each_sight_keeps_greys_and_loses_what_it_lacks():
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_lines_differ_in_dashes_too_and_surfaces_stand_out(scheme):
-    assert len(set(interactive.DASHES)) == len(interactive.DASHES) == len(interactive.LINES[scheme])
+    assert len(set(page.DASHES)) == len(page.DASHES) == len(page.LINES[scheme])
     _, paper, _ = PALETTES[f"{scheme} page"]
-    ends = [stop[1] for stop in interactive.themes()[scheme]["scale"]]
+    ends = [stop[1] for stop in page.themes()[scheme]["scale"]]
     assert min(contrast(colour, paper) for colour in ends) >= 2

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sweep.report.clouds import AXES, VIEWS, _hidden, _longest, _seen
+from sweep.report.flights import AXES, VIEWS, _hidden, _longest, _seen
 
 
 @pytest.mark.parametrize("sides", [(1, 1, 1), (1, 1, 0.05), (0.8, 0.8, 1), (0.1, 1, 0.1)])

@@ -101,7 +101,7 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
         (("figures", "small.zarr"), "sweep.analysis.figures.draw"),
         (("export", "small.zarr", "s.csv"), "sweep.analysis.export.export"),
         (("compare", "small.zarr", "small.zarr"),
-         "sweep.analysis.answers.comparison_table.compared"),
+         "sweep.analysis.answers.comparison.compared"),
     ],
 )  # fmt: skip
 def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, arguments, inner):

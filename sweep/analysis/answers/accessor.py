@@ -9,7 +9,6 @@ from typing import Any
 import xarray as xr
 
 from sweep.analysis.answers import comparison, errors, limits, physical, probability
-from sweep.analysis.answers import roc as characteristics
 from sweep.spec import SceneSpec, Spec
 
 ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two of a kind"
@@ -61,7 +60,7 @@ class SweepAccessor:
         return physical.select(self._dataset, coordinates, method=method)
 
     detection_probability = _of_dataset(probability.detection_probability)
-    roc = _of_dataset(characteristics.roc)
+    roc = _of_dataset(probability.roc)
     limit = _of_dataset(limits.limit)
     contour = _of_dataset(limits.contour)
     false_alarms_per_second = _of_dataset(probability.false_alarms_per_second)

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import dask.array
 import numpy as np
 import xarray as xr
 
 from sweep.analysis import noise_only
-from sweep.analysis.answers.physical import parameter, quantity, spec_of
+from sweep.analysis.answers.physical import parameter, quantity, si, spec_of
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.marcum import marcum_q1
+from sweep.model.philox import point_keys
+from sweep.model.sampling import simulate
+from sweep.model.shot import evaluate
+from sweep.model.threshold import TNR, WAYS, tnr_of
+from sweep.spec import Spec
 
 SEGMENTS = ("up", "doppler", "down", "shot")
 
@@ -206,3 +216,209 @@ def _of_all(parts: np.ndarray) -> np.ndarray:
     if not number:
         return np.array([np.nan, np.nan, np.nan, 0.0])
     return np.array([parts[:, 0].sum() / number, parts[:, 1].min(), parts[:, 2].max(), number])
+
+
+# Receiver operating characteristics. The magnitude of a segment's strongest bin does not depend on
+# the threshold. Where nothing is random but the noise, a store therefore holds all thresholds: with
+# the SNR of that bin and b the threshold over the noise per quadrature,
+#
+#     pd = Q_1(sqrt(2 SNR), b),    pfa of a bin = exp(-b^2 / 2).
+#
+# A point tells whether this is so: no random effect was simulated there, and the closed form gives
+# back the stored pd at the study's own threshold. (It does not where bins that hold lines have more
+# noise than others, nor where any bin of an echo detects.) All other points are simulated anew at
+# every threshold, with the same draws at each. Either way the effects are those that were simulated
+# in the study, for its own threshold: far from it, what was left out may change pd by more than the
+# study's tolerance.
+
+MOST_POINTS = 20_000
+MOST_SIMULATED = 200
+"""Points whose curves are made at once, and of these such as have to be simulated anew."""
+
+SAME = 1e-9
+"""Difference of pd up to which the closed form gives back what is stored."""
+
+CURVE_TNR = "curve_tnr"
+"""Not `tnr`, which is the study's own where that is on an axis."""
+
+DOMAIN = "sweep.analysis.roc"
+_SEGMENTS = {"up": ("up",), "doppler": ("doppler",), "down": ("down",), "shot": ("up", "down")}
+
+
+def roc(
+    dataset: xr.Dataset,
+    pfa: Sequence[float] | np.ndarray | None = None,
+    *,
+    segment: str = "shot",
+    draws: int = 1000,
+) -> xr.Dataset:
+    """Probability of detection over the probability of a false alarm in a bin of noise.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it, or better a part of it.
+    pfa
+        Probabilities of a false alarm in one bin, 0 < pfa < 1; by default 1e-16 to 0.1.
+    segment
+        ``shot``, ``up``, ``doppler`` or ``down``.
+    draws
+        Draws of each point that has to be simulated anew and has random effects.
+
+    Returns
+    -------
+    xarray.Dataset
+        `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold to noise ratio that
+        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. Where
+        draws are made, `half_width` with the study's confidence; 0 where pd is exact.
+
+    Raises
+    ------
+    ValueError
+        Too many points, a probability that is none, or a study of whole spectra.
+    """
+    if "log10_pfa_bin" not in dataset:
+        raise ValueError(
+            "a study that draws whole spectra has no closed form: put the detector's threshold or "
+            "design pfa on an axis, and read pd over pfa_bin"
+        )
+    chances = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
+    if not ((chances > 0) & (chances < 1)).all():
+        raise ValueError("probabilities of a false alarm lie between 0 and 1")
+    number = dataset[named("pd", segment)].size
+    if number > MOST_POINTS:
+        raise ValueError(
+            f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
+        )
+    dataset = dataset[_needed(dataset, segment)].compute()
+    level = xr.DataArray(np.sqrt(-2 * np.log(chances)), dims=["pfa_bin"])
+    pd, exact = _closed(dataset, segment, level)
+    tnr = level * _own_tnr(dataset) / _own_level(dataset)
+    result = xr.Dataset(
+        {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
+        {"pfa_bin": ("pfa_bin", chances)},
+    )
+    result = result.transpose("pfa_bin", *dataset[named("pd", segment)].dims)
+    if not exact.all():
+        _simulate(dataset, result, segment, draws)
+    return _described(result, dataset, segment)
+
+
+def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
+    """Variables that a curve is made of."""
+    names = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
+    return [*dict.fromkeys([*names, named("pd", segment), "log10_pfa_bin", "effects"])]
+
+
+def _closed(
+    dataset: xr.Dataset, segment: str, level: xr.DataArray
+) -> tuple[xr.DataArray, xr.DataArray]:
+    """Closed form of pd at each level, and where it holds."""
+    own = _own_level(dataset)
+    pd = xr.ones_like(level)
+    exact = (dataset["effects"] & _random_mask(dataset)) == 0
+    for name in _SEGMENTS[segment]:
+        stored = dataset[f"pd_{name}"]
+        amplitude = (2 * dataset[f"snr_{name}"]) ** 0.5
+        pd = pd * xr.apply_ufunc(_crossing, amplitude, level)
+        again = xr.apply_ufunc(_crossing, amplitude, own)
+        exact = exact & ((abs(again - stored) <= SAME) | stored.isnull())
+    return pd, exact
+
+
+def _own_level(dataset: xr.Dataset) -> xr.DataArray:
+    """The study's own threshold over the noise per quadrature."""
+    return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
+
+
+def _own_tnr(dataset: xr.Dataset) -> xr.DataArray:
+    """The study's own threshold-to-noise ratio at each point."""
+    spec, like = spec_of(dataset), dataset["log10_pfa_bin"]
+    if TNR in spec.parameters():
+        return parameter(dataset, TNR, spec)
+    places = [dict(zip(like.dims, at, strict=True)) for at in np.ndindex(like.shape)]
+    found = [tnr_of(_parameters_of(like.isel(at).coords, spec)) for at in places]
+    return like.copy(data=np.reshape(np.array(found, float), like.shape))
+
+
+def _parameters_of(coords: Mapping[Any, xr.DataArray], spec: Spec) -> dict[str, Any]:
+    """SI values of all parameters at a point, which has these coordinates."""
+    values = {str(c.attrs["path"]): c for c in coords.values() if "path" in c.attrs}
+    return spec.parameters() | {path: si(value).values.item() for path, value in values.items()}
+
+
+def _crossing(amplitude: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Q_1, nan where the amplitude or the level is."""
+    known = np.isfinite(amplitude) & np.isfinite(level)
+    return np.where(
+        known, marcum_q1(np.where(known, amplitude, 0), np.where(known, level, 0)).q, np.nan
+    )
+
+
+def _random_mask(dataset: xr.Dataset) -> int:
+    """Flags of the effects that are random."""
+    attributes = dataset["effects"].attrs
+    random = {effect.name for effect in EFFECTS if effect.is_random}
+    pairs = zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True)
+    return sum(int(mask) for name, mask in pairs if name in random)
+
+
+def _simulate(dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int) -> None:
+    """Put simulated curves in the place of those that the closed form does not give."""
+    spec = spec_of(dataset)
+    places = np.argwhere(np.asarray(result["simulated"].values))
+    if len(places) > MOST_SIMULATED:
+        raise ValueError(
+            f"{len(places):,} points have to be simulated anew (at most {MOST_SIMULATED}): select "
+            "fewer"
+        )
+    dims = dataset[named("pd", segment)].dims
+    pd, width = result["pd"].values.copy(), result["half_width"].values.copy()
+    for place in places:
+        at = dict(zip(dims, map(int, place), strict=True))
+        point = dataset.isel(at)
+        tnr = result[CURVE_TNR].isel(at).values
+        index = (slice(None), *place)
+        pd[index], width[index] = _curve(spec, point, tnr, segment, draws)
+    result["pd"] = result["pd"].copy(data=pd)
+    result["half_width"] = result["half_width"].copy(data=width)
+
+
+def _curve(
+    spec: Spec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chance of detection, and its half-width, at some threshold to noise ratios of a point."""
+    parameters = _parameters_of(point.coords, spec)
+    known = np.isfinite(tnr)
+    if not known.all():
+        return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
+    flags, attributes = int(point["effects"]), point["effects"].attrs
+    pairs = zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True)
+    effects = [name for name, mask in pairs if flags & mask]
+    name = named("pd", segment)
+    arrays = {p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS}
+    arrays[TNR] = tnr
+    if flags & _random_mask(point):
+        # One key for all thresholds: the same draws, so that curves fall without noise.
+        others = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
+        row = [[v for v in others.values() if not isinstance(v, str)]]
+        keys = np.repeat(
+            point_keys(np.array(row, float), domain=DOMAIN, seed=spec.seed), tnr.size, 0
+        )
+        found = simulate(arrays, effects, keys=keys, batch_sizes=[draws], method="probabilities")
+        return found[name], found[f"{name}_half_width"]
+    return evaluate(arrays, effects)[name], np.zeros(tnr.size)
+
+
+def _described(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
+    """Units and words."""
+    words = {
+        "pd": f"probability of detection, {segment}",
+        CURVE_TNR: "threshold to noise ratio",
+        "simulated": "whether the point was simulated anew at every threshold",
+        "half_width": f"half-width of the interval of the probability of detection, {segment}",
+        "pfa_bin": "probability of false alarm in one bin, from noise alone",
+    }
+    for name, long_name in words.items():
+        result[name].attrs = {"units": "1", "long_name": long_name}
+    return result.assign_attrs(dataset.attrs)
