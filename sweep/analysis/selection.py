@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -19,7 +19,7 @@ import xarray as xr
 from sweep.analysis import labels
 
 if TYPE_CHECKING:
-    from sweep.spec import Axis, Member, Spec
+    from sweep.spec import Axis, Member, SceneSpec, Spec
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
 _METHODS = {MEAN: "mean", LOWEST: "min", HIGHEST: "max"}
@@ -264,6 +264,15 @@ def coordinate_of(spec: Spec, path: str) -> Member | None:
         return spec.member(path)
     except KeyError:
         return None
+
+
+def parameters_at(spec: Spec | SceneSpec, position: Mapping[str, int]) -> dict[str, Any]:
+    """SI values of all parameters at a position along the axes, by dotted path."""
+    return dict(spec.parameters()) | {
+        member.path: np.asarray(member.values)[position[axis.name]].item()
+        for axis in spec.axes
+        for member in axis.members
+    }
 
 
 RANGE, GRAZING_ANGLE = "target.range", "target.grazing_angle"

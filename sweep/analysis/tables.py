@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.analysis import labels, noise_only
-from sweep.analysis.selection import NEAREST, Points, bands, beyond, cuts, si_value, split
+from sweep.analysis.selection import (
+    NEAREST,
+    Points,
+    bands,
+    beyond,
+    cuts,
+    parameters_at,
+    si_value,
+    split,
+)
 from sweep.analysis.tabular import Block, Cell, Page, percent
 from sweep.analysis.tallies import Search, Tally, for_median, median, pieces, search, tallied
 from sweep.model.shot import evaluate
@@ -176,8 +185,8 @@ class Entry:
 
 def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     """Noise alone, in closed form and by the model with a target that reflects nothing."""
-    first = {m.path: np.asarray(m.values)[0].item() for axis in spec.axes for m in axis.members}
-    parameters = spec.parameters() | first | setting | {"target.reflectance": 0.0}
+    first = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
+    parameters = first | setting | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
     bins = float(noise_only.bins_counted(parameters, noise_only.bin_probability(tnr)))
     found = evaluate(parameters)

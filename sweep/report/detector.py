@@ -12,7 +12,6 @@ import xarray as xr
 
 from sweep.analysis import charts, labels, noise_only
 from sweep.analysis.answers import probability
-from sweep.analysis.answers.physical import parameter
 from sweep.analysis.charts import CHANCE, LINEAR, LOG, Axis, Chart, Line, Panel, Ruler
 from sweep.analysis.figures import Study
 from sweep.analysis.selection import (
@@ -21,6 +20,7 @@ from sweep.analysis.selection import (
     Points,
     Side,
     coordinate_of,
+    parameters_at,
     split,
     spread,
 )
@@ -152,11 +152,7 @@ def _characteristics(study: Study, track: Track) -> list[Panel]:
     for number, place in enumerate(_places_of_interest(track)):
         point = study.dataset.isel(track.position(place)).compute()
         curve = point.sweep.roc(IN_A_BIN, draws=DRAWS)
-        parameters = study.spec.parameters() | {
-            str(c.attrs["path"]): parameter(point, str(c.attrs["path"]), study.spec).values.item()
-            for c in point.coords.values()
-            if "path" in c.attrs
-        }
+        parameters = parameters_at(study.spec, track.position(place))
         pfa, own = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
         bins, own_bins = (noise_only.bins_counted(parameters, p) for p in (IN_A_BIN, pfa))
         told = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
@@ -197,12 +193,7 @@ def noise_budget(study: Study, found: Sequence[Track], fewer: int) -> Chart:
         places = track.places(PLACES)
         budgets = []
         for place, flags in zip(places, track.values("effects", places), strict=True):
-            position = track.position(place)
-            parameters = study.spec.parameters() | {
-                member.path: np.asarray(member.values)[position[axis.name]].item()
-                for axis in study.spec.axes
-                for member in axis.members
-            }
+            parameters = parameters_at(study.spec, track.position(place))
             effects = [name for name in names_of(int(flags)) if name not in _RANDOM]
             ((_, shots),) = prepare(parameters, effects)
             budgets.append(shots.noise_sources)

@@ -30,6 +30,7 @@ from sweep.analysis.scenes.recording import (
     read_eyepoints,
     shown,
 )
+from sweep.analysis.selection import parameters_at
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.report.detector import PLACES, budget_chart, budget_panel
@@ -368,7 +369,7 @@ def _budget(study: SceneStudy, seen: Seen) -> Panel:
     eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), shots)
     place = np.flatnonzero(eyepoints.seen)
     flags = np.asarray(recording.dataset["effects"].isel(shot=shots[place]).values)
-    parameters, surfaces = seen.at.parameters(study.spec), study.spec.surfaces()
+    parameters, surfaces = parameters_at(study.spec, seen.at.index), study.spec.surfaces()
     budgets = [
         prepare_eyepoints(
             eyepoints.some(np.array([i])), parameters, surfaces, names_of(int(flag))

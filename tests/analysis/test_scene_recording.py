@@ -18,6 +18,7 @@ from sweep.analysis.scenes.recording import (
     place,
     shown,
 )
+from sweep.analysis.selection import parameters_at
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import SpecError
 from sweep.spec.figures import QUANTITIES as OF_SPECS
@@ -152,8 +153,8 @@ def test_a_place_is_the_first_that_fits_and_says_what_it_left_open(spec):
     assert (first.index, first.left_open) == ({"power": 0}, ("power",))
     assert (strong.index, strong.left_open) == ({"power": 1}, ())
     assert strong.words == "power 1000 mW"
-    assert strong.parameters(spec)["instrument.laser.power"] == 1.0
-    assert first.parameters(spec)["instrument.laser.power"] == pytest.approx(0.3e-3)
+    assert parameters_at(spec, strong.index)["instrument.laser.power"] == 1.0
+    assert parameters_at(spec, first.index)["instrument.laser.power"] == pytest.approx(0.3e-3)
 
 
 def test_places_that_are_none_are_refused_with_what_there_is(spec):

@@ -26,6 +26,7 @@ from sweep.analysis.scenes.recording import (
     read_eyepoints,
     several_surfaces,
 )
+from sweep.analysis.selection import parameters_at
 from sweep.analysis.shot_figure import scene_shot_sheet
 from sweep.analysis.shot_spectra import simulated_shot
 from sweep.analysis.tabular import Page
@@ -200,7 +201,7 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | s
     eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), np.array([number]))
     if not eyepoints.seen.all():
         return f"shot {number} sees nothing"
-    parameters = at.parameters(study.spec)
+    parameters = parameters_at(study.spec, at.index)
     effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
     prepared = prepare_eyepoints(eyepoints, parameters, study.spec.surfaces(), effects)
     told = (

@@ -344,15 +344,6 @@ class Place:
             scanner, group.isel(self.index), points.joinpath(*map(str, self.index.values()))
         )
 
-    def parameters(self, spec: SceneSpec) -> dict[str, float | int | str]:
-        """SI values of all parameters there, by dotted path."""
-        parameters = dict(spec.parameters())
-        for axis in spec.axes:
-            for member in axis.members:
-                value = member.values[self.index[axis.name]]
-                parameters[member.path] = value.item() if isinstance(value, np.generic) else value
-        return parameters
-
 
 def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     """The first place at which coordinates have the values asked for.
