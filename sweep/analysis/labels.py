@@ -32,6 +32,11 @@ def with_units(name: str, units: str) -> str:
     return name if units in _UNITLESS else f"{name} ({_SYMBOLS.get(units, units)})"
 
 
+def with_brackets(name: str, units: str) -> str:
+    """Name of a column with its units as stores have them: ``range [m]``."""
+    return name if units in _UNITLESS else f"{name} [{units}]"
+
+
 def quantity(value: object, units: str = "") -> str:
     """A value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
     text = str(value) if isinstance(value, str | np.str_) else number(float(value))  # type: ignore[arg-type]

@@ -120,7 +120,7 @@ def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -
         )
     ]
     names = list(dict.fromkeys(str(r["column"]) for r in records))
-    of = f"of {asked.variable}" + (f" [{units}]" if units not in ("", "1") else "")
+    of = f"of {labels.with_brackets(asked.variable, units)}"
     blocks = [
         _matrix(f"{heading} {of}", labels.coordinate(asked.rows), key, records, names)
         for key, heading in (("mean", "Mean"), ("median", "Median"), ("printed", "Printed value"),

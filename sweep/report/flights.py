@@ -26,7 +26,7 @@ from sweep.analysis.scenes.recording import (
     eyepoints_of,
     kinds,
     label,
-    place,
+    place_at,
     read_eyepoints,
     shown,
 )
@@ -86,21 +86,11 @@ def recordings(study: SceneStudy) -> tuple[list[Seen], int]:
     chosen = np.unique(np.linspace(0, len(every) - 1, min(MOST_CLOUDS, len(every))).round())
     made = []
     for scanner, index in (every[int(i)] for i in chosen):
-        at = _place(study, index)
+        at = place_at(study.spec, index)
         named = labels.coordinate(scanner) if len(study.scanners) > 1 else ""
         words = ", ".join(filter(None, [named, at.words]))
         made.append(Seen(words, at.recording(study.tree, scanner), at))
     return made, len(every) - len(made)
-
-
-def _place(study: SceneStudy, index: tuple[int, ...]) -> Place:
-    """A place along the axes by its numbers."""
-    where: dict[str, object] = {}
-    for axis, number in zip(study.spec.axes, index, strict=True):
-        member = axis.members[0]
-        written = f"{member.display[number]} {member.units}".strip()
-        where |= {axis.name: number} if axis.zipped else {member.name: written}
-    return place(study.spec, where)
 
 
 def solid(study: SceneStudy, found: Sequence[Seen], fewer: int) -> Plot | None:

@@ -239,14 +239,13 @@ def _grid_points(study: Study) -> Table | None:
         part[name] = known(part[name]).assign_attrs(dataset[name].attrs)
     frame = part.to_dataframe().reset_index()
     frame = frame[[c for c in frame.columns if c in dataset.coords or c in names]]
-    frame = frame.rename(columns={c: _headed(c, dataset[c].attrs) for c in frame.columns})
+    frame = frame.rename(
+        columns={
+            c: labels.with_brackets(c, dataset[c].attrs.get("units", "")) for c in frame.columns
+        }
+    )
     total = int(np.prod(list(dims.values())))
     return Table("Points", _told(len(frame), total), frame, "points")
-
-
-def _headed(name: str, attributes: dict[str, str]) -> str:
-    units = str(attributes.get("units", ""))
-    return name if units in ("", "1") else f"{name} [{units}]"
 
 
 def _told(rows: int, total: int) -> list[str]:
@@ -267,14 +266,11 @@ def _cloud_points(found: list[Seen]) -> Table:
         if rows.total:
             table = rows.rows()
             columns = {
-                _unit(name): shown(name, values) if name != "flags" else values
+                labels.with_brackets(name, "dB" if name == "snr" else QUANTITIES[name].units): (
+                    shown(name, values) if name != "flags" else values
+                )
                 for name, values in table.items()
             }
             frames.append(pandas.DataFrame({"recorded by": seen.words or "the scanner"} | columns))
     frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
     return Table("Points", _told(len(frame), total), frame, "points")
-
-
-def _unit(name: str) -> str:
-    units = "dB" if name == "snr" else QUANTITIES[name].units
-    return name if units in ("", "1") else f"{name} [{units}]"

@@ -379,6 +379,12 @@ def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     return Place(index, _words(spec, index), left_open)
 
 
+def place_at(spec: SceneSpec, numbers: Sequence[int]) -> Place:
+    """The place at some numbers along the axes."""
+    index = {axis.name: number for axis, number in zip(spec.axes, numbers, strict=True)}
+    return Place(index, _words(spec, index), ())
+
+
 def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray]:
     """The axis of a coordinate, and which of its values are among those asked for."""
     for axis in spec.axes:
