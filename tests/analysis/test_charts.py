@@ -145,19 +145,6 @@ def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
     assert "each cell stands for 10 neighbouring points" in drawn.get_supxlabel().lower()
 
 
-def test_what_else_varies_has_a_panel_for_each_value():
-    both = points_of(np.ones((2, 2, 2)), tnr=[1, 10], grazing_angle=[10.0, 20.0], range=[1.0, 2.0])
-    titles = [axes.get_title() for axes in sheet(surface(both)).axes]
-    assert titles[:2] == ["TNR 1", "TNR 10"]
-
-
-def test_long_ranges_are_in_kilometres_and_angles_in_degrees():
-    found = points_on([1000.0, 9000.0], [10.0, 20.0], [[1, 2], [3, 4]])
-    panel = sheet(surface(found)).axes[0]
-    assert panel.get_xlabel() == "range (km)" and panel.get_ylabel() == "grazing angle (°)"
-    assert panel.get_xlim() == (-3.0, 13.0)
-
-
 def test_cells_meet_half_way_between_points_and_in_the_logarithm_where_points_do():
     assert drawing.edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
     expected = np.array([0.1, 1.0, 10.0, 100.0]) * np.sqrt(10)

@@ -36,23 +36,29 @@ GRID = [
      "name": "apart"},
 ]  # fmt: skip
 SCENE = [
-    {"kind": "cloud", "path": True, "dropouts": True, "name": "oblique"},
-    {"kind": "cloud", "colour": "surface", "view": "above", "scanner": "pair", "name": "above"},
+    {"kind": "cloud", "path": True, "dropouts": True},
+    {"kind": "cloud", "colour": "surface", "view": "above", "scanner": "pair", "name": "plan"},
     {"kind": "cloud", "colour": "flags", "view": "side", "scanner": "pair", "path": True,
-     "where": {"power": "1 W"}, "name": "side"},
+     "where": {"power": "1 W"}},
+    {"kind": "cloud", "x": ["-30 m", "30 m"], "time": ["3 s", "7.5 s"], "dropouts": True,
+     "view": {"azimuth": "-30 deg", "elevation": "20 deg"}, "ranges": "interpolated",
+     "name": "close"},
     {"kind": "cloud", "z": ["5 km", "6 km"], "name": "nothing"},
-    {"kind": "scatter", "scanner": "pair", "y": "radial_velocity", "where": {"power": "1 W"},
-     "name": "points"},
-    {"kind": "scatter", "x": "altitude", "y": "pfa_up", "colour": "snr_up", "name": "shots"},
-    {"kind": "shot_spectra", "scanner": "pair", "where": {"power": "1 W"}, "name": "spectra"},
-    {"kind": "navigation", "where": {"power": "1 W"}, "bins": 4, "name": "velocity"},
-    {"kind": "navigation", "quantity": "altitude", "bins": 4, "name": "altitude"},
+    {"kind": "scatter", "scanner": "pair", "y": "radial_velocity", "where": {"power": "1 W"}},
+    {"kind": "scatter", "x": "altitude", "y": "pfa_up", "colour": "snr_up", "title": "By shots"},
+    {"kind": "shot_spectra", "scanner": "pair", "where": {"power": "1 W"}},
+    {"kind": "shot_spectra", "shot": 5000, "name": "beyond"},
+    {"kind": "navigation", "where": {"power": "1 W"}, "bins": 4},
+    {"kind": "navigation", "quantity": "altitude", "bins": 4},
+    {"kind": "navigation_table", "quantity": "altitude", "show": "rmse", "bins": 3},
 ]  # fmt: skip
 SPECKLED = {"target": TARGET | {"roughness": "10 um"}, "draws": {"number": 40}}
 
 SHEETS = (
-    "pd_shot_surface", "decades", "snr_up_slices", "apart", "drawn", "oblique", "above", "side",
-    "nothing", "points", "shots", "spectra", "velocity", "altitude", "shot", "comparison",
+    "pd_shot_surface", "decades", "snr_up_slices", "apart", "drawn", "range_cloud", "plan",
+    "pair_flags_cloud", "close", "nothing", "pair_radial_velocity_over_time_scatter",
+    "pfa_up_over_altitude_scatter", "pair_several_surfaces_shot_spectra", "beyond",
+    "velocity_all_navigation", "altitude_all_navigation", "shot", "comparison",
 )  # fmt: skip
 PLOTS = {
     "grid": ("probability of detection, shot", "signal-to-noise ratio, up-chirp",

@@ -1,7 +1,5 @@
 """Figures of scenes as specs ask for them, made from stores."""
 
-import csv
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,49 +12,10 @@ from sweep.analysis.scenes.figures import SceneStudy, default_figures
 from sweep.analysis.scenes.recording import Interval, place
 from sweep.model.pairing import TRUE
 
-ASKED = [
-    {"kind": "cloud", "path": True, "where": {"power": "1 W"}},
-    {"kind": "cloud", "colour": "surface", "view": "above", "scanner": "pair", "name": "plan"},
-    {"kind": "cloud", "x": ["-30 m", "30 m"], "time": ["3 s", "7.5 s"], "dropouts": True,
-     "view": {"azimuth": "-30 deg", "elevation": "20 deg"}, "ranges": "interpolated",
-     "name": "close"},
-    {"kind": "cloud", "z": ["5 km", "6 km"], "name": "nothing"},
-    {"kind": "scatter", "scanner": "pair", "y": "radial_velocity", "where": {"power": "1 W"}},
-    {"kind": "scatter", "x": "altitude", "y": "pd_shot", "colour": "snr_up", "title": "By shots"},
-    {"kind": "shot_spectra", "scanner": "pair", "where": {"power": "1 W"}},
-    {"kind": "shot_spectra", "shot": 7, "name": "seventh"},
-    {"kind": "shot_spectra", "shot": 5000, "name": "beyond"},
-    {"kind": "navigation", "where": {"power": "1 W"}, "bins": 4},
-    {"kind": "navigation_table", "quantity": "altitude", "show": "rmse", "bins": 3},
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    """Files of a study that asks for every kind of figure."""
-    store = flown(tmp_path_factory.mktemp("asked"), figures=ASKED)
-    return draw(store)
-
 
 @pytest.fixture(scope="module")
 def spec(tmp_path_factory):
     return scene(tmp_path_factory.mktemp("spec"))
-
-
-def test_every_figure_that_is_asked_for_is_made_beside_the_store(drawn):
-    stems = ["range_cloud", "plan", "close", "nothing", "pair_radial_velocity_over_time_scatter",
-             "pd_shot_over_altitude_scatter", "pair_several_surfaces_shot_spectra", "seventh",
-             "beyond", "velocity_all_navigation"]  # fmt: skip
-    names = [f"{stem}.png" for stem in stems]
-    names += [f"altitude_rmse_navigation_table.{suffix}" for suffix in ("txt", "csv")]
-    assert [file.name for file in drawn] == names
-    assert {file.parent.name for file in drawn} == {"scene-figures"}
-
-
-def test_the_table_has_a_row_for_each_bin(drawn):
-    rows = list(csv.DictReader(drawn[-1].open()))
-    assert [row["scanner"] for row in rows] == ["square"] * 3
-    assert "rmse" in rows[0] and "bias" not in rows[0]
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
