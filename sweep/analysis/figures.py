@@ -90,18 +90,8 @@ class Study:
         if chart is None:
             return f"no point of the study has {held(figure)}"
         title = "\n".join(filter(None, [self.spec.title, figure.title]))
-        note = labels.joined([held(figure), source(self.dataset.attrs, "points")])
+        note = labels.joined([held(figure), labels.source(self.dataset.attrs, "points")])
         return sheet_of(chart, title=title, note=note)
-
-
-def source(attributes: dict[Any, Any], unit: str) -> str:
-    """Words at a picture's foot: its study, and how much of that is computed."""
-    note = (
-        f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
-        f"model {attributes['model_version']}"
-    )
-    done, number = attributes[f"{unit}_committed"], attributes[unit]
-    return note if done >= number else f"{note}: {done:,} of {number:,} {unit} computed"
 
 
 def held(figure: Surface | Slices) -> str:

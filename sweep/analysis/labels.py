@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -93,3 +95,13 @@ def extent(values: np.ndarray) -> str:
         return "no value is known"
     low, middle, high = (f"{q:.3g}" for q in np.quantile(finite, [0, 0.5, 1]))
     return f"lowest {low}, median {middle}, highest {high}"
+
+
+def source(attributes: Mapping[Any, Any], unit: str) -> str:
+    """Words at a picture's foot: its study, and how much of that is computed."""
+    note = (
+        f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
+        f"model {attributes['model_version']}"
+    )
+    done, number = attributes[f"{unit}_committed"], attributes[unit]
+    return note if done >= number else f"{note}: {done:,} of {number:,} {unit} computed"

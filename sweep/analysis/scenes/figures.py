@@ -11,7 +11,6 @@ import xarray as xr
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.drawing import sheet_of
-from sweep.analysis.figures import source
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import pictures
 from sweep.analysis.scenes.clouds import AXES, Ground, gathered
@@ -89,7 +88,7 @@ class SceneStudy:
     @property
     def note(self) -> str:
         """Words at a picture's foot."""
-        return source(self.tree.attrs, "blocks")
+        return labels.source(self.tree.attrs, "blocks")
 
     @property
     def figures(self) -> list[SceneFigure]:
