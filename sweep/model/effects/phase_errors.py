@@ -234,9 +234,10 @@ def walk_phase(
 def walk_smear(points: Points) -> Smear | None:
     """The phase that range walk adds."""
     slide = points.approach - points.radial_velocity
-    if not points.has("target.radial_velocity") and not slide.any():
+    beta = points.beta + points.faster
+    each = beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT
+    if not each.any():
         return None
-    each = points.beta * (1 + points.beta / 2) + slide / SPEED_OF_LIGHT
     return over_record(points, {2: points.signs * points.chirp_rate * each})
 
 

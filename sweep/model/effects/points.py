@@ -306,14 +306,18 @@ class Points:
         return self.columns(*(starts if len(self.signs) == 3 else starts[::2]))
 
     @cached_property
+    def faster(self) -> np.ndarray:
+        """Growth of the Doppler ratio from the shot's start to each segment's."""
+        moving = 0.0 if self.at_one_range else 2 / SPEED_OF_LIGHT
+        return np.asarray(moving * self.acceleration * self.starts)
+
+    @cached_property
     def frequency(self) -> np.ndarray:
         """Signed beat of the line on the axis [Hz], by segment."""
-        beta = np.zeros(()) if self.at_rest else self.beta
+        beta = self.faster + (0.0 if self.at_rest else self.beta)
         delay = self.delay
         if not self.at_one_range:
-            half = self.acceleration * self.starts / SPEED_OF_LIGHT
-            delay = delay - (2 / SPEED_OF_LIGHT * self.approach + half) * self.starts
-            beta = beta + 2 * half
+            delay = delay - (2 / SPEED_OF_LIGHT * self.approach + self.faster / 2) * self.starts
         beat = self.chirp_rate * delay * (1 + beta)
         return self.carriers * beta - self.signs * beat
 

@@ -1,21 +1,21 @@
 """Tolerances are kept of instruments drawn at random, near DC and Nyquist and smeared."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-FILE = Path(__file__).parents[3] / "benchmarks" / "promise_instruments.py"
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 TOLERANCES = (1e-2, 1e-3, 1e-5)
 
 
 @pytest.fixture(scope="module")
 def promise_instruments():
-    found = importlib.util.spec_from_file_location("promise_instruments", FILE)
-    module = importlib.util.module_from_spec(found)
-    found.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        import promise_instruments
+
+        yield promise_instruments
 
 
 @pytest.mark.parametrize("asked", ["nothing", "leakage", "jitter"])

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from effect_points import points_of
 
-from sweep.model import truth
+from sweep.model import shot, truth
 from sweep.model.effects import phase_errors
 from sweep.model.effects.catalogue import CORE
 from sweep.model.segments import spectrum
@@ -111,3 +112,22 @@ def test_drift_counts_bins_and_has_the_chirps_sign():
         cycles = phase_errors.walk_phase(x, sign=sign, start=0.0, **motion)[0]
         slope = (np.diff(cycles)[[0, 2]] / 0.001) * 2  # bins at the record's ends
         np.testing.assert_allclose(np.diff(slope), sign * bins, rtol=1e-3)
+
+
+@pytest.mark.parametrize("acceleration", [50.0, -400.0])
+def test_a_target_that_starts_from_rest_walks_in_the_down_segment(table_4_1, acceleration):
+    """By a velocity of a t there; the size is no less than what leaving it out changes."""
+    parameters = table_4_1(fft_size=2**14, sample_rate=100e6, beamlets=1, radial_velocity=0.0)
+    parameters |= {"target.acceleration": acceleration, "target.range": 50.0}
+    effects = *CORE, "segment_motion", "acceleration"
+    found = [
+        shot.find(*(shots for _, shots in prepare(parameters, some)))[:, 2, 0]
+        for some in (effects, (*effects, "range_walk"))
+    ]
+    changed = np.abs(found[0] / found[1] - 1)
+    points = points_of(parameters)
+    points.smears["range_walk"] = phase_errors.walk_smear(points)
+    size = phase_errors.RANGE_WALK.size(points)
+    told = np.broadcast_to(np.ravel(size.magnitude + size.added), 3)
+    assert changed[0] < 1e-9 and changed[2] > 1e-7
+    assert (changed <= told + 1e-9).all()
