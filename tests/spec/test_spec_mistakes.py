@@ -1,5 +1,3 @@
-import pickle
-
 import pytest
 import yaml
 from written_specs import written
@@ -113,6 +111,8 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
     (mistake,) = mistakes_of(written({path: value}))
     assert mistake.path == path
     assert words in str(mistake)
+    for foreign in ("Input should", "pydantic", "type=", "https://", "Extra inputs", "Field "):
+        assert foreign not in str(mistake)
     if isinstance(parameter_rules().get(path), Numeric):
         assert mistake.suggestion
 
@@ -313,20 +313,6 @@ def test_ten_mistakes_in_one_file_are_reported_at_once_with_their_lines(tmp_path
     )
 
 
-def test_no_message_speaks_pydantics_language():
-    for path, value, _ in FIELDS:
-        for mistake in mistakes_of(written({path: value})):
-            for words in (
-                "Input should",
-                "pydantic",
-                "type=",
-                "https://",
-                "Extra inputs",
-                "Field ",
-            ):
-                assert words not in str(mistake)
-
-
 def test_mistakes_of_axes_fields_and_combinations_come_together():
     mapping = written(
         {"instrument.chirp.duration": "1 us", "target.reflectance": 2}, axes={"seed": [1]}
@@ -339,11 +325,6 @@ def test_an_axis_that_stands_in_for_a_field_is_blamed_alone():
     mapping = written({"target.range": ...}, axes={"target.range": [5, "6 m"]})
     (mistake,) = mistakes_of(mapping)
     assert mistake.path == "axes.target.range[0]"
-
-
-def test_a_spec_error_survives_pickling_as_workers_need():
-    error = SpecError(mistakes_of(written({"seed": -1})))
-    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_the_mapping_given_is_left_as_it_was():

@@ -1,0 +1,283 @@
+"""Shipped experiments and the schema that editors hold specs to, against what is read."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+from written_scenes import BOX, RICH, SPHERE, TREES, with_object
+from written_scenes import written as flight
+from written_specs import written
+
+from sweep.model import window as model_window
+from sweep.model.ground import LAWS
+from sweep.spec import SceneSpec, Spec, SpecError, json_schema, load
+from sweep.spec.fields import parameter_rules
+from sweep.spec.identity import digest
+from sweep.spec.parts import all_parts, fields_of, rule_of
+from sweep.spec.reading import read_document
+from sweep.spec.rules import WINDOWS, Numeric
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+IDS = {
+    "aperture": "2e01e4d9",
+    "beam_coupling": "1c69017d",
+    "beam_divergence": "65a414c1",
+    "cfar": "fb8a8b27",
+    "estimators": "5d9b6493",
+    "expanded_pattern": "8917a838 96bd30ac",
+    "fft_size": "84adb75c",
+    "forest_scan": "8b33869d 8f641479",
+    "gale_crater_descent": "55108643 ec9abd25",
+    "morpheus_three_beam": "72573b6a 7422a280",
+    "oblique_descent": "0ac39851 a09399cd",
+    "quickstart": "6c5f1d9f",
+    "range_angle": "0f6009c4",
+    "scan_pattern_comparison": "f4d45f6e 15a2ffe4 f8fe970d c3bbf3c2",
+    "single_shot_2000m": "3c45228d",
+    "single_shot_45deg": "2f0ac236",
+    "speckled_descent": "48b60bab 725d5aec",
+    "speckled_target": "7e0e5a1d",
+    "square_high_descent": "8a5beee2 7a90c73f",
+    "square_low_descent": "ed8f5096 b2fd9996",
+    "threshold": "838e9c02",
+    "transmit_power": "01d8ddbe",
+}
+"""Of the study, and of the geometry of each scanner: the first digits."""
+
+POINTS = {
+    "quickstart": 4500,
+    "single_shot_2000m": 1,
+    "single_shot_45deg": 2,
+    "range_angle": 900_000,
+    "threshold": 360_000,
+    "transmit_power": 3 * 20082,
+    "aperture": 3 * 20082,
+    "fft_size": 3 * 20082,
+    "beam_coupling": 444,
+    "beam_divergence": 6 * 30078,
+    "speckled_target": 24 * 4,
+    "cfar": 4 * 2 * 12,
+    "estimators": 8 * 7 * 2,
+}
+NEW = ("beam_coupling", "speckled_target", "cfar", "estimators")
+"""Studies of what the thesis has nothing of."""
+
+
+@pytest.fixture(scope="module")
+def validator():
+    schema = json.loads(json.dumps(json_schema()))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def loaded(name):
+    """A shipped study; skipped where its terrain, which is no part of the repository, is not."""
+    try:
+        return load(EXPERIMENTS / f"{name}.yaml")
+    except SpecError as error:
+        if "gale_crater_hirise_1m.tif" not in str(error):
+            raise
+        pytest.skip("the terrain is no part of the repository")
+
+
+def test_every_experiment_that_the_project_promises_is_there():
+    assert {file.stem for file in EXPERIMENTS.glob("*.yaml")} == set(IDS)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_a_shipped_study_keeps_its_id_and_agrees_with_the_schema(name, validator):
+    path = EXPERIMENTS / f"{name}.yaml"
+    validator.validate(read_document(path).value)
+    text = path.read_text()
+    assert text.startswith("# ")
+    study = loaded(name)
+    parts = [study.identity()]
+    if isinstance(study, SceneSpec):
+        parts += [study.geometry(scanner) for scanner in study.scanners]
+        assert max(map(len, text.splitlines())) <= 100
+    # The version of the model is no part of these ids.
+    assert [digest(part | {"model": ""})[:8] for part in parts] == IDS[name].split()
+    assert study.question.endswith("?")
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_a_shipped_grid_has_its_points_and_comes_back_from_a_store(name, validator):
+    study = loaded(name)
+    points = 1
+    for axis in study.axes:
+        points *= axis.size
+    assert points == POINTS[name]
+    assert Spec.from_stored(study.to_json()) == study
+    validator.validate(study.to_yaml_mapping())
+
+
+@pytest.mark.parametrize("name", sorted(set(POINTS) - set(NEW)))
+def test_a_reproduction_makes_the_thesiss_choices(name):
+    parameters = loaded(name).parameters()
+    efficiency = parameters["instrument.telescope.optical_efficiency"]
+    assert efficiency * parameters["target.reflectance"] == pytest.approx(0.1)
+    assert parameters["target.reflectance_law"] == "thesis"
+    assert parameters["footprint.phases"] == "coherent"
+    assert parameters["footprint.beamlets"] == 109
+
+
+def test_the_instrument_of_table_4_1_holds_its_printed_values():
+    parameters = load(EXPERIMENTS / "range_angle.yaml").parameters()
+    printed = {
+        "laser.wavelength": 1.55e-6, "laser.power": 1.0, "laser.beam_divergence": 5e-5,
+        "chirp.bandwidth": 1e9, "chirp.start_frequency": 5.5e9, "chirp.duration": 5e-4,
+        "telescope.aperture": 0.025, "receiver.local_oscillator_power": 1e-3,
+        "receiver.apd_gain": 1.0, "receiver.detector_bandwidth": 4e8,
+        "receiver.responsivity": 1.1, "receiver.optical_passband": 2.5e-8,
+        "receiver.noise_equivalent_power": 5e-12, "receiver.transimpedance": 7e3,
+        "receiver.amplifier_bandwidth": 4e8, "receiver.amplifier_noise_current": 2.5e-8,
+        "processing.sample_rate": 6e8, "processing.fft_size": 131072,
+        "processing.window": "hamming", "processing.tnr": 10.0,
+    }  # fmt: skip
+    assert {path: parameters[f"instrument.{path}"] for path in printed} == printed
+
+
+def test_table_5_1_differs_from_table_4_1_in_its_aperture_alone():
+    a, b = (
+        yaml.safe_load((EXPERIMENTS / "instruments" / f"{name}.yaml").read_text())
+        for name in ("table_4_1", "table_5_1")
+    )
+    assert Spec.from_mapping(written(instrument=b)).instrument.telescope.aperture == 0.05
+    b["telescope"]["aperture"] = "25 mm"
+    assert (
+        Spec.from_mapping(written(instrument=a)).id == Spec.from_mapping(written(instrument=b)).id
+    )
+
+
+VARIED = written(
+    axes={
+        "target.range": ["1 m", {"step": ["5 m", "9 m", "1 m"]}],
+        "instrument.processing.fft_size": ["2^16", 131072],
+        "instrument.processing.window": ["hann", "kaiser(8.6)"],
+        "target.reflectance": {"linear": [0.1, 1], "number": 4},
+        "cut": {"zip": {"target.grazing_angle": "5 deg", "footprint.beamlets": [1, 2]}},
+    },
+    execution={"workers": 2},
+)
+FIGURE = {"kind": "cloud", "colour": "snr", "view": {"azimuth": "1 deg", "elevation": "2 deg"}}
+READ = {
+    "target": written(),
+    "axes": VARIED,
+    "plane": flight({"figures": [FIGURE]}),
+    "rich": RICH,
+    "whole": SceneSpec.from_mapping(RICH).to_yaml_mapping(),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_study_that_is_read_agrees_with_the_schema(name, validator):
+    validator.validate(READ[name])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"instrument.laser.power": 1},
+        {"instrument.laser.power": "1"},
+        {"instrument.laser.watts": "1 W"},
+        {"instrument.processing.fft_size": "two"},
+        {"instrument.receiver.architecture": "homodine"},
+        {"target.reflectance": 2},
+        {"target.range": 5},
+        {"axes": {"target.rnge": ["1 m"]}},
+        {"axes": {"target.range": [5]}},
+        {"axes": {"target.range": []}},
+        {"axes": {"target.range": {"step": ["1 m", "2 m"]}}},
+        {"axes": {"target.range": {"linear": ["1 m", "2 m"]}}},
+        {"axes": {"cut": {"zip": [{"range": "1 m"}]}}},
+        {"figures": [{"kind": "surfce", "variable": "pd_shot"}]},
+        {"title": ...},
+        {"foorprint": {}},
+        {"scanners": {}},
+    ],
+)
+def test_an_editor_sees_the_mistake_in_a_grid_by_the_schema(changes, validator):
+    assert list(validator.iter_errors(written(changes)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scene.origin": 3},
+        {"scene.objects.ground.kind": "plan"},
+        {"scene.objects.ground.size": 3},
+        {"scene.objects.ground.reflectanc": 3},
+        {"scene.objects.ground.reflectance": ...},
+        {"scene.objects.ground.reflectance_law": "lambrt"},
+        {"platform.path.from": ...},
+        {"platform.path.from": ["0 m", "0 m"]},
+        {"platform.path.from": [0, 0, 0]},
+        {"platform.attitude": {"kind": "nadir", "heading": "trk"}},
+        {"scanners.three.beams": "many"},
+        {"scanners": 3},
+        {"scanners": ...},
+        {"axes": {"instrument.laser.beam_divergence": ["1 urad"]}},
+        {"axes": {"target.range": ["1 m"]}},
+        {"draws.number": 0},
+        {"figures": [FIGURE | {"kind": "surface"}]},
+        {"figures": [FIGURE | {"colour": "rnge"}]},
+        {"figures": [FIGURE | {"x": ["1 m"]}]},
+        {"figures": [FIGURE | {"view": {"azimuth": "1 deg"}}]},
+        {"target": {"range": "1 m"}},
+        {"scene.objects.forest": TREES | {"leaf": {"reflectance": 3}}},
+        {"scene.objects.crate": BOX | {"size": ["1 m"]}},
+    ],
+)
+def test_an_editor_sees_the_mistake_in_a_flight_by_the_schema(changes, validator):
+    assert list(validator.iter_errors(flight(changes)))
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_of_the_model_is_one_that_surfaces_take(law, validator):
+    mapping = with_object(SPHERE, reflectance_law=law)
+    validator.validate(mapping)
+    assert SceneSpec.from_mapping(mapping).surfaces()[1].law == law
+
+
+def test_every_parameter_is_described_with_an_example():
+    definitions = json_schema()["$defs"]
+    for path, rule in parameter_rules().items():
+        described = definitions[f"{path}.value"]
+        assert described["description"]
+        assert not isinstance(rule, Numeric) or described["examples"] == [rule.example]
+    receiver = definitions["Receiver"]["properties"]
+    assert receiver["local_oscillator_power"]["default"] == "0.001 W"
+    assert receiver["noise_figure"]["default"] == "0 dB"
+
+
+@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+def test_every_field_is_described_and_its_default_reads_back_as_it_is_written(kind):
+    definitions, looked_at = json.loads(json.dumps(json_schema()["$defs"])), 0
+    for model in all_parts(kind):
+        properties = definitions[model.__name__]["properties"]
+        for name, field in fields_of(model).items():
+            rule, described = rule_of(field), properties[name]
+            if rule is None or name == "axes":
+                continue
+            assert described["description"], (model, name)
+            if "default" in described:
+                jsonschema.Draft202012Validator(described).validate(described["default"])
+                read = rule.read(described["default"])
+                assert read == field.default, (model, name)
+                assert json.loads(json.dumps(rule.written(read))) == described["default"]
+                looked_at += 1
+            if rule.example and not rule.example.startswith("["):
+                rule.read(rule.example)
+    assert looked_at > 40
+
+
+@pytest.mark.parametrize(
+    "name", [*WINDOWS, *model_window.ALIASES, "kaiser(8.6)", "chebwin(100)", "tukey( 0.5 )"]
+)
+def test_every_window_that_a_spec_takes_the_model_makes(name):
+    read = Spec.from_mapping(
+        written({"instrument.processing.window": name})
+    ).instrument.processing.window
+    assert model_window.samples(read, 32).shape == (32,)
