@@ -7,7 +7,7 @@ bytes.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -309,51 +309,33 @@ def _no_kind(kind: object) -> Finding:
     return Finding(("kind",), f"must be one of {names}", near_miss(str(kind), KINDS), kind)
 
 
-def _together(cluster: AnyCluster) -> list[Finding]:
+def _together(cluster: AnyCluster) -> Iterator[Finding]:
     """What is wrong with a cluster beyond its single fields."""
-    findings = _missing_files(cluster)
+    for name, path in zip(Security.model_fields, cluster.certificates() or (), strict=False):
+        if not Path(path).is_file():
+            remedy = "make certificates with 'sweep certificates DIRECTORY'"
+            yield Finding(("security", name), "names a file that is not there", remedy, path)
     if isinstance(cluster, Local | SSH | Batch):
-        findings += _scheduler_findings(cluster.scheduler, far=not isinstance(cluster, Local))
+        yield from _scheduler_findings(cluster.scheduler, far=not isinstance(cluster, Local))
     if isinstance(cluster, Address):
-        findings += _address_findings(cluster)
+        address, encrypted = cluster.address, cluster.address.startswith("tls://")
+        if encrypted and not cluster.security:
+            rule = "is encrypted, and no certificates are given"
+            yield Finding(("address",), rule, "add a security section", address)
+        if cluster.security and not encrypted:
+            rule = "is not encrypted, for all that there are certificates"
+            yield Finding(("address",), rule, "write 'tls://...'", address)
     if isinstance(cluster, SSH) and cluster.workers.least < cluster.workers.most:
         rule = "must be a number: machines reached by SSH are there or not"
-        findings.append(Finding(("workers",), rule, f"write {cluster.workers.most}"))
+        yield Finding(("workers",), rule, f"write {cluster.workers.most}")
     if isinstance(cluster, Kubernetes) and bool(cluster.secret) != bool(cluster.security):
         rule = "goes with the security section: pods have their certificates from it"
-        findings.append(Finding(("secret",), rule, "give both, or none"))
-    return findings
+        yield Finding(("secret",), rule, "give both, or none")
 
 
-def _scheduler_findings(scheduler: Scheduler, *, far: bool) -> list[Finding]:
+def _scheduler_findings(scheduler: Scheduler, *, far: bool) -> Iterator[Finding]:
     if scheduler.host and scheduler.interface:
-        rule, remedy = "has both a host and an interface", "keep one of them"
+        yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")
     elif far and not (scheduler.host or scheduler.interface):
         rule = "must say where workers on other machines reach it"
-        remedy = "write e.g. 'interface: ib0' or 'host: 10.0.0.5'"
-    else:
-        return []
-    return [Finding(("scheduler",), rule, remedy)]
-
-
-def _address_findings(cluster: Address) -> list[Finding]:
-    encrypted = cluster.address.startswith("tls://")
-    if encrypted == (cluster.security is not None):
-        return []
-    rule, remedy = (
-        ("is encrypted, and no certificates are given", "add a security section")
-        if encrypted
-        else ("is not encrypted, for all that there are certificates", "write 'tls://...'")
-    )
-    return [Finding(("address",), rule, remedy, cluster.address)]
-
-
-def _missing_files(cluster: Cluster) -> list[Finding]:
-    paths = cluster.certificates() or ()
-    names = ("ca", "certificate", "key")
-    remedy = "make certificates with 'sweep certificates DIRECTORY'"
-    return [
-        Finding(("security", name), "names a file that is not there", remedy, path)
-        for name, path in zip(names, paths, strict=False)
-        if not Path(path).is_file()
-    ]
+        yield Finding(("scheduler",), rule, "write e.g. 'interface: ib0' or 'host: 10.0.0.5'")

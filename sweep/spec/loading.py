@@ -27,18 +27,7 @@ def load(path: str | Path) -> Spec | SceneSpec:
 
 
 def written(fields: Mapping[str, str]) -> dict[str, Any]:
-    """Values as a file has them, from the text that would stand there.
-
-    Parameters
-    ----------
-    fields : mapping
-        Text by dotted path: ``{"axes.target.range": "[1 km, 2 km]"}``.
-
-    Raises
-    ------
-    SpecError
-        Where one is no YAML.
-    """
+    """Values as a file has them, from text by path: ``{"axes.target.range": "[1 km, 2 km]"}``."""
     text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in fields.items())
     document = parsed(text, Path("--set"))
     if document.findings:
@@ -49,20 +38,8 @@ def written(fields: Mapping[str, str]) -> dict[str, Any]:
 def from_stored(text: str, base: Path | str | None = None) -> Spec | SceneSpec:
     """Study from the JSON that its `to_json` gave, the same again but for its execution.
 
-    Parameters
-    ----------
-    text : str
-        The JSON.
-    base : path, optional
-        Folder that the files of a scene are relative to; the current one by default. They are not
-        looked at before the scene is built.
-
-    Raises
-    ------
-    SpecError
-        With every mistake in it.
+    The files of a scene, relative to `base`, are not looked at before it is built.
     """
     written = json.loads(text)
-    if isinstance(written, dict) and "scene" in written:
-        return SceneSpec.from_stored(text, base=base)
-    return Spec.from_stored(text)
+    kind = SceneSpec if isinstance(written, dict) and "scene" in written else Spec
+    return kind.from_stored(text, base)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
@@ -17,10 +16,10 @@ from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
 from sweep.spec.figures import SceneFigure, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import Grid, is_method, not_in_flights
-from sweep.spec.identity import axis_identity, digest, geometry_of, leaf_values
-from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, shown
-from sweep.spec.parts import Files, named_files, values_of
-from sweep.spec.reading import Document, plain
+from sweep.spec.identity import digest, geometry_of, leaf_values
+from sweep.spec.mistakes import Finding, Location
+from sweep.spec.parts import Files, named_files
+from sweep.spec.reading import Document
 from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
     Arrangement,
@@ -36,11 +35,6 @@ if TYPE_CHECKING:
     from sweep.model.geometry.platform import Flight
     from sweep.model.geometry.scanner import PointingJitter, Scanner
     from sweep.spec.world import World
-
-FILES = "files"
-"""Section of a stored study: the digest of each file by its path."""
-
-SECTIONS = ("instrument", "atmosphere", "footprint", "accuracy")
 
 
 class SceneSpec(Study):
@@ -59,30 +53,15 @@ class SceneSpec(Study):
         default=(), description="Figures and tables of the results"
     )
 
-    _base: Path = PrivateAttr(default=Path())
-    _digests: dict[str, str] = PrivateAttr(default_factory=dict)
-
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
         """Spec from a document, which is changed, or all of its mistakes at once."""
         spec = super().from_document(document, base)
         if base is not None:
+            files = Files(base)
             spec._base = base
-            spec._digests = _digests(spec, base)
-        return spec
-
-    @classmethod
-    def from_stored(cls, text: str, base: Path | str | None = None) -> Self:
-        """Spec from the JSON that `to_json` gave, the same again but for its execution.
-
-        Files, relative to `base`, are not looked at before they are needed.
-        """
-        written = plain(json.loads(text))
-        if not isinstance(written, dict):
-            raise SpecError([Mistake("", "must be a mapping", shown(written))])
-        digests = written.pop(FILES, {})
-        spec = cls.from_document(Document(written), None)
-        spec._base, spec._digests = Path(base or "."), digests
+            named = [(file, rule) for _, rule, file in named_files(spec)]
+            spec._digests = {file: rule.digest(files.path(file)) for file, rule in named}
         return spec
 
     @classmethod
@@ -118,12 +97,7 @@ class SceneSpec(Study):
 
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
-        parameters = {
-            path: value
-            for section in SECTIONS
-            for path, value in values_of(getattr(self, section), section).items()
-            if value is not None and not is_method(path)
-        }
+        parameters = {p: v for p, v in super().parameters().items() if not is_method(p)}
         rays = rays_needed(parameters, Accuracy.of(parameters))
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,
@@ -230,16 +204,12 @@ class SceneSpec(Study):
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
 
-        Title, question, figures and execution are no part of it, nor are values that an axis
-        overrides, nor where files are: they count by content. The order of axes and of objects
-        is: it lays out the arrays and numbers the surfaces. A number of rays that follows from the
-        tolerance counts by that, as 0.
+        Files count by content, and not by where they are. The order of objects is part of it: it
+        numbers the surfaces. A number of rays that follows from the tolerance counts as 0.
         """
         digests, counted = self._digests, {BEAMLETS: 0} if self.rays_by_tolerance else {}
-        return {
-            "model": VERSION,
+        return super().identity() | {
             "parameters": self.parameters_off_axes() | counted,
-            "axes": [axis_identity(axis) for axis in self.axes],
             "objects": list(self.scene.objects),
             "scene": leaf_values(self.scene, digests),
             "platform": leaf_values(self.platform, digests),
@@ -248,17 +218,7 @@ class SceneSpec(Study):
                 for name, scanner in self.scanners.items()
                 for path, value in leaf_values(scanner, digests).items()
             },
-            "draws": values_of(self.draws, ""),
-            "navigation": values_of(self.navigation, ""),
-            "effects": self.modes(),
-            "seed": self.seed,
-            "storage": values_of(self.storage, ""),
         }
-
-    def to_json(self) -> str:
-        """The spec as JSON text, for a store to hold, with the digests of its files."""
-        mapping = self.to_yaml_mapping() | ({FILES: self._digests} if self._digests else {})
-        return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, SceneSpec):
@@ -267,9 +227,3 @@ class SceneSpec(Study):
 
     def __hash__(self) -> int:
         return hash(self.id)
-
-
-def _digests(spec: SceneSpec, base: Path) -> dict[str, str]:
-    """Digest of every file that a spec names, by its path as written."""
-    files = Files(base)
-    return {written: rule.digest(files.path(written)) for _, rule, written in named_files(spec)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -41,13 +40,15 @@ from sweep.spec.sections import (
 from sweep.units import QuantityError
 
 LARGEST_GRID = 10**15
+FILES = "files"
+"""Section of a stored study: the digest of each file by its path."""
 _UNSTORED = ("question", "execution", "axes", "figures")
 """Sections of a study of which no default is written out."""
 _READ_AXES = Special(about="What varies", reader=lambda axes: axes)
 """Rule of axes, which `read_axes` has read before pydantic sees them."""
 
 
-class Study(Part, ABC):
+class Study(Part):
     """A study as its user declared it, every value read and checked.
 
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
@@ -67,6 +68,8 @@ class Study(Part, ABC):
     axes: tuple[Axis, ...] = of.field(_READ_AXES, ())
 
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _base: Path = PrivateAttr(default=Path())
+    _digests: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
@@ -87,6 +90,20 @@ class Study(Part, ABC):
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", shown(mapping))])
         return cls.from_document(Document(plain(mapping)), Path(base))
+
+    @classmethod
+    def from_stored(cls, text: str, base: Path | str | None = None) -> Self:
+        """Spec from the JSON that `to_json` gave, the same again but for its execution.
+
+        Files, relative to `base`, are not looked at before they are needed.
+        """
+        written = plain(json.loads(text))
+        if not isinstance(written, dict):
+            raise SpecError([Mistake("", "must be a mapping", shown(written))])
+        digests = written.pop(FILES, {})
+        spec = cls.from_document(Document(written), None)
+        spec._base, spec._digests = Path(base or "."), digests
+        return spec
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
@@ -137,9 +154,15 @@ class Study(Part, ABC):
         """
         return []
 
-    @abstractmethod
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        return {
+            path: value
+            for section in SECTIONS
+            if section in type(self).model_fields
+            for path, value in values_of(getattr(self, section), section).items()
+            if value is not None
+        }
 
     def modes(self) -> dict[str, str]:
         """Whether each effect, by its name, is simulated: `auto`, `on` or `off`."""
@@ -219,9 +242,20 @@ class Study(Part, ABC):
             return float(number)
         return float((unit.factor * number + unit.offset - display.offset) / display.factor)
 
-    @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Content that makes the study this one, in SI values."""
+        """Content that makes the study this one, in SI values.
+
+        Title, question, figures and execution are no part of it, nor are values that an axis
+        overrides. The order of the axes is: it lays out the arrays.
+        """
+        sections = [n for n in ("draws", "navigation", "storage") if n in type(self).model_fields]
+        return {
+            "model": VERSION,
+            "parameters": self.parameters_off_axes(),
+            "axes": [axis_identity(axis) for axis in self.axes],
+            "effects": self.modes(),
+            "seed": self.seed,
+        } | {name: values_of(getattr(self, name), "") for name in sections}
 
     def parameters_off_axes(self) -> dict[str, float | int | str]:
         """SI values of the parameters that no axis overrides, by dotted path."""
@@ -252,8 +286,9 @@ class Study(Part, ABC):
         return mapping
 
     def to_json(self) -> str:
-        """The spec as JSON text, for a store to hold."""
-        return json.dumps(self.to_yaml_mapping(), ensure_ascii=False, allow_nan=False)
+        """The spec as JSON text, for a store to hold, with the digests of its files."""
+        mapping = self.to_yaml_mapping() | ({FILES: self._digests} if self._digests else {})
+        return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
 
 
 def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None]:
@@ -284,11 +319,6 @@ class Spec(Study):
     figures: tuple[Figure, ...] = Field(default=(), description="Figures and tables of the results")
 
     @classmethod
-    def from_stored(cls, text: str) -> Self:
-        """Spec from the JSON that `to_json` gave, the same again but for its execution."""
-        return cls.from_mapping(json.loads(text))
-
-    @classmethod
     def further_findings(
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
@@ -301,15 +331,6 @@ class Spec(Study):
             findings += _number_findings(draws)
         return findings
 
-    def parameters(self) -> dict[str, float | int | str]:
-        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
-        return {
-            path: value
-            for section in SECTIONS
-            for path, value in values_of(getattr(self, section), section).items()
-            if value is not None
-        }
-
     @cached_property
     def has_random_effects(self) -> bool:
         """Whether anything but noise may be random at any point."""
@@ -318,24 +339,13 @@ class Spec(Study):
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
 
-        Title, question, figures and execution are no part of it, nor are values that an axis
-        overrides, nor is what looks at whole spectra where none are drawn. The order of the axes
-        is: it lays out the arrays.
+        What looks at whole spectra is no part of it where none are drawn.
         """
-        looked_at = self.draws.whole_spectra
-        return {
-            "model": VERSION,
-            "parameters": {
-                path: value
-                for path, value in self.parameters_off_axes().items()
-                if looked_at or not is_method(path)
-            },
-            "axes": [axis_identity(axis) for axis in self.axes],
-            "draws": values_of(self.draws, ""),
-            "effects": self.modes(),
-            "seed": self.seed,
-            "storage": values_of(self.storage, ""),
-        }
+        identity = super().identity()
+        if not self.draws.whole_spectra:
+            counted = {p: v for p, v in identity["parameters"].items() if not is_method(p)}
+            identity["parameters"] = counted
+        return identity
 
 
 def _number_findings(draws: Draws) -> Iterator[Finding]:
