@@ -437,18 +437,16 @@ def without_draws(grid: Grid) -> Iterator[Finding]:
 
 
 def not_in_flights(grid: Grid) -> Iterator[Finding]:
-    """Random effects and methods that are asked for in a flight, and that only grids draw."""
+    """Random effects and methods that are asked for in a flight, and that only grids draw.
+
+    All other random effects are drawn; a target's own parameters are told where they stand.
+    """
     rule = "is not drawn in flights"
     for effect in EFFECTS:
         of_target = any(parameter.path.startswith("target.") for parameter in effect.parameters)
         if (effect.turn or of_target) and effect.is_random and grid.modes.get(effect.name) == ON:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
-    for effect, parameter in _random_and_there(grid):
-        # Others are drawn, or are of a target, which a flight has not and which is told elsewhere.
-        if effect.turn is not None:
-            remedy = f"leave it out, or set effects.{effect.name}: off"
-            yield grid.finding(parameter.path, rule, remedy)
     rule = "looks at whole spectra, which flights over scenes do not draw"
     for path in _methods(grid):
         if path in grid.values:
