@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +31,7 @@ from sweep.tasks import store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.journal import LOGS, RECIPE, committed
 from sweep.tasks.progress import Late, Progress, chosen
-from sweep.tasks.study import ArrayLayout, Study
+from sweep.tasks.study import ArrayLayout, BlockGrid, Study
 
 if TYPE_CHECKING:
     import zarr
@@ -117,18 +115,11 @@ def _pack_array(source: Any, output: Location) -> None:
     import zarr
 
     target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
+    dims = tuple(map(str, range(target.ndim)))
+    files = BlockGrid(dims, target.shape, target.shards or target.chunks)
     with ThreadPoolExecutor(THREADS) as pool:
-        for _ in pool.map(lambda part: _copy(source, target, part), _parts(target)):
+        for _ in pool.map(lambda n: _copy(source, target, files.block(n)), range(files.n_blocks)):
             pass
-
-
-def _parts(array: zarr.Array[Any]) -> Iterator[tuple[slice, ...]]:
-    """Slices of an array, each a whole file of it."""
-    cut = array.shards or array.chunks
-    for corner in product(*(range(0, n, c) for n, c in zip(array.shape, cut, strict=True))):
-        yield tuple(
-            slice(at, min(at + c, n)) for at, c, n in zip(corner, cut, array.shape, strict=True)
-        )
 
 
 def _copy(source: zarr.Array[Any], target: zarr.Array[Any], part: tuple[slice, ...]) -> None:
@@ -146,7 +137,7 @@ def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
     """
     if layout.values is not None:
         return None
-    room = SHARD_BYTES // max(1, math.prod(layout.chunks) * np.dtype(layout.dtype).itemsize)
+    room = SHARD_BYTES // max(1, layout.bytes_of(layout.chunks))
     counts = [1] * len(layout.shape)
     for k in reversed(range(len(counts))):
         counts[k] = max(1, min(-(-layout.shape[k] // layout.chunks[k]), room))

@@ -80,6 +80,27 @@ class ArrayLayout:
             values=values.astype(object) if text else values,
         )  # fmt: skip
 
+    @property
+    def group(self) -> str:
+        """Group that it is in; empty for the root."""
+        return self.name.rpartition("/")[0]
+
+    @property
+    def n_chunks(self) -> int:
+        """Number of its chunks."""
+        return math.prod(-(-n // chunk) for n, chunk in zip(self.shape, self.chunks, strict=True))
+
+    def bytes_of(self, shape: tuple[int, ...]) -> int:
+        """Bytes of a part of such a shape, before compression."""
+        return math.prod(shape) * np.dtype(self.dtype).itemsize
+
+    def region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
+        """Slices of the chunk at a position."""
+        return tuple(
+            slice(at * chunk, min((at + 1) * chunk, n))
+            for at, chunk, n in zip(position, self.chunks, self.shape, strict=True)
+        )
+
 
 def described(units: str, long_name: str, comment: str = "") -> dict[str, str]:
     """Attributes that say what an array holds."""
@@ -286,23 +307,19 @@ class Study(Content, ABC):
     @property
     def n_chunks(self) -> int:
         """Number of chunks of all blocks."""
-        return sum(
-            math.prod(-(-n // chunk) for n, chunk in zip(a.shape, a.chunks, strict=True))
-            for a in self.layouts.values()
-        )
+        return sum(layout.n_chunks for layout in self.layouts.values())
 
     @property
     def bytes(self) -> int:
         """Bytes of all results, before compression."""
-        return sum(math.prod(a.shape) * np.dtype(a.dtype).itemsize for a in self.layouts.values())
+        return sum(layout.bytes_of(layout.shape) for layout in self.layouts.values())
 
     @property
     def block_bytes(self) -> int:
         """Bytes of the results of the largest block, before compression."""
-        of_groups = dict.fromkeys((grid.group for grid in self.grids), 0)
-        for a in self.layouts.values():
-            size = math.prod(a.chunks) * np.dtype(a.dtype).itemsize
-            of_groups[a.name.rpartition("/")[0]] += size
+        of_groups = dict.fromkeys(self._groups, 0)
+        for layout in self.layouts.values():
+            of_groups[layout.group] += layout.bytes_of(layout.chunks)
         return max(of_groups.values())
 
     @property
@@ -330,10 +347,15 @@ class Study(Content, ABC):
             number -= grid.n_blocks
         raise IndexError(f"block {block} of {self.n_blocks}")
 
+    @cached_property
+    def _groups(self) -> dict[str, tuple[int, BlockGrid]]:
+        """Number of the first block of each group, and its grid."""
+        ends = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
+        return {g.group: (end - g.n_blocks, g) for g, end in zip(self.grids, ends, strict=True)}
+
     def first_block(self, group: str) -> int:
         """Number of the first block of a group."""
-        before = [grid.group for grid in self.grids].index(group)
-        return sum(grid.n_blocks for grid in self.grids[:before])
+        return self._groups[group][0]
 
     def block_size(self, block: int) -> int:
         """Points of a block."""
@@ -348,11 +370,9 @@ class Study(Content, ABC):
     @cached_property
     def _follows(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
         """Dimensions that arrays follow, by group and name."""
-        found: dict[str, dict[str, tuple[int | None, ...]]] = {g.group: {} for g in self.grids}
-        grids = {grid.group: grid for grid in self.grids}
+        found: dict[str, dict[str, tuple[int | None, ...]]] = {group: {} for group in self._groups}
         for name, layout in self.layouts.items():
-            group = name.rpartition("/")[0]
-            found[group][name] = grids[group].follows(layout)
+            found[layout.group][name] = self._groups[layout.group][1].follows(layout)
         return found
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
@@ -368,22 +388,13 @@ class Study(Content, ABC):
 
     def regions(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Slices of the arrays that a block writes."""
-        return {
-            name: tuple(
-                slice(at * chunk, min((at + 1) * chunk, size))
-                for at, chunk, size in zip(
-                    position, self.layouts[name].chunks, self.layouts[name].shape, strict=True
-                )
-            )
-            for name, position in self.chunks(block).items()
-        }
+        return {name: self.layouts[name].region(at) for name, at in self.chunks(block).items()}
 
     def owners(self) -> dict[str, np.ndarray]:
         """Block that writes each chunk, in the shape of the grid of chunks, of every output."""
-        grids = {grid.group: (self.first_block(grid.group), grid) for grid in self.grids}
         found = {}
         for name, layout in self.layouts.items():
-            first, grid = grids[name.rpartition("/")[0]]
+            first, grid = self._groups[layout.group]
             found[name] = first + grid.owners(layout)
         return found
 
