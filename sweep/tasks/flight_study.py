@@ -33,7 +33,7 @@ from sweep.tasks.eyepoint_study import (
     scene_map,
     world_of,
 )
-from sweep.tasks.grid import Lattice
+from sweep.tasks.grid import Lattice, LatticeGrid
 from sweep.tasks.grid_study import coordinates
 from sweep.tasks.reuse import GrowingStudy
 from sweep.tasks.study import ArrayLayout, BlockGrid, Results
@@ -63,7 +63,7 @@ class Part(NamedTuple):
     cycles: range
 
 
-class ScannerBlocks(Lattice, BlockGrid):
+class ScannerBlocks(LatticeGrid):
     """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
 
     def __init__(self, spec: SceneSpec, scanner: str) -> None:
@@ -141,10 +141,6 @@ class FlightStudy(GrowingStudy):
     def grids(self) -> list[ScannerBlocks]:
         """Blocks of each scanner."""
         return list(self.scanners.values())
-
-    def lattice(self, grid: BlockGrid) -> Lattice:
-        """Parameters along the axes, and numbers of draws and cycles."""
-        return self.scanners[grid.group]
 
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
         """True if a tighter tolerance computes shots more closely, effects apart."""

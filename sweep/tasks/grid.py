@@ -124,7 +124,11 @@ class Lattice:
         return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
 
 
-class Grid(Lattice, BlockGrid):
+class LatticeGrid(Lattice, BlockGrid):
+    """Points along axes, and perhaps further dimensions, cut into blocks."""
+
+
+class Grid(LatticeGrid):
     """Points of a study over a grid, their parameters, and the blocks they are computed in."""
 
     def __init__(self, spec: Spec) -> None:

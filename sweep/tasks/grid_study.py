@@ -19,11 +19,10 @@ from sweep.tasks.evaluate import (
     no_sums,
     with_few_draws,
 )
-from sweep.tasks.grid import Grid, Lattice
+from sweep.tasks.grid import Grid
 from sweep.tasks.reuse import DAMAGED, GrowingStudy
 from sweep.tasks.study import (
     ArrayLayout,
-    BlockGrid,
     Found,
     Known,
     Results,
@@ -86,10 +85,6 @@ class GridStudy(GrowingStudy):
     def grids(self) -> tuple[Grid]:
         """Its points."""
         return (self.grid,)
-
-    def lattice(self, grid: BlockGrid) -> Lattice:
-        """Parameters along its axes."""
-        return self.grid
 
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
         """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -26,9 +26,9 @@ from sweep.storage.opening import open_group
 from sweep.tasks import store
 from sweep.tasks.effect_selection import TOLERANCE
 from sweep.tasks.errors import StoreError
-from sweep.tasks.grid import Lattice, Value, canonical_rows
+from sweep.tasks.grid import Lattice, LatticeGrid, Value, canonical_rows
 from sweep.tasks.journal import committed, digests
-from sweep.tasks.study import BlockGrid, Results, Study
+from sweep.tasks.study import Results, Study
 
 Declared = Spec | SceneSpec
 
@@ -72,9 +72,10 @@ class GrowingStudy(Study):
         """Hash of the spec's identity."""
         return str(self.spec.id)
 
+    @property
     @abstractmethod
-    def lattice(self, grid: BlockGrid) -> Lattice:
-        """Parameters along the dimensions of one of its grids."""
+    def grids(self) -> Sequence[LatticeGrid]:
+        """Blocks of each group of its store, and parameters along their dimensions."""
 
     @abstractmethod
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
@@ -142,7 +143,7 @@ class Reuse:
 
     def _match(self, group: str) -> Matching:
         theirs, ours = (
-            next(study.lattice(grid) for grid in study.grids if grid.group == group)
+            next(grid for grid in study.grids if grid.group == group)
             for study in (self.older, self._study)
         )
         return Matching(theirs, ours, ignored(self.older.spec, self._study.spec))

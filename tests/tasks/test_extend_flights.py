@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from small import everything, quiet, small, tree
 from small_flights import SCENE, small_scene
-from test_extend import Interrupting
+from test_extend import Interrupting, larger
 
 from sweep.cli import main
 from sweep.model import clouds, navigation
@@ -93,11 +93,6 @@ def drawn_more(flown):
     files = at_once(flight(draws=MORE_DRAWS), flown)
     shutil.rmtree(flown.with_name("at_once.zarr"))
     return files
-
-
-def larger(store, spec, **options):
-    """A store extended as a plain loop, without progress."""
-    return extend(store, spec, progress=False, scheduler="none", **options)
 
 
 def at_once(spec, store):
