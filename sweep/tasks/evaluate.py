@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.model.unsupported import UnsupportedShot
-from sweep.tasks.effect_selection import EFFECTS, ERROR, Selected
+from sweep.tasks.effect_selection import Selected
 from sweep.tasks.grid import Grid, Value, canonical_rows
 from sweep.tasks.study import (
-    FILLS,
     NONE_FOUND,
     Found,
     Known,
@@ -42,16 +41,10 @@ NOT_PHYSICAL = (
 DOMAIN = "sweep.draws"
 
 
-def evaluate_block(
-    spec: Spec,
-    grid: Grid,
-    block: int,
-    selected: Selected,
-    known: Known = Known(),  # noqa: B008
-    begun: Known = Known(),  # noqa: B008
-    stop: Stop | None = None,
-) -> Results:
-    """Results of one block of a study.
+def evaluated(
+    spec: Spec, grid: Grid, block: int, selected: Selected, known: Known, begun: Known, stop: Stop
+) -> Iterator[Found]:
+    """Outputs of a block's points that are not done, those together that call for the same.
 
     Parameters
     ----------
@@ -61,40 +54,13 @@ def evaluate_block(
         Results that need not be computed, whole or of first draws: of another study, and of the
         block itself from a call that was stopped.
     stop
-        When to stop, with at least some draws taken; by default never.
-
-    Returns
-    -------
-    dict of ndarray
-        Each output of the model with the block's extent as its shape, and what was simulated;
-        counts of draws with a last dimension over batches, where the study draws a fixed number.
-        Of points that are beyond the model nan, or -1 of counts; nothing where all of them are.
+        When to stop, with at least some draws taken.
 
     Raises
     ------
     Unfinished
         Where it was stopped; the next call goes on, to the same bits.
     """
-    from sweep.model.outputs import RUNNING
-
-    extent, size = grid.extent(block), grid.block_size(block)
-    results: Results = {EFFECTS: selected.flags, ERROR: selected.error}
-    computed = _computed(spec, grid, block, selected, known, begun, stop or Stop())
-    for points, found in (known.done, begun.done, *computed):
-        for name, values in found.items():
-            room = (size, *values.shape[1:])
-            if name not in results:  # what no point has found stays unknown
-                results[name] = np.full(room, FILLS[values.dtype.kind], values.dtype)
-            results[name][points] = values
-    if spec.draws.whole_spectra:
-        results.pop(RUNNING, None)  # of use to a block that is begun
-    return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
-
-
-def _computed(
-    spec: Spec, grid: Grid, block: int, selected: Selected, known: Known, begun: Known, stop: Stop
-) -> Iterator[Found]:
-    """Outputs of a block's points that are not done, those together that call for the same."""
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
     done, step = [begun.done], _step(spec)

@@ -14,8 +14,8 @@ from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.effect_selection import EFFECTS, ERROR, EffectSelection, Selected
 from sweep.tasks.evaluate import (
     batch_sizes,
-    evaluate_block,
     evaluate_points,
+    evaluated,
     no_sums,
     with_few_draws,
 )
@@ -143,16 +143,23 @@ class GridStudy(GrowingStudy):
         begun: Known = Known(),  # noqa: B008
         stop: Stop | None = None,
     ) -> Results:
-        """Outputs of a block; `begun` and `stop` are those of :func:`evaluate_block`."""
+        """Outputs of a block; fills, where all of a point is beyond the model.
+
+        `begun` and `stop` are those of :func:`sweep.tasks.evaluate.evaluated`.
+        """
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
-        results = evaluate_block(self.spec, self.grid, block, selected, known, begun, stop)
-        if lacking := self.layouts.keys() - results.keys():  # all points are beyond the model
-            regions = self.regions(block)
-            for name in lacking:
-                layout, room = self.layouts[name], [s.stop - s.start for s in regions[name]]
-                results[name] = np.full(room, layout.fill, layout.dtype)
-        return results
+        extent, size = self.grid.extent(block), self.grid.block_size(block)
+        results = {
+            name: np.full((size, *layout.shape[len(extent) :]), layout.fill, layout.dtype)
+            for name, layout in self.layouts.items()
+        }
+        results |= {EFFECTS: selected.flags, ERROR: selected.error}
+        computed = evaluated(self.spec, self.grid, block, selected, known, begun, stop or Stop())
+        for points, found in (known.done, begun.done, *computed):
+            for name in results.keys() & found.keys():  # some are of use to later draws alone
+                results[name][points] = found[name]
+        return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
     def _known(self, block: int, selected: Selected) -> Known:
         """Points of a block that a smaller study has: whole, or their first draws."""

@@ -172,7 +172,6 @@ def test_errors_are_those_of_the_settings(coherent):
 
 def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     """The machinery of a run: the same numbers, bit for bit."""
-    from sweep.tasks.evaluate import evaluate_block
     from sweep.tasks.grid_study import GridStudy
 
     spec, _, _ = coherent
@@ -180,10 +179,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     rung = rungs.Rung(name="coarse", kind=rungs.ADAPTIVE, overrides={"accuracy.tolerance": 0.1})
     seen = bench.try_on(rung, np.arange(72), 3).seen
     study = GridStudy(rung.of(spec))
-    blocks = [
-        evaluate_block(study.spec, study.grid, b, study.selection.of_block(b))
-        for b in range(study.n_blocks)
-    ]
+    blocks = [study.evaluate(b) for b in range(study.n_blocks)]
     whole = np.full(study.grid.shape, np.nan)
     for b, results in enumerate(blocks):
         whole[study.grid.block(b)] = results["pd_shot"]
