@@ -1,8 +1,8 @@
 """Quantities with units at the edges: text such as ``25 mm`` in, SI floats out.
 
 Numbers stay exact fractions until the last step, so that every spelling of a quantity gives the
-same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; it is imported on
-first use.
+same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; the usual ones are in a
+table, so that most specs are read without pint, which takes a second to import.
 """
 
 from __future__ import annotations
@@ -54,6 +54,24 @@ _PREFIXED = {
     DECIBEL: "dB",
     "": "%",
 }
+
+_PI = Fraction("3.1415926535897932384626433832795028841971693993751")
+_WATT = {"gram": 1, "meter": 2, "second": -3}
+_BASES: dict[str, tuple[Fraction, dict[str, int]]] = {
+    "m": (Fraction(1), {"meter": 1}),
+    "s": (Fraction(1), {"second": 1}),
+    "Hz": (Fraction(1), {"second": -1}),
+    "W": (Fraction(1000), _WATT),
+    "A": (Fraction(1), {"ampere": 1}),
+    "V": (Fraction(1000), _WATT | {"ampere": -1}),
+    "ohm": (Fraction(1000), _WATT | {"ampere": -2}),
+    "K": (Fraction(1), {"kelvin": 1}),
+    "rad": (Fraction(1), {"radian": 1}),
+    "deg": (_PI / 180, {"radian": 1}),
+}
+_PREFIXES = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
+USUAL = frozenset(_BASES) | {prefix + base for prefix in _PREFIXES for base in _BASES}
+"""Units that are known without pint; its factors and root units."""
 
 
 class QuantityError(ValueError):
@@ -224,6 +242,16 @@ def _registry() -> Any:
 @cache
 def _root(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Factor, offset and dimension of one unit in pint's root units; None where unknown."""
+    if name in USUAL:
+        base = name if name in _BASES else name[1:]
+        factor, powers = _BASES[base]
+        factor *= Fraction(10) ** (0 if name in _BASES else _PREFIXES[name[0]])
+        return factor, Fraction(0), tuple(sorted((k, Fraction(v)) for k, v in powers.items()))
+    return by_pint(name)
+
+
+def by_pint(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
+    """The same, as pint has it."""
     registry = _registry()
     try:
         unit = registry.parse_units("percent" if name == "%" else name)

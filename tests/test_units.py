@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sweep import units
 from sweep.units import QuantityError, read_number, read_quantity
 
 with mpmath.workdps(40):
@@ -205,3 +206,8 @@ def test_any_text_is_a_quantity_or_a_quantity_error(text):
 def test_importing_the_package_and_its_units_leaves_pint_alone():
     code = "import sys, sweep, sweep.units; sys.exit('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("name", sorted(units.USUAL))
+def test_usual_units_are_exactly_pints(name):
+    assert units._root(name) == units.by_pint(name)

@@ -1,8 +1,10 @@
-"""Physical constants [SI, exact by definition] that more than one module needs."""
+"""Physical constants that more than one module needs, exact by definition of the SI since 2019."""
 
-from scipy.constants import c as SPEED_OF_LIGHT
-from scipy.constants import e as ELEMENTARY_CHARGE
-from scipy.constants import h as PLANCK
-from scipy.constants import k as BOLTZMANN
-
-__all__ = ["BOLTZMANN", "ELEMENTARY_CHARGE", "PLANCK", "SPEED_OF_LIGHT"]
+SPEED_OF_LIGHT = 299_792_458.0
+"""[m/s]"""
+ELEMENTARY_CHARGE = 1.602176634e-19
+"""[C]"""
+PLANCK = 6.62607015e-34
+"""[J s]"""
+BOLTZMANN = 1.380649e-23
+"""[J/K]"""

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import scipy.constants
 from scipy import integrate
 from scipy.constants import c as speed_of_light
 
-from sweep.model import link, shot
+from sweep.model import constants, link, shot
 from sweep.model.effects.noise_sources import solar_power
 from sweep.model.footprint import beamlets
 from sweep.model.ground import backscatter
@@ -403,3 +404,16 @@ def test_an_echo_gains_what_the_noise_beneath_it_loses(table_4_1):
     ratio = 10 * np.log10(shaped["snr_doppler"] / white["snr_doppler"])
     assert ratio == pytest.approx(1.4, abs=0.05)
     assert shaped["pfa_segment"] == white["pfa_segment"]
+
+
+@pytest.mark.parametrize(
+    ("ours", "name"),
+    [
+        (constants.SPEED_OF_LIGHT, "speed of light in vacuum"),
+        (constants.ELEMENTARY_CHARGE, "elementary charge"),
+        (constants.PLANCK, "Planck constant"),
+        (constants.BOLTZMANN, "Boltzmann constant"),
+    ],
+)
+def test_constants_are_those_of_the_si(ours, name):
+    assert ours == scipy.constants.value(name)
