@@ -1,8 +1,8 @@
 """Quantities with units at the edges: text such as ``25 mm`` in, SI floats out.
 
 Numbers stay exact fractions until the last step, so that every spelling of a quantity gives the
-same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; the usual ones are in a
-table, so that most specs are read without pint, which takes a second to import.
+same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; the usual ones are
+in a table, so that most specs are read without pint, which takes a second to import.
 """
 
 from __future__ import annotations

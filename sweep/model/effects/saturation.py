@@ -153,7 +153,7 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
             carrier=carrier,
             chirp_rate=shots.chirp_rate,
             range=shots.range,
-            radial_velocity=shots.beta * SPEED_OF_LIGHT / 2,
+            radial_velocity=np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
         )
         for sign, carrier in zip(waveform.SIGNS, shots.carriers, strict=True)
     ]
