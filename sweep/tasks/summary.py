@@ -225,7 +225,7 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
     places = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
     apart = len(places) <= MOST_PLACES
     rows = {
-        (scanner, place): SceneRow(", ".join([scanner, *_words(study.spec.axes, place)]))
+        (scanner, place): SceneRow(", ".join([scanner, *place_words(study.spec.axes, place)]))
         for scanner in study.scanners
         for place in (places if apart else [()])
     }
@@ -243,7 +243,7 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
     return list(rows.values())
 
 
-def _words(axes: Sequence[Axis], place: tuple[int, ...]) -> list[str]:
+def place_words(axes: Sequence[Axis], place: tuple[int, ...]) -> list[str]:
     """Values at a place along axes; of its first axes, where there are more."""
     return [
         f"{member.name} {_shown(member.display[index])}{' ' * bool(member.units)}{member.units}"
