@@ -4,8 +4,11 @@ import csv
 
 import pytest
 import xarray as xr
+import yaml
 from test_cli import STUDY, refused, sweep
 
+from sweep.spec import SceneSpec
+from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
 from sweep.tasks.eyepoint_study import world_of
 
 SCENE = (
@@ -32,6 +35,14 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "descent.yaml").write_text(SCENE)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def test_a_small_flight_is_little_work_where_its_rays_are_counted(here):
+    counted = yaml.safe_load(SCENE)
+    by_tolerance = counted | {"footprint": {"speckle": "none"}}
+    of = [SceneSpec.from_mapping(each, base=here) for each in (counted, by_tolerance)]
+    assert RunOptions().place(of[0]) is None and about_seconds(of[0]) < LITTLE
+    assert RunOptions().place(of[1]).kind == "local"
 
 
 def test_a_scene_is_planned_run_and_exported(here):

@@ -33,8 +33,7 @@ from sweep.cli.telling import (
     conclude,
     conclude_accuracy,
     effects_of,
-    grid_plan,
-    scene_plan,
+    plan_lines,
     tell_effects,
     warn_before,
     warn_of_alarms,
@@ -200,15 +199,12 @@ def plan(spec: Path, workers: int | None) -> None:
     table says at how many points and where it is simulated, how much it may change pd, log10
     pfa or |X| (a bound), and the share of a point's time that it takes there.
     """
-    from sweep.spec import SceneSpec, load
+    from sweep.spec import load
     from sweep.tasks.progress import working
 
     study = load(spec)
     with working("planning"):
-        if isinstance(study, SceneSpec):
-            lines = list(scene_plan(study, _default_store(spec), workers))
-        else:
-            lines = list(grid_plan(study, workers))
+        lines = list(plan_lines(study, _default_store(spec), workers))
         effects = effects_of(study, _default_store(spec))
     if alarms := alarms_told(study):
         lines.append(("false alarms", alarms))

@@ -213,39 +213,48 @@ def _least(column: list[str], *, is_words: bool) -> int:
     return max(longest, min(LEAST_WORDS, max(map(len, column)))) if is_words else longest
 
 
-def grid_plan(study: Spec, workers: int | None) -> Iterator[tuple[str, str]]:
-    """Lines, with their headings, of what a grid will take."""
-    from sweep.tasks.plan import plan as planned
+def plan_lines(
+    study: Spec | SceneSpec, store: Location, workers: int | None
+) -> Iterator[tuple[str, str]]:
+    """Lines, with their headings, of what a study will take."""
+    from sweep.spec import Spec
+    from sweep.tasks.cluster import RunOptions
+    from sweep.tasks.plan import plan
     from sweep.tasks.progress import duration
 
-    p = planned(study, workers=workers)
-    shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items()) or "the point"
-    yield "points", f"{p.points:,}"
-    yield "blocks", f"{p.blocks:,} of at most {shape}"
+    p = plan(study, store=store, workers=workers)
+    if isinstance(study, Spec):
+        shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items())
+        yield "points", f"{p.points:,}"
+        yield "blocks", f"{p.blocks:,} of at most {shape or 'the point'}"
+    else:
+        yield from _scene_lines(study, p)
+        yield "blocks", f"{p.blocks:,}"
     yield "chunks", f"{p.chunks:,} files"
     yield "bytes", f"{in_bytes(p.bytes)} before compression"
-    yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
-    bound = "at most about" if study.draws.adaptive else "about"
-    yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
+    if not p.scanners:
+        yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
+    bound = "at most about" if getattr(study.draws, "adaptive", False) else "about"
+    if RunOptions(workers=workers).place(study) is None:
+        yield "time", f"{bound} {duration(p.work)}, at once, without workers"
+    else:
+        yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
     yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
-    yield from _question(p)
+    if why := _excess(p.points, p.bytes, p.work):
+        yield "question", f"sweep run asks first, or takes --yes: {why}"
 
 
-def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterator[tuple[str, str]]:
-    """Lines, with their headings, of what a scene will take."""
+def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
     from sweep.model.accuracy import Accuracy
     from sweep.model.resolution import BEAMLETS
-    from sweep.tasks.plan import plan as planned
-    from sweep.tasks.progress import duration
 
-    p = planned(study, store=store, workers=workers)
-    for report in p.reports:
+    for report in plan.reports:
         yield "scene", report
     if study.rays_by_tolerance:
         parameters = study.parameters()
         rays, most = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
         yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {most:,}"
-    for s in p.scanners:
+    for s in plan.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast
             else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
@@ -253,12 +262,6 @@ def scene_plan(study: SceneSpec, store: Location, workers: int | None) -> Iterat
         yield "", f"{1e6 * s.seconds_a_draw:.3g} us a shot and draw on one core"
     places = math.prod(int(axis.size) for axis in study.axes)
     yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
-    yield "blocks", f"{p.blocks:,}"
-    yield "chunks", f"{p.chunks:,} files"
-    yield "bytes", f"{in_bytes(p.bytes)} before compression"
-    yield "time", f"about {duration(p.seconds)} on {p.workers} workers"
-    yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
-    yield from _question(p)
 
 
 def tell_effects(table: EffectsTable) -> None:
@@ -308,11 +311,6 @@ def _excess(points: int, size: int, seconds: float) -> str:
     told += [in_bytes(size)] if size > MOST_BYTES else []
     told += [f"about {duration(seconds)} of one core"] if seconds > MOST_SECONDS else []
     return ", ".join(told)
-
-
-def _question(plan: Plan) -> Iterator[tuple[str, str]]:
-    if why := _excess(plan.points, plan.bytes, plan.work):
-        yield "question", f"sweep run asks first, or takes --yes: {why}"
 
 
 def alarms_told(study: Spec | SceneSpec) -> str:

@@ -129,10 +129,15 @@ class RunOptions:
 
 
 def about_seconds(spec: Spec | SceneSpec) -> float:
-    """Time that a study takes of one core at most, about, by the study alone [s]."""
+    """Time that a study takes of one core at most, about, by the study alone [s].
+
+    Infinite where shots have as many rays as they turn out to need.
+    """
     places = math.prod(int(axis.size) for axis in spec.axes)
     if isinstance(spec, Spec):
         return places * seconds_a_point(spec)
+    if spec.rays_by_tolerance:
+        return math.inf
     shots = sum(spec.cycles(name) * spec.shots_a_cycle(name) for name in spec.scanners)
     rays = float(spec.parameters()["footprint.beamlets"])
     return shots * (rays * RAY + places * int(spec.draws.number) * SHOT)
