@@ -25,7 +25,7 @@ from sweep.cli.options import (
     folder,
     shown,
 )
-from sweep.cli.telling import (
+from sweep.cli.output import (
     INCOMPLETE,
     MISTAKE,
     alarms_told,

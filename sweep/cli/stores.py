@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sweep.cli.options import STORE, LocalPath, StorePath, shown
-from sweep.cli.telling import INCOMPLETE, in_bytes, print_table, tell_accuracy
+from sweep.cli.output import INCOMPLETE, in_bytes, print_table, tell_accuracy
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:

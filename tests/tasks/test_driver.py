@@ -16,6 +16,7 @@ from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
 from sweep.tasks import session, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.store import Arrays, Written
 from sweep.tasks.worker import Job, work
@@ -130,25 +131,19 @@ def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):
     assert tree(outcome.store) == tree(again.store) == tree(undisturbed)
 
 
-class StopAfter:
+class StopAfter(Progress):
     """Progress that asks a plain loop to stop after some points, as Ctrl-C would."""
 
     def __init__(self, points: int) -> None:
         self.points, self.said = points, []
-
-    def begin(self, *, points, done, unit): ...
 
     def advance(self, *, points, failed):
         self.points -= points
         if points and -6 < self.points <= 0:
             os.kill(os.getpid(), signal.SIGINT)
 
-    def at_work(self, *, workers, stored): ...
-
     def say(self, text):
         self.said.append(text)
-
-    def end(self): ...
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
@@ -301,17 +296,9 @@ def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
     spec = small(storage={"block_points": 1})
     most = []
 
-    class Watching:
-        def begin(self, *, points, done, unit): ...
-
+    class Watching(Progress):
         def advance(self, *, points, failed):
             most.append(len(client.futures))
-
-        def at_work(self, *, workers, stored): ...
-
-        def say(self, text): ...
-
-        def end(self): ...
 
     with (
         LocalCluster(

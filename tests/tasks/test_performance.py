@@ -1,15 +1,12 @@
 from small import small, tree
 
 from sweep.tasks.driver import run
+from sweep.tasks.progress import Progress
 
 
-class Said(list):
+class Said(Progress, list):
     """Progress that keeps what is said."""
 
-    def begin(self, *, points, done, unit): ...
-    def advance(self, *, points, failed): ...
-    def at_work(self, *, workers, stored): ...
-    def end(self): ...
     def say(self, text):
         self.append(text)
 

@@ -17,6 +17,7 @@ from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.lock import Lock
+from sweep.tasks.progress import Progress
 from sweep.tasks.verify import verify
 
 TINY = {"axes": {"target.range": ["1 km", "2 km"]}, "storage": {"block_points": 1}}
@@ -411,14 +412,12 @@ def test_the_command_tells_what_is_wrong_and_what_to_do(undisturbed, tmp_path, m
 def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
     told = []
 
-    class Watching:
+    class Watching(Progress):
         def begin(self, *, points, done, unit):
             told.append((points, done, unit))
 
         def advance(self, *, points, failed):
             told.append(points)
-
-        def say(self, text): ...
 
         def end(self):
             told.append("end")
