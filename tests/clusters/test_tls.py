@@ -116,7 +116,7 @@ def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
     from distributed import Client, Security
 
     own = psutil.Process()
-    before = listening([own])
+    before = listening([own, *own.children(recursive=True)])
     described = local(scheduler={"dashboard": "127.0.0.1:0"})
     with cluster.connected(described, most=9, processes=processes, say=lambda _: None) as reached:
         reached.client.wait_for_workers(1)
