@@ -48,8 +48,10 @@ def _reuse(path: Location, study: GridStudy | FlightStudy) -> Reuse | None:
         attributes = opening.read_attributes(path)
         identity.refuse_other_versions(path, attributes, where="this machine")
         spec = _spec(path, read_recipe(path), attributes.get("spec", "{}"))
-        if type(spec) is not type(study.spec) or unlike(spec, study.spec):
+        if type(spec) is not type(study.spec) or spec.seed != study.spec.seed:
             return None
+        if isinstance(study, FlightStudy) and unlike(spec, study.spec):
+            return None  # a grid's points are told apart by their parameters
         return Reuse(path, study_of(spec, path), study)
     except (StoreError, SceneError):
         return None

@@ -157,7 +157,11 @@ class BlockGrid:
         """
         if not 0 <= block < self.n_blocks:
             raise IndexError(f"block {block} of {self.n_blocks}")
-        return tuple(int(i) for i in np.unravel_index(block, self.along))
+        position: list[int] = []
+        for count in reversed(self.along):
+            block, at = divmod(block, count)
+            position.append(at)
+        return tuple(reversed(position))
 
     def number(self, position: tuple[int, ...]) -> int:
         """Number of the block at a position."""
@@ -380,11 +384,13 @@ class Study(Content, ABC):
         grid, number = self.find(block)
         position = grid.position(number)
         apart = {k for k, at in enumerate(position) if at}  # of these an array must have them all
-        return {
-            name: tuple(0 if k is None else position[k] for k in follows)
-            for name, follows in self._follows[grid.group].items()
+        arrays = self._follows[grid.group]
+        chunk = {
+            follows: tuple(0 if k is None else position[k] for k in follows)
+            for follows in set(arrays.values())
             if apart.issubset(follows)
         }
+        return {name: chunk[follows] for name, follows in arrays.items() if follows in chunk}
 
     def regions(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Slices of the arrays that a block writes."""
