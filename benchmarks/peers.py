@@ -135,14 +135,11 @@ def blocks_of_seconds(held, block):
 
 def filled(held, block: int) -> dict[str, np.ndarray]:
     """Arrays of the shapes and types that a block has, with numbers that don't compress away."""
-    layouts = {layout.name: layout for layout in held.arrays()}
-    values, results = np.arange(held.block_size(block), dtype=float), {}
-    for name, position in held.chunks(block).items():
-        layout = layouts[name]
-        sizes = zip(position, layout.chunks, layout.shape, strict=True)
-        shape = [min((p + 1) * c, s) - p * c for p, c, s in sizes]
-        results[name] = np.resize(values, shape).astype(layout.dtype)
-    return results
+    values = np.arange(held.block_size(block), dtype=float)
+    return {
+        name: np.resize(values, [s.stop - s.start for s in region]).astype(held.layouts[name].dtype)
+        for name, region in held.regions(block).items()
+    }
 
 
 def rehearse(client, folder: Path) -> None:

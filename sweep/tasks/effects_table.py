@@ -222,10 +222,6 @@ def _cost(spec: Spec, selection: EffectSelection, tiles: np.ndarray, name: str) 
 
 def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:
     """Numbers of the points of a tile, or of some, in C order over the grid."""
-    slices = selection.tiles.block(tile)
-    shape = tuple(s.stop - s.start for s in slices)
-    size = math.prod(shape)
+    size = selection.tiles.block_size(tile)
     few = np.unique(np.linspace(0, size - 1, most or size).astype(np.int64))
-    along = np.unravel_index(few, shape) if shape else ()
-    at = [i + s.start for i, s in zip(along, slices, strict=True)]
-    return np.asarray(np.ravel_multi_index(at, selection.tiles.grid.shape) if at else few)
+    return selection.tiles.numbers(tile, few)

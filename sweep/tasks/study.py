@@ -203,6 +203,14 @@ class BlockGrid:
             place = place * np.minimum(chunk, size - start) + i - start
         return blocks, place
 
+    def numbers(self, block: int, places: np.ndarray) -> np.ndarray:
+        """Points at some places of a block, in C order over the grid: the inverse of `locate`."""
+        if not self.shape:
+            return np.zeros(places.size, np.int64)
+        along = np.unravel_index(places, self.extent(block))
+        index = [i + s.start for i, s in zip(along, self.block(block), strict=True)]
+        return np.asarray(np.ravel_multi_index(index, self.shape))
+
     def array(
         self,
         name: str,

@@ -293,19 +293,10 @@ class GridBench(Bench):
     def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
         """A point and those that its block computes after it, round the block's end."""
         grid = self._selection_of(rung).tiles.grid
-        if not grid.shape:
-            return np.zeros(times, np.int64)
-        point = np.unravel_index(number, grid.shape)
-        along = [int(p) // side for p, side in zip(point, grid.block_shape, strict=True)]
-        block = int(np.ravel_multi_index(along, grid.along))
-        order, slices = grid.geometry_order(block), grid.block(block)
-        own = [int(p) - s.start for p, s in zip(point, slices, strict=True)]
-        first = np.flatnonzero(order == np.ravel_multi_index(own, grid.extent(block)))
-        within = np.unravel_index(
-            order.take(first + np.arange(times), mode="wrap"), grid.extent(block)
-        )
-        places = [i + s.start for i, s in zip(within, slices, strict=True)]
-        return np.asarray(np.ravel_multi_index(places, grid.shape))
+        (block,), (own,) = (each.tolist() for each in grid.locate(np.array([number])))
+        order = grid.geometry_order(block)
+        follows = np.flatnonzero(order == own) + np.arange(times)
+        return grid.numbers(block, order.take(follows, mode="wrap"))
 
     def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
         """Flags of points (n,), and the time that planning takes one.

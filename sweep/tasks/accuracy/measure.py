@@ -31,7 +31,7 @@ from sweep.tasks.accuracy.rungs import (
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.progress import Interrupts, Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
-from sweep.tasks.study import ArrayLayout, Study
+from sweep.tasks.study import ArrayLayout, Study, described
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -524,15 +524,16 @@ class Content:
             ),
         }  # fmt: skip
         names, kinds = ([getattr(rung, each) for rung in rungs] for each in ("name", "kind"))
+        known = ArrayLayout.known
         return [
-            _array("rung", by_rung, np.array(names, object)),
-            _array("kind", by_rung, np.array(kinds, object)),
+            known("rung", by_rung, np.array(names, object), {}),
+            known("kind", by_rung, np.array(kinds, object), {}),
             *(
-                _array(name, dims, values, units=units, long_name=about)
+                known(name, dims, values, described(units, about))
                 for name, (dims, values, units, about) in told.items()
             ),
             *(
-                _array(name, ("point",), np.asarray(values)[measured.done], **attributes)
+                known(name, ("point",), np.asarray(values)[measured.done], attributes)
                 for name, (values, attributes) in self._bench.coordinates().items()
             ),
         ]
@@ -541,15 +542,3 @@ class Content:
 def _tolerance(rung: Rung) -> float:
     value = rung.overrides.get("accuracy.tolerance", np.nan)
     return float(value) if rung.kind != REFERENCE else np.nan
-
-
-def _array(name: str, dims: tuple[str, ...], values: np.ndarray, **attributes: Any) -> ArrayLayout:
-    return ArrayLayout(
-        name=name,
-        shape=values.shape,
-        chunks=tuple(max(1, n) for n in values.shape),
-        dims=dims,
-        dtype="string" if values.dtype == object else str(values.dtype),
-        attributes=attributes,
-        values=values,
-    )
