@@ -67,6 +67,7 @@ _BASES: dict[str, tuple[Fraction, dict[str, int]]] = {
     "ohm": (Fraction(1000), _WATT | {"ampere": -2}),
     "K": (Fraction(1), {"kelvin": 1}),
     "rad": (Fraction(1), {"radian": 1}),
+    "sr": (Fraction(1), {"radian": 2}),
     "deg": (_PI / 180, {"radian": 1}),
 }
 _PREFIXES = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
