@@ -395,20 +395,22 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
-def test_what_is_no_larger_study_is_refused_field_by_field(tmp_path, undisturbed, changes, told):
-    before = everything(undisturbed)
-    with pytest.raises(StoreError, match="needs a store of its own") as error:
-        larger(undisturbed, small(**changes))
+def see_it_refused(store, spec, *told, match="needs a store of its own"):
+    """An extension that is refused in words, and of which nothing is left."""
+    before = everything(store)
+    with pytest.raises(StoreError, match=match) as error:
+        larger(store, spec)
     assert all(line in str(error.value) for line in told)
-    assert everything(undisturbed) == before
+    assert everything(store) == before and not beside(store).exists()
+
+
+@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_larger_study_is_refused_field_by_field(undisturbed, changes, told):
+    see_it_refused(undisturbed, small(**changes), *told)
 
 
 def test_a_flight_is_no_larger_grid(undisturbed):
-    before = everything(undisturbed)
-    with pytest.raises(StoreError, match="have nothing in common"):
-        larger(undisturbed, small_scene())
-    assert everything(undisturbed) == before
+    see_it_refused(undisturbed, small_scene(), match="have nothing in common")
 
 
 def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed):
