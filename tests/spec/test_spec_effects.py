@@ -87,18 +87,6 @@ def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
 
 
 @BROUGHT
-def test_a_parameter_of_an_effect_is_described_in_the_schema(parameter):
-    section, name = parameter.path.rsplit(".", 2)[-2:]
-    described = json_schema()["$defs"][section.capitalize()]["properties"][name]
-    assert described["description"].startswith(parameter.about)
-    assert parameter_rules()[parameter.path].read(described["default"]) == parameter.default
-    if parameter.options:
-        assert described["enum"] == list(parameter.options)
-    else:
-        assert described["examples"] == [parameter.example]
-
-
-@BROUGHT
 def test_a_flight_has_the_parameters_that_are_not_its_targets(parameter):
     is_targets = parameter.path.startswith("target.")
     assert (parameter.path in SceneSpec.from_mapping(flight()).parameters()) is not is_targets
