@@ -105,7 +105,7 @@ class Unit:
 
     @property
     def decibel(self) -> bool:
-        """Whether values of this unit are logarithms of power ratios."""
+        """True if values of this unit are logarithms of power ratios."""
         return self.text in (DECIBEL, DECIBEL_PER_HERTZ)
 
     def to_si(self, value: Fraction) -> float:

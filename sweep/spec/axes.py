@@ -83,12 +83,12 @@ class Axis:
 
     @property
     def zipped(self) -> bool:
-        """Whether the dimension has a name of its own."""
+        """True if the dimension has a name of its own."""
         return len(self.members) > 1 or self.members[0].name != self.name
 
 
 def place_on_grid(path: str, axes: tuple[Axis, ...]) -> Location:
-    """Where the values of a parameter stand in a spec: on its axis, if it has one."""
+    """Location of the values of a parameter in a spec: on its axis, if it has one."""
     for axis in axes:
         if any(member.path == path for member in axis.members):
             return ("axes", axis.name if axis.zipped else path)

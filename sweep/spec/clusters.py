@@ -127,7 +127,7 @@ class LocalWorker(Part):
 
 
 class Scheduler(Part):
-    """Where the scheduler listens: to this machine alone unless told otherwise."""
+    """Address of the scheduler, which listens to this machine alone unless told otherwise."""
 
     host: str = _word("Address that workers reach it by", "10.0.0.5", "")
     interface: str = _word("Or the network interface that it has", "ib0", "")
@@ -154,7 +154,7 @@ class Job(Part):
 
 
 class Cluster(Part):
-    """What every cluster has."""
+    """Base of all clusters."""
 
     security: Security | None = None
 
@@ -174,7 +174,7 @@ class Cluster(Part):
 
 
 class Started(Cluster):
-    """What clusters have whose workers are started here."""
+    """Base of clusters whose workers are started here."""
 
     environment: dict[str, str] = of.field(
         Special(about="Environment variables of workers", reader=_read_variables), {}
@@ -310,7 +310,7 @@ def _no_kind(kind: object) -> Finding:
 
 
 def _together(cluster: AnyCluster) -> Iterator[Finding]:
-    """What is wrong with a cluster beyond its single fields."""
+    """Mistakes in a cluster beyond its single fields."""
     for name, path in zip(Security.model_fields, cluster.certificates() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"

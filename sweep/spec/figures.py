@@ -107,7 +107,7 @@ def _variable() -> Any:
 
 
 class Drawing(Part):
-    """What all figures have."""
+    """Base of all figures."""
 
     name: str = of.text(
         "Stem of the picture's file name",
@@ -124,7 +124,7 @@ class Drawing(Part):
 
     @property
     def _shown(self) -> tuple[str | None, ...]:
-        """What the figure shows, as parts of its file's name."""
+        """Contents of the figure, as parts of its file's name."""
         return (getattr(self, "variable", self.kind),)  # type: ignore[attr-defined]
 
 
@@ -132,7 +132,7 @@ class Drawing(Part):
 
 
 class GridDrawing(Drawing):
-    """What all figures of grids have."""
+    """Base of figures of grids."""
 
     @property
     def coordinates(self) -> dict[str, str]:
@@ -206,7 +206,7 @@ QUANTITIES = (
       if XYZ not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
-"""What a figure can show of shots and of points."""
+"""Quantities of shots and of points that a figure can show."""
 
 SEVERAL_SURFACES = "several_surfaces"
 _VIEW = Choice(about="Where from", options=("oblique", "above", "side", "front"))
@@ -275,7 +275,7 @@ def _time() -> Any:
 
 
 class SceneDrawing(Drawing):
-    """What all figures of scenes have."""
+    """Base of figures of scenes."""
 
     where: dict[str, Selection] = _where()
 
@@ -344,7 +344,7 @@ class ShotSpectra(SceneDrawing):
 
 
 class _OfNavigation(SceneDrawing):
-    """What navigation is shown."""
+    """Base of figures and tables of navigation."""
 
     scanners: tuple[str, ...] | None = of.several(
         of.named("Scanner", "three"), 1, 10_000, None,
@@ -383,7 +383,7 @@ LEAST_BEAMS = 3
 
 
 def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Iterator[Finding]:
-    """What is wrong with the figures of a grid's study, as written."""
+    """Mistakes in the figures of a grid's study, as written."""
     draws = written.get("draws")
     for at, figure in _readable(written, Figure):
         yield from _coordinate_findings(figure, axes, at)
@@ -397,7 +397,7 @@ def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Itera
 def scene_figure_findings(
     written: Mapping[str, Any], axes: tuple[Axis, ...] | None
 ) -> Iterator[Finding]:
-    """What is wrong with the figures of a scene's study, as written; axes None where unreadable."""
+    """Mistakes in the figures of a scene's study, as written; axes None where unreadable."""
     scanners = written.get("scanners")
     scanners = scanners if isinstance(scanners, Mapping) else {}
     for at, figure in _readable(written, SceneFigure):
@@ -496,7 +496,7 @@ def _scanner_findings(figure: Any, scanners: Mapping[str, Any], at: Location) ->
 
 
 def _navigates(written: object) -> bool:
-    """Whether a scanner has shots enough in a cycle; so it seems, where it can't be read."""
+    """True if a scanner has shots enough in a cycle, or can't be read."""
     scanner = read_as(AnyScanner, written)
     try:
         return scanner is None or shots_a_cycle(scanner.pattern()) >= LEAST_BEAMS

@@ -1,4 +1,4 @@
-"""How things move, and where beams point: paths, attitudes, the platform, scan patterns."""
+"""Movement of things and directions of beams: paths, attitudes, the platform, scan patterns."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ class Motion(Part):
 
 
 class Platform(Motion):
-    """What carries the instrument, and how steadily."""
+    """Carrier of the instrument, and its steadiness."""
 
     attitude: AnyAttitude = Nadir(kind="nadir")
     lever_arm: Vector = of.position(

@@ -46,7 +46,7 @@ _FEWEST_BINS = 8
 """Bins of a spectrum that is looked at whole."""
 
 Condition = Callable[[Any], Any]
-"""What holds or does not for each of several values."""
+"""Condition on each of several values."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Grid:
         return cls(values, axes, modes)
 
     def knows(self, *paths: str) -> bool:
-        """Whether parameters could be read."""
+        """True if parameters could be read."""
         return all(self.span(path).size for path in paths)
 
     def span(self, path: str) -> np.ndarray:
@@ -103,11 +103,11 @@ class Grid:
         return np.asarray([self.values[path]] if path in self.values else [])
 
     def finding(self, path: str, rule: str, remedy: str) -> Finding:
-        """What is wrong with a parameter, told where its values stand."""
+        """Mistake in a parameter, told where its values stand."""
         return Finding(place_on_grid(path, self.axes), rule, remedy)
 
     def has_point(self, conditions: Mapping[str, Condition]) -> bool:
-        """Whether some point meets conditions on parameters by path, all of them."""
+        """True if some point meets conditions on parameters by path, all of them."""
         on_axes = {member.path for axis in self.axes for member in axis.members}
         for path in set(conditions) - on_axes:
             if path not in self.values or not conditions[path](np.asarray(self.values[path])):
@@ -136,7 +136,7 @@ class Grid:
 
 
 def at(written: Mapping[str, Any], path: str, otherwise: object = ABSENT) -> Any:
-    """What is written at a dotted path."""
+    """Value written at a dotted path."""
     found: Any = written
     for name in path.split("."):
         found = found.get(name, ABSENT) if isinstance(found, Mapping) else ABSENT
@@ -144,7 +144,7 @@ def at(written: Mapping[str, Any], path: str, otherwise: object = ABSENT) -> Any
 
 
 def _met(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
-    """Whether each place along an axis (n,) meets the conditions on the axis's own parameters."""
+    """True if each place along an axis (n,) meets the conditions on the axis's own parameters."""
     met = np.ones(axis.size, bool)
     for member in axis.members:
         if member.path in conditions:
@@ -169,7 +169,7 @@ def _missing(values: np.ndarray) -> np.ndarray:
 
 
 def grid_findings(grid: Grid) -> list[Finding]:
-    """What is wrong with the combinations of values in a study's grid."""
+    """Mistakes in the combinations of values in a study's grid."""
     return [
         *(list(_time_findings(grid)) or _window_findings(grid)),
         *_photon_findings(grid),
@@ -342,15 +342,15 @@ class Need(NamedTuple):
 
     path: str
     asks: Condition
-    """Whether values of it need the other."""
+    """True if values of it need the other."""
     other: str
     """Parameter that must then have another value."""
     lacks: Condition
-    """Whether values of that one will not do."""
+    """True if values of that one will not do."""
     rule: str
     remedy: str
     if_on: bool = False
-    """Whether the parameter's effect has the same need wherever it is forced on."""
+    """True if the parameter's effect has the same need wherever it is forced on."""
 
 
 def _above_zero(path: str, asks: Condition, other: str) -> Need:
@@ -454,7 +454,7 @@ def not_in_flights(grid: Grid) -> Iterator[Finding]:
 
 
 def _of_mode(effect: str, rule: str, remedy: str) -> Finding:
-    """What is wrong with an effect that is on."""
+    """Mistakes in an effect that is on."""
     return Finding(("effects", effect), rule, remedy, ON)
 
 
@@ -473,7 +473,7 @@ def _random_and_there(grid: Grid) -> Iterator[tuple[Effect, Parameter]]:
 
 
 def is_method(path: str) -> bool:
-    """Whether a parameter says how whole spectra are looked at."""
+    """True if a parameter says how whole spectra are looked at."""
     return path.startswith((DETECTOR, ESTIMATOR))
 
 

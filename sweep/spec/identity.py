@@ -1,4 +1,4 @@
-"""What makes a study this study: its content in SI values, and the hash of it."""
+"""Identity of a study: its content in SI values, and the hash of it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def leaf_values(part: BaseModel, digests: Mapping[str, str]) -> dict[str, Any]:
 def geometry_of(
     scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What a flight over a scene sees through one scanner: all but the beams' own shape.
+    """Scene as a flight sees it through one scanner: all but the beams' own shape.
 
     Objects count by their place in the scene, which is where their surfaces' numbers come from,
     and not by name.
@@ -94,7 +94,7 @@ def geometry_of(
 
 
 def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> dict[str, Any]:
-    """What rays meet of an object: no reflectance, and the ground that it stands on by place."""
+    """Object as rays meet it: no reflectance, and the ground that it stands on by place."""
     kept = {path: v for path, v in values.items() if path.rsplit(".", 1)[-1] not in OPTICAL}
     return kept | ({"on": places[kept["on"]]} if "on" in kept else {})
 

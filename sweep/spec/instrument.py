@@ -141,7 +141,7 @@ class Receiver(Part):
 
 
 class Detector(Part):
-    """What flags bins of a spectrum, where whole spectra are drawn."""
+    """Detector of bins in a spectrum, where whole spectra are drawn."""
 
     kind: str = of.field(
         Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)), FIXED
@@ -164,7 +164,7 @@ class Detector(Part):
 
 
 class Estimator(Part):
-    """What places a detected peak between bins, where whole spectra are drawn."""
+    """Estimator that places a detected peak between bins, where whole spectra are drawn."""
 
     kind: str = of.field(
         Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS)), PEAK_BIN

@@ -157,9 +157,9 @@ class Place(NamedTuple):
     location: Location
     """Keys and indices that lead there, as in the file."""
     models: Models
-    """What stands there is read as one of these; none for a single value."""
+    """Models as one of which the value there is read; none for a single value."""
     parents: Models
-    """What it stands in is read as one of these."""
+    """Models as one of which the part around it is read."""
 
 
 def place_of(location: Location, root: type[BaseModel]) -> Place:
@@ -223,7 +223,7 @@ def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
 
 
 def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
-    """Whether the mapping lacked the path, where the value then is put."""
+    """Put a value at a path that a mapping lacks; False if it is there."""
     for name in path[:-1]:
         mapping = mapping.setdefault(name, {})
         if not isinstance(mapping, dict):
@@ -252,7 +252,7 @@ class Files:
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def path(self, written: str, digest: Callable[[Path], str] = file_digest) -> Path:
-        """Where a file is; a `SceneError` where it has changed since the spec was loaded."""
+        """Path of a file; a `SceneError` if it has changed since the spec was loaded."""
         path = self.base / os.path.expanduser(written)
         known = self.digests.get(written)
         if known is not None and digest(path) != known:

@@ -276,7 +276,7 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, A
 
 
 def _is_leaf(value: Any, location: Location) -> bool:
-    """Whether the location holds something other than a mapping."""
+    """True if the location holds something other than a mapping."""
     for part in location:
         try:
             value = value[part]
@@ -342,7 +342,7 @@ def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
 
 
 def _with_kind(models: Models) -> str:
-    """What a part of several kinds is written with."""
+    """Text that a part of several kinds is written with."""
     return f"kind: and one of {', '.join(kind_of(model) for model in models)}"
 
 
@@ -354,7 +354,7 @@ def _other_kind(tag: str, kinds: list[str]) -> str:
 
 
 def _remedy(place: Place) -> str:
-    """What to write for a missing field or section."""
+    """Remedy for a missing field or section."""
     name = place.location[-1]
     field = fields_of(place.parents[0]).get(str(name)) if place.parents else None
     rule = rule_of(field) if field is not None else None

@@ -1,4 +1,4 @@
-"""What a single field of a spec may hold: reads what the user wrote and says what is wrong.
+"""Rules of single fields of a spec, which read what the user wrote and say what is wrong.
 
 A rule sits in a field's metadata. Pydantic reads the field with it, an axis over the field holds
 every one of its values to it, and the JSON Schema describes it.
@@ -34,7 +34,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What a field may hold.
+    """Rule of what a field may hold.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Rule:
         raise QuantityError("holds nothing that can be read")
 
     def written(self, value: Any) -> Any:
-        """What a user writes to have exactly `value`."""
+        """Text or number that reads back as exactly `value`."""
         return value
 
     def schema(self) -> Json:
@@ -89,7 +89,7 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Special(Rule):
-    """What one kind of field alone holds.
+    """Rule of one kind of field alone.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ class Mode(Choice):
 
 @dataclass(frozen=True, kw_only=True)
 class Flag(Rule):
-    """Whether or not."""
+    """True or false."""
 
     def read(self, written: object) -> bool:
         """True or False."""

@@ -257,7 +257,7 @@ def materials(name: str, thing: Part) -> list[tuple[str, Material]]:
 
 
 class Scene(Part):
-    """What the instrument flies over."""
+    """Scene that the instrument flies over."""
 
     origin: str = of.name("Ground whose middle is the zero of all positions, or 'world'", WORLD)
     objects: dict[str, AnyObject] = Field(description="What there is, by name")
@@ -294,7 +294,7 @@ class Navigation(Part):
 
 
 class SceneStorage(Part):
-    """How results are cut up in the store; part of a study's identity."""
+    """Division of results in the store; part of a study's identity."""
 
     block_shots: int = of.count("Shots that one block holds at most", "4096", default=4096)
     block_draws: int = of.count("Draws that one block holds at most", "64", default=64)

@@ -1,4 +1,4 @@
-"""What is wrong with a study of a scene beyond its single fields.
+"""Mistakes in a study of a scene beyond its single fields.
 
 Names and references, objects, files, the flight, and axes that would move the rays.
 """
@@ -54,7 +54,7 @@ def _readable(section: Mapping[str, Any], kind: Any) -> dict[str, Any]:
 
 
 def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Finding]:
-    """What is wrong with scene, platform and scanners beyond their single fields.
+    """Mistakes in scene, platform and scanners beyond their single fields.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def _file_findings(
 
 
 def _refused(make: Callable[[], object], location: Location) -> list[Finding]:
-    """What the model says against a part that it is asked to make."""
+    """Refusal of the model to make a part."""
     try:
         make()
     except (ValueError, ArithmeticError) as error:
@@ -159,7 +159,7 @@ def _refused(make: Callable[[], object], location: Location) -> list[Finding]:
 
 
 def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
-    """What is wrong with an object at a location, its references and files apart."""
+    """Mistakes in an object at a location, its references and files apart."""
     if isinstance(thing, Ground):
         yield from _ground_findings(thing, location)
     if isinstance(thing, Solid):
@@ -219,7 +219,7 @@ def _flight_findings(
     objects: Mapping[str, Any],
     base: Path | None,
 ) -> list[Finding]:
-    """What is wrong with platform, scanners and moving objects, of those that can be read."""
+    """Mistakes in platform, scanners and moving objects, of those that can be read."""
     span: Span | None = None
     findings: list[Finding] = []
     files = Files(base or Path())
@@ -238,7 +238,7 @@ def _flight_findings(
 
 
 def _on_files(motion: Motion) -> bool:
-    """Whether a movement is that of a table."""
+    """True if a movement is that of a table."""
     return isinstance(motion.path, WaypointPath) or isinstance(motion.attitude, Tracked)
 
 
@@ -330,7 +330,7 @@ class Arrangement(NamedTuple):
 def parameter_findings(
     arrangement: Arrangement, path: str, values: Iterable[Any], location: Location
 ) -> list[Finding]:
-    """What is wrong with a parameter taking several values, which stand at a location."""
+    """Mistakes in a parameter taking several values, which stand at a location."""
     rule, remedy = why_not(path)
     if rule:
         return [Finding(location, rule, remedy)]

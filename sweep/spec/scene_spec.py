@@ -68,7 +68,7 @@ class SceneSpec(Study):
     def further_findings(
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
-        """What is wrong with scene, flight, files, random effects and figures."""
+        """Mistakes in scene, flight, files, random effects and figures."""
         return [
             *scene_findings(written, base),
             *axis_findings(written, grid.axes),
@@ -78,11 +78,11 @@ class SceneSpec(Study):
 
     @classmethod
     def may_vary(cls, path: str) -> bool:
-        """Whether the parameter at a path is one of this kind of study that an axis may set."""
+        """True if the parameter at a path is one of this kind of study that an axis may set."""
         return not why_not(path)[0]
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
-        """What is wrong with a parameter taking a value without the geometry changing."""
+        """Mistakes in a parameter taking a value without the geometry changing."""
         return parameter_findings(self._arrangement, path, [value], location)
 
     @property
@@ -106,11 +106,11 @@ class SceneSpec(Study):
 
     @property
     def rays_by_tolerance(self) -> bool:
-        """Whether the tolerance says how many rays there are of each shot."""
+        """True if the tolerance says how many rays there are of each shot."""
         return self.footprint.beamlets == 0 and is_open(self.parameters())
 
     def surfaces(self) -> tuple[Surface, ...]:
-        """What surface numbers mean; no file is looked at."""
+        """Surfaces by their numbers; no file is looked at."""
         from sweep.spec.world import surfaces_of
 
         return surfaces_of(self.scene)
@@ -177,7 +177,7 @@ class SceneSpec(Study):
 
     @property
     def rotating(self) -> bool:
-        """Whether any body of the scene turns."""
+        """True if any body of the scene turns."""
         moving = (getattr(thing, "motion", None) for thing in self.scene.objects.values())
         return any(motion is not None and motion.attitude.kind != "fixed" for motion in moving)
 

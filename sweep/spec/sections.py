@@ -1,4 +1,4 @@
-"""What an instrument looks at, how closely it is computed, and how a study is run."""
+"""Target, footprint, air and effects; accuracy, draws, storage and execution of a study."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ class Atmosphere(Part):
 
 @with_modes
 class Effects(Part):
-    """Which physical effects are simulated: where the scene calls for it, always or never."""
+    """Modes of physical effects: simulated where the scene calls for it, always or never."""
 
 
 def _share(about: str) -> Any:
@@ -72,7 +72,7 @@ def _share(about: str) -> Any:
 
 
 class Accuracy(Part):
-    """How far the computation goes; part of a study's identity."""
+    """Accuracy of the computation; part of a study's identity."""
 
     tolerance: float = of.number(
         "How far a probability of detection, log10 of one of a false alarm or a relative "
@@ -125,22 +125,22 @@ class Draws(Part):
 
     @property
     def any(self) -> bool:
-        """Whether anything is drawn."""
+        """True if anything is drawn."""
         return self.number > 0 or self.adaptive
 
     @property
     def whole_spectra(self) -> bool:
-        """Whether a detector and an estimator look at whole spectra."""
+        """True if a detector and an estimator look at whole spectra."""
         return self.method == SPECTRA
 
     @property
     def adaptive(self) -> bool:
-        """Whether each point is drawn until its accuracy is met."""
+        """True if each point is drawn until its accuracy is met."""
         return self.limit > 0
 
 
 class Storage(Part):
-    """How results are cut up in the store; part of a study's identity."""
+    """Division of results in the store; part of a study's identity."""
 
     block_points: int = of.count(
         "Points that one block holds at most; 0 for 65536, and more in studies so large that "
@@ -150,7 +150,7 @@ class Storage(Part):
 
 
 class Execution(Part):
-    """How a study is run; never part of its identity, as it changes no result."""
+    """Execution of a study; never part of its identity, as it changes no result."""
 
     workers: int = of.count("Worker processes; 0 for one a core", "4", "0", "100000", default=0)
     threads: int = of.count("Threads of one worker", "1", "1", "10000", default=1)

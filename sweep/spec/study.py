@@ -141,14 +141,14 @@ class Study(Part):
 
     @classmethod
     def may_vary(cls, path: str) -> bool:
-        """Whether the parameter at a path is one of this kind of study."""
+        """True if the parameter at a path is one of this kind of study."""
         return True
 
     @classmethod
     def further_findings(
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
-        """What is wrong with a spec as written beyond its single fields and its grid.
+        """Mistakes in a spec as written beyond its single fields and its grid.
 
         Files are left alone without a base. Not all axes may have been read.
         """
@@ -165,7 +165,7 @@ class Study(Part):
         }
 
     def modes(self) -> dict[str, str]:
-        """Whether each effect, by its name, is simulated: `auto`, `on` or `off`."""
+        """Mode of each effect by its name: `auto`, `on` or `off`."""
         return values_of(self.effects, "")
 
     def parameters_at(self, at: Mapping[str, object]) -> dict[str, float | int | str]:
@@ -203,7 +203,7 @@ class Study(Part):
         return parameters
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
-        """What is wrong with a parameter taking a value in this kind of study: nothing."""
+        """Mistakes in giving a parameter a value in this kind of study: none."""
         return []
 
     def member(self, name: str) -> Member:
@@ -333,7 +333,7 @@ class Spec(Study):
 
     @cached_property
     def has_random_effects(self) -> bool:
-        """Whether anything but noise may be random at any point."""
+        """True if anything but noise may be random at any point."""
         return any(without_draws(Grid(self.parameters(), self.axes, self.modes())))
 
     def identity(self) -> dict[str, Any]:

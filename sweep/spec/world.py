@@ -21,16 +21,16 @@ from sweep.spec.scene import Boulders, Scene, Solid, Trees, materials
 
 
 class World(NamedTuple):
-    """What rays are cast at, in the scene's frame."""
+    """Bodies that rays are cast at, in the scene's frame."""
 
     caster: Caster
     """The bodies: all that rests is the first, if there is any, and each that moves another."""
     surfaces: tuple[Surface, ...]
-    """What surface numbers mean."""
+    """Surfaces by their numbers."""
     bodies: tuple[Flight | None, ...]
     """Motion of each of the caster's bodies; None for one at rest."""
     reports: tuple[str, ...]
-    """What loading found and mended, a line an object."""
+    """Report of what loading found and mended, a line an object."""
     origin: np.ndarray
     """(3,): what was subtracted from the objects' own coordinates [m]."""
 
@@ -91,7 +91,7 @@ def build(scene: Scene, files: Files, span: Span) -> World:
 
 
 def _unfit(name: str, error: Exception) -> SceneError:
-    """What is wrong with an object, as users are told it."""
+    """Mistakes in an object, as users are told it."""
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 
