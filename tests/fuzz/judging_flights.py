@@ -63,11 +63,15 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
         look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
 
 
+OF_HITS = ("beam_radial_velocity", "beam_acceleration", "beam_approach", "beam_turn_rate")
+"""Quantities of a beam that a beam which hits nothing has not."""
+
+
 def look_at_shots(seen: Results) -> None:
     """Where the instrument is and what its beams hit: numbers throughout, but for misses."""
     for name in (*SHOTS, *CYCLES):
         missing = np.isinf(seen[name]) if name in ("beam_range", "true_altitude") else False
-        if name == "beam_radial_velocity":
+        if name in OF_HITS:
             missing = np.isnan(seen[name]) & np.isinf(seen["beam_range"])
         assert (np.isfinite(seen[name]) | missing).all(), f"{name} is not finite"
     length = np.linalg.norm(seen["beam_direction"], axis=-1)
