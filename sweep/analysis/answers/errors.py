@@ -12,9 +12,10 @@ from scipy.interpolate import CubicSpline
 from sweep.analysis.answers.physical import parameter, spec_of
 from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import NAMES
 from sweep.model.window import transform, window
 
-_NAMES = ("up", "doppler", "down")
+_SEGMENTS = ("up", "doppler", "down")
 _INSTRUMENT = "instrument."
 _PARAMETERS = {
     "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
@@ -72,9 +73,9 @@ def _errors(
     values |= {
         name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
     }
-    values["walks"] = _simulates(dataset, "range_walk")
-    values["moves"] = _simulates(dataset, "segment_motion")
-    snr = [dataset[f"snr_{name}"] for name in _NAMES]
+    for name, effect in (("walks", "range_walk"), ("moves", "segment_motion")):
+        values[name] = (dataset["effects"] & (1 << NAMES.index(effect))) > 0
+    snr = [dataset[f"snr_{name}"] for name in _SEGMENTS]
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
         names = dict(zip(values, arrays[3:], strict=True))
@@ -102,13 +103,6 @@ def _errors(
     ):
         result[name].attrs = {"units": units, "long_name": text}
     return result.assign_attrs(dataset.attrs)
-
-
-def _simulates(dataset: xr.Dataset, effect: str) -> xr.DataArray:
-    """Mask of points at which an effect is simulated, as those that move peaks off their beats."""
-    attributes = dataset["effects"].attrs
-    masks = dict(zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True))
-    return (dataset["effects"] & int(masks[effect])) > 0
 
 
 def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators.Deviation:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from sweep.analysis import noise_only
 from sweep.analysis.answers.physical import parameter, quantity, si, spec_of
-from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.marcum import marcum_q1
 from sweep.model.philox import point_keys
 from sweep.model.sampling import simulate
@@ -242,6 +242,9 @@ CURVE_TNR = "curve_tnr"
 """Not `tnr`, which is the study's own where that is on an axis."""
 
 DOMAIN = "sweep.analysis.roc"
+_RANDOM = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
+"""Flags of the effects that are random."""
+
 _SEGMENTS = {"up": ("up",), "doppler": ("doppler",), "down": ("down",), "shot": ("up", "down")}
 
 
@@ -316,7 +319,7 @@ def _closed(
     """Closed form of pd at each level, and where it holds."""
     own = _own_level(dataset)
     pd = xr.ones_like(level)
-    exact = (dataset["effects"] & _random_mask(dataset)) == 0
+    exact = (dataset["effects"] & _RANDOM) == 0
     for name in _SEGMENTS[segment]:
         stored = dataset[f"pd_{name}"]
         amplitude = (2 * dataset[f"snr_{name}"]) ** 0.5
@@ -355,14 +358,6 @@ def _crossing(amplitude: np.ndarray, level: np.ndarray) -> np.ndarray:
     )
 
 
-def _random_mask(dataset: xr.Dataset) -> int:
-    """Flags of the effects that are random."""
-    attributes = dataset["effects"].attrs
-    random = {effect.name for effect in EFFECTS if effect.is_random}
-    pairs = zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True)
-    return sum(int(mask) for name, mask in pairs if name in random)
-
-
 def _simulate(dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int) -> None:
     """Put simulated curves in the place of those that the closed form does not give."""
     spec = spec_of(dataset)
@@ -392,13 +387,12 @@ def _curve(
     known = np.isfinite(tnr)
     if not known.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
-    flags, attributes = int(point["effects"]), point["effects"].attrs
-    pairs = zip(attributes["flag_meanings"].split(), attributes["flag_masks"], strict=True)
-    effects = [name for name, mask in pairs if flags & mask]
+    flags = int(point["effects"])
+    effects = names_of(flags)
     name = named("pd", segment)
     arrays = {p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS}
     arrays[TNR] = tnr
-    if flags & _random_mask(point):
+    if flags & _RANDOM:
         # One key for all thresholds: the same draws, so that curves fall without noise.
         others = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
         row = [[v for v in others.values() if not isinstance(v, str)]]
