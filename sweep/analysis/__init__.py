@@ -1,1 +1,1 @@
-"""What a store says: datasets, figures and tables. Reads stores, runs nothing."""
+"""Datasets, figures and tables of stores. Reads stores, runs nothing."""

@@ -25,7 +25,7 @@ DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)
 
 
 FORMATS = ("png", "pdf", "svg")
-"""What pictures can be written as; text and lines of the last two are no pixels."""
+"""Formats of pictures; text and lines of the last two are no pixels."""
 
 PRINTED_DPI = 300
 """Of what stays pixels in PDF and SVG: surfaces and clouds of many points."""

@@ -107,7 +107,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """What a figure shows.
+    """Contents of a figure.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class Ruler:
 
 
 def is_geometric(values: np.ndarray) -> bool:
-    """Whether values are spread evenly in their logarithm, over a decade or more."""
+    """Tell whether values are spread evenly in their logarithm, over a decade or more."""
     if values.size < 3 or values.min() <= 0 or values.max() < 10 * values.min():
         return False
     steps = np.diff(np.log(values))
@@ -216,7 +216,7 @@ def axis_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Axis:
 
 
 def worst(variable: str) -> str:
-    """Which of the values that share a cell is the worst; empty where none is."""
+    """Worst kind of the values that share a cell; empty if neither end is bad."""
     if variable.startswith(("pd_", "snr_")):
         return LOWEST
     return HIGHEST if variable.startswith(_CHANCES_OF_HARM) else ""
@@ -236,7 +236,7 @@ def facets_of(
 
 
 def not_shown(number: int) -> str:
-    """That some values are left out; empty where none is."""
+    """Remark that some values are left out; empty where none is."""
     return f"{labels.counted(number, 'further value')} not shown" if number else ""
 
 
@@ -309,7 +309,7 @@ def _plane(found: Points, variable: str, x: str, y: str) -> tuple[Points, Side, 
 
 
 def _reduction(each: int, sides: Sequence[Side], kinds: Sequence[str]) -> str:
-    """How many points share a cell; empty where none do."""
+    """Remark on the number of points that share a cell; empty where none do."""
     if each == 1:
         return ""
     number = math.prod(side.values.size for side in sides)
@@ -364,7 +364,7 @@ def panels_of(
 
 
 def alternative(words: str, span: str, panel: Panel) -> str:
-    """What the lines of a panel show, in words."""
+    """Extent of the lines of a panel, in words."""
     told = [f"{line.name or 'the line'}: {labels.extent(line.y)}"
             for line in panel.layers if isinstance(line, Line)]  # fmt: skip
     return f"Lines of {words} over {span}. {'; '.join(told)}."
@@ -421,7 +421,7 @@ def _kinds(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
 
 
 def _remark(together: int, confidence: float, drawn: bool) -> str:
-    """What a reader has to know of a line; empty where each point is on it."""
+    """Remark on how a line is reduced; empty where each point is on it."""
     sure = f" of a confidence of {confidence:g}" if confidence else ""
     if together > 1:
         with_ends = f", their intervals{sure} included" if sure else ""

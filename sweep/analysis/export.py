@@ -131,7 +131,7 @@ FINEST = 1e-4
 
 INTEGERS = 2.0**31 - 1
 LARGEST_RETURN = 15
-"""What LAS's coordinates, in steps from its offset, and numbers of returns go up to."""
+"""Largest coordinates, in steps from the offset, and numbers of returns in a LAS file."""
 
 _STANDARD = {"x", "y", "z", "time", "return_number", "number_of_returns"}
 
@@ -195,7 +195,7 @@ WRITERS: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
     ".laz": partial(write_las, compressed=True),
     ".csv": write_csv,
 }
-"""How to write each kind of file, by its suffix."""
+"""Writers of the kinds of files, by suffix."""
 
 
 def export(
@@ -263,7 +263,7 @@ def export(
 def _mistakes(
     study: SceneStudy, file: Path, scanner: str | None, draw: int, ranges: str, at: Place
 ) -> list[Mistake]:
-    """What is wrong with what is asked for."""
+    """Mistakes in the arguments of an export."""
     found = []
     if file.suffix.lower() not in WRITERS:
         remedy = f"take one of {', '.join(WRITERS)}"
@@ -293,7 +293,7 @@ def _mistakes(
 
 
 def _remarks(study: SceneStudy, table: PointTable, at: Place) -> list[str]:
-    """What a file says of itself, where it can."""
+    """Remarks in a file on its contents."""
     number = [f"surface {i}: {name}" for i, name in enumerate(study.surfaces)]
     bits = [f"flag {bit}: {labels.coordinate(name)}" for name, bit in FLAGS.items()]
     shown = f"scanner {table.recording.scanner}, draw {table.draw}, {table.ranges} ranges"

@@ -84,7 +84,7 @@ def joined(parts: list[str]) -> str:
 
 
 def is_words(values: np.ndarray) -> bool:
-    """Whether a coordinate's values are words."""
+    """Tell whether a coordinate's values are words."""
     return values.dtype.kind not in "fiu"
 
 

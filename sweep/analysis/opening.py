@@ -27,7 +27,7 @@ STRETCH = 8192
 """Shots, times draws, that are read at a time."""
 
 NOT_COUNTED = -1
-"""What a count holds where its block is not computed."""
+"""Value of a count in a block that is not computed."""
 
 GRID, SCENE, ACCURACY = "grid", "scene", "accuracy"
 _HOLDS = {
@@ -36,7 +36,7 @@ _HOLDS = {
     ACCURACY: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
     "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
 }
-"""What the kinds of stores hold, and what to do with them."""
+"""Contents of the kinds of stores, and the functions that open them."""
 
 
 def open(path: str | Location) -> xr.Dataset:

@@ -99,7 +99,7 @@ class Shot:
 
     @property
     def detected(self) -> bool:
-        """Whether both chirp segments have a group."""
+        """Tell whether both chirp segments have a group."""
         return all(segment.groups for segment in self.segments if segment.sign)
 
 
@@ -188,7 +188,7 @@ def groups(magnitude: np.ndarray, threshold: float) -> tuple[Group, ...]:
 
 
 def quantity_at(shot: Shot, segment: Segment, frequency: np.ndarray) -> np.ndarray:
-    """What a frequency seen in a segment means near its beat: range [m], or velocity [m/s].
+    """Range [m] or velocity [m/s] that a frequency seen in a segment stands for near its beat.
 
     Range is that of a target of the shot's velocity; a fold at DC or Nyquist is undone as for
     the shot's own beat.

@@ -39,7 +39,7 @@ MOST_ROWS = 100
 
 @dataclass(frozen=True)
 class Leakage:
-    """Where leakage comes from in a cut."""
+    """Origin of the leakage in a cut."""
 
     mean: tuple[float, float]
     median: tuple[float, float]
@@ -56,7 +56,7 @@ Values = dict[str, np.ndarray]
 
 
 class _Account:
-    """What is found out of a group, reading by reading."""
+    """Tallies of a group, made reading by reading."""
 
     def __init__(self) -> None:
         self.of = {name: Tally() for name in ("up", "down", "shot", "total")}
@@ -77,7 +77,7 @@ class _Account:
         self.least = Search([HELD * sum_of_all] if sum_of_all > 0 else [])
 
     def searched(self, values: Values) -> Iterator[tuple[Search, np.ndarray, np.ndarray | None]]:
-        """What the searches look through."""
+        """Values for the searches."""
         for name, one in self.medians.items():
             yield one, values[name], None
         yield self.least, -values["total"], values["total"]  # the largest first
@@ -333,7 +333,7 @@ def _written(value: Cell, form: str) -> Cell:
 
 
 def _origin_blocks(found: list[Entry]) -> list[Block]:
-    """Where leakage comes from: a table for each set of bands."""
+    """Origin of leakage: a table for each set of bands."""
     blocks = []
     for names in dict.fromkeys(tuple(e.leakage.shares) for e in found if e.leakage.shares):
         own = [e for e in found if tuple(e.leakage.shares) == names]

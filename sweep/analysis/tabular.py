@@ -87,7 +87,7 @@ def aligned(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
 
 
 def _numeric(cell: Cell) -> bool:
-    """Whether a cell holds a number, as such or as text."""
+    """Tell whether a cell holds a number, as such or as text."""
     try:
         float(str(cell).removesuffix(" %").replace(",", ""))
     except ValueError:

@@ -120,7 +120,7 @@ class Search:
 
     @property
     def ended(self) -> bool:
-        """Whether all bits are known."""
+        """Tell whether all bits are known."""
         return not self._left or not self._found
 
     def add(self, values: np.ndarray, weights: np.ndarray | None = None) -> None:

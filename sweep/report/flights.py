@@ -49,7 +49,7 @@ NODES = 90
 """Nodes of the terrain along a side."""
 
 SUNK = 0.012
-"""How far the terrain is drawn below itself, of the picture's size: points lie on it, not in it."""
+"""Depth at which terrain is drawn below itself, of the picture's size: points lie on it."""
 
 FIELD_OF_VIEW = math.radians(45)
 """Angle from the lower to the upper edge of what the library shows of a scene."""
@@ -64,15 +64,15 @@ VIEWS = {
     "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
     "from the east": {"x": 1.8, "y": 0.0, "z": 0.1},
 }
-"""Where the eye is, in the lengths that the library counts in."""
+"""Places of the eye, in the lengths that the library counts in."""
 
 CENTRE = {"x": 0.0, "y": 0.0, "z": -0.1}
-"""Where the eye looks."""
+"""Point that the eye looks at."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What one scanner recorded at one place along the study's axes."""
+    """Recording of a scanner at one place along the study's axes."""
 
     words: str
     recording: Recording
@@ -220,7 +220,7 @@ def _longest(sides: np.ndarray) -> float:
 
 
 def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:
-    """Whether an eye has (n, 3) corners within its field of view."""
+    """Tell whether an eye has (n, 3) corners within its field of view."""
     ahead = np.array([CENTRE[axis] for axis in AXES]) - eye
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -310,7 +310,7 @@ def _by_beam(table: dict[str, np.ndarray], name: str) -> list[Line]:
 
 
 def returns(found: Sequence[Seen]) -> Table:
-    """What came back to each scanner: shots, and points by kind, over all draws."""
+    """Shots and points by kind of each scanner, over all draws."""
     rows = []
     for seen in found:
         counts, shots = np.zeros(len(KINDS), int), 0

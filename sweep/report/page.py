@@ -298,7 +298,7 @@ def _axis(axis: Axis, **further: Any) -> dict[str, Any]:
 
 
 def title(words: str) -> dict[str, Any]:
-    """What colours mean, over their bar."""
+    """Title over the bar of colours."""
     return {
         "text": broken(words, 48), "x": 0.5, "xanchor": "center", "yref": "container", "y": 1,
         "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
@@ -386,7 +386,7 @@ def _in_script(json_text: str) -> Markup:
 
 
 def _chart_json(plot: Plot) -> Markup:
-    """What the page's script needs of a plot."""
+    """JSON of a plot for the page's script."""
     relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
     return _in_script(
         to_json_plotly({"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.cut})

@@ -1,4 +1,4 @@
-"""What a study asked for and what was simulated, how far off it may be, and how to cite it."""
+"""Provenance of a study: its fields, effects simulated, accuracy, citation and reproduction."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _shown(value: object) -> str:
 
 
 def axes(spec: Declared) -> Table | None:
-    """What varies, and over which values."""
+    """Axes with their values."""
     rows = [
         (axis.name, member.path, axis.size, _values(member.display, member.units))
         for axis in spec.axes
@@ -109,7 +109,7 @@ def _span(present: xr.DataArray) -> str:
 
 
 def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
-    """How far the results may be off, in sentences."""
+    """Accuracy of the results, in sentences."""
     tolerance = spec.accuracy.tolerance
     told = [
         f"Asked for: no probability of detection off by more than {tolerance:g}"
@@ -137,7 +137,7 @@ def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
 
 
 def reproduction(attributes: Mapping[Any, Any], spec: Declared, store: str) -> Section:
-    """How to cite the study, and how to make it again."""
+    """Citation of the study, and commands that make it again."""
     software = attributes["software"]
     version = software["sweep"]
     year = str(attributes.get("finished") or attributes.get("started") or "")[:4]

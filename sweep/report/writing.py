@@ -120,7 +120,7 @@ def _grid_page(store: Location, say: Say) -> Page:
 
 
 def _asked(spec: Spec | SceneSpec, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
-    """What was asked and simulated, and how far the results may be off."""
+    """Section on the study's fields, the effects simulated and the accuracy reached."""
     made = [provenance.axes(spec), provenance.effects(flags, spec.modes()),
             provenance.fields(spec)]  # fmt: skip
     told = provenance.accuracy(dataset, spec)

@@ -18,7 +18,7 @@ from sweep.model.outputs import OUTPUTS, PROMISED, SPECTRA_OUTPUTS, STATISTICS
 from sweep.model.pairing import TRUE
 
 ROUNDING = 1e-12
-"""What another processor's last digits may change of a probability."""
+"""Change of a probability by another processor's last digits, at the most."""
 
 _DIGITS = 12
 
@@ -78,7 +78,7 @@ def titled(store: xr.Dataset | xr.DataTree) -> str:
 
 
 def _unknown(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """How far a probability may be from the true one."""
+    """Known bound on the error of a probability."""
     parts = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
     return sum((part.fillna(0.0) for part in parts), xr.zeros_like(dataset[name]))
@@ -158,7 +158,7 @@ DETECTED = "detected"
 """Share of the draws in which a shot has a true point."""
 
 ERRORS = ("effects_error", "beamlets_error")
-"""What is known of how far a shot's probabilities may be off."""
+"""Known bounds on the errors of a shot's probabilities."""
 
 COMPARED = tuple(
     name for name, output in STATISTICS.items() if output.dtype == "float64" and name not in ERRORS
@@ -253,12 +253,12 @@ def _known(group: xr.Dataset) -> pandas.DataFrame:
 
 
 def _complete(tree: xr.DataTree) -> bool:
-    """Whether no draw is left to compute, which a point that is not there would not tell."""
+    """Tell whether no draw is left to compute; a missing point would not."""
     return bool(tree.attrs["points_committed"] >= tree.attrs["points"])
 
 
 def _quantities(group: xr.Dataset, tree: xr.DataTree, *, drawn: bool) -> xr.Dataset:
-    """What is compared of a group's shots, over its axes and shots."""
+    """Quantities of a group's shots that are compared, over its axes and shots."""
     there = [name for name in (*COMPARED, *ERRORS) if name in group]
     found = group[there].assign_attrs(tree.attrs)
     if not drawn:
@@ -347,7 +347,7 @@ def _told(coordinate: xr.DataArray) -> str:
 
 
 def met(found: xr.Dataset) -> str:
-    """How many shots two flights share, in words."""
+    """Number of the shots that two flights share, in words."""
     number, ours, other = found.sizes["shot"], found.attrs["shots"], found.attrs["other_shots"]
     if number == ours == other:
         return f"all {labels.counted(number, 'shot')}"

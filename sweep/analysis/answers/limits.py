@@ -1,4 +1,4 @@
-"""Where a probability of detection falls below a level along an axis: maximum range, least angle.
+"""Limits along an axis at which pd falls below a level: maximum range, least grazing angle.
 
 Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z):
 Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is nearly a straight line
@@ -47,7 +47,7 @@ def limit(
     segment: str = "shot",
     from_highest: bool = False,
 ) -> xr.Dataset:
-    """How far along a coordinate the probability of detection keeps to a level.
+    """Farthest value of a coordinate up to which the probability of detection keeps to a level.
 
     pd need not fall steadily: scalloping and interference make dips. So there are two answers.
 

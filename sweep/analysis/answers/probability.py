@@ -65,7 +65,7 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
 
 
 def confidence(dataset: xr.Dataset, reach: xr.DataArray | None) -> dict[str, float]:
-    """How sure an interval is, where that is one number; certain where nothing is drawn."""
+    """Confidence of an interval, if it is one number; 1 if nothing is drawn."""
     if reach is None:
         return {"confidence": 1.0}
     stored = reach.attrs.get("confidence")

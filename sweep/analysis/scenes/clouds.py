@@ -14,7 +14,7 @@ from sweep.analysis.scenes.recording import Interval, Recording, Table, Thinned,
 from sweep.model.pairing import TRUE
 
 MOST_POINTS, MOST_DROPOUTS, MOST_PATH = 120_000, 20_000, 2000
-"""What a picture still shows apart; more is thinned."""
+"""Most points, dropouts and places of the path in a picture; more is thinned."""
 
 MARGIN = 0.04
 """Room around the points, as a share of the longest side of the box that holds them."""
@@ -131,7 +131,7 @@ def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Interval])
 
 
 SUN_AZIMUTH, SUN_ELEVATION = 315.0, 40.0
-"""Where the light comes from that shades the ground [deg], from north by east; and its height."""
+"""Direction of the light that shades the ground [deg], from north by east; and its height."""
 
 STEEPEST = 1.5
 """Slope above which ground is left open: at the edges of crowns and walls, which hide points."""

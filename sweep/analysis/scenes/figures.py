@@ -107,7 +107,7 @@ class SceneStudy:
         return makers[type(figure)](self, figure, place(self.spec, figure.where))
 
     def titled(self, figure: SceneFigure, otherwise: str) -> str:
-        """What stands over a figure."""
+        """Title of a figure."""
         return "\n".join([self.spec.title, figure.title or otherwise])
 
 

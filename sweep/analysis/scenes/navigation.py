@@ -184,7 +184,7 @@ def _tallies(dataset: xr.Dataset, quantity: str, edges: np.ndarray) -> Iterator[
 
 
 def _errors(part: xr.Dataset, quantity: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether there is a solution (cycles, draws); its error (n, m) and covariance (n, m, m)."""
+    """Mask of solutions (cycles, draws), their errors (n, m) and covariances (n, m, m)."""
     status = np.asarray(part[f"{quantity}_status"].values)
     solved = (status >= SOLVED) & (status <= EXCLUDED)
     found, true = (np.asarray(part[n].values) for n in (quantity, f"true_{quantity}"))

@@ -106,7 +106,7 @@ def shown(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def kinds(flags: np.ndarray) -> np.ndarray:
-    """Which of KINDS each point's flags say, as an index; -1 where there is no point."""
+    """Index of each point's kind in KINDS, from its flags; -1 where there is no point."""
     found = np.full(np.shape(flags), -1)
     for i, bit in enumerate(KINDS.values()):
         found[(flags & bit) > 0] = i
@@ -124,7 +124,7 @@ class Interval:
     high: float = np.inf
 
     def holds(self, values: np.ndarray) -> np.ndarray:
-        """Whether each value lies within; nan does not."""
+        """Mask of the values within; nan is not."""
         return (values >= self.low) & (values <= self.high)
 
 
@@ -152,7 +152,7 @@ class Recording:
                 yield part
 
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
-        """Which shots of a stretch are computed, as far as points of a draw go, (k,) bool.
+        """Mask (k,) of the shots of a stretch of which the points of a draw are computed.
 
         Geometry is stored with a study's first place and draw: that a shot's time is known says
         nothing of the others, and no point looks like none found. Only its chunk tells.
@@ -335,7 +335,7 @@ class Place:
     left_open: tuple[str, ...]
 
     def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
-        """What a scanner recorded there."""
+        """Recording of a scanner there."""
         group = tree.children[scanner].to_dataset(inherit=False)
         if PACKED in tree.attrs:
             return Recording(scanner, group.isel(self.index))
