@@ -1,7 +1,5 @@
 """Clouds as gathered and drawn, held against the arrays of the store."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,7 +11,7 @@ from sweep.analysis.opening import opened
 from sweep.analysis.scenes import clouds, colours, pictures
 from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
 from sweep.analysis.scenes.recording import Interval, place
-from sweep.model.pairing import FLAGS, TRUE
+from sweep.model.pairing import TRUE
 
 
 @pytest.fixture(scope="module")
@@ -209,19 +207,6 @@ def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
     assert list(kinds.names.values()) == ["true", "sidelobe"]
 
 
-def test_a_legend_tells_false_points_dropouts_and_path():
-    found = small_cloud([[0, 9.0], [0, 9.0], [0, 1.0]])
-    found.points["flags"][1] = FLAGS["sidelobe"]
-    places = {axis: np.array([4.0]) for axis in AXES}
-    for options, more in (
-        ({}, set()),
-        ({"dropouts": places, "path": places}, {"shot without a point", "flight path, dot: start"}),
-    ):
-        sheet = drawn(replace(found, **options), None, quantity="flags", view="oblique")
-        words = {t.get_text().replace("\n", " ") for own in sheet.legends for t in own.get_texts()}
-        assert words == {"true", "sidelobe", "false point"} | more
-
-
 def test_far_off_coordinates_are_read_against_a_round_number():
     points = np.array([[4_000_000.0, 4_000_300.0], [10.0, 90.0], [0, 10.0]])
     sheet = drawn(small_cloud(points), None)
@@ -260,7 +245,3 @@ def test_slopes_towards_the_light_are_brighter_and_walls_are_left_open():
     step = np.where(x > 5, 10.0, 0.0) + 0 * y[:, None]
     kept = np.isfinite(Ground(x, y, step).without_walls().height)
     assert not kept[:, 10].any() and kept[:, :9].all() and kept[:, 13:].all()
-
-
-def test_flags_have_the_bits_that_the_figures_take_for_true():
-    assert FLAGS["true"] == TRUE

@@ -159,14 +159,3 @@ def test_direct_detection_has_no_doppler_segment(tmp_path):
     spec = study({}, instrument=INSTRUMENT | {"receiver": receiver}, target=TARGET)
     text, _ = shot_figure.report(spec, {"range": "20 m"}, tmp_path)
     assert "Doppler" not in text and "thermal" in text
-
-
-@pytest.mark.parametrize("form", ["pdf", "svg"])
-def test_shots_are_drawn_for_print_with_the_same_bytes_every_time(tmp_path, form):
-    drawn = []
-    for place in ("one", "other"):
-        _, files = shot_figure.report(study({}), {}, tmp_path / place, form=form)
-        assert files[0].suffix == f".{form}"
-        drawn.append(files[0].read_bytes())
-    assert drawn[0] == drawn[1]
-    assert drawn[0].startswith({"pdf": b"%PDF", "svg": b"<?xml"}[form])
