@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import dask.array
 import numpy as np
 import xarray as xr
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from sweep.spec import Axis, Member, SceneSpec, Spec
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
-_METHODS = {MEAN: "mean", LOWEST: "min", HIGHEST: "max"}
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,32 @@ def coarsened(
     for side, _ in sides:
         if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
             array = array.isel({side.dim: side.positions})
-    array = known(array).transpose(*(side.dim for side, _ in sides))
-    by = {side.dim: side.together(most) for side, most in sides}
-    if max(by.values()) == 1:
-        return array
-    cells = array.drop_vars(list(array.coords)).coarsen(by, boundary="pad")
-    return getattr(cells, _METHODS[kind])()
+    array, order = known(array), [side.dim for side, _ in sides]
+    together = {side.dim: side.together(most) for side, most in sides}
+    if max(together.values()) == 1:
+        return array.transpose(*order)
+    data, by = array.chunk().data, [together[str(dim)] for dim in array.dims]
+    lacking = [(0, -size % number) for size, number in zip(data.shape, by, strict=True)]
+    if any(after for _, after in lacking):
+        data = dask.array.pad(data, lacking, constant_values=np.nan)
+    # in the order of the store: turned before, every piece would be copied
+    cells = dask.array.coarsen(_REDUCTIONS[kind], data, dict(enumerate(by)))
+    return xr.DataArray(cells, dims=array.dims).transpose(*order)
+
+
+def _mean(values: np.ndarray, axis: tuple[int, ...] | None = None) -> np.ndarray:
+    """Mean of what is not nan; nan without any."""
+    there = ~np.isnan(values)
+    number = there.sum(axis=axis)
+    total = np.sum(values, axis=axis, where=there)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+_REDUCTIONS = {
+    MEAN: _mean,
+    LOWEST: lambda values, axis=None: np.fmin.reduce(values, axis=axis),
+    HIGHEST: lambda values, axis=None: np.fmax.reduce(values, axis=axis),
+}
 
 
 @dataclass(frozen=True)

@@ -70,21 +70,25 @@ def _values(values: np.ndarray, units: str) -> str:
 
 def effects(arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> Table:
     """Effects that were simulated: at how many points, and in which part of the study."""
-    lazy = []
+    counts, flags = [], []
     for array in arrays:
-        masks = xr.Dataset({e.name: ((array >> k) & 1) > 0 for k, e in enumerate(EFFECTS)})
-        along = [masks.any([d for d in array.dims if d != dim]) for dim in array.dims]
-        lazy.append((masks.sum(), along))
-    found = dask.compute(*lazy)
+        counts.append([((array.data >> k) & 1).sum() for k in range(len(EFFECTS))])
+        flags.append({dim: _any(array, dim) for dim in array.dims})
+    counts, flags = dask.compute(counts, flags)
     size = sum(array.size for array in arrays)
     rows = []
-    for effect in EFFECTS:
-        name = effect.name
-        number = sum(int(counts[name]) for counts, _ in found)
-        spans = [_span(masks[name]) for _, along in found for masks in along]
+    for k, effect in enumerate(EFFECTS):
+        number = sum(int(own[k]) for own in counts)
+        spans = [
+            _span(array[dim].coords, (np.asarray(along) >> k) & 1 > 0)
+            for array, own in zip(arrays, flags, strict=True)
+            for dim, along in own.items()
+        ]
         where = ", ".join(dict.fromkeys(filter(None, spans))) if number < size else "everywhere"
-        rows.append((name.replace("_", " "), modes[name], round(100 * number / size, 2), where,
-                     effect.about))  # fmt: skip
+        rows.append(
+            (effect.name.replace("_", " "), modes[effect.name], round(100 * number / size, 2),
+             where, effect.about)
+        )  # fmt: skip
     rows.sort(key=lambda row: -row[2])
     names = ["effect", "asked", "% of points", "within", "what it is"]
     caption = [
@@ -95,13 +99,29 @@ def effects(arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> Table:
     return Table("Effects", caption, pandas.DataFrame(rows, columns=names), "effects")
 
 
-def _span(present: xr.DataArray) -> str:
+def _any(array: xr.DataArray, dim: Any) -> Any:
+    """Flags that occur anywhere at each place along a dimension, chunk by chunk."""
+
+    def over(chunk: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
+        return np.asarray(np.bitwise_or.reduce(chunk, axis=axis, keepdims=keepdims))  # type: ignore[call-overload]
+
+    others = tuple(i for i, other in enumerate(array.dims) if other != dim)
+    if not others:
+        return array.data
+    return dask.array.reduction(
+        array.data, chunk=over, aggregate=over, axis=others, dtype=array.dtype
+    )
+
+
+def _span(coordinates: Any, present: np.ndarray) -> str:
     """Ends of the coordinates along a dimension between which an effect is present."""
     told = []
-    for name, coordinate in present.coords.items():
-        if present.all() or not present.any() or labels.is_words(coordinate.values):
+    for name, coordinate in coordinates.items():
+        if coordinate.ndim != 1 or present.all() or not present.any():
             continue
-        chosen = coordinate.values[present.values]
+        if labels.is_words(coordinate.values):
+            continue
+        chosen = coordinate.values[present]
         units = coordinate.attrs.get("units", "")
         ends = [labels.quantity(v, units) for v in (chosen.min(), chosen.max())]
         told.append(f"{labels.coordinate(str(name))} {ends[0]} to {ends[1]}")
