@@ -148,7 +148,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     reported = report(shots, found)
     pd_shot, miss_shot = shots.both(pd[0], pd[2]), miss[0] + pd[0] * miss[2]
     if shots.fading is not None:
-        miss_shot = miss[0] + (pd[0] - pd_shot)
+        miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)  # of roundings
     by_segment = {"pd": pd, "miss": miss, "snr": snr}
     results = {
         **{

@@ -107,7 +107,10 @@ UNSTEADY = {
     [
         pytest.param(method, effects, id=f"{method}, {name}", marks=[pytest.mark.slow] * more)
         for number, (name, effects) in enumerate(RANDOM.items())
-        for method, more in (("probabilities", number % 2 == 1), ("noise", number % 2 == 0))
+        for method, more in (
+            ("probabilities", number % 2 == 1 or name == "scintillation"),
+            ("noise", number % 2 == 0 or name == "jitter"),
+        )
     ],
 )
 def test_counts_over_random_effects_have_the_means_over_their_draws(effects, method, table_4_1):

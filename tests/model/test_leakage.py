@@ -157,7 +157,7 @@ def test_what_bins_of_a_run_add_at_most_is_more_than_they_add(beta):
     assert some > 100
 
 
-@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("phases", ["coherent", pytest.param("incoherent", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("window", EVERY_FORM)
 def test_leakage_over_ranges_and_angles_for_every_window(table_4_1, window, phases):
     generator = np.random.default_rng(3)

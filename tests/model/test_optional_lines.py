@@ -245,7 +245,7 @@ def test_the_drift_of_the_truth_itself_is_that_of_range_walk(table_4_1):
 
 
 @pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("leakage", [True, False])
+@pytest.mark.parametrize("leakage", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("effects", [DRIFTING, ("line_width",), (*DRIFTING, "line_width")])
 def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, table_4_1):
     """Peak, exempt bins and groups of 40 points against all bins of their spectra."""
@@ -325,8 +325,18 @@ def test_no_drift_and_no_width_are_what_is_without_them(window, phases, table_4_
         np.testing.assert_array_equal(a[:, FREQUENCY], b[:, FREQUENCY])
 
 
-@pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("effects", [(), DRIFTING, ("line_width",), (*DRIFTING, "line_width")])
+@pytest.mark.parametrize(
+    ("phases", "effects"),
+    [
+        ("coherent", (*DRIFTING, "line_width")),
+        ("incoherent", (*DRIFTING, "line_width")),
+        *(
+            pytest.param(phases, effects, marks=pytest.mark.slow)
+            for phases in PHASES
+            for effects in ((), DRIFTING, ("line_width",))
+        ),
+    ],
+)
 def test_the_company_of_points_changes_no_bit(effects, phases, table_4_1):
     """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
     number = 2 * POINTS + 40

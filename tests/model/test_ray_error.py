@@ -155,7 +155,7 @@ def _by_hand(seen, parameters, number):
     return np.maximum(errors, of_magnitude)
 
 
-@pytest.mark.parametrize("number", [19, 109])
+@pytest.mark.parametrize("number", [19, pytest.param(109, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("power", [6e-5, 0.006, 1.0])
 def test_it_is_what_the_formula_gives(table_4_1, number, power):
     """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0.
@@ -174,7 +174,7 @@ def test_it_is_what_the_formula_gives(table_4_1, number, power):
     np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-9)
 
 
-@pytest.mark.parametrize("number", [19, 109, 439])
+@pytest.mark.parametrize("number", [19, 109, pytest.param(439, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scene, surfaces", [("rough ground", 1), ("the edge of a table", 2)])
 def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, surfaces, number):
     """Of 99 in 100 shots at least half of it, of four in ten no more than ten times as much.
