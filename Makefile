@@ -95,6 +95,7 @@ effects: $(READY)
 
 # Time a point against model 19, ratios of one run on one machine.
 side-by-side: $(READY)
+	$(BIN)/pip install --quiet embreex  # which model 19 casts rays with
 	$(BIN)/python benchmarks/side_by_side.py
 
 scale: $(READY)
