@@ -30,10 +30,9 @@ demo: $(CORE)
 	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
 	$(BIN)/sweep figures results/quickstart.zarr
 
-# One process more than there are cores, as some tests wait for others' processes.
 test: $(READY)
 	$(MAKE) --no-print-directory --jobs 3 --output-sync timed-lint timed-kernels
-	$(TIMED) "tests" $(BIN)/pytest -n $$(($$(nproc) + 1)) --dist worksteal --durations 12
+	$(TIMED) "tests" $(BIN)/pytest -n auto --dist worksteal --durations 12
 
 timed-lint:
 	$(TIMED) "lint" $(MAKE) lint
