@@ -35,7 +35,7 @@ from sweep.tasks.eyepoint_study import (
 )
 from sweep.tasks.grid import Lattice, LatticeGrid
 from sweep.tasks.grid_study import coordinates
-from sweep.tasks.reuse import GrowingStudy
+from sweep.tasks.reuse import READING, GrowingStudy
 from sweep.tasks.study import ArrayLayout, BlockGrid, Results
 
 if TYPE_CHECKING:
@@ -211,7 +211,8 @@ class FlightStudy(GrowingStudy):
         numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
         results = shots | self._read(part.scanner, CYCLES, part.cycles)
         results |= {EFFECTS: selected.flags, ERROR: selected.error}
-        known = self._known(block, selected) if self.earlier else None
+        with READING:
+            known = self._known(block, selected) if self.earlier else None
         results |= self.look(part, shots, eyepoints, selected, numbers, known)
         found = {}
         for name in self.chunks(block):
