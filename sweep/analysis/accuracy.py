@@ -24,7 +24,7 @@ FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COU
 """Kinds of settings that are the same at every point."""
 
 AS_FAST, TIMES_FASTER = 1 / 1.1, 5.0
-"""What adaptive settings are held to: against the best fixed one, against the thesis's way."""
+"""Goals of adaptive settings: against the best fixed one, against the thesis's way."""
 
 OF_THESIS = 109
 """Beamlets of the thesis's way."""

@@ -47,11 +47,11 @@ MARKS = {
 """Marker, colour and words of each kind."""
 
 HALO = [withStroke(linewidth=2.5, foreground="white")]
-"""What keeps a name readable upon lines; marks are drawn upon it."""
+"""Halo that keeps a name readable upon lines; marks are drawn upon it."""
 
 
 PLACES = ((6, 5), (-6, -10), (6, -10), (-6, 5), (6, 15), (-6, -20), (6, -20), (-6, 15))
-"""Where a name may stand: right of its mark and above it, or left and below [points]."""
+"""Places that a name may take: right of its mark and above it, or left and below [points]."""
 
 MARK_SIZE = 7
 """Width of most marks [points]."""

@@ -427,7 +427,7 @@ def reach_of(level, weight, form):
 
 @njit(cache=True, error_model="numpy")
 def is_turned(origin, lowest, highest, view):
-    """Whether lines are seen at the bins of their negative frequencies."""
+    """True where lines are seen at the bins of their negative frequencies."""
     return origin + 0.5 * (lowest + highest) < 0.0 and view != COMPLEX
 
 

@@ -101,7 +101,7 @@ def pictures(tmp_path_factory):
 
 
 def short(values):
-    """How many values there are, and the lowest and highest to three digits."""
+    """Number of values, the lowest and highest to three digits."""
     values = np.asarray(values)
     if values.dtype.kind not in "fiu":
         return [str(v) for v in values.ravel()[:3]]
