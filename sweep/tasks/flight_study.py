@@ -35,7 +35,7 @@ from sweep.tasks.eyepoint_study import (
 )
 from sweep.tasks.grid import Lattice, LatticeGrid
 from sweep.tasks.grid_study import coordinates
-from sweep.tasks.reuse import READING, GrowingStudy
+from sweep.tasks.reuse import GrowingStudy
 from sweep.tasks.study import ArrayLayout, BlockGrid, Results
 
 if TYPE_CHECKING:
@@ -85,12 +85,7 @@ class ScannerBlocks(LatticeGrid):
             finer="shot",
             each=self.shots_a_cycle,
         )
-
-    @cached_property
-    def values(self) -> list[dict[str, np.ndarray]]:
-        """Values along each dimension: parameters, and numbers of draws and cycles."""
-        return [
-            *super().values,
+        self.values += [
             {"draw": np.arange(self.draws)},
             {"cycle": np.arange(self.total_cycles)},
         ]
@@ -211,8 +206,7 @@ class FlightStudy(GrowingStudy):
         numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
         results = shots | self._read(part.scanner, CYCLES, part.cycles)
         results |= {EFFECTS: selected.flags, ERROR: selected.error}
-        with READING:
-            known = self._known(block, selected) if self.earlier else None
+        known = self._known(block, selected) if self.earlier else None
         results |= self.look(part, shots, eyepoints, selected, numbers, known)
         found = {}
         for name in self.chunks(block):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -117,11 +117,8 @@ class Lattice:
         self.fixed: dict[str, float | int | str] = dict(spec.parameters())
         self._axes = tuple(spec.axes)
         self.shape = tuple(int(axis.size) for axis in self._axes)
-
-    @cached_property
-    def values(self) -> list[dict[str, np.ndarray]]:
-        """Values along each axis by the parameters they set."""
-        return [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+        """Values along each dimension by the parameters that they set."""
 
 
 class LatticeGrid(Lattice, BlockGrid):

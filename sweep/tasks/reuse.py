@@ -9,7 +9,6 @@ its receipt counts as absent. Points with other effects in the larger study are 
 from __future__ import annotations
 
 import math
-import threading
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
@@ -40,9 +39,6 @@ FREE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
 
 #: Values of an axis that are told where they would be lost.
 MOST_TOLD = 5
-
-READING = threading.Lock()
-"""Lets one thread of a process at a time take results from an older store."""
 
 #: Blocks of the older store that a process keeps in memory.
 BLOCKS_KEPT = 2

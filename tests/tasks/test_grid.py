@@ -4,8 +4,11 @@ import tracemalloc
 import numpy as np
 import pytest
 from small import STUDY, small
+from small_flights import small_scene
 
 from sweep.model.philox import point_keys
+from sweep.storage.locations import located
+from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid import (
     BLOCK_POINTS,
     MOST_BLOCKS,
@@ -185,3 +188,10 @@ def test_the_dearest_value_of_an_axis_decides_how_large_blocks_are():
     sizes = {"instrument.processing.fft_size": [2**12, 2**16, 2**14]}
     spec = small(axes=STUDY["axes"] | sizes, draws=SPECTRA)
     assert 1.1 > seconds_a_point(spec) / (1000 * 2e-7 * 2**16) > 1
+
+
+def test_what_runs_along_each_dimension_is_known_as_a_grid_is_made():
+    """Threads share a grid: what filled in later could be seen half filled."""
+    for grid in FlightStudy(small_scene(), located("none.zarr")).grids:
+        sizes = [len(next(iter(values.values()))) for values in vars(grid)["values"]]
+        assert sizes == list(grid.shape)
