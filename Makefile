@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy blocks stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -121,10 +121,6 @@ promise: $(READY)
 
 detectors: $(READY)
 	$(BIN)/python benchmarks/detectors.py
-
-# Whole blocks of flights, effects on demand against fixed ones, three minutes.
-blocks: $(READY)
-	$(BIN)/python benchmarks/blocks.py
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy.py

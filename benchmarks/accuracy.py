@@ -105,7 +105,7 @@ that at the bins. Three things would improve it, and stand beside it: half the t
 powers add, which are real (`real`; [T] adds amplitudes, which are not), a way back to the bins
 alone, by an FFT of a sixteenth of the size (`folded`, which is `real` too), and lines shared out
 among ten cells, by which they are where they belong (`degree 9`). All are compiled and transform
-many spectra at once (`sweep/tasks/accuracy/thesis_grid.py`), have no leakage and no range walk to
+many spectra at once (`sweep/tasks/accuracy/bench.py`), have no leakage and no range walk to
 compute, and share preparation and detection with the rest. The same beamlets with the same effects
 in closed form stand beside them too.
 
@@ -117,8 +117,7 @@ Planning counts for adaptive settings alone. A block takes some 1 ms to be plann
 nothing of what a thousand points take, and most of the time of a study of one or two points. Where
 adaptive settings are slower by more than 10 %, `sweep accuracy` says what is lost, and what it
 comes to with the making of the study's store. A run plans fixed settings too, as its store tells
-what they leave out, and its blocks draw points and solve for velocities besides: `make blocks`
-times whole blocks of flights against both, planned and not.
+what they leave out, and its blocks draw points and solve for velocities besides.
 """
 
 TAIL = """

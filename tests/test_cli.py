@@ -344,8 +344,8 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
 
 
 def test_no_effect_costs_more_than_its_points(here):
-    from sweep.tasks.effects_table import effects_table
     from sweep.tasks.grid_study import GridStudy
+    from sweep.tasks.plan import effects_table
 
     study = GridStudy(Spec.from_mapping(yaml.safe_load(STUDY)))
     costs = [row.cost for row in effects_table(study).rows]
@@ -356,12 +356,12 @@ def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_mod
     here, monkeypatch
 ):
     from sweep.model.unsupported import UnsupportedShot
-    from sweep.tasks import effects_table
+    from sweep.tasks import plan
 
     def beyond(spec, **how):
         raise UnsupportedShot("full scale is exceeded: raise it")
 
-    monkeypatch.setattr(effects_table, "effects_table", beyond)
+    monkeypatch.setattr(plan, "effects_table", beyond)
     refused(sweep("plan", "small.yaml"), "full scale is exceeded: raise it")
 
 
@@ -375,7 +375,7 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     import numpy as np
     import xarray as xr
 
-    from sweep.tasks.accuracy_table import accuracy_table
+    from sweep.tasks.summary import accuracy_table
 
     (here / "drawn.yaml").write_text(STUDY + DRAWN)
     run = sweep("run", "drawn.yaml", "--scheduler", "none")

@@ -15,8 +15,7 @@ from sweep.model.outputs import RUNNING
 from sweep.storage import logs, opening
 from sweep.storage.locations import JOURNAL, Location, located
 from sweep.storage.logs import read_lines, read_receipts
-from sweep.storage.opening import CHECKED, NotAStoreError
-from sweep.storage.unreplaced import readable
+from sweep.storage.opening import CHECKED, NotAStoreError, readable
 
 BATCH = "batch"
 PIECE = 2**20

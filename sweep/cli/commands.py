@@ -71,7 +71,7 @@ class Commands(click.Group):
             from sweep.scenes.files import SceneError
             from sweep.spec import SpecError
             from sweep.storage.locations import ObjectStoreError, worded
-            from sweep.storage.unreplaced import ReplacedError
+            from sweep.storage.opening import ReplacedError
             from sweep.tasks.errors import StoreError, TaskError
 
             told = (

@@ -13,8 +13,7 @@ from sweep.storage.locations import Location
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.effects_table import EffectRow, EffectsTable
-    from sweep.tasks.plan import Plan
+    from sweep.tasks.plan import EffectRow, EffectsTable, Plan
     from sweep.tasks.session import Outcome
 
 MISTAKE, INCOMPLETE = 2, 3
@@ -118,8 +117,7 @@ def _print_scene(store: Location) -> None:
 
 def tell_accuracy(store: Location) -> None:
     """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
-    from sweep.tasks.accuracy_table import accuracy_table, rays_table
-    from sweep.tasks.summary import beyond_model
+    from sweep.tasks.summary import accuracy_table, beyond_model, rays_table
 
     number, why = beyond_model(store)
     if number:
@@ -357,7 +355,7 @@ def warn_before(study: Spec | SceneSpec, store: Location) -> None:
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
     """Table of the effects that a study calls for, where, and their costs if asked for."""
-    from sweep.tasks.effects_table import effects_table
+    from sweep.tasks.plan import effects_table
     from sweep.tasks.studies import study_of
 
     return effects_table(study_of(study, store.absolute()), costs=costs)

@@ -26,7 +26,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.sections import Execution
 from sweep.tasks import user_code
-from sweep.tasks.clusters import common, kubernetes, local, ssh
+from sweep.tasks.clusters import kubernetes, machines
 from sweep.tasks.errors import ClusterError
 from sweep.tasks.grid import seconds_a_point
 from sweep.tasks.progress import Interrupts, Progress, chosen
@@ -269,7 +269,7 @@ def connected(
             yield Reached(client, bounds.most * cluster.worker.threads)
         return
     with (
-        local.spawning(),
+        machines.spawning(),
         _started(cluster, bounds, processes) as started,
         Client(started, set_as_default=False) as client,
     ):
@@ -296,7 +296,7 @@ def _reached(address: str, cluster: AnyCluster) -> Client:
         return Client(
             address,
             timeout=CONNECT_TIMEOUT,
-            security=common.security_of(cluster),
+            security=machines.security_of(cluster),
             set_as_default=False,
         )
     except (OSError, ValueError) as error:
@@ -307,14 +307,14 @@ def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> A
     import dask
 
     try:
-        with dask.config.set(common.CALM):
+        with dask.config.set(machines.CALM):
             if isinstance(cluster, Local):
-                return local.start(cluster, bounds, processes=processes)
+                return machines.start_here(cluster, bounds, processes=processes)
             if isinstance(cluster, Batch):
                 from sweep.tasks.clusters import batch
 
                 return batch.start(cluster, bounds)
-            return ssh.start(cluster, bounds)
+            return machines.start_by_ssh(cluster, bounds)
     except (OSError, RuntimeError, ImportError) as error:
         raise ClusterError(f"no workers could be started: {remedy(error) or error}") from error
 
@@ -330,7 +330,7 @@ def _keep(started: Any, cluster: AnyCluster, bounds: Bounds) -> None:
         batch.keep(started, cluster, bounds)
     elif bounds.least < bounds.most:
         least, most = bounds
-        started.adapt(minimum=least, maximum=most, target_duration=common.WORK_AHEAD)
+        started.adapt(minimum=least, maximum=most, target_duration=machines.WORK_AHEAD)
 
 
 def _described(cluster: AnyCluster, bounds: Bounds) -> str:

@@ -12,10 +12,17 @@ goes on in threads, beside what else there is to do; its memory is a few bytes a
 The recipe beside the logs is what a store's own bytes do not say: where its study's files are, and
 which store it extends. A study is the same wherever its files are, and however much of it was
 computed before. It is written anew by whoever runs the study from its spec.
+
+Blocks that take long are computed in pieces. A worker draws for some seconds, saves what it has in
+a file of the journal, and whoever takes up the block next goes on from there, to the same bytes.
+The file carries a digest: where it is damaged, cut short or of another block, its draws are taken
+again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 import stat
 import time
@@ -25,7 +32,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,9 +46,10 @@ from sweep.storage.logs import (
     read_receipts,
     read_sealed,
     sealed,
+    unsealed,
 )
 from sweep.tasks.errors import StoreError
-from sweep.tasks.study import Study
+from sweep.tasks.study import Found, Known, Study
 
 FAILURES = "failures.jsonl"
 SESSIONS = "sessions.jsonl"
@@ -319,3 +327,88 @@ def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> N
                     there[at] = _is_chunk(entry.stat())
     finally:
         os.close(opened)
+
+
+#: Beginning of the names of files in the journal, each of one block.
+BEGUN = "begun-"
+
+
+class Begun(NamedTuple):
+    """The saved part of a block."""
+
+    known: Known = Known()
+    points: float = 0.0
+    """That this comes to; a point that is drawn in part counts in part."""
+    seconds: float = 0.0
+    """Spent on it."""
+
+
+def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None:
+    """Save what there is of a block, in the place of less.
+
+    Raises
+    ------
+    OSError
+        Where it can't be written.
+    """
+    if read_begun(path, study_id, block).points >= begun.points:
+        return  # another worker, that was thought to be lost, was quicker
+    buffer = io.BytesIO()
+    np.savez(buffer, **dict(_arrays(begun.known)))
+    content = buffer.getvalue()
+    head = {
+        "study": study_id, "block": block, "points": begun.points, "seconds": begun.seconds,
+        "digest": _digest(content),
+    }  # fmt: skip
+    put_whole(_begun_file(path, block), sealed(head) + content)
+
+
+def read_begun(path: Location, study_id: str, block: int) -> Begun:
+    """The saved part of a block of a study."""
+    try:
+        line, _, content = _begun_file(path, block).read_bytes().partition(b"\n")
+    except (FileNotFoundError, NotADirectoryError):
+        return Begun()
+    head = unsealed(line + b"\n") or {}
+    if (head.get("study"), head.get("block")) != (study_id, block):
+        return Begun()
+    if head["digest"] != _digest(content):
+        return Begun()
+    found: dict[str, dict[str, np.ndarray]] = {"done": {}, "begun": {}}
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        for key, values in arrays.items():
+            part, _, name = key.partition("/")
+            found[part][name] = values
+    known = Known(**{part: Found(each.pop("points"), each) for part, each in found.items()})
+    return Begun(known, head["points"], head["seconds"])
+
+
+def begun_points(path: Location, study_id: str) -> dict[int, float]:
+    """Points that there are, in part, of blocks that are begun."""
+    numbers = [file.name.removeprefix(BEGUN) for file in (path / JOURNAL).glob(f"{BEGUN}*")]
+    found = {
+        int(each): read_begun(path, study_id, int(each)) for each in numbers if each.isdecimal()
+    }
+    return {block: begun.points for block, begun in found.items() if begun.points}
+
+
+def discard_begun(path: Location, block: int | str = "*") -> None:
+    """Remove what there is of a block, or of all."""
+    for file in (path / JOURNAL).glob(f"{BEGUN}{block}"):
+        file.unlink(missing_ok=True)
+
+
+def _begun_file(path: Location, block: int) -> Location:
+    return path / JOURNAL / f"{BEGUN}{block}"
+
+
+def _arrays(known: Known) -> dict[str, Any]:
+    return {
+        f"{part}/{name}": values
+        for part, (points, results) in known._asdict().items()
+        for name, values in {"points": points, **results}.items()
+    }
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()

@@ -17,7 +17,7 @@ import numpy as np
 
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.logs import read_receipts
-from sweep.tasks import begun, store
+from sweep.tasks import journal, store
 from sweep.tasks.cluster import Pool
 from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.journal import Failure, Journal, Look, Receipt, given_up
@@ -151,7 +151,7 @@ class Session:
             Rays that were cast for it.
         """
         start = time.monotonic()
-        self._begun = begun.begun_points(self._path, self._study.id)
+        self._begun = journal.begun_points(self._path, self._study.id)
         receipts = read_receipts(self._path, self._study.n_blocks)
         self._stored = int(receipts.sizes.sum())
         look = Look(self._path, self._study, receipts.points > 0)
@@ -187,7 +187,7 @@ class Session:
         )
         if outcome.complete:
             store.remove_partials(self._path)
-            begun.discard(self._path)
+            journal.discard_begun(self._path)
         self._record(
             "ended", blocks=outcome.blocks_computed, failed=len(outcome.failures), stopped=stopped
         )
@@ -307,7 +307,7 @@ class Session:
             for name in COUNTED:
                 self._committed[name] += getattr(receipt, name)
             if self._begun.pop(receipt.block, None) is not None:
-                begun.discard(self._path, receipt.block)
+                journal.discard_begun(self._path, receipt.block)
         self._gathered.clear()
 
     def _points(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sweep.storage.atomic_replace import draft
 from sweep.tasks.errors import StoreError
-from sweep.tasks.evaluate import draw_keys
+from sweep.tasks.grid_study import draw_keys
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,8 +8,8 @@ from typing import Any
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.logs import read_receipts
 from sweep.tasks import journal, lock, studies
-from sweep.tasks.begun import begun_points
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.journal import begun_points
 
 
 @dataclass(frozen=True, kw_only=True)

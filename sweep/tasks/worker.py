@@ -18,11 +18,10 @@ from typing import TypeVar
 from sweep.storage.atomic_replace import stamp
 from sweep.storage.locations import located
 from sweep.storage.opening import read_attributes
-from sweep.tasks import begun, identity, store, studies
-from sweep.tasks.begun import Begun
+from sweep.tasks import identity, journal, store, studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.journal import Failure, Receipt
+from sweep.tasks.journal import Begun, Failure, Receipt
 from sweep.tasks.study import Evaluate, Results, Stop, Unfinished
 
 T = TypeVar("T")
@@ -152,7 +151,7 @@ def _one(arrays: store.Arrays, block: int, job: Job, stop: Stop) -> Receipt | fl
     if job.evaluate:
         evaluate = partial(job.evaluate, held, block)
     elif isinstance(held, GridStudy) and held.spec.draws.any:
-        before = begun.read(path, held.id, block)
+        before = journal.read_begun(path, held.id, block)
         evaluate = partial(held.evaluate, block, before.known, stop)
     else:
         evaluate = partial(held.evaluate, block)
@@ -161,7 +160,7 @@ def _one(arrays: store.Arrays, block: int, job: Job, stop: Stop) -> Receipt | fl
     except Unfinished as unfinished:
         _refuse_another(str(path), held.id)
         spent = before.seconds + time.perf_counter() - start
-        begun.write(path, held.id, block, Begun(unfinished.known, unfinished.points, spent))
+        journal.write_begun(path, held.id, block, Begun(unfinished.known, unfinished.points, spent))
         return unfinished.points
     evaluated = time.perf_counter()
     _refuse_another(str(path), held.id)  # its driver may be long dead

@@ -13,7 +13,7 @@ import pytest
 from small import receipts, small, tree
 
 from sweep.tasks import scheduler, session
-from sweep.tasks.clusters import local
+from sweep.tasks.clusters import machines
 from sweep.tasks.driver import run
 from sweep.tasks.progress import Progress
 
@@ -55,7 +55,7 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
 def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):
-    monkeypatch.setattr(local, "FROZEN", "1 s")  # ten heartbeats at least
+    monkeypatch.setattr(machines, "FROZEN", "1 s")  # ten heartbeats at least
     monkeypatch.setattr(scheduler, "LEASE", 1.0)
     pid = tmp_path / "pid"
 
@@ -94,7 +94,7 @@ class Ending(Progress):
 def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr(session, "ABSENT", 1.0)
     monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
-    clusters, start = [], local.start
+    clusters, start = [], machines.start_here
 
     def started(*given, **options):
         clusters.append(start(*given, **options))
@@ -104,7 +104,7 @@ def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, mon
         time.sleep(0.05)  # so that some are left
         return study.evaluate(block)
 
-    monkeypatch.setattr(local, "start", started)
+    monkeypatch.setattr(machines, "start_here", started)
     told = Ending(clusters)
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}):
         outcome = run(

@@ -9,7 +9,7 @@ from small import quiet, small, tree
 from sweep.cli import main
 from sweep.spec import cluster_of
 from sweep.tasks import cluster
-from sweep.tasks.clusters import common
+from sweep.tasks.clusters import machines
 from sweep.tasks.errors import ClusterError
 
 LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
@@ -77,5 +77,5 @@ def test_a_dashboard_has_the_port_asked_for_or_any_where_that_is_taken():
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
         asked = cluster_of({**LOCAL, "scheduler": {"dashboard": f"127.0.0.1:{port}"}}).scheduler
-        assert common.dashboard(asked) == "127.0.0.1:0"
-    assert common.dashboard(asked) == f"127.0.0.1:{port}"
+        assert machines.dashboard(asked) == "127.0.0.1:0"
+    assert machines.dashboard(asked) == f"127.0.0.1:{port}"

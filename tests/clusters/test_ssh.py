@@ -14,7 +14,7 @@ import pytest
 from small import quiet, small, tree
 
 from sweep.spec import cluster_of
-from sweep.tasks.clusters import certificates, ssh
+from sweep.tasks.clusters import certificates, machines
 from sweep.tasks.errors import ClusterError
 
 SSH = {
@@ -31,15 +31,15 @@ def test_workers_are_dealt_out_evenly():
     cluster = cluster_of({**SSH, "hosts": hosts, "workers": 10})
     shares = {
         host: each["options"]["kwargs"]["n_workers"]
-        for host, each in ssh.workers(cluster, 10).items()
+        for host, each in machines.ssh_workers(cluster, 10).items()
     }
     assert shares == {"a": 3, "b": 3, "c": 2, "d": 2}
-    assert list(ssh.workers(cluster, 2)) == ["a", "b"]
+    assert list(machines.ssh_workers(cluster, 2)) == ["a", "b"]
 
 
 def test_workers_have_the_threads_of_the_file():
     cluster = cluster_of({**SSH, "worker": {"memory": "1 GB", "threads": 3}})
-    assert ssh.nanny(cluster)["nthreads"] == 3
+    assert machines.ssh_nanny(cluster)["nthreads"] == 3
 
 
 @contextmanager

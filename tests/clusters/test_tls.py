@@ -12,7 +12,7 @@ from small import quiet, small, tree
 from sweep.cli import main
 from sweep.spec import cluster_of
 from sweep.tasks import cluster
-from sweep.tasks.clusters import certificates, common
+from sweep.tasks.clusters import certificates, machines
 from sweep.tasks.errors import ClusterError
 
 
@@ -144,7 +144,7 @@ def listening(processes) -> set[tuple[str, int]]:
 
 
 def test_certificates_reach_every_role(security):
-    settings = common.security_settings(local(security=security))
+    settings = machines.security_settings(local(security=security))
     for role in ("client", "scheduler", "worker"):
         assert settings[f"tls_{role}_cert"] == security["certificate"]
         assert settings[f"tls_{role}_key"] == security["key"]

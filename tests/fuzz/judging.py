@@ -14,8 +14,8 @@ from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, NO_BIN, OUTPUTS, WI
 from sweep.model.unsupported import UnsupportedShot
 from sweep.spec import Mistake, Spec, SpecError, from_stored, load
 from sweep.tasks import plan as planning
-from sweep.tasks.effects_table import effects_table
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.plan import effects_table
 from sweep.tasks.study import Results
 from sweep.tasks.summary import why_beyond
 

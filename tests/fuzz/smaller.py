@@ -10,7 +10,7 @@ from unittest import mock
 
 from spoilt_specs import NOTHING, places, put
 
-from sweep.tasks import effects_table, eyepoint_study, plan
+from sweep.tasks import eyepoint_study, plan
 
 
 @contextmanager
@@ -20,9 +20,9 @@ def swiftly() -> Iterator[None]:
         mock.patch.object(plan, "MEASURING", 1e-3),
         mock.patch.object(plan, "MEASURING_SCANNER", 1e-3),
         mock.patch.object(eyepoint_study, "NODES", 24),
-        mock.patch.object(effects_table, "COST_POINTS", 1),
-        mock.patch.object(effects_table, "COST_TILES", 1),
-        mock.patch.object(effects_table, "ROUNDS", 1),
+        mock.patch.object(plan, "COST_POINTS", 1),
+        mock.patch.object(plan, "COST_TILES", 1),
+        mock.patch.object(plan, "ROUNDS", 1),
     ):
         yield
 

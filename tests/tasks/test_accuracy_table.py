@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from small import STUDY, quiet, small
 
 from sweep.cli import main
-from sweep.tasks.accuracy_table import accuracy_table, rays_table
+from sweep.tasks.summary import accuracy_table, rays_table
 
 ROUGH = {
     "target": STUDY["target"] | {"roughness": "10 um"},

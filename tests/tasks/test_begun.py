@@ -12,11 +12,11 @@ from small import STUDY, quiet, receipts, small, tree
 
 from sweep.model import sampling
 from sweep.storage.locations import ObjectPath
-from sweep.tasks import begun, progress, worker
-from sweep.tasks.begun import Begun
+from sweep.tasks import journal, progress, worker
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.journal import Begun
 from sweep.tasks.packing import pack
 from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
@@ -56,13 +56,13 @@ def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
 @pytest.fixture
 def saved(monkeypatch):
     """Points of a block that were saved, piece by piece."""
-    points, real = [], begun.write
+    points, real = [], journal.write_begun
 
     def write(path, study_id, block, found):
         points.append(found.points)
         real(path, study_id, block, found)
 
-    monkeypatch.setattr(begun, "write", write)
+    monkeypatch.setattr(journal, "write_begun", write)
     cut(monkeypatch.setattr)
     return points
 
@@ -77,7 +77,7 @@ def whole(tmp_path_factory):
             store = tmp_path_factory.mktemp("whole") / "whole.zarr"
             with pytest.MonkeyPatch.context() as context:
                 cut(context.setattr, piece=1 << 16, rows=4096, samples=1 << 18, seconds=600.0)
-                context.setattr(begun, "write", None)  # short blocks are never saved
+                context.setattr(journal, "write_begun", None)  # short blocks are never saved
                 assert quiet(drawn(kind, ranges), store).complete
             stores[kind, ranges] = tree(store)
         return stores[kind, ranges]
@@ -132,7 +132,7 @@ def test_a_block_of_several_points_is_stopped_at_any_of_them(
 ):
     ranges = ("100 m", "1 km", "2 km", "6 km")
     expected = whole(kind, ranges)
-    monkeypatch.setattr("sweep.tasks.evaluate.SUB_BATCH", 2)
+    monkeypatch.setattr("sweep.tasks.grid_study.SUB_BATCH", 2)
     assert quiet(drawn(kind, ranges), tmp_path / "pieces.zarr").complete
     assert tree(tmp_path / "pieces.zarr") == expected
     assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)
@@ -160,14 +160,14 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from test_begun import cut, drawn, quiet
-from sweep.tasks import begun
+from sweep.tasks import journal
 
-def write(path, study_id, block, found, real=begun.write):
+def write(path, study_id, block, found, real=journal.write_begun):
     real(path, study_id, block, found)
     if found.points > 0.5:
         os.kill(os.getpid(), 9)
 
-begun.write = write
+journal.write_begun = write
 cut()
 quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
 """
@@ -237,18 +237,22 @@ def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved
 def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(place, tmp_path):
     store = place(tmp_path / "store.zarr")
     part = Found(np.array([4, 2]), {"pd_up": np.array([0.5, np.nan]), "n": np.array([[1], [2]])})
-    assert begun.read(store, "one", 7) == Begun() and begun.begun_points(store, "one") == {}
+    assert (
+        journal.read_begun(store, "one", 7) == Begun() and journal.begun_points(store, "one") == {}
+    )
     for points in (0.5, 0.25):  # less than there is takes no place
-        begun.write(store, "one", 7, Begun(Known(begun=part), points, 1.5))
-    found = begun.read(store, "one", 7)
+        journal.write_begun(store, "one", 7, Begun(Known(begun=part), points, 1.5))
+    found = journal.read_begun(store, "one", 7)
     assert (found.points, found.seconds) == (0.5, 1.5) and not found.known.done.points.size
     np.testing.assert_array_equal(found.known.begun.points, part.points)
     for name, values in part.results.items():
         np.testing.assert_array_equal(found.known.begun.results[name], values)
-    assert begun.begun_points(store, "one") == {7: 0.5} and begun.begun_points(store, "two") == {}
-    begun.discard(store, 7)
-    begun.discard(store, 7)
-    assert begun.begun_points(store, "one") == {}
+    assert (
+        journal.begun_points(store, "one") == {7: 0.5} and journal.begun_points(store, "two") == {}
+    )
+    journal.discard_begun(store, 7)
+    journal.discard_begun(store, 7)
+    assert journal.begun_points(store, "one") == {}
 
 
 def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
@@ -262,7 +266,7 @@ def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
 
 
 def test_workers_that_do_not_find_what_others_saved_end_the_run(saved, tmp_path, monkeypatch):
-    monkeypatch.setattr(begun, "read", lambda *place: Begun())
+    monkeypatch.setattr(journal, "read_begun", lambda *place: Begun())
     with pytest.raises(StoreError, match="do all of them see the same store"):
         quiet(drawn(), tmp_path / "lost.zarr")
     assert len(saved) == 2
@@ -272,9 +276,9 @@ def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
     store = tmp_path / "slow.zarr"
     interrupted(drawn(), store)
     place = store, status(store).study_id, 0
-    found = begun.read(*place)
-    begun.discard(store, 0)
-    begun.write(*place, found._replace(seconds=100.0))
+    found = journal.read_begun(*place)
+    journal.discard_begun(store, 0)
+    journal.write_begun(*place, found._replace(seconds=100.0))
     outcome = quiet_resume(store, block_timeout=99.0)
     assert "longer than the 99 s" in outcome.failures[0].error and left(store) == ["begun-0"]
     assert quiet_resume(store, block_timeout=1000.0, retry_failed=True).complete
@@ -284,7 +288,7 @@ def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
 def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
     store = tmp_path / "timed.zarr"
     interrupted(drawn(), store)
-    spent = begun.read(store, status(store).study_id, 0).seconds
+    spent = journal.read_begun(store, status(store).study_id, 0).seconds
     outcome = quiet_resume(store)
     assert outcome.work_seconds > spent > 0
 

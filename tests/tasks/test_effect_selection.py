@@ -15,9 +15,9 @@ from sweep.tasks.effect_selection import (
     _stretches,
     tile_shape,
 )
-from sweep.tasks.effects_table import effects_table
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.plan import effects_table
 from sweep.tasks.studies import study_of
 
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")

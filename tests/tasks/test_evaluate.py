@@ -10,8 +10,8 @@ from sweep.cli import main
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS, RUNNING
 from sweep.model.realisations import RUNNING_COLUMNS
-from sweep.tasks.evaluate import evaluate_points, select
 from sweep.tasks.grid import Grid
+from sweep.tasks.grid_study import evaluate_points, select
 from sweep.tasks.summary import beyond_model
 
 RANDOM = (*CORE, "speckle", "pointing_jitter")

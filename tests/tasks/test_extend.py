@@ -18,7 +18,7 @@ from small_flights import small_scene
 from sweep.cli import main
 from sweep.model import sampling
 from sweep.storage.atomic_replace import beside
-from sweep.tasks import evaluate
+from sweep.tasks import grid_study
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
@@ -36,13 +36,13 @@ REFLECTANCE = "target.reflectance"
 def computed(monkeypatch):
     """Points that the model is given, call by call; not those that compile it."""
     calls: list[int] = []
-    real = evaluate.evaluate_points
+    real = grid_study.evaluate_points
 
     def counted(spec, parameters, count, *rest):
         calls.append(count)
         return real(spec, parameters, count, *rest)
 
-    monkeypatch.setattr(evaluate, "evaluate_points", counted)
+    monkeypatch.setattr(grid_study, "evaluate_points", counted)
     monkeypatch.setattr(GridStudy, "compile", lambda self: None)
     return calls
 

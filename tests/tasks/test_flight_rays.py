@@ -18,10 +18,10 @@ from sweep.model.resolution import rays_needed
 from sweep.report.provenance import accuracy
 from sweep.spec import SceneSpec
 from sweep.tasks import eyepoint_study
-from sweep.tasks.accuracy_table import rays_table
 from sweep.tasks.driver import extend
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import eyepoints_path
+from sweep.tasks.summary import rays_table
 
 RAYS = Accuracy.rays
 

@@ -12,7 +12,7 @@ from distributed import Client, LocalCluster
 from small import copied, evaluated, quiet, receipts, small, tree
 
 from sweep.tasks import worker
-from sweep.tasks.clusters import local
+from sweep.tasks.clusters import machines
 from sweep.tasks.driver import resume, run
 from sweep.tasks.status import status
 from sweep.tasks.worker import Overtime
@@ -72,7 +72,7 @@ def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_g
     undisturbed, tmp_path, monkeypatch
 ):
     path = tmp_path / "small.zarr"
-    monkeypatch.setattr(local, "_memory", lambda cluster, bounds: 1 << 30)
+    monkeypatch.setattr(machines, "_memory", lambda cluster, bounds: 1 << 30)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
         outcome = run(
             small(), store=path, progress=False, workers=2, block_timeout=20.0,

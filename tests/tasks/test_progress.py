@@ -95,7 +95,7 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
 @pytest.mark.parametrize(
     "arguments, inner",
     [
-        (("plan", "small.yaml"), "sweep.tasks.effects_table.effects_table"),
+        (("plan", "small.yaml"), "sweep.tasks.plan.effects_table"),
         (("shot", "small.yaml"), "sweep.analysis.shot_figure.report"),
         (("spectra", "small.yaml", "-o", "s.npz"), "sweep.tasks.spectra_export.spectra"),
         (("figures", "small.zarr"), "sweep.analysis.figures.draw"),

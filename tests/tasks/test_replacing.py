@@ -15,7 +15,7 @@ from small import STUDY, copied, failing, quiet, small, tree
 import sweep
 from sweep.cli import main
 from sweep.storage.atomic_replace import beside
-from sweep.storage.unreplaced import ReplacedError
+from sweep.storage.opening import ReplacedError
 from sweep.tasks import cluster, packing
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import ClusterError, StoreError

@@ -16,7 +16,7 @@ from dask_jobqueue.slurm import SLURMJob
 from distributed.core import Status
 
 from sweep.spec.clusters import Batch, Bounds, Slurm
-from sweep.tasks.clusters import common
+from sweep.tasks.clusters import machines
 
 #: Seconds until a running cluster submits again what was not taken.
 PAUSE = 15.0
@@ -92,7 +92,7 @@ def start(cluster: Batch, bounds: Bounds) -> Any:
 def keep(started: Any, cluster: Batch, bounds: Bounds) -> None:
     """Submit jobs in the place of those that end, and more or fewer with the work, in bounds."""
     least, most = (jobs(cluster, number) for number in bounds)
-    started.adapt(minimum_jobs=least, maximum_jobs=most, target_duration=common.WORK_AHEAD)
+    started.adapt(minimum_jobs=least, maximum_jobs=most, target_duration=machines.WORK_AHEAD)
 
 
 async def _submit(cluster: Any, number: int) -> None:
@@ -124,15 +124,15 @@ def options(cluster: Batch) -> dict[str, Any]:
             *job.prologue,
             *(
                 f"export {name}={shlex.quote(value)}"
-                for name, value in common.environment(cluster.environment).items()
+                for name, value in machines.environment(cluster.environment).items()
             ),
         ],
         "worker_extra_args": [
-            *("--preload", common.PRELOAD, "--no-dashboard"),
+            *("--preload", machines.PRELOAD, "--no-dashboard"),
             *("--lifetime", f"{lifetime:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"),
         ],
-        "security": common.security_of(cluster),
-        "scheduler_options": common.scheduler_options(cluster.scheduler),
+        "security": machines.security_of(cluster),
+        "scheduler_options": machines.scheduler_options(cluster.scheduler),
     }
     named = {"queue": job.queue, "account": job.account, "python": cluster.python}
     return given | {name: value for name, value in named.items() if value}

@@ -14,7 +14,7 @@ from typing import Any
 
 from sweep.extras import remedy
 from sweep.spec.clusters import Bounds, Kubernetes
-from sweep.tasks.clusters import common
+from sweep.tasks.clusters import machines
 from sweep.tasks.errors import ClusterError
 
 API = "kubernetes.dask.org/v1"
@@ -176,7 +176,7 @@ def _worker_words(cluster: Kubernetes) -> list[str]:
     worker = cluster.worker
     size = ["--nthreads", str(worker.threads), "--memory-limit", str(int(worker.memory))]
     name = ["--name", "$(DASK_WORKER_NAME)", "--no-dashboard"]
-    return ["dask", "worker", *name, *size, "--preload", common.PRELOAD, *_tls(cluster)]
+    return ["dask", "worker", *name, *size, "--preload", machines.PRELOAD, *_tls(cluster)]
 
 
 def _tls(cluster: Kubernetes) -> list[str]:
@@ -189,11 +189,11 @@ def _tls(cluster: Kubernetes) -> list[str]:
 
 def _scheduler_environment() -> dict[str, str]:
     return {
-        "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": common.WORK_AHEAD,
+        "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": machines.WORK_AHEAD,
         "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": str(ROUTES),
     }
 
 
 def _worker_environment(cluster: Kubernetes) -> dict[str, str]:
     address = f"{protocol(cluster)}://{host(cluster)}:{PORT}"
-    return {"DASK_SCHEDULER_ADDRESS": address, **common.environment(cluster.environment)}
+    return {"DASK_SCHEDULER_ADDRESS": address, **machines.environment(cluster.environment)}

@@ -1,0 +1,236 @@
+"""Workers on this machine and on machines reached by SSH; settings that all clusters share."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from sweep.spec.clusters import SSH, Bounds, Cluster, Local, Scheduler
+
+if TYPE_CHECKING:
+    from distributed import Security
+
+#: What a worker runs as it starts.
+PRELOAD = "sweep.tasks.preload"
+
+#: One thread a worker slot in every library that would start its own.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+#: Variable that keeps the working directory out of the places that modules are imported from: a
+#: file `socket.py` there would be run by every worker.
+SAFE_PATH = "PYTHONSAFEPATH"
+
+#: How often Dask looks at itself. By default it does so some 150 times a second in each worker,
+#: which takes a tenth of the processor's time from whatever else the worker does. And no pause near
+#: the memory's limit: tasks leave nothing behind that could be waited for, so a worker that paused
+#: would do so for ever. At the limit it is ended, and its blocks go elsewhere.
+CALM: dict[str, Any] = {
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "2s",
+    "distributed.worker.profile.interval": "200ms",
+    "distributed.worker.profile.cycle": "10s",
+    "distributed.worker.memory.monitor-interval": "200ms",
+    "distributed.worker.memory.pause": False,
+}
+
+#: Seconds of work ahead for which a cluster between bounds takes another worker thread.
+WORK_AHEAD = "1s"
+
+
+def environment(given: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables of workers: one thread a slot, calm, wary, and those given."""
+    calm = {
+        f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
+        for name, setting in CALM.items()
+    }
+    return {**ONE_THREAD, SAFE_PATH: "1", **calm, **given}
+
+
+def security_of(cluster: Cluster) -> Security | None:
+    """Certificates of client, scheduler and workers, which then refuse whoever has none."""
+    from distributed import Security
+
+    settings = security_settings(cluster)
+    return Security(**settings) if settings else None
+
+
+def security_settings(cluster: Cluster) -> dict[str, Any]:
+    """Settings of `distributed.Security`; empty without certificates."""
+    paths = cluster.certificates()
+    if paths is None:
+        return {}
+    ca, certificate, key = paths
+    parts: dict[str, str] = {}
+    for role in ("client", "scheduler", "worker"):
+        parts |= {f"tls_{role}_cert": certificate, f"tls_{role}_key": key}
+    return {"require_encryption": True, "tls_ca_file": ca, **parts}
+
+
+def scheduler_options(section: Scheduler) -> dict[str, Any]:
+    """Address at which a scheduler of this process listens, and that of its dashboard."""
+    options: dict[str, Any] = {"port": section.port, "dashboard_address": dashboard(section)}
+    if section.interface:
+        return options | {"interface": section.interface}
+    return options | {"host": section.host or "127.0.0.1"}
+
+
+def dashboard(section: Scheduler) -> str:
+    """Address for a dashboard: the one asked for, or any port where that is taken."""
+    host, _, port = section.dashboard.rpartition(":")
+    with socket.socket() as probe:
+        try:
+            probe.bind((host, int(port)))
+        except (OSError, ValueError):
+            return f"{host}:0"
+    return section.dashboard
+
+
+LEAST_MEMORY = 1 << 30
+
+#: Time after which a worker that shows no sign of life is ended, and started anew.
+FROZEN = "2 minutes"
+
+
+@contextmanager
+def spawning() -> Iterator[None]:
+    """Surroundings in which workers are started, and started anew, as processes.
+
+    A process that is spawned imports from the working directory, unless told otherwise, and runs
+    the script that its parent runs, up to ``if __name__ == "__main__"``, which many scripts lack.
+    Workers need nothing of it: functions in it travel by value.
+    """
+    main, safe = vars(sys.modules["__main__"]), os.environ.get(SAFE_PATH)
+    kept = {name: main.pop(name) for name in [*main] if name in ("__file__", "__spec__")}
+    main["__spec__"] = None
+    os.environ[SAFE_PATH] = "1"  # for what multiprocessing starts itself, too
+    try:
+        yield
+    finally:
+        main.update(kept)
+        os.environ.pop(SAFE_PATH)
+        if safe is not None:
+            os.environ[SAFE_PATH] = safe
+
+
+def start_here(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
+    """Workers of this machine, as processes or as threads of this one.
+
+    Raises
+    ------
+    OSError, RuntimeError, ImportError
+        Where they can't be started.
+    """
+    import dask
+    from distributed import LocalCluster, Security
+
+    listening = scheduler_options(cluster.scheduler)
+    dashboard, port = listening.pop("dashboard_address"), listening.pop("port")
+    options: dict[str, Any] = {
+        "n_workers": bounds.least,
+        "threads_per_worker": cluster.worker.threads,
+        "processes": processes,
+        "memory_limit": _memory(cluster, bounds) if processes else 0,
+        "preload": [PRELOAD],
+        "security": security_of(cluster),
+    }
+    if processes:  # threads need no port
+        options |= listening | {"scheduler_port": port}
+        options["scheduler_kwargs"] = {"worker_ttl": FROZEN}
+        options["security"] = options["security"] or Security.temporary()
+    else:
+        options["worker_dashboard_address"] = "127.0.0.1:0"  # which is for everyone to see without
+    name = "distributed.nanny.pre-spawn-environ"
+    variables = {**dask.config.get(name), **environment(cluster.environment)}
+    with dask.config.set({**CALM, name: variables}):
+        try:
+            return LocalCluster(dashboard_address=dashboard, **options)
+        except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
+            return LocalCluster(dashboard_address=None, **options)
+
+
+def _memory(cluster: Local, bounds: Bounds) -> int:
+    """Bytes that a worker may take before Dask restarts it: by default its share of 90 %."""
+    from distributed.system import MEMORY_LIMIT
+
+    given = cluster.worker.memory
+    return int(given) if given else max(LEAST_MEMORY, int(0.9 * MEMORY_LIMIT / bounds.most))
+
+
+def start_by_ssh(cluster: SSH, bounds: Bounds) -> Any:
+    """Workers on all machines.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        Where a machine can't be reached, or starts no worker.
+    """
+    import asyncssh
+    from distributed import Scheduler, SpecCluster
+
+    security = security_of(cluster)
+    protocol = {"protocol": "tls://", "security": security} if security else {}
+    try:
+        return SpecCluster(
+            workers=ssh_workers(cluster, bounds.most),
+            scheduler={
+                "cls": Scheduler,
+                "options": scheduler_options(cluster.scheduler) | protocol,
+            },
+            security=security,
+            name="SSH",
+        )
+    except asyncssh.Error as error:
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+
+def ssh_workers(cluster: SSH, number: int) -> dict[str, dict[str, Any]]:
+    """Workers to start on each machine, by its name: they are dealt out evenly."""
+    from distributed.deploy.ssh import Worker
+
+    hosts = cluster.hosts[:number]
+    shares = [number // len(hosts) + (i < number % len(hosts)) for i in range(len(hosts))]
+    return {
+        host: {
+            "cls": Worker,
+            "options": {
+                "address": host,
+                "connect_options": _connection(cluster),
+                "remote_python": cluster.python or None,
+                "worker_class": "distributed.Nanny",
+                "kwargs": ssh_nanny(cluster) | {"n_workers": share},
+            },
+        }
+        for host, share in zip(hosts, shares, strict=True)
+    }
+
+
+def _connection(cluster: SSH) -> dict[str, Any]:
+    """Arguments of `asyncssh.connect`."""
+    given = {
+        "username": cluster.user,
+        "client_keys": cluster.identity and [cluster.path(cluster.identity)],
+        "known_hosts": cluster.known_hosts and cluster.path(cluster.known_hosts),
+    }
+    return {"port": cluster.port, **{name: value for name, value in given.items() if value}}
+
+
+def ssh_nanny(cluster: SSH) -> dict[str, Any]:
+    """Arguments of the nannies there: what JSON can hold."""
+    security = security_settings(cluster)
+    return {
+        "nthreads": cluster.worker.threads,
+        "memory_limit": int(cluster.worker.memory),
+        "preload": [PRELOAD],
+        "env": environment(cluster.environment),
+        "dashboard": False,
+        **({"security": security, "protocol": "tls://"} if security else {}),
+    }
