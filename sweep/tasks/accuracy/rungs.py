@@ -76,7 +76,7 @@ class Rung:
     overrides
         Values of fields of the spec by dotted path, as one would write them.
     thesis
-        Options of :func:`sweep.tasks.accuracy.bench.find`, where it finds the peaks.
+        Options of :func:`sweep.tasks.accuracy.bench.find_on_grid`, where it finds the peaks.
     rays_error
         What the rays of a flight's shots may leave before they are cast with more; 0 where the
         spec says that.
