@@ -1,11 +1,36 @@
-"""Bins and lines of a segment as detection and leakage look at them."""
+"""Shots of one category, keys of points, and bins and lines as detection and leakage see them."""
 
 import numpy as np
 
-from sweep.model import line_shape
+from sweep.model import line_shape, philox
+from sweep.model.effects.catalogue import CORE
 from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
 from sweep.model.segments import runs_of
+from sweep.model.shot import prepare
 from sweep.model.spectrum import IMAGED
+
+
+def prepared(parameters, effects=CORE):
+    """Shots of parameters that are all of one category."""
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
+
+
+def keys(n, seed=5):
+    """Keys of n points."""
+    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
+
+
+def by_vectors(distance, grazing, off):
+    """Range and grazing angle of jittered rays that are followed down to the plane z = 0."""
+    start = np.array([0.0, 0.0, distance * np.sin(grazing)])
+    aim = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])
+    up, aside = np.array([np.sin(grazing), 0.0, np.cos(grazing)]), np.array([0.0, 1.0, 0.0])
+    angle = np.hypot(*off.T)[:, None]
+    across = off[:, :1] * up + off[:, 1:] * aside
+    direction = aim * np.cos(angle) + across * np.sinc(angle / np.pi)
+    far = -start[2] / direction[:, 2]
+    return far, np.arcsin(-direction[:, 2]), direction
 
 
 def run_of_bins(shots, segment):

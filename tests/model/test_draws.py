@@ -62,17 +62,6 @@ def test_batches_split_the_same_draws(table_4_1, method):
         assert np.array_equal(counts[:, 1], later[name][:, 0]), name
 
 
-def test_a_points_draws_do_not_depend_on_its_neighbours(table_4_1):
-    parameters = _points(table_4_1, tnr=7.0)
-    chosen = {"batch_sizes": [200], "method": "noise"}
-    together = simulate(parameters, CORE, keys=_keys(6), **chosen)
-    alone = parameters | {"target.range": parameters["target.range"][4:5]}
-    single = simulate(alone, CORE, keys=_keys(6)[4:5], **chosen)
-    for name in DRAW_OUTPUTS:
-        counts = single[name]
-        assert counts[0, 0] == together[name][4, 0], name
-
-
 def test_direct_detection_draws_no_doppler_detection(table_4_1):
     parameters = table_4_1() | {
         "instrument.receiver.architecture": "direct",

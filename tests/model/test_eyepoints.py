@@ -3,43 +3,21 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_scenes import flight, observed, plate
 
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight, Nadir, Spin
+from sweep.model.geometry.platform import ConstantAcceleration, Flight, Spin
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import LineScan, cone, corners, fixed
 from sweep.model.shot import evaluate, statistics
-from sweep.scenes.meshes import clean
 
-LEVEL = 1.0, 0.0, 0.0, 0.0
 GROUND = Surface("ground", 0.1, "lambert")
 
 
-def _plane(size=1e5, height=0.0):
-    """Level ground as two triangles."""
-    corner = size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    vertices = np.column_stack([corner, np.full(4, height)])
-    return clean(vertices, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
-
-
-def _flight(position=(0.0, 0.0, 1000.0), velocity=(0.0, 0.0, 0.0), attitude=None, **keywords):
-    path = ConstantAcceleration(position, velocity, (0.0, 0.0, 0.0), 10.0)
-    return Flight(path, attitude or Fixed(LEVEL), **keywords)
-
-
-def _observed(flight, *, beams=None, caster=None, index=(0,), number=19, **keywords):
-    scanner = fixed(np.array([[0, 0, -1.0]]) if beams is None else beams, rate=1.0)
-    return observe(
-        np.asarray(index),
-        flight=flight,
-        scanner=scanner,
-        caster=caster or Caster(_plane()),
-        beam_divergence=keywords.pop("beam_divergence", 50e-6),
-        number=number,
-        **keywords,
-    )
+def square(half):
+    return plate((-half, half), (-half, half))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 75.0])
@@ -49,7 +27,7 @@ def test_level_ground_gives_what_the_flat_plane_gives(table_4_1, tilt, phases):
     beams = cone(1, half_angle=np.radians(tilt), azimuth=np.pi / 2)
     pattern = "sunflower" if phases == "coherent" else "hexagonal"
     along = 45.0 * beams[0]  # no velocity across the beam: no Doppler spread, as on the plane
-    seen = _observed(_flight(velocity=along), beams=beams, number=109, pattern=pattern)
+    seen = observed(flight(velocity=along), beams=beams, number=109, pattern=pattern)
     parameters = table_4_1(phases=phases, reflectance_law="lambert")
     shots = prepare_eyepoints(seen, parameters, [GROUND])
     got = statistics(shots)
@@ -74,36 +52,11 @@ def test_level_ground_gives_what_the_flat_plane_gives(table_4_1, tilt, phases):
 
 
 def test_ranges_of_beamlets_are_those_of_rays_and_plane():
-    seen = _observed(_flight(), beams=cone(1, half_angle=0.5), beam_divergence=2e-3)
+    seen = observed(flight(), beams=cone(1, half_angle=0.5), beam_divergence=2e-3)
     # R cos(angle from nadir) is the height for every beamlet; the covariance gives the spread
     sigma = np.sqrt(np.sum(seen.weight * (seen.offset - seen.offset @ seen.weight) ** 2))
     assert sigma == pytest.approx(seen.range[0] * (2e-3 / 4) * np.tan(0.5), rel=5e-3)
     np.testing.assert_allclose((seen.range[:, None] + seen.offset) * seen.cos_incidence, 1000.0)
-
-
-def test_radial_velocity_is_positive_when_closing():
-    assert _observed(_flight(velocity=(0.0, 0.0, -30.0))).radial_velocity[0] == pytest.approx(30)
-    assert _observed(_flight(velocity=(0.0, 0.0, 30.0))).radial_velocity[0] == pytest.approx(-30)
-
-
-def test_doppler_spread_across_the_footprint_is_the_transverse_velocity_times_the_angle():
-    """Standard deviation of v_r over a Gaussian beam: |v_perp| Theta/4, exactly to first order."""
-    seen = _observed(_flight(velocity=(60.0, 80.0, 0.0)), number=109, beam_divergence=1e-3)
-    mean = seen.velocity_offset @ seen.weight
-    sigma = np.sqrt(((seen.velocity_offset - mean[:, None]) ** 2) @ seen.weight)
-    assert sigma[0] == pytest.approx(100.0 * 1e-3 / 4, rel=1e-6)
-
-
-def test_a_spinning_target_closes_on_one_side_and_recedes_on_the_other():
-    """A level plate that turns about a level axis y through its centre: v_r = -omega x there."""
-    omega = 0.7
-    path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
-    body = Flight(path, Spin((0.0, omega, 0.0)))
-    caster = Caster(_plane(size=50.0))
-    for x in (-20.0, 5.0, 20.0):
-        seen = _observed(_flight(position=(x, 0.0, 300.0)), caster=caster, bodies=[body])
-        # a point at (x, 0, 0) moves up with (omega x r)_z = -omega_y x: up is closing
-        assert seen.radial_velocity[0] == pytest.approx(-omega * x, rel=1e-4)
 
 
 def _beamlet_vectors(turn, beam, divergence, number):
@@ -120,9 +73,9 @@ def test_velocity_across_the_footprint_of_a_spinning_target_is_that_of_its_point
     """Each beamlet meets the turned plate n.P = 0 at P and closes with u.(V - omega x P)."""
     omega, place, own = np.array([0.05, 0.3, 0.1]), np.array([8.0, -3.0, 300.0]), (2.0, 1.0, -9.0)
     path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
-    seen = _observed(
-        _flight(position=place, velocity=own), caster=Caster(_plane(size=400.0)),
-        bodies=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
+    seen = observed(
+        flight(position=place, velocity=own), bodies=[square(400.0)],
+        motion=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
     )  # fmt: skip
     here = place + when * np.array(own)
     u = _beamlet_vectors(Rotation.identity(), np.array([0.0, 0.0, -1.0]), 0.02, 37)
@@ -149,13 +102,14 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
     omega, arm = np.array([0.04, -0.08, 0.3]), np.array([3.0, 1.5, -0.5])
     own, place = np.array([20.0, -5.0, -30.0]), np.array([0.0, 0.0, 900.0])
     beam = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
-    seen = _observed(
-        _flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
+    seen = observed(
+        flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
         beams=beam[None], index=[when], number=37, beam_divergence=0.02,
     )  # fmt: skip
     turn = Rotation.from_rotvec(omega * when)
     u = _beamlet_vectors(turn, beam, 0.02, 37)
     moving = own + np.cross(omega, turn.apply(arm))
+    np.testing.assert_allclose(seen.velocity[0], moving, atol=1e-12)
     got = seen.radial_velocity[0] + seen.velocity_offset[0]
     np.testing.assert_allclose(got, u @ moving, rtol=0, atol=1e-11)
     height = (place + when * own + turn.apply(arm))[2]
@@ -168,28 +122,16 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
     assert spread == pytest.approx(across * 0.02 / 4, rel=1e-3)
 
 
-def test_a_tumbling_instrument_sees_the_velocity_of_its_lever_arm():
-    omega, arm = np.array([0.2, -0.3, 0.1]), np.array([2.0, 1.0, -0.5])
-    flight = _flight(attitude=Spin(omega), lever_arm=arm)
-    seen = _observed(flight)
-    np.testing.assert_allclose(seen.velocity[0], np.cross(omega, arm), atol=1e-12)
-    assert seen.radial_velocity[0] == pytest.approx(
-        np.cross(omega, arm) @ seen.direction[0], rel=1e-4
-    )
-    still = _observed(_flight(attitude=Spin(omega)))
-    assert still.radial_velocity[0] == 0.0
-
-
 def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(table_4_1):
-    edge = Caster(_plane(size=5.0))
-    seen = _observed(
-        _flight(position=(5.0, 0.0, 100.0)), caster=edge, beam_divergence=2e-3, number=109
+    edge = [square(5.0)]
+    seen = observed(
+        flight(position=(5.0, 0.0, 100.0)), bodies=edge, beam_divergence=2e-3, number=109
     )
     hit = seen.surface[0] >= 0
     assert 0 < hit.sum() < hit.size
     shots = prepare_eyepoints(seen, table_4_1(), [GROUND])
     assert (shots.amplitude[0][~hit] == 0).all() and (shots.amplitude[0][hit] > 0).all()
-    lost = _observed(_flight(position=(50.0, 0.0, 100.0)), caster=edge)
+    lost = observed(flight(position=(50.0, 0.0, 100.0)), bodies=edge)
     assert not lost.seen.any()
     with pytest.raises(ValueError, match="sees nothing"):
         prepare_eyepoints(lost, table_4_1(), [GROUND])
@@ -198,7 +140,7 @@ def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(ta
 
 
 def test_surfaces_scatter_by_their_own_reflectance_and_law(table_4_1):
-    seen = _observed(_flight(), beams=cone(1, half_angle=1.0))
+    seen = observed(flight(), beams=cone(1, half_angle=1.0))
     bright, dark = (
         prepare_eyepoints(seen, table_4_1(), [Surface("s", reflectance, law)])
         for reflectance, law in ((0.4, "thesis"), (0.1, "lambert"))
@@ -206,15 +148,6 @@ def test_surfaces_scatter_by_their_own_reflectance_and_law(table_4_1):
     ratio = (bright.amplitude / dark.amplitude) ** 2
     # 4 times the reflectance; 1/(2 pi) against cos(incidence)/pi
     np.testing.assert_allclose(ratio, 4 / (2 * seen.cos_incidence), rtol=1e-12)
-
-
-def test_any_stretch_of_a_flight_is_the_same_bit_for_bit():
-    flight = _flight(velocity=(1.0, 2.0, -50.0), attitude=Nadir(0.3))
-    scanner_beams = corners(np.radians(22.5))
-    whole = _observed(flight, beams=scanner_beams, index=np.arange(40))
-    part = _observed(flight, beams=scanner_beams, index=np.array([33, 7, 20]))
-    for all_shots, some in zip(whole[:-1], part[:-1], strict=True):
-        assert np.array_equal(all_shots[[33, 7, 20]], some, equal_nan=True)
 
 
 def _turning(rate, arm=(0.0, 0.0, 0.0)):
@@ -245,7 +178,7 @@ def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
     """Central differences over 0.1 ms to either side, on level ground or on moving."""
     flight, scanner = MOTIONS[name]
     seen = observe(
-        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster(_plane()),
+        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster([plate()]),
         beam_divergence=50e-6, number=7, bodies=None if body is None else [_body(body)],
     )  # fmt: skip
     grows = (seen.radial_velocity[2] - seen.radial_velocity[0]) / 2e-4
@@ -258,11 +191,11 @@ def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
 
 def test_level_flight_keeps_its_range_however_fast_the_ground_ahead_closes():
     beams = cone(1, half_angle=np.radians(22.5))
-    seen = _observed(_flight(velocity=(100.0, 0.0, 0.0)), beams=beams)
+    seen = observed(flight(velocity=(100.0, 0.0, 0.0)), beams=beams)
     assert seen.radial_velocity[0] == pytest.approx(100 * np.sin(np.radians(22.5)))
     assert abs(seen.approach[0]) < 1e-9 and seen.acceleration[0] == 0
 
 
 def test_a_shot_that_sees_nothing_has_no_acceleration():
-    seen = _observed(_flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1))
+    seen = observed(flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1))
     assert np.isnan(seen.acceleration).tolist() == np.isnan(seen.approach).tolist() == [True, False]

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sweep.model.footprint import beamlets, plane_footprint
 
@@ -106,14 +104,6 @@ def test_the_range_spread_is_the_beams_projected_on_the_slope(degrees, number):
     assert spread == pytest.approx(slope, rel=3 * slope + 1e-9)
     # Rays off the axis are longer, and far ones are longer by more than near ones are shorter.
     assert mean == pytest.approx((divergence / 4) ** 2 + slope**2, rel=3 * slope + 1e-6, abs=1e-20)
-
-
-@given(st.floats(1e-4, np.pi / 2), st.floats(1e-7, 5e-3), st.integers(1, 60))
-def test_cosine_of_incidence_and_range_belong_to_one_height(grazing_angle, divergence, number):
-    """R_b cos(incidence_b) is the eyepoint's height, R_0 sin(grazing), for every beamlet."""
-    offset, cos_incidence, weights = footprint(grazing_angle, divergence, number)
-    height = ((1 + offset) * cos_incidence)[weights > 0]
-    assert height == pytest.approx(np.sin(grazing_angle), rel=1e-14)
 
 
 def test_rows_of_many_footprints_are_each_by_itself():

@@ -202,22 +202,6 @@ def test_leakage_of_beats_at_dc_at_nyquist_and_where_they_cancel(table_4_1, phas
     held(shots)
 
 
-@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
-def test_leakage_of_two_surfaces_apart_in_range_and_velocity(table_4_1, phases):
-    generator = np.random.default_rng(8)
-    rows, beamlets = 60, 12
-    apart = np.where(np.arange(beamlets) % 2, generator.uniform(-0.05, 0.05, (rows, 1)), 0.0)
-    speeds = np.where(np.arange(beamlets) % 2, generator.uniform(-2e-8, 2e-8, (rows, 1)), 0.0)
-    offset = apart + generator.normal(0, 1e-5, (rows, beamlets))
-    echo = np.full((rows, beamlets), 1 / beamlets / np.pi)
-    echo[:, 1::2] *= 10 ** generator.uniform(-6, 0, (rows, 1))
-    footprints = Footprints(np.arange(rows), offset, speeds, echo)
-    parameters = table_4_1(phases=phases, leakage_floor=1e-12, fft_size=2**14, tnr=5.0) | {
-        "target.range": generator.uniform(50.0, 3000.0, rows)
-    }
-    held(prepare_cast(parameters, Cast(footprints)))
-
-
 RANGE_BIN, DOPPLER_BIN = 149_896_229 * 600e6 / 2e12, 1550e-9 * 600e6 / 299_792_458
 """Offset [m] and change of 2 v_r / c that move a line by one bin, times the FFT's size."""
 
@@ -319,19 +303,6 @@ def test_groups_are_those_of_every_bin(table_4_1, apart):
         np.testing.assert_allclose(fast.neighbours, slow.neighbours, rtol=1e-7)
         found += (slow.bin >= 0).sum(axis=-1).max()
     assert found >= 12 * (2 if apart > 1 else 1)
-
-
-def test_a_shot_leaks_the_same_whatever_its_company(table_4_1):
-    parameters = table_4_1(phases="incoherent", beamlets=19) | {
-        "target.range": np.linspace(5.0, 9000.0, 40),
-        "target.grazing_angle": np.radians(np.linspace(3.0, 90.0, 40)),
-    }
-    ((_, together),) = prepare(parameters)
-    whole = find(together)
-    for i in (0, 17, 39):
-        alone = {k: v[i : i + 1] if np.ndim(v) else v for k, v in parameters.items()}
-        ((_, single),) = prepare(alone)
-        assert find(single)[..., 0].tobytes() == np.ascontiguousarray(whole[..., i]).tobytes()
 
 
 @pytest.mark.parametrize("beta", [0.3, 2.0, 4.5, 6.55, 10.0, 25.0, 29.9])

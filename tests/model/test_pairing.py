@@ -154,12 +154,6 @@ def test_every_surface_is_found_whatever_the_order_of_its_peaks(name, order):
         assert _agrees(_reported(up[u], down[::order][d], code), targets[i])
 
 
-def test_surfaces_with_a_common_velocity_share_their_doppler_peak():
-    up, doppler, down = _scene(*SCENES["common velocity"])
-    _, pairs = _pair(up, doppler[:1], down)
-    assert [p[1] for p in pairs] == [0, 0]
-
-
 def test_false_peaks_among_true_ones_are_paired_last_and_unconfirmed():
     up, doppler, down = _scene(*SCENES["different velocities"])
     confirmed, pairs = _pair([*up, 20011.0], doppler, [31000.0, *down])

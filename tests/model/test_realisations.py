@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from engine import by_vectors, keys
 from mean_over_draws import evaluate
 from scipy import special
 
-from sweep.model import philox, realisations
+from sweep.model import realisations
 from sweep.model.effects import pointing_jitter, scintillation
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.marcum import marcum_q1
@@ -28,10 +29,6 @@ ALL = (*CORE, *RANDOM)
 def index(legs):
     """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
     return np.expm1(sum(each.large + each.small for each in legs))
-
-
-def keys(n, seed=5):
-    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
 
 
 def scene(table_4_1, **changes):
@@ -222,17 +219,6 @@ def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     assert (means["pd_shot"] > product + 20 * means["pd_shot_error"]).all()
 
 
-def by_vectors(distance, grazing, off):
-    """Range and grazing angle of jittered rays that are followed down to the plane z = 0."""
-    start = np.array([0.0, 0.0, distance * np.sin(grazing)])
-    aim = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])
-    up, aside = np.array([np.sin(grazing), 0.0, np.cos(grazing)]), np.array([0.0, 1.0, 0.0])
-    angle = np.hypot(*off.T)[:, None]
-    across = off[:, :1] * up + off[:, 1:] * aside
-    direction = aim * np.cos(angle) + across * np.sinc(angle / np.pi)
-    return -start[2] / direction[:, 2], np.arcsin(-direction[:, 2]), direction @ aim
-
-
 @pytest.mark.parametrize(
     "changes, sigma",
     [
@@ -246,7 +232,9 @@ def test_the_mean_over_jitter_is_a_quadrature_over_both_angles(changes, sigma, t
     a, b = (v.ravel() for v in np.mgrid[-6:6.05:0.1, -6:6.05:0.1])
     share = np.exp(-(a**2 + b**2) / 2) * 0.1**2 / (2 * np.pi)
     off = sigma * np.stack([a, b], axis=1)
-    far, grazing, along = by_vectors(5000.0, parameters["target.grazing_angle"], off)
+    steepness = parameters["target.grazing_angle"]
+    far, grazing, direction = by_vectors(5000.0, steepness, off)
+    along = direction @ [np.cos(steepness), 0.0, -np.sin(steepness)]
     outputs = evaluate_without(
         parameters
         | {"target.range": far, "target.grazing_angle": grazing}

@@ -53,16 +53,6 @@ def test_pfa_of_a_shot_is_that_both_chirps_alarm_in_any_of_all_bins(exponent, pr
     assert f"{results['pfa_both_chirps'][0]:.2e}" == printed
 
 
-def test_a_doubling_of_the_fft_makes_four_times_the_false_alarms(table_4_1):
-    shots = [
-        dark(table_4_1, fft_size=2**e, bins_counted="all")["pfa_both_chirps"][0]
-        for e in (16, 17, 18)
-    ]
-    # Less N p of it, 1e-4, as alarms begin to coincide.
-    assert shots[1] / shots[0] == pytest.approx(4.0, rel=1e-4)
-    assert shots[2] / shots[1] == pytest.approx(4.0, rel=1e-4)
-
-
 def test_a_real_record_has_half_of_those_bins_and_a_detection_takes_three_more(table_4_1):
     both = {
         counted: dark(table_4_1, bins_counted=counted)["pfa_segment"][0]

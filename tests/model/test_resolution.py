@@ -181,14 +181,6 @@ def test_numbers_given_by_hand_are_kept(table_4_1):
         assert shots.offset.shape[1] == number
 
 
-def test_tolerance_0_takes_what_errs_least(table_4_1):
-    parameters = scenes(table_4_1, 5) | AUTO
-    exact = shot.evaluate(parameters | FINE)
-    found = shot.evaluate(parameters | {"accuracy.tolerance": 0.0})
-    for name in PDS:
-        assert abs(found[name] - exact[name]).max() <= 1e-7
-
-
 def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):
     """Spread over thousands of bins: a beam of 50 mrad grazing the ground at 10 km."""
     parameters = table_4_1(

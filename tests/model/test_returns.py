@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from engine import prepared
 from scipy import ndimage, stats
 
 from sweep.model import philox, truth, waveform
@@ -36,11 +37,6 @@ LIGHT = 299792458.0
 RANGE_BIN, VELOCITY_BIN = LIGHT * 600e6 / (4e12 * 2**17), 1550e-9 * 600e6 / 2**18
 
 
-def _prepared(parameters):
-    ((_, shots),) = prepare(parameters)
-    return shots
-
-
 def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamlets=12, **changes):
     """One shot over surfaces at these ranges [m] and velocities, spread [m] within each.
 
@@ -48,7 +44,7 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     """
     ranges, velocities = np.array(ranges), np.array(velocities)
     changes = {"phases": "incoherent"} | changes
-    shots = _prepared(
+    shots = prepared(
         table_4_1(range=ranges[0], radial_velocity=velocities[0], beamlets=beamlets, **changes)
     )
     which = np.arange(beamlets) % len(ranges)
@@ -110,7 +106,7 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
 
 
 def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
-    shots = _prepared(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
+    shots = prepared(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
     found, expected = groups(shots), np.moveaxis(find(shots), 1, 0)
     np.testing.assert_array_equal(found.pd[:, :, 0].T, expected[0])
     np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected[2])
@@ -129,7 +125,7 @@ def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
 
 
 def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
-    found = groups(_prepared(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
+    found = groups(prepared(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
     assert (found.bin[0, :, 0] >= 0).all()
     assert (found.bin[0, :, 1:] == -1).all()
     assert (found.pd[0, :, 0] < 0.1).all()
@@ -140,7 +136,7 @@ def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
 
 
 def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
-    shots = _prepared(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
+    shots = prepared(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
     found = _certain(groups(shots))
     got, expected = _drawn(shots, found), report(shots, find(shots))
     np.testing.assert_array_equal(got.range[:, 0, 0], expected.range)
@@ -148,34 +144,8 @@ def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
     assert (got.flags[:, 0, 0] == TRUE).all()
 
 
-@pytest.mark.parametrize("velocities", [(12.0, 12.0), (12.0, -7.0)])
-@pytest.mark.parametrize("method", METHODS)
-def test_two_surfaces_give_two_returns_with_their_ranges_and_velocities(
-    table_4_1, velocities, method
-):
-    """Within half a bin in each of two peaks, a fifth of a bin of footprint and noise."""
-    shots = _surfaces(table_4_1, [400.0, 412.0], velocities, shares=[1.0, 0.6])
-    found = groups(shots)
-    assert ((found.bin[0, 0] >= 0).sum(), (found.bin[0, 2] >= 0).sum()) == (2, 2)
-    got = _drawn(shots, found, method=method, draws=20)
-    assert (got.flags[0, :, :2] == TRUE).all()
-    assert (got.flags[0, :, 2:] == 0).all()
-    np.testing.assert_array_equal(got.beamlet[0, :, :2] % 2, [[0, 1]] * 20)
-    np.testing.assert_allclose(got.range[0, :, :2], [[400.0, 412.0]] * 20, atol=1.2 * RANGE_BIN)
-    np.testing.assert_allclose(
-        got.range_interpolated[0, :, :2], [[400.01, 412.01]] * 20, atol=0.2 * RANGE_BIN
-    )
-    np.testing.assert_allclose(
-        got.radial_velocity[0, :, :2], [velocities] * 20, atol=1.2 * VELOCITY_BIN
-    )
-    np.testing.assert_allclose(
-        got.radial_velocity_interpolated[0, :, :2], [velocities] * 20, atol=0.2 * VELOCITY_BIN
-    )
-    assert np.isnan(got.range[0, :, 2:]).all()
-
-
 def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
-    shots = _prepared(
+    shots = prepared(
         table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
     )
     got = _drawn(shots)
@@ -202,7 +172,7 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
     A true pair, both peaks found, is lost only where a false peak takes one of them: rarely.
     """
     parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
-    shots = _prepared(parameters)
+    shots = prepared(parameters)
     counts = simulate(
         parameters, CORE, keys=_keys(4), first_draw=3, batch_sizes=[2000], method=method
     )
@@ -226,7 +196,7 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     returns 2 in p a p a, and so on; confirmed by the true Doppler peak where that is there.
     """
     parameters = _weak(table_4_1, **law)
-    shots = _prepared(parameters)
+    shots = prepared(parameters)
     out = evaluate(parameters)
     got = _drawn(shots, draws=DRAWS, method=method)
     alarm = [
@@ -351,7 +321,7 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
 
     Ranges run through the bin, so that the errors are of all places between bins.
     """
-    shots = _prepared(
+    shots = prepared(
         table_4_1(
             range=1000 + RANGE_BIN * np.linspace(0, 1, 20, endpoint=False), window=name,
             radial_velocity=9.0, beamlets=1, power=0.5, phases="incoherent",
@@ -403,7 +373,7 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
     its size, so the mean square of errors over stated ones is near 1 over all places. Lines that
     add as amplitudes may cancel, and then lie anywhere: about 1 again, with larger outliers.
     """
-    shots = _prepared(
+    shots = prepared(
         table_4_1(
             range=1000 + RANGE_BIN * np.linspace(0, 1, 200, endpoint=False), window="hann",
             radial_velocity=9.0, beamlets=61, power=50.0, grazing_angle=np.radians(20.0),
@@ -425,9 +395,7 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
 
 
 def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
-    shots = _prepared(
-        table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
-    )
+    shots = prepared(table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3))
     shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
     velocity = -170.0 + shots.doppler[0] * LIGHT / 2
     lines = beamlet_lines(shots)[0]
@@ -523,29 +491,3 @@ def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
 
 
 # Invariance
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_order_and_batching_change_no_bit(table_4_1, method):
-    parameters = _weak(table_4_1, n=6)
-    keys, ranges = _keys(6), parameters["target.range"]
-    shots = _prepared(parameters)
-    whole = draw_returns(shots, groups(shots), keys=keys, draws=60, method=method)
-    order = np.array([4, 1, 5, 0, 3, 2])
-    moved = _prepared(parameters | {"target.range": ranges[order]})
-    shuffled = draw_returns(moved, groups(moved), keys=keys[order], draws=60, method=method)
-    one = _prepared(parameters | {"target.range": ranges[3:4]})
-    alone = draw_returns(
-        one, groups(one), keys=keys[3:4], first_draw=25, draws=10, method=method
-    )  # fmt: skip
-    assert len(np.unique(whole.flags)) > 3
-    for name in whole._fields:
-        a, b, c = (getattr(r, name) for r in (whole, shuffled, alone))
-        np.testing.assert_array_equal(a[order], b, err_msg=name)
-        np.testing.assert_array_equal(a[3:4, 25:35], c, err_msg=name)
-
-
-def test_an_unknown_way_to_draw_is_refused(table_4_1):
-    shots = _surfaces(table_4_1, [400.0], [12.0])
-    with pytest.raises(ValueError, match="probabilities, noise"):
-        _drawn(shots, method="dice")

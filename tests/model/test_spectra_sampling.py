@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from engine import keys
 
 from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
@@ -34,13 +35,9 @@ def _points(table_4_1, **changes):
     return table_4_1() | given | changes
 
 
-def _keys(n):
-    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=5)
-
-
 def _drawn(parameters, number=400, effects=EFFECTS, **place):
     size = np.size(parameters["target.range"])
-    return simulate(parameters, effects, keys=_keys(size), batch_sizes=[number], **place, **WHOLE)
+    return simulate(parameters, effects, keys=keys(size), batch_sizes=[number], **place, **WHOLE)
 
 
 @pytest.mark.parametrize(("window", "duration"), [("rectangular", 5e-4), ("hamming", 2.5e-6)])
@@ -48,7 +45,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1
     """2.5 us are 1500 samples in 2048 points. 5 sigma of a mean over 300 spectra of 1000 bins."""
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
     ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
-    noise = noise_of(shots, 0, 0, key=_keys(1)[0], draws=np.arange(300))[:, 8:-8]
+    noise = noise_of(shots, 0, 0, key=keys(1)[0], draws=np.arange(300))[:, 8:-8]
     power = 2 * float(shots.bin_deviation[0]) ** 2
     independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
@@ -131,24 +128,24 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
 def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
     parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
-    keys = _keys(3)
-    whole = simulate(parameters, effects, keys=keys, batch_sizes=[40, 30], **WHOLE)
+    given = keys(3)
+    whole = simulate(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
     other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
-    parts = simulate(other, effects, keys=keys[::-1], batch_sizes=[13, 7, 50], **WHOLE)
+    parts = simulate(other, effects, keys=given[::-1], batch_sizes=[13, 7, 50], **WHOLE)
     for name, values in whole.items():
         if values.ndim == 2:
             np.testing.assert_array_equal(values.sum(axis=1), parts[name][::-1].sum(axis=1))
         else:
             np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
     alone = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
-    one = simulate(alone, effects, keys=keys[1:2], batch_sizes=[70], **WHOLE)
+    one = simulate(alone, effects, keys=given[1:2], batch_sizes=[70], **WHOLE)
     for name in SPECTRA_OUTPUTS:
         np.testing.assert_array_equal(one[name], whole[name][1:2], err_msg=name)
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
     parameters, accuracy = _points(table_4_1), Accuracy(0.1, 0.95, interval="wilson")
-    given = {"keys": _keys(3), "accuracy": accuracy} | WHOLE
+    given = {"keys": keys(3), "accuracy": accuracy} | WHOLE
     found = simulate(parameters, EFFECTS, batch=20, limit=500, **given)
     assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
     again = simulate(
@@ -182,7 +179,7 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
 
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
     parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
-    given = {"parameters": parameters, "effects": EFFECTS, "keys": _keys(3), **much, **WHOLE}
+    given = {"parameters": parameters, "effects": EFFECTS, "keys": keys(3), **much, **WHOLE}
     given |= {"accuracy": Accuracy(0.1), "methods": Methods({"m:f": over_the_median})}
     whole, (found, pieces) = simulate(**given), _in_pieces(**given)
     assert pieces > 3
@@ -209,7 +206,7 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
         },
     )
     effects = (*EFFECTS, "speckle")
-    pd = averaged(parameters, effects, keys=_keys(1), draws=600)["pd_down"]
+    pd = averaged(parameters, effects, keys=keys(1), draws=600)["pd_down"]
     found = _drawn(parameters, 600, effects)["pd_down"]
     assert 0.1 < pd[0] < 0.95
     assert found == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
@@ -266,7 +263,7 @@ def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
     parameters |= {"footprint.beamlets": 1}
     ((_, pure),) = prepare(parameters, ("doppler", "image"))
     ((_, shots),) = prepare(parameters, ("doppler", "image", "line_width"))
-    key, draws, rate = _keys(1)[0], np.arange(3), 500e6
+    key, draws, rate = keys(1)[0], np.arange(3), 500e6
     delay = 100.0 / SPEED_OF_LIGHT * rate
     found = drawn_of(shots, 0, 2, signal_of(shots, 0, 2), key=key, draws=draws)
     for draw, drawn in zip(draws, found, strict=True):

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine import difference
+from engine import difference, prepared
 from scipy.constants import c as speed_of_light
 
 from sweep.model import segments, truth
-from sweep.model.shot import prepare
 from sweep.model.window import samples
 
 AGREEMENT = 1e-9
@@ -49,11 +48,6 @@ def drawn_scene(number):
         "detector_bandwidth": 10 ** rng.uniform(7, 10),
         "amplifier_bandwidth": 10 ** rng.uniform(7, 10),
     }
-
-
-def prepared(parameters):
-    ((_, shots),) = prepare(parameters)
-    return shots
 
 
 def disagreement(shots):
@@ -244,14 +238,6 @@ def test_a_tone_stands_at_half_its_amplitude_times_the_windows_sum(window, loss_
             assert magnitude[1001] == pytest.approx(magnitude[1000], rel=1e-3)
     assert heights[0] == pytest.approx(amplitude * 4096 * mean_weight / 2, rel=1e-9)
     assert 20 * np.log10(heights[0] / heights[1]) == pytest.approx(loss_db, abs=0.0055)
-
-
-def test_a_rectangular_window_leaves_nothing_beside_a_tone_on_a_bin(table_4_1):
-    scene = table_4_1(**ONE_WAY, window="rectangular")
-    v = velocity_for(777 * 600e6 / 4096, sign=0, parameters=scene)
-    magnitude = truth.spectrum(prepared(scene | {"target.radial_velocity": v}), 0, 1)
-    others = np.delete(magnitude, 777)
-    assert others.max() < 1e-9 * magnitude[777]
 
 
 def test_incoherent_truth_is_the_root_mean_square_over_independent_phases(table_4_1):

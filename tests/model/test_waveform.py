@@ -52,32 +52,6 @@ def test_the_beat_is_the_derivative_of_the_phase_that_the_delay_makes(sign, targ
     assert beats(target_range, v)[1 - sign] == pytest.approx(expected, rel=1e-13, abs=1e-7)
 
 
-def test_beats_are_the_sum_and_difference_of_doppler_and_range_frequency():
-    """[T 2.8] to leading order: what is kept beyond it is a fifth of a bin at 150 m/s."""
-    f_d, f_r = 2 * 150.0 / 1550e-9, RATE * 2 * 2000.0 / speed_of_light
-    up, doppler, down = beats(2000.0, 150.0)
-    assert up == pytest.approx(f_d - f_r, abs=0.3 * BIN)
-    assert doppler == pytest.approx(f_d, rel=1e-15)
-    assert down == pytest.approx(f_d + f_r, abs=0.3 * BIN)
-    assert down - (f_d + f_r) == pytest.approx(BANDWIDTH * 2 * 150.0 / speed_of_light, rel=0.05)
-
-
-def test_a_receding_target_mirrors_the_beats_of_a_closing_one():
-    """f_up(-v) is about -f_down(v), but for the carrier that differs by the chirp's bandwidth."""
-    closing, receding = beats(3000.0, 80.0), beats(3000.0, -80.0)
-    assert receding[0] == pytest.approx(-closing[2], abs=0.3 * BIN)
-    assert receding[1] == -closing[1]
-    assert receding[2] == pytest.approx(-closing[0], abs=0.3 * BIN)
-
-
-def test_ten_kilometres_at_150_metres_a_second_fold_the_down_beat():
-    """Figures of PHYSICS section 2: 327 MHz, past the Nyquist frequency of 300 MHz."""
-    down = beats(10e3, 150.0)[2]
-    assert down == pytest.approx(327e6, abs=0.5e6)
-    assert fold(down, 600e6) == pytest.approx(600e6 - down, rel=1e-15)
-    assert resolved(*[fold(b, 600e6) for b in beats(10e3, 150.0)]) == pytest.approx((10e3, 150.0))
-
-
 @pytest.mark.parametrize("fft_size", [512, 511])
 def test_a_folded_frequency_is_where_the_samples_of_a_tone_have_their_peak(fft_size):
     for k in range(-3 * fft_size, 3 * fft_size, 7):

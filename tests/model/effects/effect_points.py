@@ -40,11 +40,6 @@ def scene(table, number, seed, **fixed):
     return DEFAULTS | table(**values | fixed) | {ACROSS: across}
 
 
-def small(seed):
-    """Sizes that many spectra can be had of."""
-    return 2 ** int(np.random.default_rng(seed).integers(12, 16))
-
-
 def points_of(parameters, footprint=None, **further):
     """Points as the planner looks at them."""
     words = {path: str(v) for path, v in parameters.items() if np.asarray(v).dtype.kind in "UO"}
@@ -76,8 +71,3 @@ def shots_of(parameters, effects):
 def found(parameters, effects):
     """What the spectra of the points hold, :func:`sweep.model.shot.find`."""
     return find(shots_of(parameters, effects))
-
-
-def magnitudes(parameters, effects):
-    """Largest bin's |X| of each segment, (3, n)."""
-    return found(parameters, effects)[:, 2]

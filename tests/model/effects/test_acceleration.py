@@ -38,27 +38,3 @@ def test_the_phase_is_what_acceleration_adds_to_the_delays_own(sign, a):
         for t in times
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
-
-
-def test_the_doppler_segment_drifts_by_two_a_over_lambda():
-    wavelength, duration, a = 1550e-9, 2e-3, 250.0
-    carrier = 299792458 / wavelength
-    expected = 2 * a / wavelength * duration**2
-    phase = phase_errors.acceleration_phase(
-        np.array([-1.0, 0.0, 1.0]), sign=0, carrier=carrier, chirp_rate=1e12, range=1e3,
-        radial_velocity=50.0, acceleration=a, start=0.0, duration=duration,
-    )[0]  # fmt: skip
-    np.testing.assert_allclose(4 * np.diff(phase, 2), expected, rtol=1e-9)
-
-
-def scenes(n, rng, sign):
-    return {
-        "sign": sign,
-        "carrier": 1.934e14,
-        "chirp_rate": 2e12,
-        "range": 10 ** rng.uniform(0, 4, n),
-        "radial_velocity": rng.uniform(-200, 200, n),
-        "acceleration": 10 ** rng.uniform(-2, 3, n) * rng.choice([-1, 1], n),
-        "start": rng.uniform(0, 1e-4, n),
-        "duration": 10 ** rng.uniform(-4, -3.3, n),
-    }

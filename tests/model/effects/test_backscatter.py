@@ -43,17 +43,6 @@ def test_even_air_has_the_closed_form_of_exponential_integrals(extinction, lengt
     assert found == pytest.approx(expected, rel=1e-8)
 
 
-def test_clear_air_by_hand():
-    """atan(R/r_0)/r_0 of a medium that dims nothing: from r_0 = 500 m, half of it from beyond.
-
-    1e-6/m, 50 sr: 0.8 * 4.9087e-4 m^2 * 2e-8 /m/sr * (pi/4) / 500 m = 1.2337e-14 W up to 500 m.
-    """
-    near = power(even(1e-6), start_height=7.0, end_height=7.0, range=500.0, **BEAM)
-    assert near == pytest.approx(1.2337e-14, rel=1e-3)
-    far = power(even(1e-6), start_height=7.0, end_height=7.0, range=np.array([1e4, 1e5]), **BEAM)
-    np.testing.assert_allclose(far / near, [1.937, 1.992], rtol=0.05)
-
-
 def test_diffraction_limited_overlap_is_that_of_the_coherent_lidar():
     """r_0 = pi D^2 / (4 lambda): the nearest air gives 1/r_0^2, whatever its distance."""
     divergence = 4 * 1.55e-6 / (np.pi * 25e-3)

@@ -12,7 +12,6 @@ from sweep.model.effects.atmosphere import (
     exponential,
     layer,
     optical_depth,
-    transmission,
     visibility_extinction,
 )
 
@@ -56,19 +55,6 @@ def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
         assert found == pytest.approx(mean * length, rel=1e-9, abs=1e-18)
         back = optical_depth(profile, start_height=end, end_height=start, range=length)
         assert back == found
-
-
-@given(HEIGHT, HEIGHT, st.floats(0, 1))
-def test_two_pieces_of_a_path_multiply_to_the_whole(start, end, share):
-    middle = start + share * (end - start)
-    length = 2 * abs(end - start) + 500
-    for profile in PROFILES.values():
-        whole = transmission(profile, start_height=start, end_height=end, range=length)
-        first = transmission(profile, start_height=start, end_height=middle, range=share * length)
-        last = transmission(
-            profile, start_height=middle, end_height=end, range=length - share * length
-        )
-        assert first * last == pytest.approx(whole, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -128,40 +128,6 @@ def test_pure_line_and_pedestal_are_the_autocorrelation_at_every_lag(name, laser
     assert np.abs(found - expected) < share * pedestal + 1e-13 * found
 
 
-@pytest.mark.parametrize("g", [1e-6, 0.019, 0.021, 1.0, 30.0])
-def test_the_density_under_the_line_is_the_integral_over_the_lags(g):
-    x, weight = np.polynomial.legendre.leggauss(200)
-    delay = 5e-6
-    laser_width = g / (2 * np.pi * delay)
-    lag = delay * (x + 1) / 2
-    value = np.exp(-g * lag / delay) * -np.expm1(-g * (1 - lag / delay))
-    found = line_width.density_under_line(line_width=laser_width, delay=delay)
-    assert found == pytest.approx(delay * (weight * value).sum(), rel=1e-10)
-
-
-@pytest.mark.parametrize("laser_width", [0.015 * RATE, 0.017 * RATE, RATE, 1e5 * RATE])
-@pytest.mark.parametrize("delay", [0.3, 20, 1000])
-def test_a_line_about_as_wide_as_the_band_leaves_noise_of_its_own_power(laser_width, delay):
-    """Either side of where lags are taken one by one, and far beyond: never more than there is."""
-    g = 2 * np.pi * laser_width / RATE
-    expected = by_lags("hann", np.zeros(1), np.exp(-g * np.minimum(np.arange(LENGTH), delay)))
-    found, pedestal = lorentzian_power("hann", laser_width, delay / RATE)
-    kinks = g / (10 * delay**2) if g < 0.1 else 0.0
-    assert np.abs(found - expected) < (1e-6 + kinks) * found
-    even = 1 + 2 * np.exp(-g) / -np.expm1(-g)  # the sum over all lags, without a window
-    assert pedestal <= window("hann", LENGTH).energy * even * (1 + 1e-6)
-
-
-def test_a_narrow_pedestal_in_a_long_record_is_its_density_times_the_windows_energy():
-    length = 4096
-    laser = {"line_width": np.array([1e3]), "delay": np.array([40 / RATE])}
-    form, duration = window("hann", length), np.array([length / RATE])
-    found = line_width.power_under_line(duration=duration, window=form, **laser)
-    # Lags up to a hundredth of the record: the window's autocorrelation has hardly fallen there.
-    density = line_width.density_under_line(**laser)
-    np.testing.assert_allclose(found, form.energy * RATE * density, rtol=2e-3)
-
-
 @pytest.mark.parametrize("name", ["rectangular", "hamming", "hann"])
 @pytest.mark.parametrize("delays", [64, 4, 0.5])
 @pytest.mark.parametrize("g", [0.4, 3.8])

@@ -20,7 +20,6 @@ from sweep.model.effects.scintillation import (
 )
 
 WAVENUMBER = 2 * np.pi / 1.55e-6
-EVEN = Turbulence(uniform=1e-14)
 
 
 def index(legs):
@@ -47,15 +46,6 @@ def test_hufnagel_and_valley_have_five_centimetres_and_seven_microradians():
     assert (2.914 * k**2 * column(5 / 3)) ** -0.6 == pytest.approx(7e-6, rel=0.03)
 
 
-@pytest.mark.parametrize("wave, constant", [("plane", 1.23), ("spherical", 0.5)])
-def test_even_turbulence_has_the_rytov_variance_of_the_textbook(wave, constant):
-    found = rytov_variance(
-        wave, EVEN, wavelength=1.55e-6, range=1000.0, start_height=3.0, end_height=3.0
-    )
-    textbook = constant * 1e-14 * WAVENUMBER ** (7 / 6) * 1000 ** (11 / 6)
-    assert found == pytest.approx(textbook, rel=0.01)
-
-
 @pytest.mark.parametrize("wave", ["plane", "spherical"])
 @pytest.mark.parametrize("start, end", [(0.0, 100.0), (3000.0, 0.0), (0.0, 10e3), (20e3, 0.0)])
 def test_slant_paths_through_a_profile_agree_with_adaptive_quadrature(wave, start, end):
@@ -73,18 +63,6 @@ def test_slant_paths_through_a_profile_agree_with_adaptive_quadrature(wave, star
         end_height=end,
     )  # fmt: skip
     assert found == pytest.approx(expected, rel=1e-6)
-
-
-def test_turbulence_near_the_receiver_twinkles_a_plane_wave_least():
-    """Seen from below, the turbulent ground is at the receiver; from above, at the source."""
-    up, down = (
-        rytov_variance(
-            "plane", HUFNAGEL_VALLEY._replace(wind=0.0), wavelength=1.55e-6, range=5e3,
-            start_height=a, end_height=b,
-        )
-        for a, b in ((0.0, 5e3), (5e3, 0.0))
-    )  # fmt: skip
-    assert up > 5 * down
 
 
 @pytest.mark.parametrize("wave", ["plane", "spherical"])
@@ -191,15 +169,6 @@ def test_gamma_gamma_draws_follow_the_law_with_the_bessel_function():
     assert cumulative[-1] == pytest.approx(1, abs=1e-5)
     distance = stats.kstest(drawn, lambda x: np.interp(x, value, cumulative)).statistic
     assert distance < SURE / np.sqrt(drawn.size)
-
-
-def test_draws_belong_to_point_and_number_alone():
-    variances = tuple(leg(np.linspace(0, 0.5, 5), 0.1) for _ in range(2))
-    whole = draws_of("gamma_gamma", variances, 5, 8)
-    realisation = Realisation(keys(5)[[4, 3]], np.array([7, 6]))
-    part = factors("gamma_gamma", [leg(v.large[[4, 3]], 0.1) for v in variances], realisation)
-    assert np.array_equal(whole[[4, 3], [7, 6]], part)
-    assert np.unique(whole).size == whole.size
 
 
 def test_still_air_is_exactly_one_and_faint_turbulence_the_same_by_either_law():

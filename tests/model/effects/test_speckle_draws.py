@@ -2,17 +2,18 @@
 
 import numpy as np
 import pytest
+from engine import keys, prepared
 from mean_over_draws import evaluate
 from speckle_pairs import joint_detection
 
-from sweep.model import philox, truth, window
+from sweep.model import truth, window
 from sweep.model.effects import speckle
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.effect import Realisation
 from sweep.model.marcum import marcum_q1
 from sweep.model.realisations import realise
 from sweep.model.shot import evaluate as evaluate_without
-from sweep.model.shot import find, prepare, statistics
+from sweep.model.shot import find, statistics
 
 AGREEMENT = 1e-9
 """Largest difference from the truth over the peak: the truth's own floor is 1e-11."""
@@ -23,15 +24,6 @@ STILL = tuple(effect for effect in SPECKLED if effect != "doppler_spread")
 ROUGH = {"target.roughness": 1e-5}
 ONE_BIN = {"range": 2000.0, "grazing_angle": np.pi / 2, "beamlets": 3, "phases": "incoherent"}
 """Ranges 3 um apart in bins of 0.34 m."""
-
-
-def keys(n, seed=5):
-    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
-
-
-def prepared(parameters, effects=CORE):
-    ((_, shots),) = prepare(parameters, effects)
-    return shots
 
 
 def with_share(parameters, share):

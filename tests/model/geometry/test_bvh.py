@@ -147,15 +147,6 @@ def test_every_triangle_lies_in_just_one_leaf_and_inside_its_box():
     assert seen == 5000
 
 
-def test_the_children_lie_inside_their_parents_box():
-    tree = build(*soup(np.random.default_rng(4), 3000, "plain"))
-    for node, c in np.argwhere(tree.children >= 0):
-        inside = tree.bounds[tree.children[node, c]]
-        inside = inside[:, inside[0] < inside[3]]
-        assert (inside[:3] >= tree.bounds[node, :3, c, None]).all()
-        assert (inside[3:] <= tree.bounds[node, 3:, c, None]).all()
-
-
 def test_the_same_mesh_gives_the_same_tree():
     vertices, faces = soup(np.random.default_rng(5), 2000, "plain")
     for one, other in zip(build(vertices, faces), build(vertices, faces), strict=True):
