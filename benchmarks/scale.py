@@ -46,12 +46,12 @@ class Line:
 
 def receipt(block, points=65_536):
     """A receipt as workers give it."""
-    from sweep.tasks import identity
+    from sweep.tasks import store
     from sweep.tasks.journal import Receipt
 
     return Receipt(
         block=block, points=points, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
-        write_seconds=0.0123, host="node-0123", pid=12_345, versions=identity.software(),
+        write_seconds=0.0123, host="node-0123", pid=12_345, versions=store.software(),
     )  # fmt: skip
 
 

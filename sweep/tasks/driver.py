@@ -14,7 +14,7 @@ import numpy as np
 from sweep.storage.atomic_replace import beside, put, real, replaced_by, settle
 from sweep.storage.locations import PACKED, Location, located
 from sweep.storage.opening import read_attributes, study_id
-from sweep.tasks import identity, studies, user_code
+from sweep.tasks import studies, user_code
 from sweep.tasks.cluster import Pool, RunOptions
 from sweep.tasks.errors import BusyError, ClusterError, StoreError, told
 from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
@@ -35,7 +35,16 @@ from sweep.tasks.lock import Lock
 from sweep.tasks.progress import working
 from sweep.tasks.reuse import changed, refuse_unlike, what_is_there
 from sweep.tasks.session import Outcome, Session
-from sweep.tasks.store import create, remove, sync
+from sweep.tasks.store import (
+    create,
+    refuse_altered,
+    refuse_other_study,
+    refuse_other_versions,
+    refuse_to_replace,
+    remove,
+    sync,
+    under_way,
+)
 from sweep.tasks.verify import refuse_damaged
 
 if TYPE_CHECKING:
@@ -104,10 +113,10 @@ def resume(store: str | Location, *, spec: Declared | None = None, **options: An
     """
     named, how = real(located(store)), RunOptions(**options)
     named = replaced_by(named) if isinstance(named, Path) else named
-    path = identity.under_way(named) or named
+    path = under_way(named) or named
     attributes, study = _held(path)
     if spec is not None:
-        identity.refuse_other_study(path, attributes, study.spec, spec)
+        refuse_other_study(path, attributes, study.spec, spec)
     _refuse_unsound(path, attributes, study)
     user_code.check(study.spec)
     if spec is None:
@@ -175,7 +184,7 @@ def extend(
     refuse_unlike(path, older.spec, asked)
     goal = path if to is None else real(located(to))
     if not overwrite:
-        identity.under_way(goal)
+        under_way(goal)
     return _into(goal, asked, pool, replace=overwrite or goal == path, anew=overwrite, extends=path)
 
 
@@ -197,17 +206,17 @@ def _refuse_unsound(
     path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
 ) -> None:
     """Refuse a store of other versions, or one that is not as it was made."""
-    identity.refuse_other_versions(path, attributes, where="this machine")
-    identity.refuse_altered(path, attributes, study.spec)
+    refuse_other_versions(path, attributes, where="this machine")
+    refuse_altered(path, attributes, study.spec)
     refuse_damaged(path)
 
 
 def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
     """Refuse a place in which there is something, or for which something is under way."""
-    new = identity.under_way(path)
+    new = under_way(path)
     if path.exists():
         attributes, held = _held(path)
-        identity.refuse_other_study(path, attributes, held.spec, study.spec)
+        refuse_other_study(path, attributes, held.spec, study.spec)
         done = int(np.count_nonzero(receipted(path, study)))
         said = f"{path} holds this study already, {done} of {study.n_blocks} blocks done"
     elif new:
@@ -235,7 +244,7 @@ def _into(
     new, facts, durable = path, _facts(asked), pool.options.durable
     with ExitStack() as stack:
         if replace and path.exists():
-            identity.refuse_to_replace(path)
+            refuse_to_replace(path)
             stack.callback(Lock(path).release)
         if replace and isinstance(path, Path) and (path.exists() or beside(path).exists()):
             new = beside(path)
@@ -248,7 +257,7 @@ def _into(
             Lock(new).release()  # refuses where someone writes to it
         elif there:
             begun, held = _held(new)
-            identity.refuse_other_study(new, begun, held.spec, asked)
+            refuse_other_study(new, begun, held.spec, asked)
             _refuse_unsound(new, begun, held)
             write_recipe(new, **read_recipe(new) | facts)
         if isinstance(study, FlightStudy) and (anew or not there):
@@ -393,7 +402,7 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
     attributes = read_attributes(path)
     if attributes["study_id"] != eyepoints.id:
         raise StoreError(f"{path} holds other eyepoints than its name says: remove it")
-    identity.refuse_other_versions(path, attributes, where="this machine")
+    refuse_other_versions(path, attributes, where="this machine")
     refuse_damaged(path)
     return bool(read_recipe(path)) and bool(committed(path, eyepoints).all())
 

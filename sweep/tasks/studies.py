@@ -10,7 +10,7 @@ from sweep.scenes.files import SceneError
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, located
-from sweep.tasks import identity
+from sweep.tasks import store
 from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
@@ -46,7 +46,7 @@ def _reuse(path: Location, study: GridStudy | FlightStudy) -> Reuse | None:
     """Results that the store at a path has of a study; None where it is gone, or has none."""
     try:
         attributes = opening.read_attributes(path)
-        identity.refuse_other_versions(path, attributes, where="this machine")
+        store.refuse_other_versions(path, attributes, where="this machine")
         spec = _spec(path, read_recipe(path), attributes.get("spec", "{}"))
         if type(spec) is not type(study.spec) or spec.seed != study.spec.seed:
             return None

@@ -380,11 +380,13 @@ class Study(Content, ABC):
         return sum(grid.points_in(part) for grid, part in zip(self.grids, marked, strict=True))
 
     @cached_property
-    def _follows(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
-        """Dimensions that arrays follow, by group and name."""
-        found: dict[str, dict[str, tuple[int | None, ...]]] = {group: {} for group in self._groups}
-        for name, layout in self.layouts.items():
-            found[layout.group][name] = self._groups[layout.group][1].follows(layout)
+    def _follows(self) -> dict[str, tuple[list[tuple[int | None, ...]], dict[str, int]]]:
+        """Dimensions that arrays of a group may follow, and by name which of these each does."""
+        found: dict[str, tuple[list[tuple[int | None, ...]], dict[str, int]]] = {}
+        for group, (_, grid) in self._groups.items():
+            follows = {n: grid.follows(a) for n, a in self.layouts.items() if a.group == group}
+            kinds = list(dict.fromkeys(follows.values()))
+            found[group] = kinds, {name: kinds.index(each) for name, each in follows.items()}
         return found
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
@@ -392,13 +394,14 @@ class Study(Content, ABC):
         grid, number = self.find(block)
         position = grid.position(number)
         apart = {k for k, at in enumerate(position) if at}  # of these an array must have them all
-        arrays = self._follows[grid.group]
-        chunk = {
-            follows: tuple(0 if k is None else position[k] for k in follows)
-            for follows in set(arrays.values())
+        kinds, arrays = self._follows[grid.group]
+        at = [
+            tuple(0 if k is None else position[k] for k in follows)
             if apart.issubset(follows)
-        }
-        return {name: chunk[follows] for name, follows in arrays.items() if follows in chunk}
+            else None
+            for follows in kinds
+        ]
+        return {name: place for name, kind in arrays.items() if (place := at[kind]) is not None}
 
     def regions(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Slices of the arrays that a block writes."""

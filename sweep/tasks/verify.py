@@ -31,7 +31,7 @@ from sweep.storage.locations import (
 )
 from sweep.storage.logs import damaged_lines, digest, read_lines, read_sealed
 from sweep.storage.opening import MANIFEST
-from sweep.tasks import identity, journal, lock, store, studies
+from sweep.tasks import journal, lock, store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
@@ -142,7 +142,7 @@ def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
 def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progress) -> Report:
     found, restored = damages(path), []
     if found and study and repair:
-        identity.refuse_foreign(path)  # a lock would be the first thing of ours in it
+        store.refuse_foreign(path)  # a lock would be the first thing of ours in it
         with lock.Lock(path):
             found, restored = [], restore(path, study)
     logs = _of_logs(path)
@@ -350,7 +350,7 @@ def restore(path: Location, study: Study) -> list[str]:
     except StoreError:
         written = {}
     if written:
-        identity.refuse_other_versions(path, written, where="this machine")
+        store.refuse_other_versions(path, written, where="this machine")
     if written.get("study_id", study.id) != study.id:
         raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     with told(f"{path} can't be mended"), tempfile.TemporaryDirectory() as directory:

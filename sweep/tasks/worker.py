@@ -18,7 +18,7 @@ from typing import TypeVar
 from sweep.storage.atomic_replace import stamp
 from sweep.storage.locations import located
 from sweep.storage.opening import read_attributes
-from sweep.tasks import identity, journal, store, studies
+from sweep.tasks import journal, store, studies
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun, Failure, Receipt
@@ -92,7 +92,7 @@ def study(path: str, study_id: str) -> store.Arrays:
 def _open(path: str, study_id: str) -> store.Arrays:
     attributes, held = studies.read(located(path))
     _refuse_another(path, study_id)
-    identity.refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
+    store.refuse_other_versions(path, attributes, where=f"worker on {socket.gethostname()}")
     return store.Arrays(path, held)
 
 
@@ -176,7 +176,7 @@ def _one(arrays: store.Arrays, block: int, job: Job, stop: Stop) -> Receipt | fl
         write_seconds=round(ended - evaluated, 6),
         host=socket.gethostname(),
         pid=os.getpid(),
-        versions=identity.software(),
+        versions=store.software(),
         taken=earlier.taken.pop(block, 0) if earlier else 0,
     )
 

@@ -5,11 +5,12 @@ import pytest
 import xarray as xr
 from small import STUDY, copied, everything, quiet, small, tree
 
-from sweep.tasks import cluster, driver, identity
+from sweep.tasks import cluster
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.lock import Lock
 from sweep.tasks.status import status
+from sweep.tasks.store import software
 
 
 def altered(store, **changes):
@@ -42,7 +43,7 @@ def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tm
 @pytest.mark.parametrize(
     ("changes", "shown"),
     [
-        ({"software": {**identity.software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
+        ({"software": {**software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
         ({"model_version": "0.0"}, "model: 0.0 in the store, "),
         ({"study_id": "0" * 32}, "attributes were changed"),
         ({"layout": 99}, "laid out as version 99"),
@@ -112,7 +113,7 @@ def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monk
     store = copied(undisturbed, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     before = tree(store)
-    monkeypatch.setattr(driver.identity, "refuse_other_versions", refusing_on_workers)
+    monkeypatch.setattr("sweep.tasks.store.refuse_other_versions", refusing_on_workers)
     with pytest.raises(StoreError, match="worker on"):
         resume(store, progress=False, workers=1, processes=False)
     assert tree(store) == before

@@ -15,7 +15,7 @@ import numpy as np
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
-from sweep.tasks import identity, store
+from sweep.tasks import store
 from sweep.tasks.accuracy.bench import Bench, GridBench, Seen, Trial, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.rungs import (
@@ -160,7 +160,7 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
         raise StoreError(f"{path} holds a study's results: name another --store")
     if not overwrite:
         raise StoreError(f"{path} is there already: --overwrite measures anew")
-    identity.refuse_to_replace(path)
+    store.refuse_to_replace(path)
 
 
 def storing(study: Study) -> float:
@@ -466,7 +466,7 @@ class Content:
             "question": "What does accuracy cost in time?",
             "spec": self._spec.to_json(),
             "reference": measured.ladder.about,
-            "environment": {"processor": identity.processor(), **identity.software()},
+            "environment": {"processor": store.processor(), **store.software()},
             "unit": self._bench.unit,
             "points": len(measured.done),
             "study_points": self._bench.whole,
