@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos bench side-by-side effects accuracy stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -77,9 +77,6 @@ fuzz: $(READY)
 KILLS ?= 210
 chaos: $(READY)
 	$(BIN)/python tests/faults/chaos.py --kills $(KILLS) --seed $(SEED)
-
-bench: $(READY)
-	$(BIN)/python benchmarks/bench.py
 
 # What the engine costs beside others', and what a second worker brings; on a quiet machine.
 peers: $(READY)
