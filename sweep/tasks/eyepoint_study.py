@@ -64,14 +64,20 @@ class EyepointStudy(Study):
     ----------
     spec, scanner
         A study of the scene, and the name of the scanner.
-    beamlets
-        Rays of each shot; those of the spec by default.
+    beamlets, world
+        Rays of each shot, and the scene, built; those of the spec by default.
     """
 
     unit = "shots"
 
-    def __init__(self, spec: SceneSpec, scanner: str, beamlets: int | None = None) -> None:
-        self.spec, self.scanner = spec, scanner
+    def __init__(
+        self,
+        spec: SceneSpec,
+        scanner: str,
+        beamlets: int | None = None,
+        world: World | None = None,
+    ) -> None:
+        self.spec, self.scanner, self._world = spec, scanner, world
         self.cycles = spec.cycles(scanner)
         self.shots_a_cycle = spec.shots_a_cycle(scanner)
         self.beamlets = beamlets or int(spec.parameters()["footprint.beamlets"])
@@ -191,7 +197,7 @@ class EyepointStudy(Study):
     @property
     def world(self) -> World:
         """The scene, built when it is first looked at."""
-        return world_of(self.spec)
+        return self._world or world_of(self.spec)
 
     @cached_property
     def _optics(self) -> dict[str, Any]:
@@ -229,19 +235,16 @@ def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)
 
 
 class FinerRays:
-    """Casts shots of a scene with any number of rays.
+    """Casts shots of a scene, its own or another's that is built, with any number of rays."""
 
-    ``make`` makes the study of what is seen with so many.
-    """
-
-    def __init__(self, spec: SceneSpec, make: Callable[..., EyepointStudy] = EyepointStudy) -> None:
-        self._spec, self._make = spec, make
+    def __init__(self, spec: SceneSpec, world: World | None = None) -> None:
+        self._spec, self._world = spec, world
         self._known: dict[tuple[str, int], EyepointStudy] = {}
 
     def see(self, scanner: str, shots: np.ndarray, rays: int) -> Eyepoints:
         """Eyepoints of shots, by number (n,)."""
         if (scanner, rays) not in self._known:
-            self._known[scanner, rays] = self._make(self._spec, scanner, beamlets=rays)
+            self._known[scanner, rays] = EyepointStudy(self._spec, scanner, rays, self._world)
         return self._known[scanner, rays].observe(shots)
 
 

@@ -35,7 +35,6 @@ from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
-    from sweep.spec.world import World
     from sweep.tasks.accuracy.bench import Look
 
 #: Places along the axes at which each scanner is looked at.
@@ -83,21 +82,6 @@ class Cast(NamedTuple):
     seconds: float
 
 
-class _Caster(EyepointStudy):
-    """Eyepoints in a world that others share, as building one can take seconds."""
-
-    def __init__(
-        self, spec: SceneSpec, scanner: str, world: World, beamlets: int | None = None
-    ) -> None:
-        super().__init__(spec, scanner, beamlets)
-        self._world = world
-
-    @property
-    def world(self) -> World:
-        """The scene."""
-        return self._world
-
-
 class FlightBench(Bench):
     """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
@@ -111,7 +95,7 @@ class FlightBench(Bench):
         super().__init__()
         self.spec = spec
         self._studies: dict[str, FlightStudy] = {}
-        self._casters: dict[str, _Caster] = {}
+        self._casters: dict[str, EyepointStudy] = {}
         self._cast: dict[tuple[str, int, bytes], Cast] = {}
         self._finer: dict[str, FinerRays] = {}
         self._geometries: dict[tuple[str, str], str] = {}
@@ -216,7 +200,8 @@ class FlightBench(Bench):
             self._geometries[rung.name, scanner] = spec.geometry_id(scanner)
         geometry = self._geometries[rung.name, scanner]
         if geometry not in self._casters:
-            self._casters[geometry] = _Caster(spec, scanner, world_of(self.spec))
+            # in a world that all share, as building one can take seconds
+            self._casters[geometry] = EyepointStudy(spec, scanner, world=world_of(self.spec))
         which_shots = geometry, tiles.start, tiles.index.tobytes()
         if which_shots not in self._cast:
             caster = self._casters[geometry]
@@ -265,8 +250,7 @@ class FlightBench(Bench):
 
     def _finer_rays(self, rung: Rung) -> FinerRays:
         if rung.name not in self._finer:
-            make = partial(_Caster, world=world_of(self.spec))
-            self._finer[rung.name] = FinerRays(self._study(rung).spec, make)
+            self._finer[rung.name] = FinerRays(self._study(rung).spec, world_of(self.spec))
         return self._finer[rung.name]
 
 
