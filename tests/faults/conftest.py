@@ -1,4 +1,14 @@
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "tasks"))
+
+from small import quiet, small, tree
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """Files of the small study, run as a plain loop."""
+    return tree(quiet(small(), tmp_path_factory.mktemp("undisturbed") / "small.zarr").store)

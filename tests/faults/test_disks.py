@@ -13,13 +13,6 @@ from sweep.tasks.status import status
 from sweep.tasks.verify import verify
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    path = tmp_path_factory.mktemp("undisturbed") / "small.zarr"
-    assert run(small(), store=path, scheduler="none", progress=False).complete
-    return tree(path)
-
-
 @pytest.fixture
 def disk(tmp_path):
     """A small disk of our own."""

@@ -107,13 +107,6 @@ def wait_for(condition, timeout: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    path = tmp_path_factory.mktemp("undisturbed") / "small.zarr"
-    assert run(small(), store=path, scheduler="none", progress=False).complete
-    return tree(path)
-
-
 def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Resume, and see that the store is the undisturbed one and committed work was not repeated."""
     store = tmp_path / "small.zarr"

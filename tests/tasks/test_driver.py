@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from distributed import Client, LocalCluster
-from small import STUDY, copied, deadly, evaluated, failing, logged, quiet, receipts, small, tree
+from small import STUDY, deadly, evaluated, failing, logged, quiet, receipts, small, tree
 
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
 from sweep.tasks import session, store
@@ -48,37 +48,7 @@ def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
     assert tree(outcome.store) == tree(undisturbed)
 
 
-def test_the_values_are_the_same_bit_for_bit_in_blocks_of_another_size(undisturbed, tmp_path):
-    whole = quiet(small(storage={"block_points": 1000}), tmp_path / "whole.zarr")
-    single = quiet(small(storage={"block_points": 1}), tmp_path / "single.zarr")
-    assert (whole.blocks, single.blocks) == (1, 72)
-    expected = xr.open_zarr(undisturbed)
-    for other in (whole, single):
-        found = xr.open_zarr(other.store)
-        assert set(found.data_vars) == set(expected.data_vars)
-        for name in expected.data_vars:
-            assert found[name].values.tobytes() == expected[name].values.tobytes(), name
-
-
-def test_counts_of_draws_do_not_depend_on_blocks_workers_or_axes(tmp_path):
-    draws = {"number": 70, "batch": 30}
-    plain = quiet(small(draws=draws), tmp_path / "plain.zarr")
-    threads = quiet(small(draws=draws), tmp_path / "t.zarr", workers=2, processes=False)
-    assert tree(plain.store) == tree(threads.store)
-    expected = xr.open_zarr(plain.store)
-    assert expected.batch_draws.values.tolist() == [30, 30, 10]
-    assert 0 < expected.n_detected_up.values.sum() < 70 * 72
-    blocks = quiet(small(draws=draws, storage={"block_points": 5}), tmp_path / "blocks.zarr")
-    np.testing.assert_array_equal(
-        xr.open_zarr(blocks.store).n_detected_up.values, expected.n_detected_up.values
-    )
-    axes = {path: values for path, values in STUDY["axes"].items() if "power" not in path}
-    one_watt = quiet(small(draws=draws, axes=axes), tmp_path / "one_watt.zarr")
-    np.testing.assert_array_equal(
-        xr.open_zarr(one_watt.store).n_detected_up.values, expected.n_detected_up.values[0]
-    )
-
-
+FIXED = {"draws": {"number": 70, "batch": 30}}
 ADAPTIVE = {
     "draws": {"limit": 60, "batch": 20},
     "accuracy": {"tolerance": 0.09, "confidence": 0.9},
@@ -89,17 +59,22 @@ ADAPTIVE = {
 """Drawn until pd is known within 0.09, but 60 times at most."""
 
 
-def test_what_is_drawn_to_an_accuracy_does_not_depend_on_blocks_workers_or_axes(tmp_path):
-    plain = quiet(small(**ADAPTIVE), tmp_path / "plain.zarr")
-    threads = quiet(small(**ADAPTIVE), tmp_path / "t.zarr", workers=2, processes=False)
+@pytest.mark.parametrize("drawn", [FIXED, ADAPTIVE], ids=["a fixed number", "to an accuracy"])
+def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn):
+    plain = quiet(small(**drawn), tmp_path / "plain.zarr")
+    threads = quiet(small(**drawn), tmp_path / "t.zarr", workers=2, processes=False)
     assert tree(plain.store) == tree(threads.store)
     expected = xr.open_zarr(plain.store)
-    numbers = expected.n_draws.values
-    assert set(np.unique(numbers)) == {40, 60} and "batch" not in expected.dims
-    assert ((expected.accuracy_missed > 0).values <= (numbers == 60)).all()
-    whole = quiet(small(**ADAPTIVE, storage={"block_points": 1000}), tmp_path / "whole.zarr")
+    if drawn is FIXED:
+        assert expected.batch_draws.values.tolist() == [30, 30, 10]
+        assert 0 < expected.n_detected_up.values.sum() < 70 * 72
+    else:
+        numbers = expected.n_draws.values
+        assert set(np.unique(numbers)) == {40, 60} and "batch" not in expected.dims
+        assert ((expected.accuracy_missed > 0).values <= (numbers == 60)).all()
+    whole = quiet(small(**drawn, storage={"block_points": 1000}), tmp_path / "whole.zarr")
     axes = {path: values for path, values in STUDY["axes"].items() if "power" not in path}
-    one_watt = quiet(small(**ADAPTIVE, axes=axes), tmp_path / "one_watt.zarr")
+    one_watt = quiet(small(**drawn, axes=axes), tmp_path / "one_watt.zarr")
     again, at_one_watt = xr.open_zarr(whole.store), xr.open_zarr(one_watt.store)
     for name, values in expected.data_vars.items():
         assert again[name].values.tobytes() == values.values.tobytes(), name
@@ -161,36 +136,6 @@ def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
     assert resumed.complete and resumed.blocks_computed == 12 - outcome.blocks_done
     assert Counter(evaluated(log)) == Counter(range(12))
     assert tree(path) == tree(undisturbed)
-
-
-def test_what_is_complete_is_not_computed_again(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    log = tmp_path / "log"
-    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
-    assert outcome.complete and outcome.blocks_computed == 0
-    assert evaluated(log) == []
-
-
-@pytest.mark.parametrize("damage", ["missing", "empty"])
-def test_a_block_whose_chunk_is_missing_or_empty_is_computed_again(undisturbed, tmp_path, damage):
-    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
-    chunk = store / "pd_up" / "c" / "0" / "5" / "0"
-    chunk.unlink() if damage == "missing" else chunk.write_bytes(b"")
-    assert status(store).blocks_done == 12  # it reads the log; `resume` looks at the chunks
-    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
-    assert outcome.complete and evaluated(log) == [5]
-    assert tree(store) == tree(undisturbed)
-
-
-def test_a_block_whose_receipt_was_torn_is_computed_again(undisturbed, tmp_path):
-    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
-    path = store / ".sweep" / "receipts.jsonl"
-    path.write_bytes(path.read_bytes()[:-20])
-    last = receipts(undisturbed)[-1]
-    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
-    assert outcome.complete and evaluated(log) == [last]
-    assert sorted(receipts(store)) == list(range(12))
-    assert tree(store) == tree(undisturbed)
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])

@@ -22,7 +22,6 @@ from sweep.tasks import grid_study
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.lock import Lock
 from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.verify import verify
@@ -156,13 +155,6 @@ def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
 @given(pair=studies())
 def test_many_grids_extended_to_larger_ones(tmp_path_factory, pair):
     see_that_it_extends(tmp_path_factory.mktemp("many"), pair)
-
-
-@pytest.mark.slow
-def test_workers_take_points_as_a_plain_loop_does(tmp_path, undisturbed):
-    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["in between"][0])
-    outcome = extend(store, spec, workers=2, progress=False)
-    assert outcome.complete and tree(store) == at_once(spec, tmp_path)
 
 
 #: Effects on demand: which ones a point is simulated with depends on the points around it.
@@ -424,14 +416,6 @@ def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed)
     assert tree(path) == tree(undisturbed)
     assert larger(path, other, overwrite=True).complete
     assert tree(path) == at_once(other, tmp_path)
-
-
-def test_one_that_is_written_is_not_extended(tmp_path, undisturbed):
-    path = copied(undisturbed, tmp_path)
-    lock = Lock(path)
-    with pytest.raises(StoreError, match="is being written by process"):
-        larger(path, small(axes=MORE["appended"][0]))
-    lock.release()
 
 
 class Interrupting(Progress):

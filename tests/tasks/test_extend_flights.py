@@ -6,13 +6,12 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
-from small import everything, quiet, small, tree
+from small import everything, quiet, tree
 from small_flights import SCENE, small_scene
 from test_extend import Interrupting, larger, see_it_refused
 
 from sweep.cli import main
 from sweep.model import clouds, navigation
-from sweep.storage.atomic_replace import beside
 from sweep.tasks import flight_study
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.flight_study import FlightStudy
@@ -246,16 +245,6 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, 
     assert tree(here) == at_once(spec, here)
 
 
-def test_ctrl_c_leaves_the_store_and_both_commands_go_on(here, flown, computed, drawn_more):
-    spec = flight(draws=MORE_DRAWS)
-    for _ in range(2):
-        outcome = extend(here, spec, progress=Interrupting(), scheduler="none")
-        assert outcome.stopped == "interrupted" and outcome.store == beside(here)
-        assert tree(here) == tree(flown)
-    assert resume(here, progress=False, scheduler="none").complete
-    assert computed.shots == SHOTS * 6 and tree(here) == drawn_more
-
-
 def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeypatch, computed):
     base = tmp_path / "declared"
     base.mkdir()
@@ -323,10 +312,6 @@ REFUSED = {
 def test_what_is_no_larger_study_is_refused_field_by_field(flown, changes, told):
     words = "new scanners, more draws.* needs a store of its own"
     see_it_refused(flown, flight(**changes), *told, match=words)
-
-
-def test_a_grid_is_no_larger_flight(flown):
-    see_it_refused(flown, small(), match="have nothing in common")
 
 
 def test_another_study_put_in_the_older_ones_place_is_not_taken_for_it(

@@ -6,7 +6,6 @@ import pytest
 from small import STUDY, small
 from small_flights import small_scene
 
-from sweep.model.philox import point_keys
 from sweep.storage.locations import located
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid import (
@@ -119,13 +118,6 @@ def test_words_and_signed_zeros_are_canonical():
     other = canonical_rows({"b": np.array([-0.0, 0.0]), "a": np.array(["hamming", "hann"])}, 2)
     assert one[0].tobytes() == other[0].tobytes()
     assert one[1].tobytes() != other[1].tobytes()
-
-
-def test_rows_of_points_make_keys_that_differ():
-    grid = Grid(small())
-    rows = canonical_rows(grid.parameters(0), grid.block_size(0))
-    keys = point_keys(rows, domain="test", seed=3)
-    assert len(np.unique(keys, axis=0)) == len(rows)
 
 
 def test_no_text_makes_a_row_that_holds_nan():

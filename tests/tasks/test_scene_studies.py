@@ -8,13 +8,12 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from small import evaluated, logged, receipts, tree
+from small import evaluated, logged, quiet, receipts, tree
 from small_flights import SCENE, small_scene
 from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
-from sweep.spec import SpecError
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
@@ -26,10 +25,6 @@ from sweep.tasks.progress import Progress
 from sweep.tasks.status import status
 from sweep.tasks.store import create
 from sweep.tasks.summary import scene_summary
-
-
-def quiet(spec, path, **place):
-    return run(spec, store=path, progress=False, **(place or {"scheduler": "none"}))
 
 
 @pytest.fixture(autouse=True)
@@ -113,25 +108,6 @@ def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbe
         [sys.executable, "-c", script], check=True, env=environment | dict.fromkeys(names, "1")
     )
     assert tree(tmp_path / "one.zarr") == tree(undisturbed.store)
-
-
-def test_blocks_of_another_size_hold_the_same_values(undisturbed, tmp_path):
-    storage = {"block_shots": 33, "block_draws": 5}
-    found = opened(quiet(small_scene(storage=storage), tmp_path / "scene.zarr").store)
-    expected = opened(undisturbed.store)
-    for scanner in ("three", "line"):
-        for name in expected[scanner].data_vars:
-            a, b = found[scanner][name].values, expected[scanner][name].values
-            assert a.tobytes() == b.tobytes(), (scanner, name)
-
-
-def test_more_draws_and_fewer_axes_leave_the_draws_that_both_have_alone(undisturbed, tmp_path):
-    spec = small_scene(draws={"number": 8, "returns": 3}, axes={})
-    found, expected = opened(quiet(spec, tmp_path / "scene.zarr").store), opened(undisturbed.store)
-    # The small instrument's own power is 1 W, the axis's second value.
-    for name in ("flags", "range_interpolated", "radial_velocity"):
-        few = expected["three"][name].values[1]
-        assert found["three"][name].values[:, :5].tobytes() == few.tobytes(), name
 
 
 def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_path, monkeypatch):
@@ -243,11 +219,6 @@ def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_pa
     assert tree(tmp_path) == tree(undisturbed.store.parent)
 
 
-def test_another_study_in_the_store_is_refused_with_what_differs(undisturbed):
-    with pytest.raises(StoreError, match=r"platform.*jitter"):
-        quiet(small_scene(platform=SCENE["platform"] | {"jitter": "10 urad"}), undisturbed.store)
-
-
 def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
     found = plan(small_scene(), store=tmp_path / "none.zarr", workers=2)
     assert {s.name: s.rays for s in found.scanners} == undisturbed.rays
@@ -307,13 +278,3 @@ def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
     assert unseen.any() and np.isfinite(found.true_altitude.values).all()
     assert np.isnan(found.pd_shot.values[unseen]).all()
     assert not (found.flags.values[unseen] & 1).any()
-
-
-def test_a_scene_that_can_not_be_made_leaves_nothing_behind(tmp_path):
-    spec = small_scene()
-    with pytest.raises(SpecError):
-        small_scene(scanners={})
-    (tmp_path / "scene.zarr").write_text("mine")
-    with pytest.raises(StoreError):
-        quiet(spec, tmp_path / "scene.zarr")
-    assert [p.name for p in tmp_path.iterdir()] == ["scene.zarr"]

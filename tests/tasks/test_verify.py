@@ -174,15 +174,6 @@ def test_a_directory_in_the_place_of_a_chunk_or_a_log_is_healed(undisturbed, tmp
     assert tree(store) == tree(undisturbed)
 
 
-def test_a_directory_in_the_place_of_an_eyepoint_is_healed(flight, tmp_path):
-    directory = shutil.copytree(flight.parent, tmp_path / "copy")
-    store = directory / flight.name
-    eyepoints = eyepoints_path(store, small_scene().geometry_id("line"))
-    put_directory(next(file for file in files(eyepoints) if file.parent.parent.name == "c"))
-    assert resume(store, progress=False, scheduler="none").complete
-    assert damages(store) == [] and tree(directory) == tree(flight.parent)
-
-
 @pytest.mark.parametrize("how", ["missing", "a directory", "flipped"])
 def test_a_store_without_a_coordinate_is_not_opened(undisturbed, tmp_path, how):
     store = copied(undisturbed, tmp_path)
