@@ -9,6 +9,12 @@ from sweep.model.segments import runs_of
 from sweep.model.shot import prepare
 from sweep.model.spectrum import IMAGED
 
+DRAWS = 20_000
+"""5 sigma of a proportion are at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows.
+
+A sample variance of as many is known to sqrt(2/20,000) = 1 %: at 5 sigma 5 % in a variance show.
+"""
+
 
 def prepared(parameters, effects=CORE):
     """Shots of parameters that are all of one category."""
@@ -19,6 +25,12 @@ def prepared(parameters, effects=CORE):
 def keys(n, seed=5):
     """Keys of n points."""
     return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
+
+
+def within_5_sigma(counts, chance, slack=0.0):
+    """Counts of as many draws that a chance explains, True for each."""
+    spread = np.sqrt(DRAWS * chance * (1 - chance))
+    return np.abs(counts - DRAWS * chance) <= 5 * spread + slack + 1e-9
 
 
 def by_vectors(distance, grazing, off):

@@ -17,18 +17,7 @@ def evaluate(
     first_draw: int = 0,
     draws: int,
 ) -> dict[str, np.ndarray]:
-    """Statistics of n shots, means over draws of random effects.
-
-    Parameters
-    ----------
-    parameters, effects, keys, first_draw, draws
-        As of :func:`sweep.model.realisations.realise`.
-
-    Returns
-    -------
-    dict of (n,) ndarray
-        As of :meth:`sweep.model.realisations.Means.results`.
-    """
+    """Statistics of n shots, (n,) by name, means over draws of random effects as realised."""
     means = Means(len(keys))
     for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
         means.add(stretch.point, statistics(stretch.shots))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from engine import DRAWS, within_5_sigma
 from scipy import stats
 from small_scenes import flight, instrument, observed, plate
 
@@ -16,9 +17,6 @@ from sweep.model.groups import groups
 from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
 from sweep.model.shot import evaluate
-
-DRAWS = 20_000
-"""5 sigma of a proportion is at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows."""
 
 METHODS = pytest.mark.parametrize("method", ["probabilities", "noise"])
 RANGE_BIN, VELOCITY_BIN = 299792458.0 * 600e6 / (4e12 * 2**16), 1550e-9 * 600e6 / 2**17
@@ -56,11 +54,6 @@ def _strong(table_4_1, **changes):
 def _weak(table_4_1, tnr, power=1.6e-3):
     """Light that leaves pd between 0 and 1, and a threshold in so many deviations of noise."""
     return instrument(table_4_1, fft_size=2**16, power=power, tnr=tnr)
-
-
-def _within_5_sigma(counts, chance, slack=0.0):
-    spread = np.sqrt(DRAWS * chance * (1 - chance))
-    return np.abs(counts - DRAWS * chance) <= 5 * spread + slack + 1e-9
 
 
 KIND = TRUE | FALSE_ALARM | MISPAIRED | MISREAD | SIDELOBE
@@ -189,7 +182,7 @@ def test_a_shot_that_sees_nothing_has_the_false_alarms_of_noise_alone(table_4_1,
     assert (got["flags"][:, :, 1:] == 0).all()
     there = got["flags"][:, :, 0] > 0
     assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM).all()
-    assert _within_5_sigma(there.sum(axis=1), chance**2).all()
+    assert within_5_sigma(there.sum(axis=1), chance**2).all()
     assert (got["surface"] == -1).all()
     for name in ("true_range", "true_radial_velocity", "pd"):
         assert np.isnan(got[name]).all(), name
@@ -205,7 +198,7 @@ def test_dropouts_of_one_surface_have_the_probability_stated(table_4_1, method):
         assert ((got["pd_shot"] > 0.05) & (got["pd_shot"] < 0.98)).all()
         assert (got["pfa_up"] < 1e-4).all()
         there = (got["flags"] > 0).any(axis=2).sum(axis=1)
-        assert _within_5_sigma(there, got["pd_shot"], DRAWS * 1e-4).all()
+        assert within_5_sigma(there, got["pd_shot"], DRAWS * 1e-4).all()
         assert (np.nan_to_num(got["pd"][:, :, 0], nan=-1.0).max(axis=1) == got["pd_shot"]).all()
 
 
@@ -230,7 +223,7 @@ def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
     stronger = counts.argmax(axis=0)
     assert set(stronger) == {0, 1}
     for place, surface in ((0, stronger), (1, 1 - stronger)):
-        assert _within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
+        assert within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
 
 
 @METHODS
@@ -256,7 +249,7 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
     points = (got["flags"][0] > 0).sum(axis=1)
     expected = tails[0] * tails[1]
     for k in range(1, min(4, len(expected)) + 1):
-        assert _within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
+        assert within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
     assert expected[2] > 0.01
     if place == ON_GROUND:
         # what is neither the true pair nor missing holds a false peak; a false peak takes a true
@@ -278,7 +271,7 @@ def test_leaked_signal_raises_the_false_alarms_stated(table_4_1, method):
     chance = got["pfa_up"] * got["pfa_down"]
     assert ((chance > 0.01) & (chance < 0.1)).all()
     second = (got["flags"][:, :, 1] & FALSE_ALARM) > 0
-    assert _within_5_sigma(second.sum(axis=1), chance).all()
+    assert within_5_sigma(second.sum(axis=1), chance).all()
     target = table_4_1(range=HEIGHT, radial_velocity=20.0, reflectance_law="lambert")
     plane = evaluate(target | parameters)
     expected = 1 - (1 - plane["pfa_segment"]) * (1 - plane["p_leakage_up"])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from engine import DRAWS
 from scipy.spatial.transform import Rotation
 from small_scenes import flight, instrument, observed, plate
 
@@ -14,10 +15,6 @@ from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, sol
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
 from sweep.spec.scene import Navigation
-
-DRAWS = 20_000
-"""A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of
-5 % in a variance (2.5 % in a standard error) shows."""
 
 MOVING = np.array([12.0, -7.0, -85.0])
 THREE, FOUR = cone(3, half_angle=np.radians(22.5), azimuth=0.2), corners(np.radians(22.5))

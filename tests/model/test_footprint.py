@@ -104,11 +104,3 @@ def test_the_range_spread_is_the_beams_projected_on_the_slope(degrees, number):
     assert spread == pytest.approx(slope, rel=3 * slope + 1e-9)
     # Rays off the axis are longer, and far ones are longer by more than near ones are shorter.
     assert mean == pytest.approx((divergence / 4) ** 2 + slope**2, rel=3 * slope + 1e-6, abs=1e-20)
-
-
-def test_rows_of_many_footprints_are_each_by_itself():
-    angles, divergences = np.radians([3.0, 50.0, 90.0]), np.array([1e-3, 50e-6, 1e-6])
-    together = plane_footprint(grazing_angle=angles, beam_divergence=divergences, number=37)
-    for row in range(3):
-        alone = footprint(angles[row], divergences[row], 37)
-        assert all(np.array_equal(a[row], b) for a, b in zip(together[:3], alone, strict=True))

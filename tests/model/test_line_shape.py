@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from engine import shape_of
 
-from sweep.model.line_shape import has_modes, record_places, to_modes
+from sweep.model.line_shape import has_modes
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.segments import tangents, tones
 from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
@@ -79,14 +79,6 @@ def test_few_modes_serve_small_phase_errors_and_tables_of_all_bins_the_large(nam
     assert numbers[0] == 1 and numbers[-1] == 0
     assert numbers[:4] == sorted(numbers[:4]) and numbers[1] < 24 < numbers[3]
     assert not has_modes(window(name, 512), 512) and not has_modes(shape, 65536)
-
-
-def test_modes_are_chebyshevs_coefficients():
-    x = record_places(48)
-    wave = np.polynomial.chebyshev.chebval(x, [0.3, -1.0, 0.0, 0.25, 0, 0, 0, 2.0])
-    expected = np.zeros(48)
-    expected[[0, 1, 3, 7]] = 0.3, -1.0, 0.25, 2.0
-    np.testing.assert_allclose(to_modes(48).T @ wave, expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", WINDOWS)

@@ -4,16 +4,13 @@ from math import radians
 
 import numpy as np
 import pytest
+from engine import DRAWS, within_5_sigma
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
 from sweep.model import navigation
 from sweep.model.geometry.scanner import cone, corners, squares
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, velocity
-
-DRAWS = 20_000
-"""A sample variance of as many draws is known to sqrt(2/20,000) = 1 %: at 5 sigma, an error of
-5 % in a variance (2.5 % in a standard error) shows."""
 
 THREE = cone(3, half_angle=radians(22.5))
 FOUR = corners(radians(22.5))
@@ -39,10 +36,6 @@ def _ranges(beams, height, *, normal=(0.0, 0.0, 1.0), offset=0.0):
     normal = np.asarray(normal)
     ahead = np.broadcast_to(offset, (len(beams), 3)) @ normal
     return (-height * normal[2] - ahead) / (beams @ normal)
-
-
-def _within_5_sigma(count, probability, draws=DRAWS):
-    return abs(count - draws * probability) <= 5 * np.sqrt(draws * probability * (1 - probability))
 
 
 # ---- velocity ----
@@ -193,7 +186,7 @@ def _drawn_with_alarm(beams, *, alarm, beam, seed):
 def test_true_beams_are_suspect_at_the_stated_level(beams):
     found = _drawn_with_alarm(beams, alarm=0.0, beam=0, seed=6)
     suspect = (found.status != SOLVED).sum()
-    assert suspect == 0 if len(beams) == 3 else _within_5_sigma(suspect, LEVEL)
+    assert suspect == 0 if len(beams) == 3 else within_5_sigma(suspect, LEVEL)
 
 
 @pytest.mark.parametrize("beam", [0, 6, 13])
@@ -201,7 +194,7 @@ def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
     found = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
     right = (found.status == EXCLUDED) & ~found.used[:, beam]
-    assert _within_5_sigma(right.sum(), 1 - LEVEL)
+    assert within_5_sigma(right.sum(), 1 - LEVEL)
     assert (found.status[~right] == WITHHELD).all() and np.isnan(found.value[~right]).all()
     assert (found.used[right].sum(axis=1) == 15).all() and (found.degrees[right] == 12).all()
     left = np.delete(SIXTEEN, beam, axis=0)
@@ -217,7 +210,7 @@ def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
     power = ncx2.sf(chi2.isf(LEVEL, 13), 13, (alarm / 0.01) ** 2 * (1 - leverage))
     assert 0.3 < power < 0.95
     found = _drawn_with_alarm(SIXTEEN, alarm=alarm, beam=beam, seed=8)
-    assert _within_5_sigma((found.status != SOLVED).sum(), power)
+    assert within_5_sigma((found.status != SOLVED).sum(), power)
     excluded = found.status == EXCLUDED
     assert (~found.used[excluded, beam]).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
 
@@ -242,7 +235,7 @@ def test_level_ground_tells_which_of_four_ranges_is_false():
     known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "level": LEVEL}
     found = altitude(**known, slope=0.0)
     right = (found.status == EXCLUDED) & (found.used.argmin(axis=1) == np.arange(DRAWS) % 4)
-    assert _within_5_sigma(right.sum(), 1 - LEVEL)
+    assert within_5_sigma(right.sum(), 1 - LEVEL)
     assert (altitude(**known).status == WITHHELD).all()  # a free plane has one degree of freedom
 
 

@@ -1,10 +1,10 @@
-"""Returns of footprints with one and several surfaces: truth, statistics, flags, invariances."""
+"""Returns of footprints with one and several surfaces: truth, statistics, flags."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from engine import prepared
+from engine import DRAWS, prepared, within_5_sigma
 from scipy import ndimage, stats
 
 from sweep.model import philox, truth, waveform
@@ -28,9 +28,6 @@ from sweep.model.returns import (
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate, find, prepare, report
 from sweep.model.window import samples, window
-
-DRAWS = 20_000
-"""5 sigma of a proportion is at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows."""
 
 METHODS = ["probabilities", "noise"]
 LIGHT = 299792458.0
@@ -70,10 +67,6 @@ def _certain(found, sure=1.0):
 def _drawn(shots, found=None, **keywords):
     found = groups(shots) if found is None else found
     return draw_returns(shots, found, keys=_keys(shots.range.size), **keywords)
-
-
-def _within_5_sigma(counts, chance, draws=DRAWS):
-    return np.abs(counts - draws * chance) <= 5 * np.sqrt(draws * chance * (1 - chance)) + 1e-9
 
 
 # Groups
@@ -210,8 +203,8 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
         none.append((1 - pd) * (1 - a))
         two.append(pd * a)
     number = (got.flags > 0).sum(2)
-    assert _within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
-    assert _within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
+    assert within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
+    assert within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
     # readings by chance (1e-3 of the false peaks) take a true peak from its partner
     both = ((got.group[..., 0] == 0) & (got.group[..., 2] == 0)).any(2)
     slack = 3e-3 * DRAWS * alarm[0]
@@ -488,6 +481,3 @@ def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
     got = _drawn(shots)
     assert got.flags[0, 0].tolist() == [TRUE, 0, 0, 0]
     assert 399.8 < got.range[0, 0, 0] < 400.5
-
-
-# Invariance

@@ -1,4 +1,4 @@
-"""Radial acceleration: its phase against the exact delay, its drift, its bound."""
+"""Radial acceleration: its phase against the exact delay."""
 
 import mpmath
 import numpy as np

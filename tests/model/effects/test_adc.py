@@ -1,4 +1,4 @@
-"""Rounding and clipping: against records quantised sample by sample, and a clipped sine's forms."""
+"""Rounding and clipping: against records quantised sample by sample."""
 
 import numpy as np
 import pytest

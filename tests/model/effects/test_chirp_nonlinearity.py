@@ -1,4 +1,4 @@
-"""Chirp nonlinearity: its phase against the sweep integrated, side lobes, symmetry, its bound."""
+"""Chirp nonlinearity: its phase against the sweep integrated."""
 
 import numpy as np
 import pytest

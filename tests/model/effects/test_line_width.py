@@ -1,4 +1,4 @@
-"""Line width: mean bin powers against simulated records, lags and limits; bounds."""
+"""Line width: mean bin powers against simulated records, and lags."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Jitter over a plane: vectors that meet it, small angles, draws within bounds."""
+"""Jitter over a plane: vectors that meet it, and laws of small angles."""
 
 import numpy as np
 import pytest

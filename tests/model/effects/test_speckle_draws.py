@@ -1,10 +1,10 @@
-"""Draws of speckle against the time-domain truth, Swerling's and Rice's laws, and plain sums."""
+"""Draws of speckle against the time-domain truth, Swerling's and Rice's laws, and integrals."""
 
 import numpy as np
 import pytest
 from engine import keys, prepared
 from mean_over_draws import evaluate
-from speckle_pairs import joint_detection
+from scipy.integrate import quad
 
 from sweep.model import truth, window
 from sweep.model.effects import speckle
@@ -155,15 +155,32 @@ def test_speckled_beamlets_in_a_bin_are_a_swerling_1_target(draws, table_4_1):
         assert (error < 0.51 / np.sqrt(draws)).all()
 
 
+def joint_detection(powers, covariance, level):
+    """Chance that bins of two segments both cross: given the first, the second is Rice's.
+
+    Mean powers of the diffuse signal, its covariance, and the threshold, in noise of sigma 1.
+    """
+
+    def both(first, second, shared, level):
+        first, second = first + 2.0, second + 2.0
+        sigma = np.sqrt((second - shared**2 / first) / 2)
+
+        def rice(t):
+            return np.exp(-t) * marcum_q1(shared * np.sqrt(t / first) / sigma, level / sigma).q
+
+        return quad(rice, level**2 / first, 60.0, epsabs=1e-13, limit=200)[0]
+
+    return np.vectorize(both)(*powers, covariance, level)
+
+
 def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     """All that parts the two segments is noise: the bivariate Rayleigh law of one amplitude."""
     parameters = at_snrs(table_4_1, SNRS, beamlets=1)
     shots, plain = prepared(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
     exact = joint_detection(
-        powers=powers, covariance=np.sqrt(powers[0] * powers[1]), bin_deviation=1.0,
-        threshold=shots.threshold / shots.bin_deviation,
-    )  # fmt: skip
+        powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_deviation
+    )
     means = evaluate(parameters, SPECKLED, keys=keys(3), draws=40_000)
     assert (abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1e-6).all()
     alone = means["pd_up"] * means["pd_down"]
@@ -181,6 +198,18 @@ def test_partly_rough_surfaces_are_ricean(share, beamlets, table_4_1):
         error = means[f"pd_{segment}_error"]
         assert (abs(means[f"pd_{segment}"] - exact) <= 5 * error + 1e-6).all(), segment
         assert (error > 1e-7).all()
+
+
+def test_the_coherent_share_is_that_of_a_sum_over_random_heights():
+    rng = np.random.default_rng(3)
+    wavelength, number = 1550e-9, 400_000
+    for roughness in (0.02, 0.08, 0.15):
+        heights = rng.normal(scale=roughness * wavelength, size=number)
+        mean = np.exp(4j * np.pi * heights / wavelength).mean()
+        share = speckle.coherent_share(roughness=roughness * wavelength, wavelength=wavelength)
+        assert abs(abs(mean) - np.sqrt(share)) < 5 / np.sqrt(number)
+    assert speckle.coherent_share(roughness=np.inf, wavelength=wavelength) == 0
+    assert speckle.coherent_share(roughness=0.0, wavelength=wavelength) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
@@ -238,9 +267,10 @@ def joint(parameters, phase):
     shots, plain = prepared(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
     return joint_detection(
-        powers=powers, covariance=np.exp(-0.5 * phase**2) * np.sqrt(powers[0] * powers[1]),
-        bin_deviation=1.0, threshold=shots.threshold / shots.bin_deviation,
-    )  # fmt: skip
+        powers,
+        np.exp(-0.5 * phase**2) * np.sqrt(powers[0] * powers[1]),
+        shots.threshold / shots.bin_deviation,
+    )
 
 
 def test_what_moves_across_the_beam_turns_speckles_apart_between_segments(table_4_1):

@@ -105,16 +105,6 @@ def test_an_instrument_on_an_arm_moves_with_the_body_that_turns_it():
     np.testing.assert_allclose(np.linalg.norm(arm, axis=1), math.sqrt(5.25), rtol=1e-9)
 
 
-def test_an_arm_on_a_spinning_body_runs_round_a_circle():
-    hover = ConstantAcceleration([0, 0, 100.0], [0, 0, 0], [0, 0, 0], 10.0)
-    flight = Flight(hover, Spin(rate=(0, 0, 0.5)), lever_arm=(3.0, 0.0, 0.0))
-    t = np.linspace(0, 10, 21)
-    state = flight.state(t)
-    circle = [3 * np.cos(t / 2), 3 * np.sin(t / 2), np.full(21, 100.0)]
-    np.testing.assert_allclose(state.position, np.column_stack(circle), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(state.velocity, axis=1), 1.5)
-
-
 @given(st.floats(0, 10), st.floats(0, 2 * math.pi))
 def test_a_fixed_attitude_does_not_turn(t, angle):
     q = quat.about(1, angle)
