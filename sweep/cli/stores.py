@@ -32,7 +32,7 @@ def status(store: Location) -> None:
     Where it draws, a table says at how many points accuracy.tolerance is met.
     """
     from sweep.tasks.progress import amount, duration
-    from sweep.tasks.status import status as read
+    from sweep.tasks.summary import status as read
 
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"

@@ -9,7 +9,7 @@ from small import receipts, small, tree
 
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 

@@ -16,7 +16,7 @@ import pytest
 from small import evaluated, logged, receipts, small, tree
 
 from sweep.tasks.driver import resume, run
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 BLOCKS = 12

@@ -29,7 +29,7 @@ from sweep.storage.logs import read_lines, sealed, unsealed
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.errors import StoreError
 from sweep.tasks.lock import LOCK, Holder, Lock, holder
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 

@@ -19,7 +19,7 @@ from sweep.storage.opening import NotAStoreError
 from sweep.tasks import store
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 
 
 class Payload:

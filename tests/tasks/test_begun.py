@@ -19,8 +19,8 @@ from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun
 from sweep.tasks.packing import pack
 from sweep.tasks.progress import Progress
-from sweep.tasks.status import status
 from sweep.tasks.study import Found, Known
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 QUICK = {**STUDY["instrument"], "laser": {**STUDY["instrument"]["laser"], "power": "0.1 W"}}

@@ -17,8 +17,8 @@ from sweep.tasks import session, store
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import Progress
-from sweep.tasks.status import status
 from sweep.tasks.store import Arrays, Written
+from sweep.tasks.summary import status
 from sweep.tasks.worker import Job, work
 
 

@@ -23,7 +23,7 @@ from sweep.tasks.driver import extend, resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import Progress
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 AXES = STUDY["axes"]

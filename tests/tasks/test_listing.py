@@ -13,7 +13,7 @@ from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Look, chunks_there, listed
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 
 STUDIES = {
     "grid": lambda path: GridStudy(small()),

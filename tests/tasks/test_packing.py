@@ -16,9 +16,8 @@ from sweep.tasks import packing
 from sweep.tasks.driver import resume
 from sweep.tasks.errors import StoreError
 from sweep.tasks.packing import pack, shard_shape
-from sweep.tasks.status import status
 from sweep.tasks.study import ArrayLayout
-from sweep.tasks.summary import scene_summary
+from sweep.tasks.summary import scene_summary, status
 from sweep.tasks.verify import verify
 
 

@@ -14,7 +14,7 @@ from small import copied, evaluated, quiet, receipts, small, tree
 from sweep.tasks import worker
 from sweep.tasks.clusters import machines
 from sweep.tasks.driver import resume, run
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.worker import Overtime
 
 

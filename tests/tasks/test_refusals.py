@@ -9,8 +9,8 @@ from sweep.tasks import cluster
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.lock import Lock
-from sweep.tasks.status import status
 from sweep.tasks.store import software
+from sweep.tasks.summary import status
 
 
 def altered(store, **changes):

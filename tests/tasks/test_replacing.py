@@ -22,7 +22,7 @@ from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.lock import Lock
 from sweep.tasks.packing import pack
 from sweep.tasks.spectra_export import write
-from sweep.tasks.status import status
+from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
 POWERS = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}

@@ -22,9 +22,8 @@ from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.lock import Lock
 from sweep.tasks.plan import plan
 from sweep.tasks.progress import Progress
-from sweep.tasks.status import status
 from sweep.tasks.store import create
-from sweep.tasks.summary import scene_summary
+from sweep.tasks.summary import scene_summary, status
 
 
 @pytest.fixture(autouse=True)

@@ -101,8 +101,8 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
     del os.environ[user_code.ALLOWED], sys.modules[mine]
     ran = runs(mine, tmp_path)
     sweep.open(tmp_path / "a.zarr")
-    from sweep.tasks.status import status
     from sweep.tasks.studies import read
+    from sweep.tasks.summary import status
 
     assert status(tmp_path / "a.zarr").complete
     assert read(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
