@@ -235,10 +235,12 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
 
 
 @pytest.mark.parametrize("fft_size", [64, 100, 255, 512, 1023, 2048, 4099, 8192])
-def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_size):
-    """Among them bundles as wide as the band, and all of whose lines lie past DC or Nyquist."""
+@pytest.mark.parametrize("image", [True, False])
+def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_size, image):
+    """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
-        held(drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart))
+        shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
+        held(replace(shots, image=image))
 
 
 @pytest.mark.parametrize("fft_size", [64, 255, 1023, 5000])
