@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sweep.spec import Spec
 from sweep.tasks.driver import run
+from sweep.tasks.progress import Progress
 
 STUDY = {
     "title": "Small",
@@ -48,6 +49,13 @@ STUDY = {
 def small(**changes) -> Spec:
     """The small study, 72 points, with some of its sections replaced."""
     return Spec.from_mapping({**STUDY, **changes}, base=Path("."))
+
+
+class Said(Progress, list):
+    """Progress that keeps what is said."""
+
+    def say(self, text):
+        self.append(text)
 
 
 def quiet(spec, store, **place):

@@ -1,14 +1,6 @@
-from small import small, tree
+from small import Said, small, tree
 
 from sweep.tasks.driver import run
-from sweep.tasks.progress import Progress
-
-
-class Said(Progress, list):
-    """Progress that keeps what is said."""
-
-    def say(self, text):
-        self.append(text)
 
 
 def test_dasks_own_account_of_a_run_is_a_page_and_changes_no_result(undisturbed, tmp_path):

@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small import quiet, small
+from small import Said, quiet, small
 
 import sweep
 from sweep.tasks import plan as planned
 from sweep.tasks import user_code
 from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
-from sweep.tasks.progress import Progress
 
 CODE = """
     import numpy as np
@@ -112,16 +111,6 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
         sweep.resume(tmp_path / "a.zarr", progress=False)
 
 
-class Told(Progress):
-    """Progress that keeps what is said."""
-
-    def __init__(self):
-        self.lines = []
-
-    def say(self, text):
-        self.lines.append(text)
-
-
 @pytest.mark.parametrize("extended", [False, True])
 def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, tmp_path, extended):
     user_code.allow([mine])
@@ -130,13 +119,13 @@ def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, t
 
     def told():
         sys.modules.pop(mine, None)
-        progress, place = Told(), {"scheduler": "none", "overwrite": True}
+        progress, place = Said(), {"scheduler": "none", "overwrite": True}
         if extended:
             spec = study(f"{mine}:detect", **larger)
             sweep.extend(store, spec, to=tmp_path / "b.zarr", progress=progress, **place)
         else:
             sweep.resume(store, scheduler="none", progress=progress)
-        return [line for line in progress.lines if f"the module {mine} has changed" in line]
+        return [line for line in progress if f"the module {mine} has changed" in line]
 
     assert told() == []
     with (tmp_path / f"{mine}.py").open("a") as file:
