@@ -487,6 +487,23 @@ def test_a_spec_is_read_and_planned_without_what_few_specs_need():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("command", ["status s.zarr", "run wrong.yaml", "run scene.yaml"])
+def test_no_command_that_computes_nothing_waits_for_the_compiler(here, command):
+    study = STUDY + "draws: {limit: 3}\n"  # whose status has a table of accuracy
+    Path("small.yaml").write_text(study)
+    Path("wrong.yaml").write_text(study.replace("reflectance", "reflektance"))
+    Path("scene.yaml").write_text(study.replace("target: {", "scene: {"))
+    if command.startswith("status"):
+        assert sweep("run", "small.yaml", "--store", "s.zarr", "--scheduler", "none").exit_code == 0
+    code = (
+        "import sys; from click.testing import CliRunner; from sweep.cli import main;"
+        f"done = CliRunner().invoke(main, {command.split()});"
+        "print(done.exit_code, 'pydantic' in sys.modules, 'numba' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0" if command.startswith("status") else "2", "True", "False"]
+
+
 def test_the_package_offers_load_run_and_resume(here):
     import sweep as package
 

@@ -26,7 +26,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.marcum import log_at_least_one, marcum_q1
 from sweep.model.window import Window, samples
 
 CIRCULAR = 0.01
@@ -82,6 +81,8 @@ def independent_bins(bins: ArrayLike, *, level: ArrayLike, correlation: float) -
 
 def _share(level: np.ndarray, correlation: float) -> np.ndarray:
     """ln(1 - h) / ln(1 - p), what each further bin counts for."""
+    from sweep.model.marcum import marcum_q1
+
     if correlation == 0.0:
         return np.ones_like(level)
     scaled = level / np.sqrt((1 - correlation) * (1 + correlation))
@@ -152,6 +153,8 @@ def log_segment_pfa(bins: ArrayLike, *, level: ArrayLike, correlation: float) ->
     >>> bool(log_segment_pfa(511, level=3.9, correlation=hann) < np.log(511) - 3.9**2 / 2)
     True
     """
+    from sweep.model.marcum import log_at_least_one
+
     level = np.asarray(level, float)
     number = independent_bins(bins, level=level, correlation=correlation)
     return log_at_least_one(-0.5 * np.square(level), number)

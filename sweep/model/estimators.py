@@ -57,8 +57,7 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detectors import Setting, taper
-from sweep.model.interpolation import lone_tone, phasors
+from sweep.model.detectors import FIXED, Setting, taper
 from sweep.model.waveform import SIGNS
 from sweep.model.window import Window
 
@@ -70,6 +69,17 @@ Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
 setting to frequencies (m,) [bins], float64."""
 
 PEAK_BIN = "peak_bin"
+
+DETECTOR, ESTIMATOR = "instrument.processing.detector.", "instrument.processing.estimator."
+DEFAULTS: dict[str, float | int | str] = {
+    DETECTOR + "kind": FIXED,
+    DETECTOR + "training": 32,
+    DETECTOR + "guard": 4,
+    DETECTOR + "rank": 0,
+    DETECTOR + "pfa": 1e-6,
+    ESTIMATOR + "kind": PEAK_BIN,
+}
+"""Of the parameters that say how whole spectra are looked at."""
 
 _STEPS = 512
 """Places between -1 and 1 bin at which curves are known."""
@@ -139,6 +149,8 @@ def chirp_z(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndar
 
 def maximum_likelihood(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
     """Most likely frequency of a lone tone in white noise."""
+    from sweep.model.interpolation import phasors
+
     w = setting.taper
     used = np.abs(w) > _LEAST_WEIGHT * np.abs(w).max()
     weight = np.where(used, 1.0 / np.where(used, w, 1.0), 0.0)
@@ -196,6 +208,8 @@ def _ratio(turned: np.ndarray, sign: int) -> np.ndarray:
 @lru_cache(maxsize=16)
 def _lone_tones(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances [bins] from -1 to 1, and the turned bins of tones that far above one, (k, 3)."""
+    from sweep.model.interpolation import lone_tone
+
     delta = np.arange(-_STEPS, _STEPS + 1) / _STEPS
     return delta, lone_tone(window, fft_size)(np.array([-1, 0, 1]) - delta[:, None]).real
 
@@ -234,6 +248,8 @@ def _at_rest(record: np.ndarray, bin_: int, setting: Setting) -> np.ndarray:
 
 def _climb(record: np.ndarray, start: float, fft_size: float) -> float:
     """Place [bins] of the nearest maximum of |sum x e^{-2 pi i n f / N}|^2, from a start."""
+    from sweep.model.interpolation import phasors
+
     n = np.arange(record.size) - 0.5 * (record.size - 1)
     place = start
     for _ in range(_NEWTON):

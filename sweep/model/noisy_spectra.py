@@ -31,12 +31,13 @@ from scipy import fft
 
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
+from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
 from sweep.model.draws import fading_of_draws
 from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
 from sweep.model.estimators import (
+    DETECTOR,
+    ESTIMATOR,
     ESTIMATORS,
-    PEAK_BIN,
     Deviation,
     Estimator,
     beat_deviation,
@@ -47,16 +48,6 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
-
-DETECTOR, ESTIMATOR = "instrument.processing.detector.", "instrument.processing.estimator."
-DEFAULTS: dict[str, float | int | str] = {
-    DETECTOR + "kind": FIXED,
-    DETECTOR + "training": 32,
-    DETECTOR + "guard": 4,
-    DETECTOR + "rank": 0,
-    DETECTOR + "pfa": 1e-6,
-    ESTIMATOR + "kind": PEAK_BIN,
-}
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
 """What is averaged over draws; the last two are squares of bounds."""
@@ -211,7 +202,7 @@ class Found(NamedTuple):
 
 
 def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Methods) -> View:
-    """View of one of some shots, by the parameters p of its point (:data:`DEFAULTS`)."""
+    """View of one of some shots, by the parameters p of its point, those of `DEFAULTS`."""
     training, rank = int(p[DETECTOR + "training"]), int(p[DETECTOR + "rank"])
     setting = Setting(
         fft_size=shots.fft_size,

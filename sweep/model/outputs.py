@@ -153,6 +153,13 @@ RUNNING_OUTPUTS: dict[str, Output] = {
 }
 """What draws of random effects leave for further ones, a row a point."""
 
+LOGARITHMS = np.array([name.startswith("log10_") for name in OUTPUTS])
+SPREAD_OF = LOGARITHMS | np.array([f"{name}_error" in ERROR_OUTPUTS for name in OUTPUTS])
+"""Outputs whose spread shows in a result."""
+
+RUNNING_COLUMNS = len(OUTPUTS) + int(SPREAD_OF.sum()) + int(LOGARITHMS.sum())
+"""Numbers a point that further draws need besides the means: counts, spreads, logarithms."""
+
 KEPT = ("snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance")
 """Of :data:`OUTPUTS`, what does not depend on the detector."""
 

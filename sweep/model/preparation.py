@@ -12,18 +12,20 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import alarms, beam, detection, link, waveform
+from sweep.model import alarms, beam, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import Fading
 from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
 from sweep.model.threshold import tnr_of
 from sweep.model.window import Window, canonical_name, window
+
+if TYPE_CHECKING:
+    from sweep.model.detection import Fading
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -158,7 +160,7 @@ class Shots:
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
     """Whether the record is I and Q, and its spectrum has signed bins and no images."""
-    fading: Fading | None = None
+    fading: "Fading | None" = None
     """Of echoes in developed speckle."""
     image: bool = False
     """Whether the lines' images at negative frequencies are summed."""
@@ -238,11 +240,15 @@ class Shots:
     @cached_property
     def threshold(self) -> np.ndarray:
         """Threshold on |X| [V], (n,)."""
+        from sweep.model import detection
+
         return detection.threshold(tnr=self.tnr, bin_deviation=self._deviation(self.quiet_variance))
 
     @property
     def floor(self) -> np.ndarray:
         """Signal over sigma below which bins that are taken one by one count as noise alone."""
+        from sweep.model import detection
+
         given, bins = self.leakage_floor, self.fft_size // 2 + 1
         if not np.any(given == AUTOMATIC):
             return given
@@ -253,6 +259,8 @@ class Shots:
 
     def both(self, up: np.ndarray, down: np.ndarray) -> np.ndarray:
         """Chance that up and down segment are detected, both, by their own chances; (..., n)."""
+        from sweep.model import detection
+
         if self.fading is None:
             return up * down
         level = self.threshold / self.line_deviation

@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.catalogue import DEFAULTS, SHARED
 from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane
-from sweep.model.outputs import ERROR_OUTPUTS, OUTPUTS, RUNNING
+from sweep.model.outputs import ERROR_OUTPUTS, LOGARITHMS, OUTPUTS, RUNNING, SPREAD_OF
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.resolution import resolved_categories
-from sweep.model.shot import SHARED, assembled, nodes
+from sweep.model.shot import assembled, nodes
 
 ROWS = 4096
 """Draws that are prepared at once, of all points together."""
@@ -30,12 +30,6 @@ BEAMLETS = 1 << 19
 """Beamlets of all these draws, of some 100 bytes each."""
 
 _NAMES = list(OUTPUTS)
-_LOGARITHMS = np.array([name.startswith("log10_") for name in _NAMES])
-_SPREAD_OF = _LOGARITHMS | np.array([f"{name}_error" in ERROR_OUTPUTS for name in _NAMES])
-"""Outputs whose spread shows in a result."""
-
-RUNNING_COLUMNS = len(_NAMES) + int(_SPREAD_OF.sum()) + int(_LOGARITHMS.sum())
-"""Numbers a point that further draws need besides the means: counts, spreads, logarithms."""
 
 
 class Stretch(NamedTuple):
@@ -113,13 +107,13 @@ class Means:
     def __init__(self, size: int) -> None:
         shape = len(OUTPUTS), size
         self._count = np.zeros(shape, np.int64)
-        self._mean = np.where(_LOGARITHMS[:, None], -np.inf, np.zeros(shape))
+        self._mean = np.where(LOGARITHMS[:, None], -np.inf, np.zeros(shape))
         self._spread = np.zeros(shape)
 
     def add(self, point: np.ndarray, outputs: Mapping[str, np.ndarray]) -> None:
         """Adds draws, (m,) each, in the order of their numbers for each point."""
         values = np.array([outputs[name] for name in OUTPUTS])
-        add(point, values, _LOGARITHMS, self._count, self._mean, self._spread)
+        add(point, values, LOGARITHMS, self._count, self._mean, self._spread)
 
     def moments(
         self, names: Sequence[str], points: np.ndarray
@@ -136,17 +130,17 @@ class Means:
 
     def running(self) -> np.ndarray:
         """What further draws are added to, besides the means, (n, RUNNING_COLUMNS)."""
-        kept = self._count, self._spread[_SPREAD_OF], self._mean[_LOGARITHMS]
+        kept = self._count, self._spread[SPREAD_OF], self._mean[LOGARITHMS]
         return np.concatenate(kept).T
 
     def go_on_from(self, means: Mapping[str, np.ndarray]) -> None:
         """Go on from what `results` and `running` gave before; zeros where nothing was drawn."""
-        columns = np.cumsum([len(_NAMES), _SPREAD_OF.sum()])
+        columns = np.cumsum([len(_NAMES), SPREAD_OF.sum()])
         count, spread, largest = np.split(means[RUNNING].T, columns)
         self._count[...] = count
-        self._spread[_SPREAD_OF] = spread
+        self._spread[SPREAD_OF] = spread
         mean = np.array([means[name] for name in OUTPUTS])
-        mean[_LOGARITHMS] = largest
+        mean[LOGARITHMS] = largest
         self._mean[...] = np.where(count > 0, mean, self._mean)
 
     def sums(self) -> np.ndarray:
@@ -165,7 +159,7 @@ class Means:
             error = np.sqrt(self._spread / (n * (n - 1.0)))
         # The running maximum of logarithms that are all -inf has nothing to add to it.
         logarithm = np.where(np.isneginf(self._mean), self._mean, logarithm)
-        mean = np.where(_LOGARITHMS[:, None], logarithm, self._mean)
+        mean = np.where(LOGARITHMS[:, None], logarithm, self._mean)
         means = dict(zip(OUTPUTS, np.where(n > 0, mean, np.nan), strict=True))
         errors = dict(zip(OUTPUTS, error, strict=True))
         return means | {name: errors[name.removesuffix("_error")] for name in ERROR_OUTPUTS}

@@ -44,7 +44,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import beam, detection, ground
+from sweep.model import beam, ground
 from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.lobes import Lobe, lobe
@@ -229,6 +229,8 @@ def beamlets_needed(
 
 def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Most that pd changes, summed over the segments, for the relative change of a bin's power."""
+    from sweep.model import detection
+
     b = detection.threshold(tnr=tnr_of(p), bin_deviation=np.asarray(1.0))
     a = 0.5 * (b + np.sqrt(b * b + 2))
     steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)

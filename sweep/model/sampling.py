@@ -28,7 +28,8 @@ import numpy as np
 
 from sweep.model.accuracy import COUNTED, Accuracy, bounded_mean, half_width
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, is_noisy
-from sweep.model.noisy_spectra import DEFAULTS, VALUES, Methods, View, counted, view_of
+from sweep.model.estimators import DEFAULTS
+from sweep.model.noisy_spectra import VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.realisations import ROWS, Means, add, certain, random_effects, realise
@@ -185,7 +186,7 @@ def simulate(
     parameters, effects
         As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
         are means over the same draws that are counted. For whole spectra, parameters also by the
-        names of :data:`sweep.model.noisy_spectra.DEFAULTS`.
+        names of :data:`sweep.model.estimators.DEFAULTS`.
     keys : (n, 2) uint64
         Random key of each point.
     first_draw : int

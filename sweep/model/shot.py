@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import waveform
-from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, PARAMETERS
+from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, SHARED
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.ground import Cast, Ground, Plane
 from sweep.model.marcum import log_any, log_at_least_one
@@ -19,9 +19,6 @@ from sweep.model.resolution import resolved_categories
 from sweep.model.segments import find
 
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
-
-SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
-"""Numbers of effects that points must share to be prepared together."""
 
 
 def nodes(effects: Collection[str]) -> tuple[Effect, ...]:

@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 
 from sweep.model import alarms
-from sweep.model.detection import RAYLEIGH_DEVIATION
-from sweep.model.marcum import log_at_least_one
 from sweep.model.waveform import record_length
 from sweep.model.window import canonical_name, window
 
@@ -59,6 +57,9 @@ def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
     >>> round(float(four_times_the_mean), 2)
     7.65
     """
+    from sweep.model.detection import RAYLEIGH_DEVIATION
+    from sweep.model.marcum import log_at_least_one
+
     given = [way for way in WAYS if way in p]
     if len(given) != 1:
         raise ValueError(f"give exactly one of {', '.join(WAYS)}, not {len(given)}")
@@ -97,6 +98,8 @@ def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np
 
 def _law(p: Mapping[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
     """Logarithm of the probability that noise alone raises an alarm in a segment, by the level."""
+    from sweep.model.marcum import log_at_least_one
+
     return lambda level: log_at_least_one(-0.5 * level**2, segment_bins(p, level))
 
 

@@ -7,8 +7,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
-
 COSINE_SUMS: dict[str, tuple[str, ...]] = {
     "rectangular": ("1", "0"),
     "hann": ("0.5", "0.5"),
@@ -77,6 +75,8 @@ class Window:
 
     def node_limits(self, power: bool) -> np.ndarray:
         """How few lines stand for many under this window (:mod:`sweep.model.lines`)."""
+        from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
+
         if power:
             return node_limits(self.power_band_weights, POWER_TOLERANCES)
         return node_limits(self.band_weights, AMPLITUDE_TOLERANCES)

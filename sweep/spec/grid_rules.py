@@ -21,7 +21,7 @@ from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
-from sweep.model.noisy_spectra import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.spec.axes import Axis, place_on_grid
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding

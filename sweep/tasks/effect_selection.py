@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.catalogue import FLAGS_APART, flags_of, names_of
+from sweep.model.effects.catalogue import FLAGS_APART, SHARED, flags_of, names_of
 from sweep.tasks.grid import Grid, Value
 from sweep.tasks.study import BlockGrid
 
@@ -132,8 +132,6 @@ class Tiles(BlockGrid):
             yield Alike(int(code), chosen, parameters)
 
     def _is_undivided(self, axis: int) -> bool:
-        from sweep.model.shot import SHARED
-
         return any(
             values.dtype.kind in "UO" or path in UNDIVIDED or path in SHARED
             for path, values in self.grid.values[axis].items()

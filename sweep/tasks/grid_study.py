@@ -114,8 +114,7 @@ class GridStudy(GrowingStudy):
 
     def outputs(self) -> list[ArrayLayout]:
         """An array for each output of the model, and those that say what was simulated."""
-        from sweep.model.outputs import ACCURACY_OUTPUTS
-        from sweep.model.realisations import RUNNING_COLUMNS
+        from sweep.model.outputs import ACCURACY_OUTPUTS, RUNNING_COLUMNS
 
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
         found = []
@@ -402,8 +401,7 @@ def _drawn(
 
 def no_sums(spec: Spec, count: int) -> Results:
     """Running sums of points that have none, where any point of the study may have some."""
-    from sweep.model.outputs import RUNNING
-    from sweep.model.realisations import RUNNING_COLUMNS
+    from sweep.model.outputs import RUNNING, RUNNING_COLUMNS
 
     some = spec.has_random_effects and not spec.draws.whole_spectra
     return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}

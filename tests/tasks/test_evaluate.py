@@ -8,8 +8,14 @@ from small import quiet, small
 
 from sweep.cli import main
 from sweep.model.effects.catalogue import CORE
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS, RUNNING
-from sweep.model.realisations import RUNNING_COLUMNS
+from sweep.model.outputs import (
+    ACCURACY_OUTPUTS,
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    OUTPUTS,
+    RUNNING,
+    RUNNING_COLUMNS,
+)
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import evaluate_points, select
 from sweep.tasks.summary import beyond_model

@@ -57,6 +57,9 @@ PARAMETERS: tuple[Parameter, ...] = tuple(
 )
 """Fields that effects bring into a spec."""
 
+SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
+"""Numbers of effects that points must share to be prepared together."""
+
 DEFAULTS = beam.DEFAULTS | {parameter.path: parameter.default for parameter in PARAMETERS}
 """Of the beams' parameters and of the effects'."""
 

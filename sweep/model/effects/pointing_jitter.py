@@ -27,7 +27,6 @@ from numpy.typing import ArrayLike
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Size
 from sweep.model.effects.points import Points, Smear, by_power
 from sweep.model.footprint import NO_SPREAD, reach_of
-from sweep.model.philox import STREAM_POINTING_JITTER, normals, uniforms
 
 RARE = 1e-6
 """Chance of a draw whose beam is further off than its size takes it to be."""
@@ -48,6 +47,8 @@ class Turned(NamedTuple):
 
 def angles(realisation: Realisation, sigma: np.ndarray) -> np.ndarray:
     """Angles (a, b) by which beams of this standard deviation are off, (n, 2) [rad]."""
+    from sweep.model.philox import STREAM_POINTING_JITTER, normals, uniforms
+
     draws = uniforms(realisation.keys, realisation.draw, STREAM_POINTING_JITTER, 2)
     return normals(draws) * np.asarray(sigma, float)[..., None]
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, detection, ground, link, resolution, waveform
+from sweep.model import beam, ground, link, resolution, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.lobes import Lobe, lobe
 from sweep.model.footprint import (
@@ -239,6 +239,8 @@ class Points:
     @cached_property
     def threshold(self) -> np.ndarray:
         """Threshold over sigma."""
+        from sweep.model import detection
+
         return np.asarray(
             detection.threshold(
                 tnr=tnr_of(self._words | self._numbers), bin_deviation=np.asarray(1.0)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from sweep.model import beam, philox
+from sweep.model import beam
 from sweep.model.effects.atmosphere import path_heights
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
@@ -164,6 +164,8 @@ def factors(
     realisation : Realisation
         Which draws.
     """
+    from sweep.model import philox
+
     uniforms = philox.uniforms(realisation.keys, realisation.draw, philox.STREAM_SCINTILLATION, 4)
     total = np.ones(realisation.draw.size)
     for i, variance in enumerate(v for leg in legs for v in leg):

@@ -38,7 +38,6 @@ import numpy as np
 from sweep.model.effects.effect import Effect, Scene, Size
 from sweep.model.effects.lobes import lobe
 from sweep.model.effects.points import Points
-from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import PROCESSING, Shots
 from sweep.model.window import window
 
@@ -152,6 +151,8 @@ def leakage_size(points: Points) -> Size:
 @lru_cache(maxsize=256)
 def table(name: str, length: int, fft_size: int, level: float) -> np.ndarray:
     """Chances by reach and by octaves of A over the threshold, the last row by Parseval alone."""
+    from sweep.model.marcum import marcum_q1
+
     form, rows = lobe(name, length, fft_size), (_STRONGEST - _FAINTEST) * _OCTAVES + 1
     together = level * 2.0 ** (np.arange(rows) / _OCTAVES + _FAINTEST)
     quiet = marcum_q1(np.zeros(1), np.array([level])).q[0]
@@ -172,6 +173,8 @@ def table(name: str, length: int, fft_size: int, level: float) -> np.ndarray:
 
 def _crossing(signal: np.ndarray, level: float, quiet: float) -> np.ndarray:
     """Chance to cross the threshold that a bin of some signal has more than one without."""
+    from sweep.model.marcum import marcum_q1
+
     chance = marcum_q1(signal, np.full(signal.shape, level)).q
     return np.maximum(chance - quiet, 0.0) / max(1 - quiet, 1e-12)
 

@@ -42,8 +42,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import philox
-from sweep.model.detection import Fading
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
@@ -95,6 +93,8 @@ def factors(
     random_phases : bool
         Whether the coherent share has an independent uniform phase in each beamlet.
     """
+    from sweep.model import philox
+
     share = np.asarray(coherent_share, float) + np.zeros(realisation.draw.size)
     keys, draw = realisation.keys, realisation.draw
     drawn = philox.uniforms(keys, draw, philox.STREAM_SPECKLE, 2 * beamlets)
@@ -200,6 +200,8 @@ def fade(shots: Shots, scene: Scene) -> Shots:
 
     Direct detection averages over the speckles in its aperture, of which nothing is known.
     """
+    from sweep.model.detection import Fading
+
     law = str(scene.parameters[_LAW])
     if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots

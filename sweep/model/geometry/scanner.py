@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
-from sweep.model.philox import STREAM_POINTING_JITTER, normals, point_keys, uniforms
 
 JITTER_DOMAIN = "sweep.jitter"
 """Domain of the random key, so that no other use of the same seed meets its numbers."""
@@ -361,6 +360,8 @@ class PointingJitter(NamedTuple):
 
     def turned(self, attitude: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Attitudes (n, 4) of shots by number (n,), turned; any stretch is the same bit for bit."""
+        from sweep.model.philox import STREAM_POINTING_JITTER, normals, point_keys, uniforms
+
         key = point_keys(np.empty((1, 0)), domain=JITTER_DOMAIN, seed=self.seed)
         keys = np.broadcast_to(key, (len(index), 2))  # a shot's number stands for that of a draw
         draws = normals(uniforms(keys, np.asarray(index), STREAM_POINTING_JITTER, 4))[:, :3]
