@@ -7,8 +7,9 @@ import pickle
 import pytest
 import yaml
 from written_scenes import BOULDERS, BOX, HILLS, RELIEF, SPHERE, TREES, with_object, written
+from written_specs import written as grid
 
-from sweep.spec import SceneSpec, SpecError, load
+from sweep.spec import SceneSpec, Spec, SpecError, load
 
 
 def mistakes_of(mapping, base="."):
@@ -411,10 +412,17 @@ def test_no_junk_anywhere_gets_past_as_a_traceback(junk):
                     assert words not in str(mistake), (path, str(mistake))
 
 
-def test_the_mapping_given_is_left_as_it_was():
-    before = yaml.safe_dump(EVERYTHING)
-    SceneSpec.from_mapping(EVERYTHING)
-    assert yaml.safe_dump(EVERYTHING) == before
+@pytest.mark.parametrize(
+    ("kind", "mapping"),
+    [
+        (Spec, grid({"target.range": ...}, axes={"target.range": ["5 m", "6 m"]})),
+        (SceneSpec, EVERYTHING),
+    ],
+)
+def test_the_mapping_given_is_left_as_it_was(kind, mapping):
+    before = yaml.safe_dump(mapping)
+    kind.from_mapping(mapping)
+    assert yaml.safe_dump(mapping) == before
 
 
 def test_no_axis_over_wavelength_moves_the_rays_of_a_single_mode():

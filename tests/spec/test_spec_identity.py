@@ -247,6 +247,7 @@ def test_a_stored_spec_comes_back_the_same():
     assert again.figures == original.figures
     assert again.parameters() == original.parameters()
     assert again.to_json() == text
+    assert pickle.loads(pickle.dumps(original)) == original
 
 
 def test_a_stored_spec_says_everything_itself():
@@ -257,11 +258,6 @@ def test_a_stored_spec_says_everything_itself():
             part = part[name]
     assert {"draws", "seed", "storage"} <= set(mapping)
     assert "execution" not in spec({"execution.workers": 3}).to_yaml_mapping()
-
-
-def test_specs_travel_to_workers():
-    original = spec(axes=AXES)
-    assert pickle.loads(pickle.dumps(original)) == original
 
 
 def test_parameters_are_all_there_in_si():
