@@ -16,7 +16,7 @@ w p(0) (1 + B(0)) / (8 pi) whatever the incidence: a ball of it shines as evenly
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -110,7 +110,8 @@ class Plane:
     @cached_property
     def beamlets(self) -> Footprints:
         """The whole footprint: a row for each distinct geometry."""
-        shapes, row = np.unique(np.stack(self._columns), axis=1, return_inverse=True)
+        first, row = different_rows(self._columns)
+        shapes = np.stack(self._columns)[:, first]
         offset, cos_incidence, weights, closing = footprint.plane_footprint(
             grazing_angle=shapes[0],
             beam_divergence=shapes[1],
@@ -216,3 +217,13 @@ def _moments(values: np.ndarray, weight: np.ndarray) -> Moments:
     weighted = weight * values
     extreme = np.where(weight > 0, np.abs(values), 0.0).max(axis=1)
     return Moments(np.abs(weighted.sum(axis=1)), np.sqrt((weighted * values).sum(axis=1)), extreme)
+
+
+def different_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """A row of each kind among rows of columns, (kinds,); the kind of each, (n,)."""
+    order = np.lexsort(columns)
+    rows = np.stack(columns)[:, order]
+    is_new = np.append(True, (rows[:, 1:] != rows[:, :-1]).any(axis=0))
+    kind = np.empty(order.size, np.int64)
+    kind[order] = np.cumsum(is_new) - 1
+    return order[is_new], kind

@@ -103,7 +103,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
             crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
         least = min(max(crossing, float(beside)), float(beside + half))
         left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
-    known = n, lowest, highest, 0, faint / max(total, 1e-300)
+    known = n, lowest, highest, np.int64(0), faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
         count = high - low + 1

@@ -16,6 +16,7 @@ from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
 from sweep.model.detection import found_pair
 from sweep.model.effects.line_width import gaussian_shifts
+from sweep.model.ground import different_rows
 from sweep.model.leakage import MOST_POINTS, inspect, of_bins
 from sweep.model.line_shape import Shapes
 from sweep.model.lines import (
@@ -310,19 +311,19 @@ def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndar
 
 def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of which no two have the same phase errors; which of these each of some points has."""
-    values = [
+    of_all = [
         np.broadcast_to(np.asarray(one, float), shots.size)[some]
         for error in shots.phase_errors
         for value in error.values.values()
         for one in (value if isinstance(value, tuple) else (value,))
     ]
-    varying = [v for v in values if (v != v[0]).any()]
+    varying = [v for v in of_all if (v != v[0]).any()]
     if not varying:
         return some[:1], np.zeros(some.size, np.int64)
     if not shots.alike:
         return some, np.arange(some.size)
-    _, first, which = np.unique(np.stack(varying), axis=1, return_index=True, return_inverse=True)
-    return some[first], which.ravel()
+    first, which = different_rows(varying)
+    return some[first], which
 
 
 def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -484,7 +485,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
-    before, made_of = -1.0, -1
+    before, made_of = -1.0, np.int64(-1)  # a literal would compile what takes it once more
     for i in range(points.shape[0]):
         p, row, which, shift = points[i], where[0, i], where[1, i], _used(shifts[i])
         if which != made_of:

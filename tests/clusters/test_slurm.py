@@ -17,12 +17,12 @@ from sweep.tasks.driver import run
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
-#: Blocks of some tenths of a second (nearer, where more bins count, of minutes): time enough for
+#: Blocks of a second (nearer, where more bins count, of minutes): time enough for
 #: another job in the place of a killed one.
 SLOW = {
     **STUDY,
     "footprint": {"beamlets": 109, "speckle": "none"},
-    "draws": {"number": 500_000, "method": "noise", "batch": 1000},
+    "draws": {"number": 120_000, "method": "noise", "batch": 1000},
     "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 20}},
     "storage": {"block_points": 1},
 }
