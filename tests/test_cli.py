@@ -572,16 +572,16 @@ def test_durations_are_said_in_words(seconds, text):
 
 def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(here):
     spec = Spec.from_mapping(
-        {**_mapping(), "execution": {"workers": 3, "scheduler": "none"}}, base=here
+        {**yaml.safe_load(STUDY), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
     assert RunOptions().place(spec) is None
     assert RunOptions(workers=2).place(spec).workers == (2, 2)
-    spec = Spec.from_mapping({**_mapping(), "execution": {"workers": 3}}, base=here)
+    spec = Spec.from_mapping({**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=here)
     assert RunOptions().place(spec).workers == (3, 3)
 
 
 def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwise(here):
-    little, large = _mapping(), _mapping()
+    little, large = yaml.safe_load(STUDY), yaml.safe_load(STUDY)
     large["axes"]["target.range"]["number"] = 10**6
     little, large = (Spec.from_mapping(mapping, base=here) for mapping in (little, large))
     assert about_seconds(little) < LITTLE < about_seconds(large)
@@ -592,12 +592,6 @@ def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwis
         assert RunOptions(**said).place(little).kind == "local"
     assert RunOptions(scheduler="tcp://10.0.0.5:8786").place(little).kind == "scheduler"
     assert RunOptions(scheduler="none").place(large) is None
-
-
-def _mapping() -> dict:
-    import yaml
-
-    return yaml.safe_load(STUDY)
 
 
 def test_a_study_is_extended_by_the_file_of_a_larger_one(here):

@@ -4,20 +4,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
-
-from sweep.cli import main
+from test_cli import sweep
 
 sys.path.insert(0, str(Path(__file__).parent / "tasks"))
 
 from small import quiet, small, tree
 
 POWER = "axes.instrument.laser.power"
-
-
-def sweep(*arguments):
-    """The command in this process; an error that is not a user's mistake is raised."""
-    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
 
 
 @pytest.fixture

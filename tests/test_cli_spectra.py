@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
-from click.testing import CliRunner
 from test_cli import STUDY
+from test_cli import sweep as command
 
 import sweep
-from sweep.cli import main
 from sweep.spec import Spec
 
 DRAWS = 30
@@ -28,10 +27,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(mapping))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def command(*arguments):
-    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
 
 
 def test_spectra_are_those_that_the_study_looks_at(here):

@@ -188,11 +188,6 @@ def test_pure_numbers_are_read_exactly(written, value):
     assert unit.factor * number == (Fraction(1, 10) if value == 0.1 else value)
 
 
-def test_a_pure_number_takes_no_unit():
-    with pytest.raises(QuantityError, match="takes no unit"):
-        read_number("3 W")
-
-
 @given(st.text(max_size=120))
 def test_any_text_is_a_quantity_or_a_quantity_error(text):
     for si_unit in ("m", "W/Hz^0.5", "dB", "K", "1/Hz", "m^(-2/3)"):

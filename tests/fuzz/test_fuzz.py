@@ -7,9 +7,9 @@ from judging import judge
 from judging_commands import judge_command
 from judging_flights import judge_flight
 from random_flights import PARTS as FLIGHT_PARTS
-from random_flights import flights, write_files
+from random_flights import flights
 from random_studies import PARTS, studies
-from smaller import shrunk, swiftly
+from smaller import swiftly
 from spoilt_specs import GARBAGE, ODD, Spoilt, dumped, spoilt
 from written_values import values
 
@@ -42,28 +42,21 @@ def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
     judge(file)
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
-    place = tmp_path_factory.mktemp("flown")
-    write_files(place)
-    return place
-
-
-def test_a_flight_is_computed_to_sane_points_or_refused_in_words(flown):
+def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
     @settings(FEW, max_examples=25)
-    @given(written=flights(flown))
+    @given(written=flights(folder))
     def holds(written):
-        (flown / "now.yaml").write_text(dumped(written), encoding="utf-8")
-        judge_flight(flown / "now.yaml")
+        (folder / "now.yaml").write_text(dumped(written), encoding="utf-8")
+        judge_flight(folder / "now.yaml")
 
     holds()
 
 
-def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(flown):
+def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(folder):
     @settings(FEW, max_examples=100)
-    @given(wrong=spoilt(st.one_of(studies(), flights(flown))))
+    @given(wrong=spoilt(st.one_of(studies(), flights(folder))))
     def holds(wrong):
-        judge_command(flown / "spoilt.yaml", wrong)
+        judge_command(folder / "spoilt.yaml", wrong)
 
     holds()
 
@@ -115,11 +108,6 @@ def test_every_rule_has_a_strategy_all_of_whose_values_it_takes(model, name, rul
         rule.read(written)
 
     holds()
-
-
-def test_a_failing_spec_is_shrunk_to_what_makes_it_fail():
-    written = {"a": {"b": 1, "c": [1, 2]}, "d": 3}
-    assert shrunk(written, lambda w: w.get("a", {}).get("b") == 1) == {"a": {"b": 1}}
 
 
 def test_tightened_bounds_are_those_of_fields_that_there_are():

@@ -90,17 +90,11 @@ def test_surfaces_that_cannot_be_are_refused():
         Surface("odd", 0.5, roughness=-1.0)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"unit": "seconds"}, "seconds"),
-        ({"unit": "furlonks"}, "furlonks"),
-    ],
-)
-def test_a_mesh_that_is_oddly_placed_is_refused_with_file_rule_and_remedy(file, options, said):
+@pytest.mark.parametrize("unit", ["seconds", "furlonks"])
+def test_a_mesh_in_no_unit_of_length_is_refused_with_file_rule_and_remedy(file, unit):
     path = file(BOX, "box.ply")
-    with pytest.raises(SceneError, match=said) as refused:
-        read_mesh(path, **options)
+    with pytest.raises(SceneError, match=unit) as refused:
+        read_mesh(path, unit=unit)
     assert str(path) in str(refused.value) and refused.value.remedy
 
 
