@@ -13,7 +13,13 @@ from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import version as _version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # as checkers of programs that use it see the names below
+    from sweep.analysis.export import export
+    from sweep.analysis.opening import open, open_scene
+    from sweep.spec import load
+    from sweep.tasks.driver import extend, resume, run
 
 __version__ = _version("sweep")
 
@@ -28,7 +34,7 @@ _HOMES = {
     "export": "sweep.analysis.export",
 }
 
-__all__ = ["__version__", *_HOMES]
+__all__ = ["__version__", "export", "extend", "load", "open", "open_scene", "resume", "run"]
 
 
 def _is_writable(folder: Path) -> bool:
