@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -300,6 +302,9 @@ def _reached(address: str, cluster: AnyCluster) -> Client:
             set_as_default=False,
         )
     except (OSError, ValueError) as error:
+        # Collected here, as one that goes while another is made waits for ever for that one's lock.
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
         raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
 
 

@@ -1,5 +1,6 @@
 """Certificates: all parts talk TLS with them on, and whoever has none is refused."""
 
+import gc
 import ssl
 import stat
 from contextlib import suppress
@@ -77,7 +78,7 @@ def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
 def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
     security, undisturbed, tmp_path, monkeypatch
 ):
-    from distributed import Client, Security
+    from distributed import Security
 
     described = local(security=security, scheduler={"dashboard": "127.0.0.1:0"})
     monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 2.0)
@@ -99,11 +100,29 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
         stranger = address_of(address, {k: str(v) for k, v in others._asdict().items()})
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
             quiet(small(), tmp_path / "stranger.zarr", cluster=stranger)
-        with pytest.raises((OSError, TypeError)):
-            Client(
-                address, timeout=2, security=Security(require_encryption=True), set_as_default=False
-            )
+        refuses(address, Security(require_encryption=True))
     assert not (tmp_path / "plain.zarr").exists()
+
+
+def refuses(address: str, security) -> None:
+    """See a client refused, and collected: amid the making of another it would wait for ever."""
+    from distributed import Client
+
+    with pytest.raises((OSError, TypeError)):
+        Client(address, timeout=2, security=security, set_as_default=False)
+    gc.collect()
+
+
+def test_a_client_that_could_not_connect_is_gone_before_another_is_made(monkeypatch):
+    from distributed import Client
+
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.2)
+    gone, deleted = [], Client.__del__
+    monkeypatch.setattr(Client, "__del__", lambda self: (gone.append(self.id), deleted(self)))
+    with pytest.raises(ClusterError, match="no Dask scheduler answers") as refused:
+        cluster._reached("tcp://127.0.0.1:1", cluster_of({"kind": "local"}))
+    assert len(gone) == 1
+    assert refused.value.__cause__ is not None  # nor is it kept by what is told
 
 
 def address_of(address: str, security: dict[str, str]) -> dict:
@@ -113,7 +132,7 @@ def address_of(address: str, security: dict[str, str]) -> dict:
 @pytest.mark.parametrize("processes", [True, False])
 def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
     import psutil
-    from distributed import Client, Security
+    from distributed import Security
 
     own = psutil.Process()
     before = listening([own, *own.children(recursive=True)])
@@ -125,10 +144,8 @@ def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
         if processes:
             assert address.startswith("tls://127.0.0.1:")
             for security in (None, Security.temporary()):
-                with pytest.raises((OSError, TypeError)):
-                    Client(address, timeout=2, security=security, set_as_default=False)
-            with pytest.raises(OSError):
-                Client(address.replace("tls", "tcp"), timeout=2, set_as_default=False)
+                refuses(address, security)
+            refuses(address.replace("tls", "tcp"), None)
     assert len(found) >= 3 if processes else len(found) == 2  # pages, of scheduler and worker
     assert {host for host, _ in found} == {"127.0.0.1"}
 
