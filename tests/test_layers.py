@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 48_633, "modules": 184, "lines of the model": 17_440, "modules of the model": 67,
+    "lines": 48_634, "modules": 184, "lines of the model": 17_440, "modules of the model": 67,
     "compiled functions": 125, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

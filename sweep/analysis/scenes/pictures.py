@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import product
 from types import MappingProxyType
@@ -35,7 +36,7 @@ from sweep.model.pairing import TRUE
 DROPOUT, PATH, GROUND = "#C1121F", "#1A1A1A", "0.86"
 
 
-class _Picture:
+class _Picture(ABC):
     """Points, dropouts and path on axes of two or three dimensions."""
 
     cloud: Cloud
@@ -46,13 +47,13 @@ class _Picture:
     further: Mapping[str, Any] = MappingProxyType({})
     """Further options of marks."""
 
+    @abstractmethod
     def _columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
         """Columns of world positions (3, n) as the axes take them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _on_paper(self, places: np.ndarray) -> np.ndarray:
         """World positions (3, n) on the picture (2, n) [inches]."""
-        raise NotImplementedError
 
     def _order(self, chosen: np.ndarray) -> np.ndarray:
         """Numbers of the points of a mask, in the order in which they are drawn."""
