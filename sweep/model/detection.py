@@ -49,9 +49,11 @@ class Fading(NamedTuple):
     """Correlations of a point's segments in developed speckle, (n,) each."""
 
     next: np.ndarray
-    """complex: of amplitudes in segments that follow each other, within the unit circle."""
+    """complex: of amplitudes in up and Doppler segment, within the unit circle."""
     over: np.ndarray
-    """complex: of those in the first and the last."""
+    """complex: of those in up and down segment."""
+    last: np.ndarray
+    """complex: of those in Doppler and down segment."""
 
     def mixing(self) -> np.ndarray:
         """Numbers by which three standard normal amplitudes mix, (6, n).
@@ -59,8 +61,8 @@ class Fading(NamedTuple):
         Segment by segment z_0, m z_0 + sqrt(1 - m^2) z_1 and o z_0 + c z_1 + d z_2, with phases
         turned away where they do not matter: m, its complement, o, the two parts of c, and d.
         """
-        near, far = np.minimum(np.abs(self.next), 1.0), np.minimum(np.abs(self.over), 1.0)
-        turned = near * np.exp(1j * np.angle(self.next**2 * np.conj(self.over)))
+        near, far, last = (np.minimum(np.abs(one), 1.0) for one in self)
+        turned = last * np.exp(1j * np.angle(self.next * self.last * np.conj(self.over)))
         own = np.sqrt(1 - near**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             cross = np.where(own > 1e-7, (turned - near * far) / own, 0.0)

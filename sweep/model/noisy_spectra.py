@@ -315,7 +315,8 @@ def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]
     width = view.setting.sample_rate / view.setting.fft_size
     up, doppler, down = (segment.frequency * width for segment in found)
     reported = waveform.resolve(
-        up=up, doppler=doppler, down=down, carrier=_carriers(shots, i)[0],
+        up=up, doppler=doppler if shots.segments[1] else None, down=down,
+        carrier=_carriers(shots, i)[0],
         bandwidth=_at(shots.bandwidth, i), duration=_at(shots.duration, i),
         sample_rate=shots.sample_rate[i], bin_width=np.asarray(width),
     )  # fmt: skip

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-NO_DOPPLER = "nan for direct detection, which has no optical Doppler segment"
+NO_DOPPLER = "nan without a Doppler segment, which direct detection never has"
 NO_ECHO = "nan where no light comes back"
 NO_BIN = "-inf where the detection occupies every bin, so that none is left to raise an alarm"
 CLOSING = "positive when closing"
@@ -93,7 +93,7 @@ OUTPUTS: dict[str, Output] = {
     "range_error": Output(
         "m",
         "reported less true range, without noise",
-        f"peak bins of the three segments resolved; {NO_ECHO}",
+        f"peak bins of the segments resolved; {NO_ECHO}",
     ),
     "radial_velocity_error": Output(
         "m s-1", "reported less true radial velocity, without noise", f"{CLOSING}; {NO_ECHO}"
@@ -274,7 +274,7 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
 """Probabilities of each shot, before any draw.
 
 Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
-``pd_doppler`` of direct detection, which has no optical Doppler segment.
+``pd_doppler`` without a Doppler segment.
 """
 
 SIMULATED: dict[str, Output] = _over(("shot",), {

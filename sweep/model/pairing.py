@@ -15,6 +15,10 @@ where there is none, **with the half sum as the Doppler frequency**, the order o
 (PHYSICS section 2 leaves both open): range and velocity are exchanged where that is wrong.
 
 An up (or down) peak in which two surfaces coincide serves one return only.
+
+Without a Doppler segment nothing tells which peaks belong together, and none is unconfirmed: the
+strongest up peak goes with the strongest down peak, and so on, by the reading
+:data:`sweep.model.waveform.FAR`.
 """
 
 import math
@@ -22,7 +26,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.waveform import FOLD_PENALTY, READINGS, reading
+from sweep.model.waveform import FAR, FOLD_PENALTY, READINGS, reading
 
 TOLERANCE = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
@@ -102,6 +106,15 @@ def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs):
             pairs[number, 3] = code if doppler.size else ASSUMED
             number, j = number + 1, j + 1
     return confirmed, number
+
+
+@njit(cache=True, error_model="numpy")
+def pair_by_strength(ups, downs, pairs):
+    """Pairs of as many up and down peaks in their order, as of :func:`pair_peaks`; their number."""
+    number = min(ups, downs)
+    for i in range(number):
+        pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3] = i, -1, i, FAR
+    return number
 
 
 @njit(cache=True, error_model="numpy")

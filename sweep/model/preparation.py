@@ -90,6 +90,10 @@ class Shots:
     """``any_bin``: of the echo; ``peak_bin``: the largest alone, as in [T]."""
     noise_shape: str
     """``receiver``: noise passes the receiver as signals do; ``white``: none of it, as in [T]."""
+    order: tuple[str, ...]
+    """Names of the segments that there are, in the order of time."""
+    gap: np.ndarray
+    """Time from a segment's end to the next one's start [s]."""
     tnr: np.ndarray
     range: np.ndarray
     """(n,): of the target on the beam's axis."""
@@ -296,7 +300,7 @@ class Shots:
     def motion(self) -> dict[str, Any]:
         """Range [m] and radial velocity [m/s], (n,); where they differ, tuples by segment."""
         here: dict[str, Any] = {"range": self.range, "radial_velocity": self.radial_velocity}
-        if np.any(self.starts[-1]):
+        if self.moves_on:
             here["range"] = tuple(self.range - each.nearer for each in self.waveform)
             if np.any(self.acceleration):
                 here["radial_velocity"] = tuple(
@@ -305,9 +309,19 @@ class Shots:
         return here
 
     @property
+    def moves_on(self) -> bool:
+        """True where the target moves on between segments."""
+        return any(np.any(start) for start in self.starts)
+
+    @property
     def segments(self) -> np.ndarray:
         """Which of up, Doppler and down segment exist, (3,) bool."""
-        return np.array([True, self.architecture != "direct", True])
+        return np.array([name in self.order for name in waveform.SEGMENTS])
+
+    @property
+    def schedule(self) -> tuple[np.ndarray, ...]:
+        """Times [s] from the shot's start to each segment's, by the waveform."""
+        return waveform.segment_starts(self.order, duration=self.duration, gap=self.gap)
 
     def point_table(self) -> np.ndarray:
         """Numbers of each point as compiled code takes them, (16 + 6 segments, n).
@@ -458,6 +472,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
         noise_shape=str(p[RECEIVER + "noise_shape"]),
+        order=waveform.order_of(architecture, str(p[waveform.ORDER])),
+        gap=p[waveform.GAP],
         tnr=tnr_of(p),
         range=p["target.range"] + everywhere,
         radial_velocity=p["target.radial_velocity"] + everywhere,

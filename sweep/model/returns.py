@@ -60,6 +60,7 @@ from sweep.model.pairing import (
     TOLERANCE,
     TRUE,
     UNCONFIRMED,
+    pair_by_strength,
     pair_peaks,
 )
 from sweep.model.preparation import Shots
@@ -305,10 +306,11 @@ def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
     truth = _columns(shots, shots.radial_velocity) + doppler
     seen = np.maximum(drawn.beamlet, 0)
-    # Up and down beat tell the range at half the time between them; acceleration adds to it.
-    last = _columns(shots, shots.starts[2], 2)
+    # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
+    first, last = (_columns(shots, shots.starts[s], 2) for s in (0, 2))
     pulled = carrier / (bandwidth / duration) * _columns(shots, shots.acceleration, 3)
-    pulled = 0.5 * last * (pulled[..., 0] - _columns(shots, shots.approach, 2))
+    pulled = 0.5 * (last - first) * pulled[..., 0]
+    pulled -= 0.5 * (last + first) * _columns(shots, shots.approach, 2)
     off = distance[..., FINE] - pulled - deepest[..., 0] * (1 + offset[point, seen])
     right = abs(off) <= reach * metre
     right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
@@ -338,17 +340,18 @@ def _draw(keys, how, known, seen, tables, out):
         for d in range(draws):
             address = keys[i, 0], keys[i, 1], how.first_draw + d
             for s in range(3):
-                if s == 1 and not how.doppler:
-                    number[s], which[s, 0] = 1, ABSENT
-                else:
+                if s != 1 or how.doppler:
                     number[s] = draw_peaks(
                         address, (i, s), how, known, seen, tables, peaks[s], which[s], up
                     )
-            confirmed, count = pair_peaks(
-                peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
-                peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, TOLERANCE,
-                pairs,
-            )  # fmt: skip
+            if how.doppler:
+                confirmed, count = pair_peaks(
+                    peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
+                    peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, TOLERANCE,
+                    pairs,
+                )  # fmt: skip
+            else:
+                confirmed = count = pair_by_strength(number[0], number[2], pairs)
             for r in range(min(count, most)):
                 u, k, v, out.code[i, d, r] = pairs[r]
                 group, centres = out.group[i, d, r], np.zeros(3)

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model import waveform
 from sweep.model.accuracy import COUNTED, Accuracy, bounded_mean, half_width
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, is_noisy
 from sweep.model.estimators import DEFAULTS
@@ -405,8 +406,10 @@ class SpectraSample(Drawn):
     def _there(self) -> np.ndarray:
         """0, but nan for a segment that is not there, (4, n), by the names of PROMISED."""
         direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
+        order = np.asarray(self.parameters.get(waveform.ORDER, waveform.DEFAULTS[waveform.ORDER]))
+        none = direct | (np.char.find(order, "doppler") < 0)
         there = np.zeros((len(PROMISED), self.number.size))
-        there[PROMISED.index("pd_doppler"), np.broadcast_to(direct, self.number.shape)] = np.nan
+        there[PROMISED.index("pd_doppler"), np.broadcast_to(none, self.number.shape)] = np.nan
         return there
 
     def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:

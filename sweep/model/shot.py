@@ -169,11 +169,11 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
 
 
 def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
-    """Range and radial velocity that the peaks of the three segments report."""
+    """Range and radial velocity that the peaks of the segments report."""
     frequency = found[:, 3]
     return waveform.resolve(
         up=frequency[0],
-        doppler=frequency[1] if shots.segments[1] else np.zeros_like(frequency[0]),
+        doppler=frequency[1] if shots.segments[1] else None,
         down=frequency[2],
         carrier=shots.carriers[0],
         bandwidth=shots.bandwidth,

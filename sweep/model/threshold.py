@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sweep.model import alarms
-from sweep.model.waveform import record_length
+from sweep.model.waveform import DEFAULTS, ORDER, order_of, record_length
 from sweep.model.window import canonical_name, window
 
 PROCESSING = "instrument.processing."
@@ -72,8 +72,10 @@ def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
         return np.sqrt(-2 * np.log(value)) / RAYLEIGH_DEVIATION
     log_pfa = np.log(value)
     if given[0] == PFA_SHOT:  # segments are independent
-        segments = 2 if str(p["instrument.receiver.architecture"]) == "direct" else 3
-        log_pfa = log_at_least_one(log_pfa, 1 / segments)
+        order = order_of(
+            str(p["instrument.receiver.architecture"]), str(p.get(ORDER, DEFAULTS[ORDER]))
+        )
+        log_pfa = log_at_least_one(log_pfa, 1 / len(order))
     return level_of(log_pfa, _law(p)) / RAYLEIGH_DEVIATION
 
 

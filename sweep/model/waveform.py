@@ -1,4 +1,4 @@
-"""The three-segment waveform: beats, their phases, and what a set of three peaks says.
+"""The waveform and its segments: beats, their phases, and what a set of peaks says.
 
 Homodyne beat phase of a segment (PHYSICS section 2), tau(t) = tau_0 - beta t, beta = 2 v_r / c:
 
@@ -15,6 +15,12 @@ f_d + f_r with f_d = 2 v_r / lambda and f_r = S 2 R / c [T 2.8]; what is kept be
 the down beat of Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of
 its own. By [T] each segment starts with the target at range R; that it moves on in between is an
 effect too.
+
+A shot has an up- and a down-chirp, in any order, and may have a Doppler segment before, between or
+behind them: the lander's ``up doppler down``, the triangle ``up down`` of automotive lidars. All
+last as long, with equal gaps. Without a Doppler segment two beats tell of two unknowns, and
+half sum and half difference could be exchanged: the target is taken to be further away than
+|v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded.
 """
 
 from typing import NamedTuple
@@ -24,6 +30,13 @@ import numpy as np
 from sweep.model.constants import SPEED_OF_LIGHT
 
 SEGMENTS = ("up", "doppler", "down")
+ORDER, GAP = "instrument.chirp.segments", "instrument.chirp.gap"
+ORDERS = (
+    "up doppler down", "up down", "down up", "down doppler up", "doppler up down",
+    "doppler down up", "up down doppler", "down up doppler",
+)  # fmt: skip
+"""Segments of a shot in the order of time."""
+DEFAULTS: dict[str, float | int | str | np.ndarray] = {ORDER: ORDERS[0], GAP: 0.0}
 SIGNS = (1, 0, -1)
 """Sign s of the chirp rate in each segment."""
 
@@ -67,13 +80,34 @@ def carrier_frequencies(
     return start, start, start + bandwidth
 
 
-def segment_starts(architecture: str, duration: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Times [s] from the shot's start to that of up, Doppler and down segment.
+def order_of(architecture: str, segments: str) -> tuple[str, ...]:
+    """Names of the segments of a shot, of :data:`ORDERS`, in the order of time.
 
-    They follow each other without a gap. Direct detection has no Doppler segment to wait for.
+    Direct detection has no optical Doppler segment.
     """
-    before = (0, 0, 1) if architecture == "direct" else (0, 1, 2)
-    return tuple(number * np.asarray(duration, float) for number in before)
+    names = segments.split()
+    return tuple(name for name in names if name != "doppler" or architecture != "direct")
+
+
+def segment_starts(
+    order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, ...]:
+    """Times [s] from the shot's start to that of up, Doppler and down segment; 0 for none.
+
+    Parameters
+    ----------
+    order : tuple of str
+        Of :func:`order_of`.
+    duration, gap : (n,) ndarray or float
+        Length of a segment, and time from its end to the next one's start [s], >= 0.
+
+    Examples
+    --------
+    >>> [float(start) for start in segment_starts(("up", "down"), duration=32e-6, gap=1e-6)]
+    [0.0, 0.0, 3.3e-05]
+    """
+    step = np.asarray(duration, float) + gap
+    return tuple(step * (order.index(name) if name in order else 0) for name in SEGMENTS)
 
 
 def beat_frequency(
@@ -111,6 +145,9 @@ FOLD_PENALTY = 4.0
 
 READINGS = 16
 
+FAR = 1
+"""Reading without folds in which the half difference is the Doppler frequency: |f_d| < f_r."""
+
 
 def reading(code, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
     """(f_d, f_r): signed Doppler and range beat by one of the readings, in the unit given.
@@ -137,7 +174,7 @@ def measured(  # type: ignore[no-untyped-def]  # of arrays, or compiled
 def resolve(
     *,
     up: np.ndarray,
-    doppler: np.ndarray,
+    doppler: np.ndarray | None,
     down: np.ndarray,
     carrier: np.ndarray,
     bandwidth: np.ndarray,
@@ -145,9 +182,10 @@ def resolve(
     sample_rate: np.ndarray,
     bin_width: np.ndarray,
 ) -> Resolution:
-    """Range and velocity from three unsigned, folded peak frequencies [Hz], (n,) each.
+    """Range and velocity from unsigned, folded peak frequencies [Hz], (n,) each.
 
-    Two unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
+    Without a Doppler segment, ``doppler=None``, by the reading :data:`FAR`. With it there are two
+    unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
     half sum or half difference being the Doppler frequency) predicts the third peak. The reading
     that predicts it best is taken, a fold counting as :data:`FOLD_PENALTY` bins of mismatch. The
     sign of down - up is the velocity's.
@@ -155,6 +193,9 @@ def resolve(
     PHYSICS section 2 gives the unfolded readings. That half sum and half difference belong to
     the carrier and to the range at mid-chirp is put right here.
     """
+    if doppler is None:
+        f_d, f_r = reading(FAR, up, down, sample_rate)
+        return Resolution(*measured(f_d, f_r, carrier, bandwidth, duration))
     at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
     least, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())
     for code in range(READINGS):

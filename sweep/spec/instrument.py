@@ -9,6 +9,7 @@ from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
 import sweep.spec.declaring as of
+from sweep.model import waveform
 from sweep.model.beam import COUPLINGS, SINGLE_MODE
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
@@ -49,13 +50,24 @@ class Laser(Part):
 
 @with_parameters("instrument.chirp")
 class Chirp(Part):
-    """Linear frequency sweep of one segment."""
+    """Segments of a shot: linear sweeps of the frequency, and the light without one."""
 
     bandwidth: float = of.quantity("Frequency swept in one chirp", "Hz", "1 GHz", *_HERTZ)
     start_frequency: float = of.quantity(
         "Frequency at which the chirp starts", "Hz", "5.5 GHz", "0 Hz", "1e15 Hz"
     )
     duration: float = of.duration("Length of one segment", "500 us", "1 ps", "1e6 s")
+    segments: str = of.choice(
+        "Segments of a shot in the order of time: up- and down-chirp, and the light without a "
+        "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
+        "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
+        waveform.ORDERS,
+        waveform.ORDERS[0],
+    )
+    gap: float = of.duration(
+        "Time from the end of a segment to the start of the next", "5 us", "0 s", "1e6 s",
+        default=0.0,
+    )  # fmt: skip
 
 
 @with_parameters("instrument.telescope")

@@ -18,7 +18,7 @@ from sweep.model.groups import groups
 from sweep.model.realisations import realise
 from sweep.model.returns import beamlet_lines, draw_returns
 from sweep.model.shot import prepare
-from sweep.model.waveform import SIGNS
+from sweep.model.waveform import GAP, ORDER, ORDERS, SEGMENTS, SIGNS
 from sweep.tasks.effect_selection import plan_shots
 
 MOVING = (*CORE, "segment_motion")
@@ -51,23 +51,35 @@ def test_acceleration_moves_the_doppler_shift_on_from_segment_to_segment(table_4
     np.testing.assert_allclose(kilohertz, [0, 6.4516, 12.9032], rtol=1e-4)
 
 
-@pytest.mark.parametrize("architecture, later", [("homodyne", 2), ("direct", 1)])
-def test_the_down_chirp_follows_the_segments_that_there_are(architecture, later, table_4_1):
-    shots = prepared(table_4_1(architecture=architecture, radial_velocity=80.0))
-    assert float(shots.starts[2]) == later * 500e-6
+@pytest.mark.parametrize(
+    "architecture, order, gap, starts",
+    [
+        ("homodyne", "up doppler down", 0.0, [0.0, 500e-6, 1000e-6]),
+        ("homodyne", "down doppler up", 20e-6, [1040e-6, 520e-6, 0.0]),
+        ("homodyne", "up down", 20e-6, [0.0, 0.0, 520e-6]),
+        ("direct", "up doppler down", 0.0, [0.0, 0.0, 500e-6]),
+        ("direct", "doppler down up", 0.0, [500e-6, 0.0, 0.0]),
+    ],
+)
+def test_segments_follow_those_that_there_are(architecture, order, gap, starts, table_4_1):
+    scene = table_4_1(architecture=architecture, radial_velocity=80.0)
+    shots = prepared(scene | {ORDER: order, GAP: gap})
+    np.testing.assert_allclose([float(start) for start in shots.starts], starts, rtol=1e-12)
+    assert shots.segments.tolist() == [True, architecture != "direct" and "dopp" in order, True]
 
 
 @pytest.mark.parametrize("segment", [0, 1, 2])
-@pytest.mark.parametrize("a", [0.0, -11.4, 900.0])
-def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, table_4_1):
+@pytest.mark.parametrize("a, order", [(0.0, 0), (-11.4, 3), (900.0, 4)])
+def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, order, table_4_1):
     """In 40 digits: R - v T - a T^2 / 2 from the shot's start, and each segment's own chirp."""
-    range_0, v, begun = 1400.0, -130.0, segment * 500e-6
+    place = ORDERS[order].split().index(SEGMENTS[segment])
+    range_0, v, begun = 1400.0, -130.0, place * 500e-6
     shots = prepared(
         table_4_1(
             range=range_0, radial_velocity=v, beamlets=1, fft_size=512, sample_rate=1.2e6,
             acquisition_delay=20e-6, detector_bandwidth=1e30, amplifier_bandwidth=1e30,
         )
-        | {"target.acceleration": a}
+        | {"target.acceleration": a, ORDER: ORDERS[order]}
     )  # fmt: skip
     record = truth.analytic_record(shots, 0, segment, 0, acceleration=True)
     sign, carrier = SIGNS[segment], float(shots.carriers[segment])
@@ -99,6 +111,8 @@ def drawn(number):
     further = {
         "target.acceleration": rng.choice([-1, 1]) * 10 ** rng.uniform(0, 5),
         "target.transverse_velocity": rng.uniform(-200, 200),
+        ORDER: ORDERS[number % len(ORDERS)],
+        GAP: float(rng.choice([0.0, 130e-6])),
     }
     return scene, further
 
@@ -151,21 +165,25 @@ def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
 
 @pytest.mark.parametrize("velocity", [150.0, -90.0])
 @pytest.mark.parametrize("across", [0.0, 40.0])
+@pytest.mark.parametrize("order, up, down", [(0, 0, 2), (1, 0, 1), (3, 2, 0), (7, 1, 0)])
 def test_what_is_reported_is_put_right_by_the_velocity_that_is_measured(
-    velocity, across, table_4_1
+    velocity, across, order, up, down, table_4_1
 ):
     """Down to 0.1 mm and 3 um/s; what slides over the slope is not known, nor put right."""
+    if order == 1:  # |f_d| < f_r
+        velocity /= 20
     scene = table_4_1(
         range=812.34, radial_velocity=velocity, power=100.0, beamlets=1, grazing_angle=1.1
     )
-    shots = prepared(scene | {"target.transverse_velocity": across}, (*MOVING, "range_walk"))
+    moving = {"target.transverse_velocity": across, ORDER: ORDERS[order]}
+    shots = prepared(scene | moving, (*MOVING, "range_walk"))
     keys = np.ones((1, 2), np.uint64)
     found = draw_returns(shots, groups(shots), keys=keys, draws=400)
     slid = across / np.tan(1.1)
-    within = 500e-6 + 2**17 / 600e6 / 2
+    within = (up + down) / 2 * 500e-6 + 2**17 / 600e6 / 2
     off = np.median(found.range_interpolated[0, :, 0]) - 812.34
     assert off == pytest.approx(-slid * within, abs=1e-4)
-    mixed = slid * 2e12 * 500e-6 / (speed_of_light / 1550e-9)
+    mixed = slid * 2e12 * (down - up) / 2 * 500e-6 / (speed_of_light / 1550e-9)
     speed = np.median(found.radial_velocity_interpolated[0, :, 0])
     assert speed == pytest.approx(velocity - mixed, abs=3e-6)
 

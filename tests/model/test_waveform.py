@@ -206,9 +206,33 @@ def test_direct_detection_resolves_without_a_doppler_peak():
             for sign in (1, 0, -1)
         )  # fmt: skip
         report = resolve(
-            up=np.array([abs(up)]), doppler=np.zeros(1), down=np.array([abs(down)]),
+            up=np.array([abs(up)]), doppler=None, down=np.array([abs(down)]),
             carrier=5.5e9, bandwidth=BANDWIDTH, duration=DURATION, sample_rate=600e6,
             bin_width=BIN,
         )  # fmt: skip
         assert report.range[0] == pytest.approx(target_range, abs=1e-9)
         assert report.radial_velocity[0] == pytest.approx(velocity, abs=1e-6)
+
+
+@given(far=st.floats(0.0, 1.0), velocity=st.floats(-80.0, 80.0), rate=st.sampled_from([256e6, 1e9]))
+def test_a_triangle_tells_range_and_velocity_of_what_is_far_enough(far, velocity, rate):
+    """Settembrini's chirp: 6 GHz in 32 us at 1310 nm. Beyond |f_d| = f_r, below Nyquist."""
+    carrier, slope = speed_of_light / 1310e-9, 6e9 / 32e-6
+    nearest = abs(velocity) * speed_of_light / (1310e-9 * slope) * (1 + 1e-4)
+    folds = (rate / 2 - 2 * abs(velocity) / 1310e-9) * speed_of_light / (2 * slope) * (1 - 1e-4)
+    assume(folds > nearest)
+    target = nearest + far * (folds - nearest)
+    up, down = (
+        beat_frequency(
+            sign, carrier=carrier + 6e9 * (sign < 0), chirp_rate=slope, range=target,
+            radial_velocity=velocity,
+        )
+        for sign in (1, -1)
+    )  # fmt: skip
+    assert up <= 0 <= down
+    report = resolve(
+        up=fold(up, rate), doppler=None, down=fold(down, rate), carrier=carrier, bandwidth=6e9,
+        duration=32e-6, sample_rate=rate, bin_width=rate / 2**13,
+    )  # fmt: skip
+    assert report.range == pytest.approx(target, abs=1e-7)
+    assert report.radial_velocity == pytest.approx(velocity, abs=1e-7)

@@ -20,7 +20,8 @@ _INSTRUMENT = "instrument."
 _PARAMETERS = {
     "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
     "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
-    "duration": "chirp.duration", "sample_rate": "processing.sample_rate",
+    "duration": "chirp.duration", "segments": "chirp.segments", "gap": "chirp.gap",
+    "sample_rate": "processing.sample_rate",
     "fft_size": "processing.fft_size", "window": "processing.window",
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape",
@@ -110,8 +111,9 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
     flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
     seen = [np.broadcast_to(a, shape).ravel() for a in snr]
-    kinds = list(zip(flat["architecture"], flat["window"], flat["fft_size"], flat["duration"],
-                     flat["delay"], flat["sample_rate"], strict=True))  # fmt: skip
+    kinds = list(zip(flat["architecture"], flat["segments"], flat["window"], flat["fft_size"],
+                     flat["duration"], flat["delay"], flat["sample_rate"],
+                     strict=True))  # fmt: skip
     spread = np.empty((2, len(kinds)))
     for kind in dict.fromkeys(kinds):
         mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
@@ -121,7 +123,7 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
 
 
 def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviation:
-    """Bounds of points of one architecture, window and record."""
+    """Bounds of points of one architecture, waveform, window and record."""
     size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
     length = int(waveform.record_length(
         fft_size=p["fft_size"][:1], duration=p["duration"][:1], acquisition_delay=p["delay"][:1],
@@ -134,9 +136,11 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     )  # fmt: skip
     chirp_rate = p["bandwidth"] / p["duration"]
     deviations = []
+    order = waveform.order_of(str(p["architecture"][0]), str(p["segments"][0]))
+    starts = waveform.segment_starts(order, duration=p["duration"], gap=p["gap"])
     for segment, sign in enumerate(waveform.SIGNS):
         carrier, seen = carriers[segment], snr[segment]
-        moved = np.where(p["moves"], segment * p["radial_velocity"] * p["duration"], 0.0)
+        moved = np.where(p["moves"], starts[segment] * p["radial_velocity"], 0.0)
         beat = waveform.beat_frequency(
             sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
             radial_velocity=p["radial_velocity"],

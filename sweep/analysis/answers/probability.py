@@ -11,6 +11,7 @@ import xarray as xr
 
 from sweep.analysis import noise_only
 from sweep.analysis.answers.physical import parameter, quantity, si, spec_of
+from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.marcum import marcum_q1
 from sweep.model.philox import point_keys
@@ -74,10 +75,6 @@ def confidence(dataset: xr.Dataset, reach: xr.DataArray | None) -> dict[str, flo
     return {} if stored is None else {"confidence": float(stored)}
 
 
-SEGMENTS_OF_A_SHOT = 3
-"""Up-chirp, Doppler segment and down-chirp follow each other without a pause."""
-
-
 def false_alarms_per_second(
     dataset: xr.Dataset, rate: str | float | None = None, *, leakage: bool = False
 ) -> xr.DataArray:
@@ -89,7 +86,7 @@ def false_alarms_per_second(
         As `sweep.open` gives it, or a part of it.
     rate
         Shots a second, ``"20 Hz"`` or a number; by default as many as chirps leave time for,
-        1 / (3 T), 3 being the segments.
+        one after so many segments and as many gaps as it has.
     leakage
         Whether extra groups that leaked signal raises count as well as noise. A study that draws
         whole spectra counts every false alarm of a shot, of either cause, whatever is asked.
@@ -106,8 +103,15 @@ def false_alarms_per_second(
     """
     shots: xr.DataArray | float
     if rate is None:
-        duration = parameter(dataset, "instrument.chirp.duration", spec_of(dataset))
-        shots = 1 / (SEGMENTS_OF_A_SHOT * duration)
+        architecture, order, duration, gap = (
+            parameter(dataset, f"instrument.{path}", spec_of(dataset))
+            for path in ("receiver.architecture", "chirp.segments", "chirp.duration", "chirp.gap")
+        )
+        segments = xr.apply_ufunc(
+            lambda a, names: len(waveform.order_of(str(a), str(names))), architecture, order,
+            vectorize=True, dask="parallelized", output_dtypes=[int],
+        )  # fmt: skip
+        shots = 1 / (segments * (duration + gap))
     else:
         shots = quantity(rate, si_unit="Hz", name="the rate of shots")
         if not shots > 0:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import beam
+from sweep.model import beam, waveform
 from sweep.model.effects import (
     atmosphere,
     doppler,
@@ -60,8 +60,12 @@ PARAMETERS: tuple[Parameter, ...] = tuple(
 SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 """Numbers of effects that points must share to be prepared together."""
 
-DEFAULTS = beam.DEFAULTS | {parameter.path: parameter.default for parameter in PARAMETERS}
-"""Of the beams' parameters and of the effects'."""
+DEFAULTS: dict[str, float | int | str | np.ndarray] = (
+    beam.DEFAULTS
+    | waveform.DEFAULTS
+    | {parameter.path: parameter.default for parameter in PARAMETERS}
+)
+"""Of the beams' parameters, the waveform's and the effects'."""
 
 CORE = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",

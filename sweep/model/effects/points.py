@@ -5,7 +5,7 @@ nothing is computed before it is asked for. By segment arrays have one axis more
 segments that exist. Words, and what :meth:`Points.whole` names, all points share.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -115,6 +115,7 @@ class Points:
             (number, ground.pattern(self._words)) if number else resolution.finest(self._words)
         )
         direct = self.architecture == "direct"
+        self.order = waveform.order_of(self.architecture, self.word(waveform.ORDER))
         self.sample_rate = self[PROCESSING + "sample_rate"]
         self.start = self[PROCESSING + "acquisition_delay"]
         """Acquisition delay t_0 [s]."""
@@ -128,7 +129,7 @@ class Points:
         """Doppler ratio."""
         self.acceleration = self["target.acceleration"]
         """[m/s^2]."""
-        self.signs = self.columns(*(waveform.SIGNS[::2] if direct else waveform.SIGNS))
+        self.signs = self.columns(*self._there(waveform.SIGNS))
         coherent = self.word("footprint.phases") == "coherent"
         self.adds_amplitudes = coherent or direct
         self.by_roots = coherent and not direct
@@ -168,6 +169,11 @@ class Points:
     def has(self, *paths: str) -> bool:
         """Whether any of some numbers is other than 0 anywhere."""
         return any(bool(self._numbers[path].any()) for path in paths)
+
+    def _there(self, of_all: Sequence[Any]) -> list[Any]:
+        """Values of the segments that there are: up, Doppler, down."""
+        named = zip(waveform.SEGMENTS, of_all, strict=True)
+        return [value for name, value in named if name in self.order]
 
     def columns(self, *values: np.ndarray | float) -> np.ndarray:
         """Values by segment, one behind the other."""
@@ -217,7 +223,7 @@ class Points:
             start_frequency=self[CHIRP + "start_frequency"],
             bandwidth=self[CHIRP + "bandwidth"],
         )
-        return self.columns(*(found if len(self.signs) == 3 else found[::2]))
+        return self.columns(*self._there(found))
 
     @cached_property
     def receiver(self) -> link.ReceiverNoise:
@@ -304,8 +310,10 @@ class Points:
     @cached_property
     def starts(self) -> np.ndarray:
         """Time from the shot's start to each segment's [s]."""
-        starts = waveform.segment_starts(self.architecture, self[CHIRP + "duration"])
-        return self.columns(*(starts if len(self.signs) == 3 else starts[::2]))
+        starts = waveform.segment_starts(
+            self.order, duration=self[CHIRP + "duration"], gap=self[waveform.GAP]
+        )
+        return self.columns(*self._there(starts))
 
     @cached_property
     def faster(self) -> np.ndarray:

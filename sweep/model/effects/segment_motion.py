@@ -1,4 +1,4 @@
-"""Motion between segments: they follow each other, and the target moves on from one to the next.
+"""Motion between segments: the target moves on from one to the next.
 
 A segment that starts at t finds the target at R - u t - a t^2 / 2 and v_r + a t, with u the speed
 at which the range along the beam falls: 7.5 cm nearer after 500 us at 150 m/s. [T] has all segments
@@ -15,12 +15,13 @@ larger by as much as the footprint is than what slides past: it is left out.
 
 Beamlets keep their scatterers: their ranges differ by what their own velocities have made of it.
 
-Up and down beat are those of R at half the time t_d from the one to the other, but for what they
-mix. Their half sum is short of 2 v_r / lambda by the share S t_d / 2 of the optical frequency at
-mid-chirp, and the acceleration changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2 for
-Table 4.1. Range and velocity that are interpolated are put right for the velocity that is measured
-with them (as they are for range walk), by v_r t_d / 2 and by that share; nothing in three beats
-tells of the acceleration, or of a beam that slides over slanting ground.
+Up and down beat are those of R at the middle t_m of their starts, but for what they mix. With t_d
+the time from up to down segment, which is negative where the down-chirp comes first, their half sum
+is short of 2 v_r / lambda by the share S t_d / 2 of the optical frequency at mid-chirp, and the
+acceleration changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2 for Table 4.1. Range and
+velocity that are interpolated are put right for the velocity that is measured with them (as they
+are for range walk), by v_r t_m and by that share; nothing in the beats tells of the acceleration,
+or of a beam that slides over slanting ground.
 """
 
 from dataclasses import replace
@@ -32,7 +33,6 @@ from sweep.model.effects.doppler import moved_size
 from sweep.model.effects.effect import Effect, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.preparation import Shots
-from sweep.model.waveform import segment_starts
 
 
 def size(points: Points) -> Size | None:
@@ -60,12 +60,12 @@ def size(points: Points) -> Size | None:
 
 def act(shots: Shots, scene: Scene) -> Shots:
     """Segments that start one after the other."""
-    starts = segment_starts(shots.architecture, shots.duration)
-    half = starts[2] / 2
+    starts = shots.schedule
+    middle, half = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
     return replace(
         shots,
         starts=starts,
-        walk=shots.walk + half,
+        walk=shots.walk + middle,
         slowing=shots.chirp_rate * half / (shots.carriers[0] + shots.bandwidth / 2),
     )
 

@@ -170,11 +170,10 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     amplitude = steady * magnitude
     # The steady share of a smooth shape is at the start of each segment what it is in the others.
     turning = shots.incoherent | (share < _SMOOTH)
-    turning &= not np.any(shots.starts[-1])  # else their lines have it
-    interval = np.where(turning, shots.duration, 0.0) + np.zeros(shots.size)
+    turning &= not shots.moves_on  # else their lines have it
     phase = np.empty((3, *cycles.shape))
-    for s, carrier in enumerate(shots.carriers):
-        turned = np.asarray(carrier, float) * (s * interval)
+    for s, (carrier, start) in enumerate(zip(shots.carriers, shots.schedule, strict=True)):
+        turned = np.where(turning, np.asarray(carrier, float) * start, 0.0) + np.zeros(shots.size)
         np.add(cycles, turned[:, None] * doppler, out=phase[s])
     brighter = (amplitude**2).sum(axis=1) / np.maximum((steady**2).sum(axis=1), _SMALLEST)
     return replace(
@@ -205,19 +204,19 @@ def fade(shots: Shots, scene: Scene) -> Shots:
     law = str(scene.parameters[_LAW])
     if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots
-    turn = np.asarray(shots.carriers[0] * shots.duration)  # [cycles per beta]
-    whole, rows = turn.ndim == 0, shots.row
-    found = np.ones((2, len(shots.doppler) if whole else shots.size), complex)
+    up, doppler, down = shots.schedule
+    turns = np.stack([shots.carriers[0] * lag for lag in (doppler - up, down - up, down - doppler)])
+    whole, rows = turns.ndim == 1, shots.row  # [cycles per beta]
+    found = np.ones((3, len(shots.doppler) if whole else shots.size), complex)
     share = shots.amplitude**2
     share = share / np.maximum(share.sum(axis=1), _SMALLEST)[:, None]
     if shots.doppler.any():
         for first in range(0, found.shape[1], _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
             row = some if whole else rows[some]
-            cycles = shots.doppler[row] * (turn if whole else turn[some, None])
-            one = np.exp(2j * np.pi * cycles)
-            found[0, some] = (share[row] * one).sum(axis=1)
-            found[1, some] = (share[row] * one * one).sum(axis=1)
+            for k, turn in enumerate(turns):
+                cycles = shots.doppler[row] * (turn if whole else turn[some, None])
+                found[k, some] = (share[row] * np.exp(2j * np.pi * cycles)).sum(axis=1)
     return replace(shots, fading=Fading(*(found[:, rows] if whole else found)))
 
 

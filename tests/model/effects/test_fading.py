@@ -136,7 +136,7 @@ def test_correlations_are_the_sum_over_the_beamlets(sloping):
 def test_drawn_factors_have_the_correlations(near):
     number = 200_000
     far = 0.1 - 0.4j if near != 1.0 else 1.0
-    fading = Fading(np.array([near + 0j]), np.array([far + 0j]))
+    fading = Fading(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
     found = np.empty((3, number))
     fading_of_draws(
         np.array([3, 4], np.uint64), np.arange(number), fading.mixing()[:, 0].copy(), found
@@ -177,7 +177,7 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
     number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=9)
     shots = prepared(sloping | {"target.range": 8000.0})
     apart = np.zeros(1, complex)
-    shots = replace(shots, fading=Fading(apart, apart))
+    shots = replace(shots, fading=Fading(apart, apart, apart))
     method = "noise" if noisy else "probabilities"
     found = groups(shots)
     drawn = draw_returns(shots, found, keys=key, draws=number, method=method)
