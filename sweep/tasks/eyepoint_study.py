@@ -234,20 +234,6 @@ def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)
     return [None if s is None else Pose(s.position[at], s.attitude[at]) for s in states]
 
 
-class FinerRays:
-    """Casts shots of a scene, its own or another's that is built, with any number of rays."""
-
-    def __init__(self, spec: SceneSpec, world: World | None = None) -> None:
-        self._spec, self._world = spec, world
-        self._known: dict[tuple[str, int], EyepointStudy] = {}
-
-    def see(self, scanner: str, shots: np.ndarray, rays: int) -> Eyepoints:
-        """Eyepoints of shots, by number (n,)."""
-        if (scanner, rays) not in self._known:
-            self._known[scanner, rays] = EyepointStudy(self._spec, scanner, rays, self._world)
-        return self._known[scanner, rays].observe(shots)
-
-
 def refine(
     rays: int,
     error: np.ndarray,
