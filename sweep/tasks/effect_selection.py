@@ -95,15 +95,7 @@ class Tiles(BlockGrid):
         super().__init__(grid.dims, grid.shape, tile_shape(grid.shape, self._undivided))
 
     def of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Tiles that a block meets, and where each of its points lies among them.
-
-        Returns
-        -------
-        tiles : (m,) ndarray of int
-            Numbers of tiles, in C order over the grid of tiles.
-        place : (points,) ndarray of int
-            Index into them of each point of the block, in C order over the block.
-        """
+        """Tiles that a block meets, (m,), and the index into them of each of its points."""
         along = [
             np.arange(s.start, s.stop) // side
             for s, side in zip(self.grid.block(block), self.block_shape, strict=True)
@@ -267,16 +259,8 @@ def plan_shots(
 ) -> ShotsPlan | None:
     """Plans of a flight's shots at one place along its axes; None where none sees anything.
 
-    Parameters
-    ----------
-    eyepoints, tiles
-        Shots, and the number of the tile of each, rising.
-    parameters, surfaces
-        As of :func:`sweep.model.eyepoints.seen_ground`.
-    modes, rotating
-        Mode of each effect; whether any body turns.
-    rays_by_tolerance
-        Whether the tolerance is for the number of rays too.
+    ``tiles``: the number of the tile of each shot, rising. ``rays_by_tolerance``: whether the
+    tolerance is for the number of rays too.
     """
     from sweep.model.effects.catalogue import DEFAULTS
     from sweep.model.effects.planning import plan

@@ -60,12 +60,7 @@ def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
 class EyepointStudy(Study):
     """Eyepoints of the shots of a flight through one scanner.
 
-    Parameters
-    ----------
-    spec, scanner
-        A study of the scene, and the name of the scanner.
-    beamlets, world
-        Rays of each shot, and the scene, built; those of the spec by default.
+    Rays of each shot, and the scene, built, are those of the spec by default.
     """
 
     unit = "shots"
@@ -242,18 +237,8 @@ def refine(
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
 
-    How many that are follows from each shot alone.
-
-    Parameters
-    ----------
-    rays
-        Of each shot so far.
-    error
-        (n,): what they leave.
-    accuracy
-        Of the study.
-    again
-        Looks at some shots, by their places (m,), with so many rays; says what these leave, (m,).
+    How many that are follows from each shot alone. What the ``rays`` of each so far leave is its
+    ``error``, (n,); ``again`` looks at shots, by place, with more, and says what these leave.
     """
     needed = more_rays(rays, error, accuracy)
     for number in accuracy.rays:  # rising, and so are the needs of each shot

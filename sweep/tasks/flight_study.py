@@ -120,12 +120,7 @@ class KnownCloud(NamedTuple):
 class FlightStudy(GrowingStudy):
     """The point clouds of a flight, a group of arrays for each scanner.
 
-    Parameters
-    ----------
-    spec, path
-        The study, and its store, beside which the eyepoints are.
-    world
-        The scene, built; by default that of the spec.
+    Its eyepoints are beside its store. The scene, built, is by default that of the spec.
     """
 
     unit = "shots"
@@ -271,18 +266,9 @@ class FlightStudy(GrowingStudy):
         numbers: np.ndarray,
         known: KnownCloud | None = None,
     ) -> Results:
-        """Radiometry, draws and navigation of some shots.
+        """Radiometry, draws and navigation of shots in whole cycles, by number in the flight.
 
-        Parameters
-        ----------
-        part
-            Scanner, place along the axes and stretch of draws.
-        shots, eyepoints
-            Whole cycles of them.
-        selected, numbers
-            What is simulated of each; their numbers, counted from the flight's first.
-        known
-            Results that need not be computed.
+        Results that are ``known`` are not computed.
         """
         blocks = self.scanners[part.scanner]
         draws, each = len(part.draws), blocks.shots_a_cycle

@@ -140,10 +140,7 @@ class GridStudy(GrowingStudy):
         begun: Known = Known(),  # noqa: B008
         stop: Stop | None = None,
     ) -> Results:
-        """Outputs of a block; fills, where all of a point is beyond the model.
-
-        `begun` and `stop` are those of :func:`sweep.tasks.grid_study.evaluated`.
-        """
+        """Outputs of a block; fills, where all of a point is beyond the model."""
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
         extent, size = self.grid.extent(block), self.grid.block_size(block)
@@ -241,20 +238,9 @@ def evaluated(
 ) -> Iterator[Found]:
     """Outputs of a block's points that are not done, those together that call for the same.
 
-    Parameters
-    ----------
-    selected
-        Effects simulated at each of its points, in C order over it.
-    known, begun
-        Results that need not be computed, whole or of first draws: of another study, and of the
-        block itself from a call that was stopped.
-    stop
-        When to stop, with at least some draws taken.
-
-    Raises
-    ------
-    Unfinished
-        Where it was stopped; the next call goes on, to the same bits.
+    Those that need not be computed are ``known``, of another study, or ``begun`` by a call that
+    was stopped. Raises Unfinished where it is stopped, with at least some draws taken; the next
+    call goes on, to the same bits.
     """
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
@@ -300,16 +286,9 @@ def evaluate_points(
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
-    Parameters
-    ----------
-    spec, parameters
-        The study; dotted path to scalars, strings or arrays (count,).
-    effects
-        Names of the effects that are simulated in all of them. Outputs are means over the
-        study's draws where random ones are among them, and an error where it has no draws.
-    before, stop
-        Draws that there are already; when to return with those that there are then, by default
-        with all.
+    Parameters are scalars, strings or arrays (count,). Outputs are means over the study's draws
+    where random effects are simulated, and an error where it has no draws. Draws go on from those
+    ``before``, until there are all or ``stop`` says so.
     """
     if spec.draws.any:
         return _drawn(spec, parameters, count, effects, before, stop)

@@ -123,13 +123,7 @@ class _Counting(Progress):
 
 
 class Late(_Counting):
-    """Progress of what may be over before anybody looks: nothing is shown of the first seconds.
-
-    Parameters
-    ----------
-    shown
-        Where it is shown then.
-    """
+    """Progress of what may be over before anybody looks: nothing is shown of the first seconds."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()

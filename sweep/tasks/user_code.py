@@ -59,10 +59,7 @@ def _allowed() -> set[str]:
 def check(spec: Spec | SceneSpec) -> None:
     """Import the functions that a study names, and try each on a small known spectrum.
 
-    Raises
-    ------
-    CodeError
-        Where one may not run, can't be imported, or does not answer as it must.
+    CodeError where one may not run, can't be imported, or does not answer as it must.
     """
     for role, name in _named(spec):
         _try(role, name)

@@ -142,14 +142,9 @@ class Ladder:
     def with_fixed(
         self, sets: Mapping[float, frozenset[str]], tolerances: Iterable[float] = ()
     ) -> Ladder:
-        """The ladder with rungs that simulate the same effects at every point.
+        """The ladder with rungs that simulate at every point what a tolerance calls for anywhere.
 
-        Parameters
-        ----------
-        sets
-            Effects that a tolerance calls for anywhere.
-        tolerances
-            For lines and leakage, each tried with each set; those of the effects by default.
+        ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
         """
         as_at: dict[frozenset[str], float] = {}
         for tolerance, names in sets.items():

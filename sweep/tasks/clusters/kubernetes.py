@@ -34,10 +34,7 @@ ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 def deployed(cluster: Kubernetes, bounds: Bounds) -> Iterator[str]:
     """Address of the scheduler, while the cluster is there.
 
-    Raises
-    ------
-    ClusterError
-        Where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
+    ClusterError where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
     """
     try:
         from httpx import HTTPError
