@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import dask
 import pytest
 from distributed import Client, LocalCluster
 from small import copied, receipts, small, tree
@@ -109,6 +110,7 @@ def two_workers(monkeypatch):
     monkeypatch.setattr(scheduler, "TICK", 0.1)
     monkeypatch.setattr(scheduler, "LEASE", 1.0)
     with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),  # of a scheduler that is gone
         LocalCluster(
             n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
         ) as cluster,
@@ -155,6 +157,20 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
     else:
         assert outcome.complete and outcome.blocks_computed == 12
     assert tree(outcome.store) == tree(undisturbed)
+
+
+def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):
+    def slowly(study, block):
+        time.sleep(0.05)
+        return study.evaluate(block)
+
+    cluster = two_workers.cluster
+    told = Told(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
+    path = tmp_path / "s.zarr"
+    outcome = run(small(), store=path, client=two_workers, progress=told, evaluate=slowly)
+    assert outcome.stopped.startswith("the scheduler is gone") and outcome.blocks_done < 12
+    assert resume(path, scheduler="none", progress=False).complete
+    assert tree(path) == tree(undisturbed)
 
 
 def versions_differ(path, opened):
