@@ -119,6 +119,8 @@ def measure(
     SceneError
         Where a file of a scene is missing, changed or unfit.
     """
+    from sweep.spec import SceneSpec
+
     if getattr(spec.draws, "whole_spectra", False):
         raise TaskError(
             "this study draws whole spectra, which have no settings to try: "
@@ -129,24 +131,21 @@ def measure(
     told = chosen(progress)
     with Interrupts() as interrupts:
         with working("choosing points", told):
-            bench = _bench_of(spec, points)
+            bench: Bench
+            if isinstance(spec, SceneSpec):
+                bench = FlightBench(spec, points)
+            else:
+                bench = GridBench(spec, points)
         try:
-            measurement = Measurement(
+            measured = Measurement(
                 bench, time_limit=time_limit, told=told, interrupts=interrupts
-            )  # fmt: skip
-            measured = measurement.run()
+            ).run()
         except Nothing:
             return False
     stored = storing(study_of(spec, store_path))
     _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
     store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
     return True
-
-
-def _bench_of(spec: Spec | SceneSpec, points: int) -> Bench:
-    from sweep.spec import SceneSpec
-
-    return FlightBench(spec, points) if isinstance(spec, SceneSpec) else GridBench(spec, points)
 
 
 def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
