@@ -13,7 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.catalogue import FLAGS_APART, SHARED, flags_of, names_of
+from sweep.model.effects.catalogue import DEFAULTS, FLAGS_APART, SHARED, flags_of, names_of
+from sweep.model.effects.catalogue import EFFECTS as ALL
+from sweep.model.effects.points import Points
+from sweep.model.ground import of_rays
+from sweep.model.resolution import BEAMLETS, effects_tolerance
 from sweep.tasks.grid import Grid, Value
 from sweep.tasks.study import BlockGrid
 
@@ -179,9 +183,6 @@ class EffectSelection:
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
         """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
-        from sweep.model.effects.catalogue import DEFAULTS
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-
         flags = np.zeros(count, np.uint32)
         for k, effect in enumerate(ALL):
             absent = effect.absent(DEFAULTS | dict(parameters))
@@ -213,10 +214,7 @@ class EffectSelection:
 
     def _plan(self, alike: Alike) -> Plan:
         """The plan of tiles that share words and sizes."""
-        from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
-        from sweep.model.effects.points import Points
-        from sweep.model.resolution import BEAMLETS, effects_tolerance
 
         parameters, number = alike.parameters, len(alike.tiles)
         along = tuple(range(1, len(self.tiles.shape) + 1))
@@ -262,12 +260,8 @@ def plan_shots(
     ``tiles``: the number of the tile of each shot, rising. ``rays_by_tolerance``: whether the
     tolerance is for the number of rays too.
     """
-    from sweep.model.effects.catalogue import DEFAULTS
     from sweep.model.effects.planning import plan
-    from sweep.model.effects.points import Points
     from sweep.model.eyepoints import seen_ground
-    from sweep.model.ground import of_rays
-    from sweep.model.resolution import effects_tolerance
 
     seen = eyepoints.seen.nonzero()[0]
     if not seen.size:

@@ -10,7 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.accuracy import Accuracy
+from sweep.model.effects.catalogue import EFFECTS as ALL
 from sweep.model.effects.catalogue import flag_attributes, names_of
+from sweep.model.outputs import (
+    ACCURACY_OUTPUTS,
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    OUTPUTS,
+    RUNNING,
+    RUNNING_COLUMNS,
+    RUNNING_OUTPUTS,
+    SIMULATED,
+    SPECTRA_OUTPUTS,
+    Output,
+)
 from sweep.model.resolution import by_tolerance
 from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.effect_selection import EFFECTS, ERROR, EffectSelection, Selected
@@ -29,7 +43,6 @@ from sweep.tasks.study import (
 )
 
 if TYPE_CHECKING:
-    from sweep.model.outputs import Output
     from sweep.model.sampling import Before
     from sweep.spec import Axis, Spec
 
@@ -39,17 +52,6 @@ BATCH = "batch"
 
 def outputs_of(spec: Spec) -> dict[str, Output]:
     """Arrays that blocks of a study write, sorted by name, with dimensions besides the axes."""
-    from sweep.model.outputs import (
-        ACCURACY_OUTPUTS,
-        DRAW_OUTPUTS,
-        ERROR_OUTPUTS,
-        OUTPUTS,
-        RUNNING,
-        RUNNING_OUTPUTS,
-        SIMULATED,
-        SPECTRA_OUTPUTS,
-    )
-
     error = replace(
         SIMULATED[ERROR],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -114,8 +116,6 @@ class GridStudy(GrowingStudy):
 
     def outputs(self) -> list[ArrayLayout]:
         """An array for each output of the model, and those that say what was simulated."""
-        from sweep.model.outputs import ACCURACY_OUTPUTS, RUNNING_COLUMNS
-
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
         found = []
         for name, output in outputs_of(self.spec).items():
@@ -193,8 +193,6 @@ class GridStudy(GrowingStudy):
         One draw of a point with every effect that may be called for, and one with none. Random
         effects are not for every instrument: of these, only what the point itself calls for.
         """
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
         own = names_of(int(self.selection.of_block(0).flags[0]))
@@ -332,7 +330,6 @@ def draw_keys(spec: Spec, parameters: Mapping[str, Value], count: int) -> np.nda
 
 def drawn_before(spec: Spec, begun: Found, points: np.ndarray) -> Before | None:
     """Draws that there are of some points of a block; None where there are none."""
-    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS, RUNNING
     from sweep.model.sampling import Before
 
     _, theirs, ours = np.intersect1d(begun.points, points, return_indices=True)
@@ -360,7 +357,6 @@ def _drawn(
     before: Before | None,
     stop: Callable[[], bool] | None,
 ) -> Results:
-    from sweep.model.accuracy import Accuracy
     from sweep.model.sampling import never, simulate
     from sweep.tasks.user_code import methods
 
@@ -380,8 +376,6 @@ def _drawn(
 
 def no_sums(spec: Spec, count: int) -> Results:
     """Running sums of points that have none, where any point of the study may have some."""
-    from sweep.model.outputs import RUNNING, RUNNING_COLUMNS
-
     some = spec.has_random_effects and not spec.draws.whole_spectra
     return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
 
 import numpy as np
 
+from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
 from sweep.storage.atomic_replace import beside, discard, draft, settle
 from sweep.storage.locations import (
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     import zarr
     from numcodecs.zstd import Zstd
     from zarr.core.array_spec import ArrayConfigLike
-
-    from sweep.spec import SceneSpec, Spec
 
 ROOT = "zarr.json"
 
@@ -516,8 +515,6 @@ def refuse_other_study(
     path: Location, attributes: dict[str, Any], held: Spec | SceneSpec, asked: Spec | SceneSpec
 ) -> None:
     """Refuse a store that holds another study than the one asked for."""
-    from sweep.spec import difference
-
     if attributes["study_id"] == asked.id:
         return
     refuse_other_versions(path, attributes, where="this machine")  # the version is in the id too

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
+from sweep.model.outputs import PROMISED
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.logs import read_receipts
@@ -305,8 +306,6 @@ class ErrorRow:
 
 def accuracy_table(store: str | Location) -> list[ErrorRow]:
     """A row for each probability that is promised; none where nothing is drawn or computed."""
-    from sweep.model.outputs import PROMISED
-
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy) or not study.spec.draws.any:

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
@@ -24,6 +25,7 @@ from sweep.tasks.accuracy.rungs import (
     DRAWN,
     REFERENCE,
     THESIS,
+    Declared,
     Ladder,
     Rung,
     ladder,
@@ -32,10 +34,6 @@ from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.progress import Interrupts, Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
-
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.accuracy.rungs import Declared
 
 POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
@@ -119,8 +117,6 @@ def measure(
     SceneError
         Where a file of a scene is missing, changed or unfit.
     """
-    from sweep.spec import SceneSpec
-
     if getattr(spec.draws, "whole_spectra", False):
         raise TaskError(
             "this study draws whole spectra, which have no settings to try: "
