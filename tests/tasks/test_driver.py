@@ -9,8 +9,7 @@ import dask
 import numpy as np
 import pytest
 import xarray as xr
-from distributed import Client, LocalCluster
-from small import STUDY, deadly, evaluated, failing, logged, quiet, receipts, small, tree
+from small import STUDY, deadly, evaluated, failing, logged, quiet, receipts, small, threads, tree
 
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
 from sweep.tasks import session, store
@@ -81,12 +80,7 @@ def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn
 
 
 def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with threads(1, each=2) as client:
         outcome = quiet(small(), tmp_path / "small.zarr", client=client)
         again = quiet(small(), tmp_path / "again.zarr", client=client)
         assert client.status == "running"
@@ -232,12 +226,7 @@ def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
         def advance(self, *, points, failed):
             most.append(len(client.futures))
 
-    with (
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with threads(2) as client:
         outcome = run(spec, store=tmp_path / "s.zarr", client=client, progress=Watching())
     assert outcome.complete and outcome.blocks == 72
     assert max(most) <= 2 * 2 + 1

@@ -8,16 +8,22 @@ from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from time import thread_time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sweep.model import shot, truth
 from sweep.model.accuracy import Accuracy
 from sweep.model.effects.catalogue import NAMES, flags_of, names_of
+from sweep.model.eyepoints import Eyepoints, seen_ground
+from sweep.model.ray_error import ray_error
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import SceneSpec
 from sweep.tasks.accuracy.bench import (
     AS_WRITTEN,
     NOT_IN_TRUTH,
     Bench,
+    Look,
     Seen,
     Trial,
     along_axes,
@@ -31,11 +37,6 @@ from sweep.tasks.effect_selection import TILE_SHOTS, Selected
 from sweep.tasks.eyepoint_study import world_of
 from sweep.tasks.flight_study import FlightStudy, Part
 from sweep.tasks.study import Results
-
-if TYPE_CHECKING:
-    from sweep.model.eyepoints import Eyepoints
-    from sweep.spec import SceneSpec
-    from sweep.tasks.accuracy.bench import Look
 
 #: Places along the axes at which each scanner is looked at.
 PLACES = 2
@@ -126,8 +127,6 @@ class FlightBench(Bench):
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
         """A shot in the time domain, and as the rung has it without what the truth lacks."""
-        from sweep.model import shot, truth
-
         tiles, one = self._around(np.array([place]), 1)
         every, _ = self._see(rung, tiles)
         flags = self._selected(rung, tiles, every)[0].flags[one]
@@ -195,8 +194,6 @@ class FlightBench(Bench):
 
         Rays are cast once for all rungs of the same geometry.
         """
-        from sweep.scenes.eyepoint_arrays import from_arrays
-
         caster = self._study(rung).caster(tiles.part.scanner)
         which_shots = caster.id, tiles.start, tiles.index.tobytes()
         if which_shots not in self._cast:
@@ -232,15 +229,11 @@ def _statistics(
     flags: np.ndarray,
 ) -> Results:
     """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
-    from sweep.model.eyepoints import seen_ground
-    from sweep.model.ray_error import ray_error
-    from sweep.model.shot import prepare_cast, statistics
-
     there, rays = eyepoints.seen.nonzero()[0], eyepoints.weight.size
     given, ground = seen_ground(eyepoints.some(there), study.parameters_at(part), study.surfaces)
-    shots = prepare_cast(given, ground, effects, flags[there])
+    shots = shot.prepare_cast(given, ground, effects, flags[there])
     found = look(shots)
-    results = statistics(shots, found) | {"beamlets": np.full(shots.size, rays)}
+    results = shot.statistics(shots, found) | {"beamlets": np.full(shots.size, rays)}
     if study.rays_accuracy is not None:
         bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
         results["beamlets_error"] = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
