@@ -79,14 +79,13 @@ tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, th
 calls for anywhere, with lines and leakage to three tolerances; fixed numbers of beamlets, where
 they add as powers; numbers of draws, where the study draws; and the way that the thesis describes.
 All take turns on parts of the sample, each round in an order of its own, so that whatever slows the
-machine slows them alike; a study that takes next to nothing is run up to fifteen times in a row, of
-which the best counts. What a point costs depends on those that are computed beside it, as they
-share what is worked out for them: so times are taken on stretches of the blocks that the study
-computes, some thousands of points each, around points of the sample. They are those that the
-processor spends on the work. The best round counts for them, and ratios are medians of those within
-each round, or of the best where there are but two. Planning is counted with what it plans. Storing
-is not counted, as all settings share it, but told beside: the processor's time for making the store
-and writing its blocks.
+machine slows them alike; a study that takes next to nothing has up to 27 rounds. What a point costs
+depends on those that are computed beside it, as they share what is worked out for them: so times
+are taken on stretches of the blocks that the study computes, some thousands of points each, around
+points of the sample. They are those that the processor spends on the work. The best round counts
+for them, and ratios are medians of those within each round, or of the best where there are but two.
+Planning is counted with what it plans. Storing is not counted, as all settings share it, but told
+beside: the processor's time for making the store and writing its blocks.
 
 The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
 the differences from the reference in a probability of detection, of the segments and the shot, in

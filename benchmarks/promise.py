@@ -19,9 +19,9 @@ from shared import DOCS, EXPERIMENTS, table
 
 from sweep.model.accuracy import Accuracy
 from sweep.spec import SceneSpec, Spec, SpecError, load
-from sweep.tasks.accuracy.bench import Bench, GridBench, Seen, Trial
+from sweep.tasks.accuracy.bench import Bench, GridBench, Trial
 from sweep.tasks.accuracy.flight_bench import FlightBench
-from sweep.tasks.accuracy.measure import FIXED_AS_AT, PROMISED, apart
+from sweep.tasks.accuracy.measure import PROMISED, apart, completed, together, tolerance_of
 from sweep.tasks.accuracy.rungs import (
     ADAPTIVE,
     ALL_ON,
@@ -44,7 +44,7 @@ KEPT = 0.999
 """Share of the points that shall keep a tolerance."""
 LONG = 0.5
 """Seconds that a trial may take to be repeated: longer ones are timed well enough as it is."""
-TOLERANCE, BEAMLETS = "accuracy.tolerance", "footprint.beamlets"
+BEAMLETS = "footprint.beamlets"
 MORE_RAYS = 31_987
 """What the reference of flights is held against."""
 MANY = 4_009
@@ -143,7 +143,7 @@ def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
     for rung in rungs:  # compiles what there is to compile
         bench.try_on(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
     bench.forget()
-    found: list[list[Trial]] = [[] for _ in rungs]
+    found: list[list[Trial]] = []
     for part in parts:
         best: dict[int, Trial] = {}
         for turn in range(rounds):  # in turn, so that whatever slows the machine slows all
@@ -153,19 +153,9 @@ def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
                 stretch = 1 if rung.kind == REFERENCE else min(STRETCH, bench.most_times)
                 trial = bench.try_on(rung, part, stretch)
                 best[k] = min(best.get(k, trial), trial, key=lambda trial: trial.seconds)
-        for trials, k in zip(found, sorted(best), strict=True):
-            trials.append(best[k])
+        found.append([best[k] for k in sorted(best)])
         bench.forget()
-    share = np.array([len(part) for part in parts]) / bench.size
-    return [together(trials, share) for trials in found]
-
-
-def together(trials: Sequence[Trial], share: np.ndarray) -> Trial:
-    """Trials of the parts of a sample as one."""
-    seen = Seen(*map(np.concatenate, zip(*(t.seen for t in trials), strict=True)))
-    seconds = sum(t.seconds * s for t, s in zip(trials, share, strict=True))
-    planning = sum(t.planning * s for t, s in zip(trials, share, strict=True))
-    return Trial(seen, float(seconds), float(planning))
+    return together(parts, found)
 
 
 class Found(NamedTuple):
@@ -181,9 +171,8 @@ def known(spec: Spec | SceneSpec) -> Found:
     flight = isinstance(spec, SceneSpec)
     bench = FlightBench(spec, POINTS) if flight else GridBench(spec, POINTS, drawn_points(spec))
     whole = ladder(spec)
-    at = {float(r.overrides[TOLERANCE]): r for r in whole.rungs if r.kind == ADAPTIVE}
-    whole = whole.with_fixed({t: bench.effects(at[t]) for t in FIXED_AS_AT}, TOLERANCES)
-    bench.forget()
+    at = {tolerance_of(rung): rung for rung in whole.rungs if rung.kind == ADAPTIVE}
+    whole = completed(whole, bench, TOLERANCES)
     fixed = [rung for rung in whole.rungs if rung.kind in (FIXED, ALL_ON)]
     rungs = [*at.values(), *fixed, whole.reference]
     trials = tried(bench, rungs, ROUNDS)

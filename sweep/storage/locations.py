@@ -72,18 +72,10 @@ class ObjectStoreError(OSError):
 
 @dataclass(frozen=True, order=True)
 class ObjectPath:
-    """A key in an object store, spoken to as far as needed in the words of `pathlib`.
+    """A key in an object store, spoken to as far as needed in the words of `pathlib`."""
 
-    Parameters
-    ----------
-    root
-        Kind and bucket: ``s3://bucket``.
-    key
-        The key, without a slash at either end.
-    """
-
-    root: str
-    key: str
+    root: str  # kind and bucket: s3://bucket
+    key: str  # without a slash at either end
 
     def __str__(self) -> str:
         return f"{self.root}/{self.key}"
@@ -189,13 +181,7 @@ class ObjectPath:
         return None
 
     def put_if(self, content: bytes, tag: Tag | None) -> Tag | None:
-        """Put an object if none is there, or only what has a tag.
-
-        Returns
-        -------
-        dict or None
-            The new tag; None where somebody was quicker.
-        """
+        """Put an object if none is there, or only what has a tag; None if somebody was quicker."""
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
         mode = "create" if tag is None else tag
@@ -363,13 +349,8 @@ def put_whole(location: Location, content: bytes) -> None:
 def put(file: str, content: bytes, *, durable: bool = False) -> None:
     """Write a file on disk in one step, also where a directory has got into its place.
 
-    Parameters
-    ----------
-    file, content
-        Its path, and what it is to hold. Folders above it are made.
-    durable
-        Write the content to the disk before the file gets its name: else a power cut may leave
-        the name with nothing behind it.
+    Folders above it are made. Where it is `durable` the content is on the disk before the file gets
+    its name: else a power cut may leave the name with nothing behind it.
     """
     draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
     try:

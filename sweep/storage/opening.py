@@ -101,10 +101,7 @@ def read_attributes(path: Location) -> dict[str, Any]:
 def read_document(path: Location) -> dict[str, Any]:
     """The document of a store's root, with the metadata of all its arrays, checked.
 
-    Raises
-    ------
-    NotAStoreError
-        Where there is no store, or one that this version of the program does not write.
+    NotAStoreError where there is no store, or one that this version of the program does not write.
     """
     document = _document(path)
     attributes = recognised(path, document["attributes"])
@@ -129,10 +126,7 @@ def read_document(path: Location) -> dict[str, Any]:
 def recognised(path: Location, attributes: Any) -> dict[str, Any]:
     """Attributes of a store, where this version of the program writes such.
 
-    Raises
-    ------
-    NotAStoreError
-        Where it does not.
+    NotAStoreError where it does not.
     """
     ours = _ours(path, attributes)
     if (layout := ours.get("layout")) != LAYOUT:
@@ -303,13 +297,7 @@ class ReplacedError(ValueError):
 
 
 class Unreplaced(LocalStore):
-    """A store on disk whose every read fails once another study's store is in its place.
-
-    Parameters
-    ----------
-    root, held
-        The store, and the id of the study that it is read for.
-    """
+    """A store on disk whose every read fails once another study's store is in its place."""
 
     def __init__(self, root: Path, held: str) -> None:
         super().__init__(root, read_only=True)

@@ -100,10 +100,8 @@ class RunOptions:
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
         """The cluster asked for, here or by the spec's `execution`; None for a plain loop.
 
-        Raises
-        ------
-        ClusterError
-            Where both a scheduler and a cluster are named, or workers that are not ours to start.
+        ClusterError where both a scheduler and a cluster are named, or workers that are not ours to
+        start.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -146,13 +144,7 @@ def about_seconds(spec: Spec | SceneSpec) -> float:
 
 
 class Pool(ExitStack):
-    """A place in use: its workers serve one study after another, and end with it.
-
-    Parameters
-    ----------
-    options, spec
-        How to compute, and what.
-    """
+    """A place in use: its workers serve one study after another, and end with it."""
 
     def __init__(self, options: RunOptions, spec: Spec | SceneSpec) -> None:
         super().__init__()
@@ -170,10 +162,7 @@ class Pool(ExitStack):
     def connect(self) -> Reached:
         """Reach the workers, of which there are to be no more than `most`.
 
-        Raises
-        ------
-        ClusterError
-            Where there is no scheduler or worker to be had.
+        ClusterError where there is no scheduler or worker to be had.
         """
         if self._reached is None:
             client = self.options.client
@@ -252,10 +241,7 @@ def connected(
     No more workers are started than there can be tasks at once (`most`); those of this machine are
     processes, or threads of this one. `say` takes where the cluster is, and its dashboard.
 
-    Raises
-    ------
-    ClusterError
-        Where no scheduler answers or no worker starts.
+    ClusterError where no scheduler answers or no worker starts.
     """
     from distributed import Client
 

@@ -355,21 +355,10 @@ def _is_done(path: Location, study: FlightStudy) -> bool:
 
 
 def _cast(study: FlightStudy, pool: Pool) -> tuple[dict[str, int], str]:
-    """Cast what is missing of a study's eyepoints.
+    """Cast what is missing of a study's eyepoints; rays by scanner, and why any is still missing.
 
-    Returns
-    -------
-    rays : dict of int
-        Rays cast by scanner; 0 where its eyepoints were there.
-    why : str
-        Why eyepoints are still missing; empty where none is.
-
-    Raises
-    ------
-    StoreError
-        Where an eyepoint store is not what its name says, or can't be written.
-    SceneError
-        Where a file of the scene is missing, changed or unfit.
+    StoreError where an eyepoint store is not what its name says, or can't be written; SceneError
+    where a file of the scene is missing, changed or unfit.
     """
     rays: dict[str, int] = {}
     for eyepoints in study.eyepoint_studies():

@@ -13,7 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.catalogue import FLAGS_APART, SHARED, flags_of, names_of
+from sweep.model.effects.catalogue import DEFAULTS, FLAGS_APART, SHARED, flags_of, names_of
+from sweep.model.effects.catalogue import EFFECTS as ALL
+from sweep.model.effects.points import Points
+from sweep.model.ground import of_rays
+from sweep.model.resolution import BEAMLETS, effects_tolerance
 from sweep.tasks.grid import Grid, Value
 from sweep.tasks.study import BlockGrid
 
@@ -95,15 +99,7 @@ class Tiles(BlockGrid):
         super().__init__(grid.dims, grid.shape, tile_shape(grid.shape, self._undivided))
 
     def of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Tiles that a block meets, and where each of its points lies among them.
-
-        Returns
-        -------
-        tiles : (m,) ndarray of int
-            Numbers of tiles, in C order over the grid of tiles.
-        place : (points,) ndarray of int
-            Index into them of each point of the block, in C order over the block.
-        """
+        """Tiles that a block meets, (m,), and the index into them of each of its points."""
         along = [
             np.arange(s.start, s.stop) // side
             for s, side in zip(self.grid.block(block), self.block_shape, strict=True)
@@ -187,9 +183,6 @@ class EffectSelection:
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
         """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
-        from sweep.model.effects.catalogue import DEFAULTS
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-
         flags = np.zeros(count, np.uint32)
         for k, effect in enumerate(ALL):
             absent = effect.absent(DEFAULTS | dict(parameters))
@@ -221,10 +214,7 @@ class EffectSelection:
 
     def _plan(self, alike: Alike) -> Plan:
         """The plan of tiles that share words and sizes."""
-        from sweep.model.effects.catalogue import DEFAULTS
         from sweep.model.effects.planning import plan
-        from sweep.model.effects.points import Points
-        from sweep.model.resolution import BEAMLETS, effects_tolerance
 
         parameters, number = alike.parameters, len(alike.tiles)
         along = tuple(range(1, len(self.tiles.shape) + 1))
@@ -267,23 +257,11 @@ def plan_shots(
 ) -> ShotsPlan | None:
     """Plans of a flight's shots at one place along its axes; None where none sees anything.
 
-    Parameters
-    ----------
-    eyepoints, tiles
-        Shots, and the number of the tile of each, rising.
-    parameters, surfaces
-        As of :func:`sweep.model.eyepoints.seen_ground`.
-    modes, rotating
-        Mode of each effect; whether any body turns.
-    rays_by_tolerance
-        Whether the tolerance is for the number of rays too.
+    ``tiles``: the number of the tile of each shot, rising. ``rays_by_tolerance``: whether the
+    tolerance is for the number of rays too.
     """
-    from sweep.model.effects.catalogue import DEFAULTS
     from sweep.model.effects.planning import plan
-    from sweep.model.effects.points import Points
     from sweep.model.eyepoints import seen_ground
-    from sweep.model.ground import of_rays
-    from sweep.model.resolution import effects_tolerance
 
     seen = eyepoints.seen.nonzero()[0]
     if not seen.size:

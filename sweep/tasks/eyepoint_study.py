@@ -60,12 +60,7 @@ def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
 class EyepointStudy(Study):
     """Eyepoints of the shots of a flight through one scanner.
 
-    Parameters
-    ----------
-    spec, scanner
-        A study of the scene, and the name of the scanner.
-    beamlets, world
-        Rays of each shot, and the scene, built; those of the spec by default.
+    Rays of each shot, and the scene, built, are those of the spec by default.
     """
 
     unit = "shots"
@@ -234,20 +229,6 @@ def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)
     return [None if s is None else Pose(s.position[at], s.attitude[at]) for s in states]
 
 
-class FinerRays:
-    """Casts shots of a scene, its own or another's that is built, with any number of rays."""
-
-    def __init__(self, spec: SceneSpec, world: World | None = None) -> None:
-        self._spec, self._world = spec, world
-        self._known: dict[tuple[str, int], EyepointStudy] = {}
-
-    def see(self, scanner: str, shots: np.ndarray, rays: int) -> Eyepoints:
-        """Eyepoints of shots, by number (n,)."""
-        if (scanner, rays) not in self._known:
-            self._known[scanner, rays] = EyepointStudy(self._spec, scanner, rays, self._world)
-        return self._known[scanner, rays].observe(shots)
-
-
 def refine(
     rays: int,
     error: np.ndarray,
@@ -256,18 +237,8 @@ def refine(
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
 
-    How many that are follows from each shot alone.
-
-    Parameters
-    ----------
-    rays
-        Of each shot so far.
-    error
-        (n,): what they leave.
-    accuracy
-        Of the study.
-    again
-        Looks at some shots, by their places (m,), with so many rays; says what these leave, (m,).
+    How many that are follows from each shot alone. What the ``rays`` of each so far leave is its
+    ``error``, (n,); ``again`` looks at shots, by place, with more, and says what these leave.
     """
     needed = more_rays(rays, error, accuracy)
     for number in accuracy.rays:  # rising, and so are the needs of each shot

@@ -27,7 +27,6 @@ from sweep.tasks.effect_selection import EFFECTS, ERROR, TILE_SHOTS, Selected, S
 from sweep.tasks.eyepoint_study import (
     SIZES,
     EyepointStudy,
-    FinerRays,
     eyepoints_path,
     refine,
     scene_map,
@@ -42,6 +41,10 @@ if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
     from sweep.spec import SceneSpec
+    from sweep.spec.world import World
+
+    Cloud = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
+    """Results of shots with some effects, by their eyepoints, numbers and flags."""
 
 #: Domain of the keys of draws; a shot's key is its number, so that the draws of a flight are the
 #: same along every axis and for every instrument.
@@ -117,17 +120,15 @@ class KnownCloud(NamedTuple):
 class FlightStudy(GrowingStudy):
     """The point clouds of a flight, a group of arrays for each scanner.
 
-    Parameters
-    ----------
-    spec, path
-        The study, and its store, beside which the eyepoints are.
+    Its eyepoints are beside its store. The scene, built, is by default that of the spec.
     """
 
     unit = "shots"
 
-    def __init__(self, spec: SceneSpec, path: Location) -> None:
+    def __init__(self, spec: SceneSpec, path: Location, world: World | None = None) -> None:
         super().__init__(spec)
         self.path = path
+        self.caster = cache(partial(EyepointStudy, spec, world=world))
         self.scanners = {scanner: ScannerBlocks(spec, scanner) for scanner in spec.scanners}
         self._eyepoints = cache(self._open_eyepoints)
         self._parameters = cache(self._parameters_along)
@@ -265,24 +266,18 @@ class FlightStudy(GrowingStudy):
         numbers: np.ndarray,
         known: KnownCloud | None = None,
     ) -> Results:
-        """Radiometry, draws and navigation of some shots.
+        """Radiometry, draws and navigation of shots in whole cycles, by number in the flight.
 
-        Parameters
-        ----------
-        part
-            Scanner, place along the axes and stretch of draws.
-        shots, eyepoints
-            Whole cycles of them.
-        selected, numbers
-            What is simulated of each; their numbers, counted from the flight's first.
-        known
-            Results that need not be computed.
+        Results that are ``known`` are not computed.
         """
         blocks = self.scanners[part.scanner]
         draws, each = len(part.draws), blocks.shots_a_cycle
         there, results = known or self._nothing_known(blocks, selected.flags.size, draws)
         for rows, some in _gaps(~there):
-            for index, found in self._clouds(part, eyepoints, selected, numbers, rows, some):
+            cloud = partial(self._cloud, part, some)
+            for index, found in self.clouds(
+                part.scanner, eyepoints, selected, numbers, rows, cloud
+            ):
                 _put(results, index, some, found)
         if blocks.navigates:
             lacking = (~there).reshape(-1, each, draws).any(axis=1)
@@ -302,23 +297,25 @@ class FlightStudy(GrowingStudy):
         results = {name: output.empty(sizes) for name, output in named.items()}
         return KnownCloud(np.zeros((shots, draws), bool), results)
 
-    def _clouds(
+    def clouds(
         self,
-        part: Part,
+        scanner: str,
         eyepoints: Eyepoints,
         selected: Selected,
         numbers: np.ndarray,
         rows: np.ndarray,
-        draws: slice,
+        cloud: Cloud,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Points of some of the shots, those together that call for much the same."""
+        """Results of some of the shots, those together that call for much the same.
+
+        With more rays of those whose own tell that they are too few.
+        """
         for index, effects, flags in selected.some(rows).together():
-            some = rows[index]
-            cloud = partial(self._cloud, part, draws, effects)
-            results = cloud(eyepoints.some(some), numbers[some], flags)
+            some, look = rows[index], partial(cloud, effects)
+            results = look(eyepoints.some(some), numbers[some], flags)
             if self.rays_accuracy is not None:
                 rays = eyepoints.weight.size
-                self._refine(part.scanner, rays, numbers[some], flags, results, cloud)
+                self._refine(scanner, rays, numbers[some], flags, results, look)
             yield some, results
 
     def _cloud(
@@ -363,7 +360,7 @@ class FlightStudy(GrowingStudy):
 
         def again(places: np.ndarray, more: int) -> np.ndarray:
             some = numbers[places]
-            finer = cloud(self._finer_rays.see(scanner, some, more), some, flags[places])
+            finer = cloud(self.caster(scanner, more).observe(some), some, flags[places])
             for name, values in finer.items():
                 results[name][places] = values
             return finer["beamlets_error"]
@@ -447,12 +444,8 @@ class FlightStudy(GrowingStudy):
             surfaces=self.surfaces,
             modes=self.spec.modes(),
             rotating=self.spec.rotating,
-            rays_by_tolerance=self.rays_accuracy is not None,
+            rays_by_tolerance=self.spec.rays_by_tolerance,
         )
-
-    @cached_property
-    def _finer_rays(self) -> FinerRays:
-        return FinerRays(self.spec)
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
@@ -473,10 +466,9 @@ class FlightStudy(GrowingStudy):
         beamlets = self._read(scanner, BEAMLETS, some)
         return shots, from_arrays(shots | beamlets, self._eyepoints(scanner)["weight"])
 
-    def eyepoint_studies(self) -> Iterator[EyepointStudy]:
+    def eyepoint_studies(self) -> list[EyepointStudy]:
         """The studies that this one looks with."""
-        for scanner in self.scanners:
-            yield EyepointStudy(self.spec, scanner)
+        return [self.caster(scanner) for scanner in self.scanners]
 
     @property
     def reports(self) -> tuple[str, ...]:

@@ -84,14 +84,7 @@ def block_shape(
 
     Radiometric axes are kept whole before geometric ones, and the last axis before the first, as
     far as the block has room: a block then holds every radiometric variation of the geometry that
-    it places.
-
-    Parameters
-    ----------
-    sizes, geometric
-        Points along each axis, and whether it changes the geometry.
-    block_points
-        Most points in a block [1], at least 1.
+    it places. ``geometric``: whether each axis changes the geometry.
     """
     order = sorted(range(len(sizes)), key=lambda k: (geometric[k], -k))
     shape, room = [1] * len(sizes), block_points
@@ -139,11 +132,8 @@ class Grid(LatticeGrid):
     def parameters(self, block: int) -> dict[str, Value]:
         """Parameters of the points of a block, by dotted path.
 
-        Returns
-        -------
-        dict
-            SI scalars and strings where all points agree, arrays (n,) along which the points of
-            the block run in C order where an axis varies them.
+        SI scalars and strings where all points agree, arrays (n,) along which the points of the
+        block run in C order where an axis varies them.
         """
         slices = self.block(block)
         index = [along.ravel() for along in np.indices(self.extent(block))]
@@ -161,13 +151,10 @@ class Grid(LatticeGrid):
         return selected
 
     def geometry_order(self, block: int) -> np.ndarray:
-        """Order of a block's points that brings equal geometry together.
+        """Order of a block's points, (n,) in C order over it, that brings equal geometry together.
 
-        Returns
-        -------
-        ndarray of int (n,)
-            Numbers of the points in C order over the block, sorted so that radiometric axes run
-            fastest, and velocities slowest: what a line becomes within a record follows from them.
+        Radiometric axes run fastest, and velocities slowest: what a line becomes within a record
+        follows from them.
         """
         numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
         moving = ["target.radial_velocity" in {m.path for m in axis.members} for axis in self._axes]
@@ -178,21 +165,10 @@ class Grid(LatticeGrid):
 
 
 def canonical_rows(parameters: Mapping[str, Value], count: int) -> np.ndarray:
-    """Rows of float64 that say what a point is by its values alone.
+    """Rows of float64, (count, parameters), that say what a point is by its values alone.
 
     A row holds every parameter, in the order of the sorted paths: which of them are axes, in what
     order and with which neighbours does not show. Strings stand as 62 bits of their hash.
-
-    Parameters
-    ----------
-    parameters
-        Scalars, strings or arrays (count,) by dotted path.
-    count
-        Number of points.
-
-    Returns
-    -------
-    ndarray of float64 (count, number of parameters)
     """
     rows = np.empty((count, len(parameters)), dtype=np.uint64)
     for column, path in enumerate(sorted(parameters)):

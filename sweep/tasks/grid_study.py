@@ -10,7 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.accuracy import Accuracy
+from sweep.model.effects.catalogue import EFFECTS as ALL
 from sweep.model.effects.catalogue import flag_attributes, names_of
+from sweep.model.outputs import (
+    ACCURACY_OUTPUTS,
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    OUTPUTS,
+    RUNNING,
+    RUNNING_COLUMNS,
+    RUNNING_OUTPUTS,
+    SIMULATED,
+    SPECTRA_OUTPUTS,
+    Output,
+)
 from sweep.model.resolution import by_tolerance
 from sweep.model.unsupported import UnsupportedShot
 from sweep.tasks.effect_selection import EFFECTS, ERROR, EffectSelection, Selected
@@ -29,7 +43,6 @@ from sweep.tasks.study import (
 )
 
 if TYPE_CHECKING:
-    from sweep.model.outputs import Output
     from sweep.model.sampling import Before
     from sweep.spec import Axis, Spec
 
@@ -39,17 +52,6 @@ BATCH = "batch"
 
 def outputs_of(spec: Spec) -> dict[str, Output]:
     """Arrays that blocks of a study write, sorted by name, with dimensions besides the axes."""
-    from sweep.model.outputs import (
-        ACCURACY_OUTPUTS,
-        DRAW_OUTPUTS,
-        ERROR_OUTPUTS,
-        OUTPUTS,
-        RUNNING,
-        RUNNING_OUTPUTS,
-        SIMULATED,
-        SPECTRA_OUTPUTS,
-    )
-
     error = replace(
         SIMULATED[ERROR],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -114,8 +116,6 @@ class GridStudy(GrowingStudy):
 
     def outputs(self) -> list[ArrayLayout]:
         """An array for each output of the model, and those that say what was simulated."""
-        from sweep.model.outputs import ACCURACY_OUTPUTS, RUNNING_COLUMNS
-
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
         found = []
         for name, output in outputs_of(self.spec).items():
@@ -140,10 +140,7 @@ class GridStudy(GrowingStudy):
         begun: Known = Known(),  # noqa: B008
         stop: Stop | None = None,
     ) -> Results:
-        """Outputs of a block; fills, where all of a point is beyond the model.
-
-        `begun` and `stop` are those of :func:`sweep.tasks.grid_study.evaluated`.
-        """
+        """Outputs of a block; fills, where all of a point is beyond the model."""
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
         extent, size = self.grid.extent(block), self.grid.block_size(block)
@@ -196,8 +193,6 @@ class GridStudy(GrowingStudy):
         One draw of a point with every effect that may be called for, and one with none. Random
         effects are not for every instrument: of these, only what the point itself calls for.
         """
-        from sweep.model.effects.catalogue import EFFECTS as ALL
-
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
         own = names_of(int(self.selection.of_block(0).flags[0]))
@@ -241,20 +236,9 @@ def evaluated(
 ) -> Iterator[Found]:
     """Outputs of a block's points that are not done, those together that call for the same.
 
-    Parameters
-    ----------
-    selected
-        Effects simulated at each of its points, in C order over it.
-    known, begun
-        Results that need not be computed, whole or of first draws: of another study, and of the
-        block itself from a call that was stopped.
-    stop
-        When to stop, with at least some draws taken.
-
-    Raises
-    ------
-    Unfinished
-        Where it was stopped; the next call goes on, to the same bits.
+    Those that need not be computed are ``known``, of another study, or ``begun`` by a call that
+    was stopped. Raises Unfinished where it is stopped, with at least some draws taken; the next
+    call goes on, to the same bits.
     """
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
@@ -300,16 +284,9 @@ def evaluate_points(
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
-    Parameters
-    ----------
-    spec, parameters
-        The study; dotted path to scalars, strings or arrays (count,).
-    effects
-        Names of the effects that are simulated in all of them. Outputs are means over the
-        study's draws where random ones are among them, and an error where it has no draws.
-    before, stop
-        Draws that there are already; when to return with those that there are then, by default
-        with all.
+    Parameters are scalars, strings or arrays (count,). Outputs are means over the study's draws
+    where random effects are simulated, and an error where it has no draws. Draws go on from those
+    ``before``, until there are all or ``stop`` says so.
     """
     if spec.draws.any:
         return _drawn(spec, parameters, count, effects, before, stop)
@@ -353,7 +330,6 @@ def draw_keys(spec: Spec, parameters: Mapping[str, Value], count: int) -> np.nda
 
 def drawn_before(spec: Spec, begun: Found, points: np.ndarray) -> Before | None:
     """Draws that there are of some points of a block; None where there are none."""
-    from sweep.model.outputs import DRAW_OUTPUTS, OUTPUTS, RUNNING
     from sweep.model.sampling import Before
 
     _, theirs, ours = np.intersect1d(begun.points, points, return_indices=True)
@@ -381,7 +357,6 @@ def _drawn(
     before: Before | None,
     stop: Callable[[], bool] | None,
 ) -> Results:
-    from sweep.model.accuracy import Accuracy
     from sweep.model.sampling import never, simulate
     from sweep.tasks.user_code import methods
 
@@ -401,8 +376,6 @@ def _drawn(
 
 def no_sums(spec: Spec, count: int) -> Results:
     """Running sums of points that have none, where any point of the study may have some."""
-    from sweep.model.outputs import RUNNING, RUNNING_COLUMNS
-
     some = spec.has_random_effects and not spec.draws.whole_spectra
     return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}
 

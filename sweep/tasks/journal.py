@@ -100,12 +100,8 @@ class Failure:
 class Journal:
     """Logs of a store, to append to; on opening, lines that are damaged or cut short are dropped.
 
-    Parameters
-    ----------
-    store_path
-        The store, whose lock the caller holds.
-    durable
-        Whether a receipt is on the disk, and not only with the operating system, once committed.
+    The caller holds the store's lock. Where it is `durable`, a receipt is on the disk once
+    committed, and not only with the operating system.
     """
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
@@ -215,15 +211,7 @@ def refuse_damaged_recipe(store_path: Location) -> None:
 
 
 class Look:
-    """A look at the chunks of some blocks, begun as it is made.
-
-    Parameters
-    ----------
-    path, study
-        The store and the study that it holds.
-    among : ndarray of bool (blocks,)
-        Which blocks to look at.
-    """
+    """A look at the chunks of blocks that are marked, (blocks,) bool, begun as it is made."""
 
     def __init__(self, path: Location, study: Study, among: np.ndarray) -> None:
         self._among, self._stopped = among.copy(), False
@@ -247,10 +235,7 @@ class Look:
     def whole(self) -> np.ndarray:
         """Blocks that lack nothing as far as was looked, (blocks,) bool.
 
-        Raises
-        ------
-        OSError
-            Where a folder can't be read.
+        OSError where a folder can't be read.
         """
         found = self._among.copy()
         for array in self._arrays:
@@ -346,10 +331,7 @@ class Begun(NamedTuple):
 def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None:
     """Save what there is of a block, in the place of less.
 
-    Raises
-    ------
-    OSError
-        Where it can't be written.
+    OSError where it can't be written.
     """
     if read_begun(path, study_id, block).points >= begun.points:
         return  # another worker, that was thought to be lost, was quicker

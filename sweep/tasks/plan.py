@@ -98,7 +98,7 @@ def plan(
     reports: tuple[str, ...] = ()
     shape = {}
     if isinstance(study, FlightStudy):
-        eyepoints = list(study.eyepoint_studies())
+        eyepoints = study.eyepoint_studies()
         scanners = tuple(_scanner(study, each) for each in eyepoints)
         rays = sum(0 if s.is_cast else s.rays * s.seconds_a_ray for s in scanners)
         looking = sum(

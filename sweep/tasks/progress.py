@@ -121,15 +121,19 @@ class _Counting(Progress):
         """Points a second of this run."""
         return (self._done - self._before) / max(time.monotonic() - self._begun, 1e-9)
 
+    @property
+    def _words(self) -> dict[str, Any]:
+        """All of it in words, by the names of a bar's columns."""
+        return {
+            "done": amount(self._done),
+            "rate": f"{amount(self._rate)} {self._unit}/s" if self._rate > 0 else "",
+            "work": self._work,
+            "failures": f"{self._failed} blocks failed" if self._failed else "",
+        }
+
 
 class Late(_Counting):
-    """Progress of what may be over before anybody looks: nothing is shown of the first seconds.
-
-    Parameters
-    ----------
-    shown
-        Where it is shown then.
-    """
+    """Progress of what may be over before anybody looks: nothing is shown of the first seconds."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()
@@ -183,16 +187,11 @@ class Lines(_Counting):
 
     def _line(self) -> None:
         self._said = time.monotonic()
-        parts = [f"{amount(self._done)} of {self._points:,} {self._unit}"]
-        if (rate := self._rate) > 0:
-            parts.append(f"{amount(rate)} {self._unit}/s")
-            if self._done < self._points:
-                parts.append(f"{duration((self._points - self._done) / rate)} left")
-        if self._work:
-            parts.append(self._work)
-        if self._failed:
-            parts.append(f"{self._failed} blocks failed")
-        self.say(", ".join(parts))
+        done, rate, work, failures = self._words.values()
+        left = (self._points - self._done) / self._rate if self._rate > 0 else 0.0
+        parts = [f"{done} of {self._points:,} {self._unit}", rate]
+        parts += [f"{duration(left)} left" if left > 0 else "", work, failures]
+        self.say(", ".join(filter(None, parts)))
 
 
 class Bar(_Counting):
@@ -225,35 +224,20 @@ class Bar(_Counting):
     def begin(self, *, points: int, done: float, unit: str) -> None:
         """The bar appears."""
         super().begin(points=points, done=done, unit=unit)
-        self._task = self._bar.add_task(
-            unit,
-            total=points,
-            completed=int(done),
-            done=amount(done),
-            rate="",
-            work="",
-            failures="",
-        )
+        self._task = self._bar.add_task(unit, total=points, completed=int(done), **self._words)
         self._bar.start()
 
     def advance(self, *, points: float, failed: int) -> None:
         """The bar moves."""
         super().advance(points=points, failed=failed)
-        if self._task is None or not (points or failed):
-            return
-        self._bar.update(
-            self._task,
-            completed=self._done,
-            done=amount(self._done),
-            rate=f"{amount(self._rate)} {self._unit}/s",
-            failures=f"{self._failed} blocks failed" if self._failed else "",
-        )
+        if self._task is not None and (points or failed):
+            self._bar.update(self._task, completed=self._done, **self._words)
 
     def at_work(self, *, workers: int, stored: int) -> None:
         """Shown beside the rate."""
         super().at_work(workers=workers, stored=stored)
         if self._task is not None:
-            self._bar.update(self._task, work=self._work)
+            self._bar.update(self._task, **self._words)
 
     def say(self, text: str) -> None:
         """A line above the bar."""

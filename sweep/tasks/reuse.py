@@ -48,13 +48,7 @@ DAMAGED = (OSError, ValueError, RuntimeError)
 
 
 class GrowingStudy(Study):
-    """A study that may be extended, and may extend another.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    """
+    """A study that may be extended, and may extend another."""
 
     spec: Any
 
@@ -103,15 +97,7 @@ class Share(NamedTuple):
 
 
 class Reuse:
-    """Results that a store has of a larger study.
-
-    Parameters
-    ----------
-    path, older
-        The store, and the study in it.
-    study
-        The larger one.
-    """
+    """Results that the store of an older study has of a larger one."""
 
     def __init__(self, path: Location, older: GrowingStudy, study: GrowingStudy) -> None:
         self._path, self.older, self._study = path, older, study
@@ -253,19 +239,9 @@ def _tolerance(spec: Declared) -> float | None:
 
 
 def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
-    """A study with some of its fields written anew.
+    """A study with values by dotted path, as in a file: ``{"axes.target.range": ["1 km"]}``.
 
-    Parameters
-    ----------
-    spec
-        The study.
-    changes
-        Values by dotted path, as in a file: ``{"axes.target.range": ["1 km", "2 km"]}``.
-
-    Raises
-    ------
-    SpecError
-        With every mistake in what comes out; where a path goes through a single value.
+    SpecError with every mistake in what comes out; where a path goes through a single value.
     """
     written = spec.to_yaml_mapping()
     for path, value in changes.items():
@@ -285,13 +261,7 @@ def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
 
 
 def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:
-    """Refuse what is not a larger study than the one in a store.
-
-    Raises
-    ------
-    StoreError
-        With each field, its rule, its values, and what to do.
-    """
+    """Refuse what is not a larger study than the one in a store, field by field."""
     if type(older) is not type(spec):
         raise StoreError(
             f"{path} can't be extended to this study: a flight over a scene and a study over a "
@@ -384,14 +354,8 @@ class Places(NamedTuple):
 class Matching:
     """Points along the axes of one study by the points of another.
 
-    Axes may be longer, in another order, new, or zipped otherwise.
-
-    Parameters
-    ----------
-    other, grid
-        Those that are looked in, and those that are looked from.
-    ignored
-        Dotted paths of parameters that may differ.
+    Axes may be longer, in another order, new, or zipped otherwise. The ``other`` ones are looked in
+    from those of a ``grid``; paths that are ``ignored`` may differ.
     """
 
     def __init__(self, other: Lattice, grid: Lattice, ignored: Collection[str] = ()) -> None:
@@ -402,13 +366,7 @@ class Matching:
         ]
 
     def of(self, slices: tuple[slice, ...]) -> np.ndarray:
-        """Numbers, in C order over the other axes, of points in slices along one's own.
-
-        Returns
-        -------
-        ndarray of int64 (points,)
-            -1 of those that are not there.
-        """
+        """Numbers, in C order over the other axes, of points in slices of its own; -1 for none."""
         numbers = np.zeros((1,) * len(slices), np.int64)
         lacking = np.zeros((1,) * len(slices), bool)
         for places in self.places:

@@ -54,13 +54,7 @@ Say = Callable[[str], None]
 
 
 class BlockQueue:
-    """Blocks that are not done, handed out lazily; what fails comes back once, alone.
-
-    Parameters
-    ----------
-    done : ndarray of bool (blocks,)
-        Which blocks are done already.
-    """
+    """Blocks that are not done, (blocks,) bool, handed out lazily; what fails comes back, alone."""
 
     def __init__(self, done: np.ndarray) -> None:
         self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
@@ -170,17 +164,9 @@ class Scheduler:
     and its blocks go to the others. Blocks of a worker that is silent for long are computed by
     others too, once these have nothing else to do; the first answer counts.
 
-    Parameters
-    ----------
-    client, hoped
-        The cluster, and worker threads that it may come to have.
-    job, blocks
-        The study and its blocks.
-    seen
-        Tells whether what a receipt is for is in the store here: by its size, or read and held to
-        its digest, as is done with the first block of each worker.
-    say
-        Takes what befalls workers, in words.
+    The cluster may come to have the worker threads that are ``hoped`` for. ``seen`` tells whether
+    what a receipt is for is in the store here: by its size, or read and held to its digest, as is
+    done with the first block of each worker.
     """
 
     def __init__(
@@ -206,12 +192,8 @@ class Scheduler:
         Once `stopping` says so nothing more is sent, and the iteration ends with what is out, or
         at once where there is no worker to do it.
 
-        Raises
-        ------
-        SchedulerLost
-            Where the scheduler, and with it what was out, is gone.
-        StoreError, OSError
-            Where no worker can write to the store.
+        SchedulerLost where the scheduler, and with it what was out, is gone. StoreError, OSError
+        where no worker can write to the store.
         """
         try:
             while True:

@@ -115,17 +115,7 @@ class Absence:
 
 
 class Session:
-    """One run over what a store lacks.
-
-    Parameters
-    ----------
-    path, study
-        The store and the study that it holds.
-    pool
-        Where to compute, whom to tell, and whether to stop.
-    lock
-        The store's, held by this process.
-    """
+    """One run over what a store lacks, whose lock this process holds."""
 
     def __init__(self, path: Location, study: Study, pool: Pool, lock: Lock) -> None:
         self._path, self._study, self._pool, self._lock = path, study, pool, lock
@@ -143,12 +133,7 @@ class Session:
     def run(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
         """Compute all that is left, or as much as can be.
 
-        Parameters
-        ----------
-        before
-            Why what comes before this study is not there; empty where it is.
-        rays
-            Rays that were cast for it.
+        ``before``: why what comes before this study is not there. ``rays``: those cast for it.
         """
         start = time.monotonic()
         self._begun = journal.begun_points(self._path, self._study.id)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.detectors import taper
+from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.storage.atomic_replace import draft
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import draw_keys
@@ -43,7 +45,6 @@ def spectra(
         Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
         Every effect is there that is not off and that the point has anything of.
     """
-    from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
     from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
 
@@ -97,8 +98,6 @@ def _dataset(
     spec: Spec, shots: Shots, spectrum: np.ndarray, found: list[list[Any]], numbers: np.ndarray
 ) -> xr.Dataset:
     import xarray as xr
-
-    from sweep.model.detectors import taper
 
     width = float(shots.sample_rate[0]) / shots.fft_size
     there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]

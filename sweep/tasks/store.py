@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
 
 import numpy as np
 
+from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
 from sweep.storage.atomic_replace import beside, discard, draft, settle
 from sweep.storage.locations import (
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     import zarr
     from numcodecs.zstd import Zstd
     from zarr.core.array_spec import ArrayConfigLike
-
-    from sweep.spec import SceneSpec, Spec
 
 ROOT = "zarr.json"
 
@@ -120,10 +119,7 @@ def _send(built: Path, path: ObjectPath) -> None:
 def making(path: ObjectPath) -> Iterator[None]:
     """A place while a store is made there: nobody else's, and marked as half made till the end.
 
-    Raises
-    ------
-    StoreError
-        Where something is there, or somebody makes a store there.
+    StoreError where something is there, or somebody makes a store there.
     """
     mark = path / JOURNAL / UNFINISHED
     with Lock(path):
@@ -378,10 +374,7 @@ def sync(path: Location) -> None:
     One call for the whole file system, which costs as much as syncing the files one by one costs
     for a few of them. What an object store has taken it keeps.
 
-    Raises
-    ------
-    OSError
-        Where the disk did not take it.
+    OSError where the disk did not take it.
     """
     if not isinstance(path, Path):
         return
@@ -504,10 +497,7 @@ def refuse_to_replace(path: Location) -> None:
 def under_way(path: Location) -> Path | None:
     """The store that is to take the place of the one at a path, where one was begun.
 
-    Raises
-    ------
-    StoreError
-        Where it was begun to take the place of another store than is there now.
+    StoreError where it was begun to take the place of another store than is there now.
     """
     settle(path)
     if not isinstance(path, Path) or not (new := beside(path)).exists():
@@ -525,8 +515,6 @@ def refuse_other_study(
     path: Location, attributes: dict[str, Any], held: Spec | SceneSpec, asked: Spec | SceneSpec
 ) -> None:
     """Refuse a store that holds another study than the one asked for."""
-    from sweep.spec import difference
-
     if attributes["study_id"] == asked.id:
         return
     refuse_other_versions(path, attributes, where="this machine")  # the version is in the id too

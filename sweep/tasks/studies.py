@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sweep.scenes.files import SceneError
+from sweep.spec import SceneSpec, Spec, SpecError, from_stored
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location, located
@@ -17,9 +18,6 @@ from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import EXTENDS, read_recipe
 from sweep.tasks.reuse import Reuse, unlike
-
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec, Spec
 
 ACCURACY = "accuracy"
 """Kind of the stores of `sweep accuracy`, in which there is no study."""
@@ -34,8 +32,6 @@ def study_of(
 
     ``extends``: the store of a smaller one, whose results are taken; by default there is none.
     """
-    from sweep.spec import SceneSpec
-
     study = FlightStudy(spec, path) if isinstance(spec, SceneSpec) else GridStudy(spec)
     if extends:
         study.look_up = partial(_reuse, extends, study)
@@ -81,8 +77,6 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
 def _spec(path: Location, recipe: dict[str, Any], text: str) -> Any:
     """A spec that a store holds; StoreError where this program can't read it."""
-    from sweep.spec import SpecError, from_stored
-
     try:
         return from_stored(text, base=Path(recipe["base"]) if "base" in recipe else None)
     except (SpecError, ValueError) as error:

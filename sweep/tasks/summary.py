@@ -1,7 +1,7 @@
 """Stores in numbers: blocks done, detection, what came back in a flight, errors and tolerance.
 
 Errors are, of a grid, those of what is drawn; of a flight, what rays leave where the tolerance says
-how many they are.
+how many they are. StoreError where there is no store of sweep's, or one of another kind.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
+from sweep.model.outputs import PROMISED
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.logs import read_receipts
@@ -76,11 +77,6 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
         One for each part of that axis, and a last one for the whole grid.
     share : float
         Of the blocks that are done, what was looked at.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store of sweep's.
     """
     path = located(store)
     _, study = studies.read(path)
@@ -216,14 +212,7 @@ class SceneRow:
 
 
 def scene_summary(store: str | Location) -> list[SceneRow]:
-    """A row for each scanner and each place along the axes, or for each scanner where there are
-    many.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store of a scene.
-    """
+    """A row for each scanner and place along the axes; for each scanner where there are many."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, FlightStudy):
@@ -316,15 +305,7 @@ class ErrorRow:
 
 
 def accuracy_table(store: str | Location) -> list[ErrorRow]:
-    """A row for each probability that is promised; none where nothing is drawn or computed.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store of sweep's.
-    """
-    from sweep.model.outputs import PROMISED
-
+    """A row for each probability that is promised; none where nothing is drawn or computed."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
@@ -339,11 +320,6 @@ def rays_table(store: str | Location) -> list[ErrorRow]:
     """A row for each scanner; none where the tolerance does not say how many rays there are.
 
     Of a grid one row, with no scanner, where even the most beamlets are too few for some points.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store of sweep's.
     """
     path = located(store)
     _, study = studies.read(path)
@@ -430,13 +406,7 @@ class Status:
 
 
 def status(store: str | Location) -> Status:
-    """State of a store, by its log of receipts; whether all chunks are there is not looked at.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store of sweep's.
-    """
+    """State of a store, by its log of receipts; whether all chunks are there is not looked at."""
     path = located(store)
     attributes, study = studies.read(path)
     begun = journal.last_begun(path)

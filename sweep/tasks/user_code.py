@@ -19,10 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model.detectors import DETECTORS, Setting
+from sweep.model.estimators import ESTIMATORS
+from sweep.model.window import window
 from sweep.tasks.errors import CodeError
 
 if TYPE_CHECKING:
-    from sweep.model.detectors import Setting
     from sweep.model.noisy_spectra import Methods
     from sweep.spec import SceneSpec, Spec
 
@@ -59,10 +61,7 @@ def _allowed() -> set[str]:
 def check(spec: Spec | SceneSpec) -> None:
     """Import the functions that a study names, and try each on a small known spectrum.
 
-    Raises
-    ------
-    CodeError
-        Where one may not run, can't be imported, or does not answer as it must.
+    CodeError where one may not run, can't be imported, or does not answer as it must.
     """
     for role, name in _named(spec):
         _try(role, name)
@@ -97,8 +96,6 @@ def _named(spec: Spec | SceneSpec) -> Iterator[tuple[str, str]]:
 
 def methods(parameters: Mapping[str, Any]) -> Methods:
     """Detectors and estimators by the names in the parameters of some points; as :func:`check`."""
-    from sweep.model.detectors import DETECTORS
-    from sweep.model.estimators import ESTIMATORS
     from sweep.model.noisy_spectra import Methods
 
     own = {
@@ -169,9 +166,6 @@ def _whole(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> n
 
 def _try(role: str, name: str) -> None:
     """One call on three spectra of a tone at bin 40.25 of 128, in a little noise."""
-    from sweep.model.detectors import Setting
-    from sweep.model.window import window
-
     size, rng = 256, np.random.default_rng(1)
     setting = Setting(
         fft_size=size, sample_rate=1e6, window=window("hann", size), noise_power=0.375 * size,

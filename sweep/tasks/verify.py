@@ -275,10 +275,7 @@ class Damage(NamedTuple):
 def _made_with(path: Location) -> dict[str, Any]:
     """Attributes that a store was made with, from its list, else from its group.
 
-    Raises
-    ------
-    StoreError
-        Where there is no store, or not one of this program's; where both are damaged.
+    StoreError where there is no store, or not one of this program's; where both are damaged.
     """
     if listed := opening.listed_attributes(path):
         return opening.recognised(path, listed)
@@ -339,10 +336,7 @@ def restore(path: Location, study: Study) -> list[str]:
     The caller holds the store's lock. The study is what it holds, by its attributes or by a spec
     that is said to be its own.
 
-    Raises
-    ------
-    StoreError
-        Where this machine can't make the same again. Nothing is touched.
+    StoreError where this machine can't make the same again. Nothing is touched.
     """
     store.refuse_links(path)
     try:

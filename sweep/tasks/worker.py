@@ -75,10 +75,7 @@ _opening = threading.Lock()
 def study(path: str, study_id: str) -> store.Arrays:
     """The study of a store, opened for writing its blocks, once a process.
 
-    Raises
-    ------
-    StoreError
-        Where the store holds another study, or was begun with other software than is here.
+    StoreError where the store holds another study, or was begun with other software than is here.
     """
     with _opening:
         if (path, study_id) not in _studies:
@@ -258,10 +255,7 @@ def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) ->
     Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
     later ends itself; a process that computes on its own account waits for it to return.
 
-    Raises
-    ------
-    Overtime
-        Where it took longer.
+    Overtime where it took longer.
     """
     if seconds is None:
         return work()

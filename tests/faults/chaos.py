@@ -117,13 +117,7 @@ KINDS = (
 
 
 class Disk:
-    """A disk of its own in a file, whose power can be cut.
-
-    Parameters
-    ----------
-    directory
-        Where the file is, and the disk mounted.
-    """
+    """A disk of its own in a file in a directory, whose power can be cut."""
 
     def __init__(self, directory: Path) -> None:
         self._image, self.place = directory / "disk.img", directory / "disk"
@@ -165,15 +159,7 @@ def has_disks(directory: Path) -> bool:
 
 
 class Arena:
-    """One study, its store and notes of what was done to it.
-
-    Parameters
-    ----------
-    directory
-        A place of its own.
-    disk
-        Where the store is, in place of the directory.
-    """
+    """One study, its store, on a disk of its own if there is one, and notes of what was done."""
 
     def __init__(self, directory: Path, disk: Disk | None = None) -> None:
         self.directory, self.disk = directory, disk
@@ -556,17 +542,7 @@ def undisturbed_stores(directory: Path) -> dict[str, Path]:
 def campaign(
     kills: int, seed: int, *, kinds: tuple[Kind, ...] = KINDS, a_study: int = 4, show: bool = False
 ) -> dict[str, Count]:
-    """Kill so often, and judge every study.
-
-    Parameters
-    ----------
-    kills, seed
-        How many, and the seed of when and whom.
-    kinds, a_study
-        Ways to be killed; most kills of one study.
-    show
-        Whether to show a bar.
-    """
+    """Kill so often, each study some times at the most, and judge every study."""
     prepare()
     dice, counts = random.Random(seed), {kind.name: Count() for kind in kinds}
     directory = Path(tempfile.mkdtemp(prefix="chaos-"))
@@ -619,10 +595,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=210)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="Part of the names of kinds of kills.")
+    parser.add_argument("--only", default="", help="Parts of the names of kinds of kills, a|b.")
     arguments = parser.parse_args()
     begun = time.monotonic()
-    kinds = tuple(kind for kind in KINDS if arguments.only in kind.name)
+    parts = arguments.only.split("|")
+    kinds = tuple(kind for kind in KINDS if any(part in kind.name for part in parts))
     counts = campaign(arguments.kills, arguments.seed, kinds=kinds, show=True)
     Console(width=200).print(told(counts))
     kills = sum(sum(count.kills.values()) for count in counts.values())

@@ -5,10 +5,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
-def test_killed_studies_end_as_if_nobody_had_disturbed_them():
+
+@pytest.mark.parametrize(
+    "kills, kinds",
+    [pytest.param("10", "", marks=pytest.mark.slow), ("1", "scheduler|power, run")],
+    ids=["of all kinds", "of kinds that no other test has"],
+)
+def test_killed_studies_end_as_if_nobody_had_disturbed_them(kills, kinds):
     script = Path(__file__).with_name("chaos.py")  # forks, which a process with threads should not
-    command = [sys.executable, str(script), "--kills", "10", "--seed", "20"]
+    command = [sys.executable, str(script), "--kills", kills, "--seed", "20", "--only", kinds]
     environment = {**os.environ, "COLUMNS": "200"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -37,8 +37,9 @@ def committed_is_whole(store) -> None:
     assert report.sound and report.whole == len(set(receipts(store))) < 12
 
 
-@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
-@pytest.mark.parametrize("size", ["640k", "1M"])
+@pytest.mark.parametrize(
+    "size, place", [("640k", {"scheduler": "none"}), ("1M", {"workers": 2, "processes": False})]
+)
 def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undisturbed, size, place):
     store = disk / "small.zarr"
     assert mount("-o", f"remount,size={size}", str(disk))

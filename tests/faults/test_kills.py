@@ -30,10 +30,9 @@ from small import logged, small
 from sweep.tasks.driver import run
 
 if __name__ == "__main__":
-    store, log, slow, scheduler = sys.argv[1:]
-    place = {"scheduler": scheduler} if scheduler else {"workers": 2}
+    store, log, slow = sys.argv[1:]
     evaluate = logged(Path(log), float(slow))
-    outcome = run(small(), store=store, evaluate=evaluate, progress=False, **place)
+    outcome = run(small(), store=store, evaluate=evaluate, progress=False, workers=2)
     print(outcome.stopped)
 """
 
@@ -67,37 +66,12 @@ def process(*command: str):
 
 
 @contextmanager
-def client_process(tmp_path: Path, scheduler: str = ""):
+def client_process(tmp_path: Path):
     script = tmp_path / "client.py"
     script.write_text(CLIENT)
     paths = [str(tmp_path / name) for name in ("small.zarr", "log")]
-    with process(sys.executable, str(script), *paths, str(SLOW), scheduler) as child:
+    with process(sys.executable, str(script), *paths, str(SLOW)) as child:
         yield child
-
-
-@contextmanager
-def dask_cluster(tmp_path: Path):
-    """A scheduler and two workers, each a process; their address and the processes."""
-    file = tmp_path / "scheduler.json"
-    common = ["--scheduler-file", str(file), "--host", "127.0.0.1"]
-    worker = dask("worker", *common, "--nthreads", "1", "--no-nanny", "--no-dashboard")
-    with (
-        process(*dask("scheduler", *common, "--port", "0", "--no-dashboard")) as head,
-        process(*worker) as one,
-        process(*worker) as two,
-    ):
-        yield address(file), head, [one, two]
-
-
-def dask(command: str, *options: str) -> list[str]:
-    return [sys.executable, "-m", f"distributed.cli.dask_{command}", *options]
-
-
-def address(file: Path) -> str:
-    import json
-
-    wait_for(lambda: file.exists() and file.stat().st_size > 0)
-    return json.loads(file.read_text())["address"]
 
 
 def wait_for(condition, timeout: float = 120.0) -> None:
@@ -121,21 +95,6 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     before = Counter(evaluated(tmp_path / "log"))
     assert all(before[block] == 1 for block in committed)
     assert tree(store) == undisturbed
-
-
-@pytest.mark.slow
-def test_the_scheduler_killed_the_run_says_so_and_resumes(tmp_path, undisturbed):
-    store = tmp_path / "small.zarr"
-    with (
-        dask_cluster(tmp_path) as (scheduler, head, _),
-        client_process(tmp_path, scheduler) as client,
-    ):
-        wait_for(lambda: len(receipts(store)) >= 3)
-        os.kill(head.pid, signal.SIGKILL)
-        output, _ = client.communicate(timeout=120)
-        assert "the scheduler is gone" in output
-        assert client.returncode == 0
-    finish(tmp_path, undisturbed)
 
 
 #: Repairs a store, and dies as the first, second, ... object is about to get its place.

@@ -12,24 +12,11 @@ DENIED = b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Err
 
 
 class Faulty:
-    """A server in front of another.
-
-    Parameters
-    ----------
-    port
-        Of the other, on loopback.
-
-    Attributes
-    ----------
-    fate : callable
-        What becomes of a request, by its number from 1, its method and its path.
-    seen : Counter
-        How many requests met each fate.
-    """
+    """A server in front of another on loopback."""
 
     def __init__(self, port):
-        self.fate = lambda number, method, path: PASS
-        self.seen, self._number, self._lock = Counter(), 0, threading.Lock()
+        self.fate = lambda number, method, path: PASS  # of a request, by its number from 1
+        self.seen, self._number, self._lock = Counter(), 0, threading.Lock()  # by fate
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self, port))
         self._server.daemon_threads = True
         self.port = self._server.server_address[1]

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 from sweep.spec import Spec
@@ -61,6 +62,20 @@ class Said(Progress, list):
 def quiet(spec, store, **place):
     """A run without progress, as a plain loop unless said otherwise."""
     return run(spec, store=store, progress=False, **(place or {"scheduler": "none"}))
+
+
+@contextmanager
+def threads(workers: int, *, each: int = 1):
+    """A client of a cluster whose workers are threads of this process."""
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(
+            n_workers=workers, threads_per_worker=each, processes=False, dashboard_address=None
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
 
 
 def copied(store: Path, directory: Path) -> Path:

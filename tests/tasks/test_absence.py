@@ -9,9 +9,10 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import dask
 import pytest
-from distributed import Client, LocalCluster
-from small import copied, receipts, small, tree
+from distributed import Client
+from small import copied, receipts, small, threads, tree
 
 from sweep.tasks import progress, scheduler, session, store, worker
 from sweep.tasks.driver import resume, run
@@ -46,26 +47,23 @@ def without_workers(monkeypatch):
     monkeypatch.setattr(session, "ABSENT", 0.2)
     monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
     monkeypatch.setattr(scheduler, "TICK", 0.1)
-    with (
-        LocalCluster(
-            n_workers=0, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        yield cluster, client
+    with threads(0) as client:
+        yield client
 
 
 def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_the_next(
     undisturbed, tmp_path, without_workers
 ):
-    cluster, client = without_workers
+    cluster = without_workers.cluster
 
     def slowly(study, block):
         time.sleep(0.05)
         return study.evaluate(block)
 
     told = Told(lambda: cluster.scale(1), lambda: cluster.scale(0))
-    outcome = run(small(), store=tmp_path / "s.zarr", client=client, progress=told, evaluate=slowly)
+    outcome = run(
+        small(), store=tmp_path / "s.zarr", client=without_workers, progress=told, evaluate=slowly
+    )
     assert outcome.complete and tree(outcome.store) == tree(undisturbed)
     assert told.lines[0].startswith("no worker yet (")
     assert "Ctrl-C stops, nothing is lost" in told.lines[0]
@@ -75,9 +73,8 @@ def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_
 
 
 def test_one_ctrl_c_stops_a_run_that_no_worker_will_end(tmp_path, without_workers):
-    _, client = without_workers
     told = Told(lambda: os.kill(os.getpid(), signal.SIGINT) if len(told.lines) == 1 else None)
-    outcome = run(small(), store=tmp_path / "s.zarr", client=client, progress=told)
+    outcome = run(small(), store=tmp_path / "s.zarr", client=without_workers, progress=told)
     assert outcome.stopped == "interrupted" and outcome.blocks_done == 0
     assert told.lines[0].startswith("no worker yet (")
 
@@ -109,10 +106,8 @@ def two_workers(monkeypatch):
     monkeypatch.setattr(scheduler, "TICK", 0.1)
     monkeypatch.setattr(scheduler, "LEASE", 1.0)
     with (
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),  # of a scheduler that is gone
+        threads(2) as client,
     ):
         yield client
 
@@ -155,6 +150,20 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
     else:
         assert outcome.complete and outcome.blocks_computed == 12
     assert tree(outcome.store) == tree(undisturbed)
+
+
+def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):
+    def slowly(study, block):
+        time.sleep(0.05)
+        return study.evaluate(block)
+
+    cluster = two_workers.cluster
+    told = Told(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
+    path = tmp_path / "s.zarr"
+    outcome = run(small(), store=path, client=two_workers, progress=told, evaluate=slowly)
+    assert outcome.stopped.startswith("the scheduler is gone") and outcome.blocks_done < 12
+    assert resume(path, scheduler="none", progress=False).complete
+    assert tree(path) == tree(undisturbed)
 
 
 def versions_differ(path, opened):

@@ -10,7 +10,7 @@ from small import STUDY, small
 from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
-from sweep.tasks import flight_study, progress, store
+from sweep.tasks import eyepoint_study, flight_study, progress, store
 from sweep.tasks.accuracy import flight_bench, measure, rungs
 from sweep.tasks.accuracy.bench import GridBench, Seen, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
@@ -277,7 +277,7 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
 
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
     """Shots computed beside a part take part in its time, and change nothing that it sees."""
-    for module in (flight_bench, flight_study):
+    for module in (flight_bench, flight_study, eyepoint_study):
         monkeypatch.setattr(module, "TILE_SHOTS", 32)
     bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)
     parts = bench.parts(64)

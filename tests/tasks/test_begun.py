@@ -116,8 +116,7 @@ def left(store):
     return sorted(file.name for file in (store / ".sweep").glob("begun*"))
 
 
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind, place", [*((k, PLACES[0]) for k in KINDS), ("fixed", PLACES[1])])
 def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
     told, store = Told(), tmp_path / "pieces.zarr"
     assert run(drawn(kind), store=store, progress=told, **place).complete
@@ -126,7 +125,11 @@ def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whol
     assert told.points == [0, *saved, 1] and receipts(store) == [0] and left(store) == []
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    ["fixed", "adaptive spectra"]
+    + [pytest.param(k, marks=pytest.mark.slow) for k in ("noise alone", "adaptive", "spectra")],
+)
 def test_a_block_of_several_points_is_stopped_at_any_of_them(
     kind, whole, saved, tmp_path, monkeypatch
 ):

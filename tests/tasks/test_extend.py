@@ -57,14 +57,10 @@ def at_once(spec, tmp_path):
 
 
 MORE = {
-    "appended": ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, 36),
-    "prepended": ({**AXES, POWER: ["0.2 W", "1 W", "3 W"]}, 36),
-    "in between": ({**AXES, ANGLE: ["20 deg", "35 deg", "50 deg", "80 deg", "90 deg"]}, 48),
     "on two axes": (
         {**AXES, POWER: ["1 W", "2 W", "3 W"], ANGLE: ["20 deg", "50 deg", "90 deg", "9 deg"]},
         72,
     ),
-    "new axis": ({**AXES, REFLECTANCE: [0.01, 0.02]}, 72),
     "new axis and values": (
         {REFLECTANCE: [0.01, 0.02], **AXES, POWER: ["1 W", "2 W", "3 W"]},
         144,
@@ -76,16 +72,10 @@ MORE = {
         36,
     ),
 }  # fmt: skip
-LIKE_OTHERS = ("appended", "prepended", "in between", "new axis")
+APPENDED, NEW_AXIS = ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, {**AXES, REFLECTANCE: [0.01, 0.02]})
 
 
-@pytest.mark.parametrize(
-    "axes, new",
-    [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in LIKE_OTHERS))
-        for name, case in MORE.items()
-    ],
-)
+@pytest.mark.parametrize("axes, new", MORE.values(), ids=MORE)
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, axes, new
 ):
@@ -147,6 +137,7 @@ def see_that_it_extends(here, pair):
 @settings(max_examples=4, deadline=None)
 @given(pair=studies())
 def test_any_grid_extended_to_any_larger_one(tmp_path_factory, pair):
+    """Values before, after and between those that there are, and further axes, among others."""
     see_that_it_extends(tmp_path_factory.mktemp("any"), pair)
 
 
@@ -229,11 +220,10 @@ MORE_DRAWS = {
     "method, scene",
     [
         ("probabilities", ROUGH),
-        ("noise", {}),
-        pytest.param("probabilities", {}, marks=pytest.mark.slow),
-        pytest.param("noise", ROUGH, marks=pytest.mark.slow),
+        pytest.param("noise", {}, marks=pytest.mark.slow),
+        ("noise", ROUGH),
     ],
-    ids=["probabilities, speckle", "noise alone", "probabilities alone", "noise, speckle"],
+    ids=["probabilities, speckle", "noise alone", "noise, speckle"],
 )
 def test_more_draws_go_on_from_those_that_are_there(
     tmp_path, drawn, scene, method, before, after, accuracy, tighter
@@ -310,7 +300,7 @@ def test_a_tighter_tolerance_computes_what_follows_from_it(tmp_path, computed, e
 
 
 def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undisturbed, computed):
-    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
+    store, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
     log = store / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
     assert larger(store, spec).complete
@@ -320,7 +310,7 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undist
 
 @pytest.mark.parametrize("name", ["pd_shot", "effects"])
 def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name):
-    store, spec = copied(undisturbed, tmp_path), small(axes=MORE["new axis"][0])
+    store, spec = copied(undisturbed, tmp_path), small(axes=NEW_AXIS)
     chunk = store / name / "c" / "0" / "1" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 4
@@ -338,27 +328,13 @@ def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name)
 
 def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed):
     store, new = copied(undisturbed, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
-    before, spec = everything(store), small(axes=MORE["in between"][0])
+    before, spec = everything(store), small(axes=APPENDED)
     for file in [store, *store.rglob("*")]:
         file.chmod(0o555 if file.is_dir() else 0o444)
     outcome = larger(store, spec, to=new)
     assert outcome.complete and outcome.store == new
     assert everything(store) == before
     assert tree(new) == at_once(spec, tmp_path)
-
-
-def test_its_own_place_named_is_its_own_place(tmp_path, undisturbed, computed):
-    path, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
-    assert larger(path, spec, to=path, overwrite=True).complete and sum(computed) == 36
-    assert tree(path) == at_once(spec, tmp_path)
-
-
-def test_changes_say_what_is_larger(tmp_path, undisturbed, computed):
-    store = copied(undisturbed, tmp_path)
-    outcome = larger(store, None, changes={f"axes.{POWER}": ["1 W", "2 W", "3 W"]})
-    assert outcome.complete and sum(computed) == outcome.points_computed == 36
-    assert outcome.points_done == outcome.points == 108
-    assert tree(store) == at_once(small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]}), tmp_path)
 
 
 def test_the_same_study_is_nothing_to_extend(tmp_path, undisturbed, computed, capsys):
@@ -427,7 +403,7 @@ class Interrupting(Progress):
 
 
 def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, computed):
-    path, spec = copied(undisturbed, tmp_path), small(axes=MORE["appended"][0])
+    path, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
     for _ in range(2):
         outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
         assert outcome.stopped == "interrupted" and outcome.store == beside(path)
@@ -486,13 +462,10 @@ MOMENTS = (
 @pytest.mark.parametrize(
     "moment, how, again",
     [
-        pytest.param(
-            moment, how, again, marks=[] if place % 3 == number % 3 else [pytest.mark.slow]
-        )
-        for number, moment in enumerate(MOMENTS)
-        for place, (how, again) in enumerate(
-            [("extend", "extend"), ("extend", "resume"), ("overwrite", "resume")]
-        )
+        (MOMENTS[0], "extend", "extend"),
+        pytest.param(MOMENTS[1], "extend", "resume", marks=pytest.mark.slow),
+        (MOMENTS[2], "overwrite", "resume"),
+        pytest.param(MOMENTS[3], "extend", "extend", marks=pytest.mark.slow),
     ],
 )
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(

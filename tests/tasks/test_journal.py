@@ -39,20 +39,6 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
     assert records[0]["digest"] == "ab"
 
 
-@pytest.mark.parametrize(
-    "tail", ['{"block":9', "\x00\xff", '{"block": 9, "seconds": 1}', "x" * 200_000]
-)
-def test_a_torn_last_line_is_cut_and_what_stands_before_it_stays(tmp_path, tail):
-    opened = Journal(tmp_path)
-    opened.commit(receipt(1))
-    path = tmp_path / JOURNAL / RECEIPTS
-    whole = path.read_bytes()
-    path.write_bytes(whole + tail.encode("latin-1"))
-    assert [record["block"] for record in read_lines(path)] == [1]
-    Journal(tmp_path)
-    assert path.read_bytes() == whole
-
-
 def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp_path):
     log = tmp_path / JOURNAL / RECEIPTS
     log.parent.mkdir()
@@ -111,14 +97,6 @@ def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch)
     with pytest.raises(OSError, match="No space left"):
         opened.commit(receipt(2))
     assert (tmp_path / JOURNAL / RECEIPTS).read_bytes() == before
-
-
-def test_failures_keep_the_last_error_of_a_block_with_its_traceback(tmp_path):
-    opened = Journal(tmp_path)
-    for text in ("first", "second"):
-        opened.record_failure(Failure(block=3, error=text, traceback="trace", host="h", pid=1))
-    assert journal.given_up(tmp_path, 4)[3]["error"] == "second"
-    assert journal.given_up(tmp_path, 4)[3]["traceback"] == "trace"
 
 
 def test_runs_are_recorded_with_their_times(tmp_path):

@@ -8,8 +8,7 @@ from functools import partial
 
 import dask
 import pytest
-from distributed import Client, LocalCluster
-from small import copied, evaluated, quiet, receipts, small, tree
+from small import copied, evaluated, quiet, receipts, small, threads, tree
 
 from sweep.tasks import worker
 from sweep.tasks.clusters import machines
@@ -100,12 +99,7 @@ def test_a_block_that_failed_goes_to_another_worker(tmp_path):
             raise ValueError("nothing good comes of it")
         return study.evaluate(block)
 
-    with (
-        LocalCluster(
-            n_workers=3, threads_per_worker=1, processes=False, dashboard_address=None
-        ) as workers,
-        Client(workers) as client,
-    ):
+    with threads(3) as client:
         run(small(), store=tmp_path / "s.zarr", client=client, evaluate=evaluate, progress=False)
     first, second = (line.split()[1] for line in log.read_text().splitlines() if line[:2] == "5 ")
     assert first != second

@@ -25,29 +25,27 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from time import thread_time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy import fft
 from scipy.stats import qmc
 
+from sweep.model import shot, truth
 from sweep.model import window as windows
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
 from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
 from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
-from sweep.tasks.accuracy.rungs import WRITTEN, Rung
+from sweep.spec import Axis, Spec
+from sweep.tasks.accuracy.rungs import WRITTEN, Declared, Rung
 from sweep.tasks.effect_selection import EffectSelection, Selected
 from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import evaluate_points
 
-if TYPE_CHECKING:
-    from sweep.spec import Axis, Spec
-    from sweep.tasks.accuracy.rungs import Declared
-
-    Look = Callable[[Shots], np.ndarray]
+Look = Callable[[Shots], np.ndarray]
 
 SEGMENTS = ("up", "doppler", "down")
 
@@ -171,9 +169,7 @@ def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
 
 def look_of(rung: Rung) -> Look:
     """Finder of a rung's peaks in the spectra."""
-    from sweep.model.shot import find
-
-    return partial(find_on_grid, **rung.thesis) if rung.thesis else find
+    return partial(find_on_grid, **rung.thesis) if rung.thesis else shot.find
 
 
 def along_axes(
@@ -262,8 +258,6 @@ class GridBench(Bench):
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
         """A point in the time domain, and as the rung has it without what the truth lacks."""
-        from sweep.model import shot, truth
-
         lacking = NOT_IN_TRUTH | {effect.name for effect in EFFECTS if effect.is_random}
         number = self._numbers[[place]]
         flags, _ = self._planned(rung, number)
@@ -290,8 +284,6 @@ class GridBench(Bench):
 
     def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
         """Outputs of points, the time they take together, and that of planning one of them."""
-        from sweep.model.shot import evaluate
-
         grid = self._selection_of(rung).tiles.grid
         flags, planning = self._planned(rung, numbers)
         selected = Selected(flags, np.zeros(flags.size)).groups()
@@ -303,7 +295,7 @@ class GridBench(Bench):
             parameters = grid.parameters_at(numbers[members])
             begun = thread_time()
             if rung.thesis:
-                found = evaluate(parameters, effects, look=look_of(rung))
+                found = shot.evaluate(parameters, effects, look=look_of(rung))
             else:
                 found = evaluate_points(grid.spec, parameters, len(members), effects)
             spent += thread_time() - begun

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from time import thread_time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from sweep.model import shot, truth
 from sweep.model.accuracy import Accuracy
 from sweep.model.effects.catalogue import NAMES, flags_of, names_of
+from sweep.model.eyepoints import Eyepoints, seen_ground
+from sweep.model.ray_error import ray_error
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import SceneSpec
 from sweep.tasks.accuracy.bench import (
     AS_WRITTEN,
     NOT_IN_TRUTH,
     Bench,
+    Look,
     Seen,
     Trial,
     along_axes,
@@ -29,13 +34,9 @@ from sweep.tasks.accuracy.bench import (
 )
 from sweep.tasks.accuracy.rungs import Rung
 from sweep.tasks.effect_selection import TILE_SHOTS, Selected
-from sweep.tasks.eyepoint_study import EyepointStudy, FinerRays, refine, world_of
-from sweep.tasks.flight_study import FlightStudy, Part, ScannerBlocks
-
-if TYPE_CHECKING:
-    from sweep.model.eyepoints import Eyepoints
-    from sweep.spec import SceneSpec
-    from sweep.tasks.accuracy.bench import Look
+from sweep.tasks.eyepoint_study import world_of
+from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.study import Results
 
 #: Places along the axes at which each scanner is looked at.
 PLACES = 2
@@ -75,13 +76,6 @@ class Tiles:
         return np.flatnonzero(np.isin(self.tile, [*own, *tiles[order[:enough]]]))
 
 
-class Cast(NamedTuple):
-    """Eyepoints of shots, and the time that casting their rays took [s]."""
-
-    eyepoints: Eyepoints
-    seconds: float
-
-
 class FlightBench(Bench):
     """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
@@ -95,10 +89,7 @@ class FlightBench(Bench):
         super().__init__()
         self.spec = spec
         self._studies: dict[str, FlightStudy] = {}
-        self._casters: dict[str, EyepointStudy] = {}
-        self._cast: dict[tuple[str, int, bytes], Cast] = {}
-        self._finer: dict[str, FinerRays] = {}
-        self._geometries: dict[tuple[str, str], str] = {}
+        self._cast: dict[tuple[str, int, bytes], tuple[Eyepoints, float]] = {}
         # What costs the same for any number of shots, as planning mostly does, a block shares.
         self.most_times = max(int(spec.storage.block_shots), TILE_SHOTS)
         self._tiles = self._sample(points)
@@ -116,13 +107,19 @@ class FlightBench(Bench):
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """A rung on a part of the sample, timed with its rays and the tiles beside it."""
         tiles, own = self._around(part, times)
-        cast = self._see(rung, tiles)
-        selected, planning = self._selected(rung, tiles, cast.eyepoints)
+        eyepoints, casting = self._see(rung, tiles)
+        selected, planning = self._selected(rung, tiles, eyepoints)
+        study, whole = self._study(rung), nothing(len(tiles.index))
+        cloud = partial(_statistics, study, tiles.part, look_of(rung))
         begun = thread_time()
-        seen = self._look(rung, tiles, cast.eyepoints, selected)
-        spent = thread_time() - begun + cast.seconds + planning
+        for rows, found in study.clouds(
+            tiles.part.scanner, eyepoints, selected, tiles.index, eyepoints.seen.nonzero()[0], cloud
+        ):
+            for values, some in zip(whole, seen_in(found), strict=True):
+                values[rows] = some
+        spent = thread_time() - begun + casting + planning
         number = len(tiles.index)
-        return Trial(Seen(*(values[own] for values in seen)), spent / number, planning / number)
+        return Trial(Seen(*(values[own] for values in whole)), spent / number, planning / number)
 
     def forget(self) -> None:
         """Drop the rays that rungs of the same geometry share."""
@@ -130,22 +127,18 @@ class FlightBench(Bench):
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
         """A shot in the time domain, and as the rung has it without what the truth lacks."""
-        from sweep.model import shot, truth
-
         tiles, one = self._around(np.array([place]), 1)
-        cast = self._see(rung, tiles)
-        selected, _ = self._selected(rung, tiles, cast.eyepoints)
-        eyepoints = cast.eyepoints.some(one)
+        every, _ = self._see(rung, tiles)
+        flags = self._selected(rung, tiles, every)[0].flags[one]
+        eyepoints = every.some(one)
         if not eyepoints.seen.all():
             return nothing(1), nothing(1)
-        every = names_of(int(selected.flags[one[0]]))
-        names = tuple(name for name in every if name not in NOT_IN_TRUTH)
-        study = self._study(rung)
+        names = tuple(name for name in names_of(int(flags[0])) if name not in NOT_IN_TRUTH)
         in_time, ordinary = (
-            _statistics(study, tiles.part, names, look, eyepoints)[0]
+            _statistics(self._study(rung), tiles.part, look, names, eyepoints, one, flags)
             for look in (truth.find, shot.find)
         )
-        return in_time, ordinary
+        return seen_in(in_time), seen_in(ordinary)
 
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
         """Scanner and number of each shot, and its place along the axes."""
@@ -171,7 +164,8 @@ class FlightBench(Bench):
             places = np.transpose(np.unravel_index(spread(axes, PLACES), axes)) if axes else [()]
             wanted = math.ceil(points / TILE_SHOTS / len(scanners) / len(places))
             for place in places:
-                index = _spread_shots(stretches, max(self.most_times // TILE_SHOTS, wanted))
+                tiles = max(self.most_times // TILE_SHOTS, wanted)
+                index = self._study(AS_WRITTEN).caster(stretches.scanner).spread(tiles)
                 part = stretches.first_part(tuple(int(i) for i in place))
                 found.append(Tiles(part, index, start))
                 start += len(index)
@@ -187,34 +181,32 @@ class FlightBench(Bench):
 
     def _study(self, rung: Rung) -> FlightStudy:
         if rung.name not in self._studies:
-            spec = rung.of(self.spec)
-            self._studies[rung.name] = FlightStudy(spec, Path("nowhere.zarr"))  # type: ignore[arg-type]
+            spec: Any = rung.of(self.spec)
+            # in a world that all share, as building one can take seconds
+            study = FlightStudy(spec, Path("nowhere.zarr"), world_of(self.spec))
+            if rung.rays_error:
+                study.rays_accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
+            self._studies[rung.name] = study
         return self._studies[rung.name]
 
-    def _see(self, rung: Rung, tiles: Tiles) -> Cast:
-        """Eyepoints of shots: rays are cast once for all rungs of the same geometry."""
-        from sweep.scenes.eyepoint_arrays import from_arrays
+    def _see(self, rung: Rung, tiles: Tiles) -> tuple[Eyepoints, float]:
+        """Eyepoints of shots, and the time that casting their rays took [s].
 
-        spec, scanner = self._study(rung).spec, tiles.part.scanner
-        if (rung.name, scanner) not in self._geometries:
-            self._geometries[rung.name, scanner] = spec.geometry_id(scanner)
-        geometry = self._geometries[rung.name, scanner]
-        if geometry not in self._casters:
-            # in a world that all share, as building one can take seconds
-            self._casters[geometry] = EyepointStudy(spec, scanner, world=world_of(self.spec))
-        which_shots = geometry, tiles.start, tiles.index.tobytes()
+        Rays are cast once for all rungs of the same geometry.
+        """
+        caster = self._study(rung).caster(tiles.part.scanner)
+        which_shots = caster.id, tiles.start, tiles.index.tobytes()
         if which_shots not in self._cast:
-            caster = self._casters[geometry]
             begun = thread_time()
             eyepoints = from_arrays(caster.cast(tiles.index), caster.weight)
-            self._cast[which_shots] = Cast(eyepoints, thread_time() - begun)
+            self._cast[which_shots] = eyepoints, thread_time() - begun
         return self._cast[which_shots]
 
     def _flags(self, rung: Rung) -> np.ndarray:
         selected = [
-            self._selected(rung, tiles, self._see(rung, tiles).eyepoints) for tiles in self._tiles
+            self._selected(rung, tiles, self._see(rung, tiles)[0])[0] for tiles in self._tiles
         ]
-        return np.concatenate([each.flags for each, _ in selected])
+        return np.concatenate([each.flags for each in selected])
 
     def _selected(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints) -> tuple[Selected, float]:
         """Effects simulated at shots, planned in their tiles, and the time that this took [s]."""
@@ -226,95 +218,26 @@ class FlightBench(Bench):
         selected = self._study(rung).select(tiles.part, eyepoints, tiles.index)
         return selected, thread_time() - begun if rung.plans else 0.0
 
-    def _look(self, rung: Rung, tiles: Tiles, eyepoints: Eyepoints, selected: Selected) -> Seen:
-        """Statistics of shots, of those that see anything; more rays are cast where they must."""
-        whole, study = nothing(len(selected.flags)), self._study(rung)
-        accuracy = study.rays_accuracy
-        if rung.rays_error:
-            accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
-        seen = np.flatnonzero(eyepoints.seen)
-        for among, names, flags in selected.some(seen).together():
-            look = partial(_statistics, study, tiles.part, names, look_of(rung))
-            group = _Group(
-                whole=whole,
-                index=seen[among],
-                numbers=tiles.index[seen[among]],
-                flags=flags,
-                look=partial(look, estimates=accuracy is not None),
-                cast=partial(self._finer_rays(rung).see, tiles.part.scanner),
-            )
-            error = group.put(np.arange(among.size), eyepoints.some(group.index))
-            if accuracy is not None:
-                refine(eyepoints.weight.size, error, accuracy, group.cast_again)
-        return whole
-
-    def _finer_rays(self, rung: Rung) -> FinerRays:
-        if rung.name not in self._finer:
-            self._finer[rung.name] = FinerRays(self._study(rung).spec, world_of(self.spec))
-        return self._finer[rung.name]
-
-
-def _spread_shots(stretches: ScannerBlocks, tiles: int) -> np.ndarray:
-    """Numbers of the shots, in whole cycles, of some tiles of a scanner."""
-    cycle = stretches.shots_a_cycle
-    total = stretches.total_cycles * cycle
-    some = np.sort(spread((-(-total // TILE_SHOTS),), tiles))
-    shots = (some[:, None] * TILE_SHOTS + np.arange(TILE_SHOTS)).ravel()
-    cycles = np.unique(shots[shots < total] // cycle)
-    return np.asarray((cycles[:, None] * cycle + np.arange(cycle)).ravel())
-
 
 def _statistics(
     study: FlightStudy,
     part: Part,
-    names: tuple[str, ...],
     look: Look,
+    effects: tuple[str, ...],
     eyepoints: Eyepoints,
-    flags: np.ndarray | None = None,
-    estimates: bool = False,
-) -> tuple[Seen, np.ndarray]:
-    """Statistics of shots that see something, from a way to look at their spectra.
-
-    And what their rays leave, (n,), if that is asked for.
-    """
-    from sweep.model.eyepoints import seen_ground
-    from sweep.model.ray_error import ray_error
-    from sweep.model.shot import prepare_cast, statistics
-
-    given, ground = seen_ground(eyepoints, study.parameters_at(part), study.surfaces)
-    shots = prepare_cast(given, ground, names, flags)
+    numbers: np.ndarray,
+    flags: np.ndarray,
+) -> Results:
+    """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
+    there, rays = eyepoints.seen.nonzero()[0], eyepoints.weight.size
+    given, ground = seen_ground(eyepoints.some(there), study.parameters_at(part), study.surfaces)
+    shots = shot.prepare_cast(given, ground, effects, flags[there])
     found = look(shots)
-    rays = np.full(shots.size, float(eyepoints.weight.size))
-    seen = seen_in(statistics(shots, found))._replace(beamlets=rays)
-    if not estimates:
-        return seen, np.zeros(shots.size)
-    bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
-    return seen, ray_error(shots, ground.beamlets, bins, found[:, 2].T)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Group:
-    """Shots that are computed together, and where their statistics go."""
-
-    whole: Seen
-    """Statistics of all shots."""
-    index: np.ndarray
-    """Places of the group among them."""
-    numbers: np.ndarray
-    flags: np.ndarray
-    look: Callable[[Eyepoints, np.ndarray], tuple[Seen, np.ndarray]]
-    cast: Callable[[np.ndarray, int], Eyepoints]
-
-    def put(self, places: np.ndarray, eyepoints: Eyepoints) -> np.ndarray:
-        """Put statistics of some of the group into those of all; what their rays leave."""
-        seen, error = self.look(eyepoints, self.flags[places])
-        for values, some in zip(self.whole, seen, strict=True):
-            values[self.index[places]] = some
-        return error
-
-    def cast_again(self, places: np.ndarray, rays: int) -> np.ndarray:
-        """The same with more rays, of those that then see anything."""
-        eyepoints = self.cast(self.numbers[places], rays)
-        there, error = np.flatnonzero(eyepoints.seen), np.zeros(len(places))
-        error[there] = self.put(places[there], eyepoints.some(there))
-        return error
+    results = shot.statistics(shots, found) | {"beamlets": np.full(shots.size, rays)}
+    if study.rays_accuracy is not None:
+        bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+        results["beamlets_error"] = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
+    whole = {name: np.full(numbers.size, np.nan) for name in results}
+    for name, values in results.items():
+        whole[name][there] = values
+    return whole

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
@@ -24,6 +25,7 @@ from sweep.tasks.accuracy.rungs import (
     DRAWN,
     REFERENCE,
     THESIS,
+    Declared,
     Ladder,
     Rung,
     ladder,
@@ -33,25 +35,17 @@ from sweep.tasks.progress import Interrupts, Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
 
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.accuracy.rungs import Declared
-
 POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
 
-MOST_ROUNDS, MANY_ROUNDS = 9, 27
-"""Rounds at the most; of a study that takes next to nothing, as chance tells most there."""
+MOST_ROUNDS = 27
+"""Rounds at the most, which a study that takes next to nothing has: chance tells most there."""
 
 LONG_ENOUGH = 0.003
 """Share of the time limit that a trial takes: its calls then cost little beside its points."""
 
 TOO_LONG = 2
 """Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
-
-MOST_RUNS, SHORT = 15, 4
-"""Runs of a trial of a study that takes next to nothing, of which the best counts: as many as make
-such a part of what is long enough."""
 
 FIRST_TRIED = 8
 """How much shorter the stretches are by which settings are known to be dear."""
@@ -133,24 +127,21 @@ def measure(
     told = chosen(progress)
     with Interrupts() as interrupts:
         with working("choosing points", told):
-            bench = _bench_of(spec, points)
+            bench: Bench
+            if isinstance(spec, SceneSpec):
+                bench = FlightBench(spec, points)
+            else:
+                bench = GridBench(spec, points)
         try:
-            measurement = Measurement(
+            measured = Measurement(
                 bench, time_limit=time_limit, told=told, interrupts=interrupts
-            )  # fmt: skip
-            measured = measurement.run()
+            ).run()
         except Nothing:
             return False
     stored = storing(study_of(spec, store_path))
     _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
     store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
     return True
-
-
-def _bench_of(spec: Spec | SceneSpec, points: int) -> Bench:
-    from sweep.spec import SceneSpec
-
-    return FlightBench(spec, points) if isinstance(spec, SceneSpec) else GridBench(spec, points)
 
 
 def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
@@ -211,11 +202,11 @@ class Measured:
     """(rungs, rounds): a point."""
     times: np.ndarray
     """(rungs,): points of a stretch that is timed."""
-    truth: dict[int, tuple[Seen, Seen]] = field(default_factory=dict)
+    truth: dict[int, tuple[Seen, Seen]]
     """By place in the sample: in the time domain, and as the reference has it."""
-    truth_beamlets: int = 0
+    truth_beamlets: int
     """Of both, where their number is not the reference's; else 0."""
-    stopped: str = ""
+    stopped: str
     """Why the sample is not whole; empty where it is."""
 
 
@@ -236,11 +227,10 @@ class Measurement:
         self._bench, self._limit = bench, time_limit
         self._told, self._interrupts = told, interrupts
         self._begun = time.monotonic()
-        self._ladder = self._completed(ladder(bench.spec))
+        self._ladder = completed(ladder(bench.spec), bench)
         self._rungs = self._ladder.rungs
         self._times = np.ones(len(self._rungs), np.int64)
         self._once = np.zeros(len(self._rungs), bool)
-        self._runs = np.ones(len(self._rungs), np.int64)
         self._orders = np.random.default_rng(0)
 
     def run(self) -> Measured:
@@ -268,32 +258,26 @@ class Measurement:
         first = self._round(parts, until=FIRST_ROUND)
         if not first:
             raise Nothing
-        kept = parts[: len(first)]
-        measured = self._gathered(kept, first)
-        if len(kept) < len(parts):
-            measured.stopped = "interrupted" if self._interrupts.stopping else "time limit"
-        self._add_truth(measured)
+        stopped = "interrupted" if self._interrupts.stopping else "time limit"
+        stopped = stopped if len(first) < len(parts) else ""
+        parts = parts[: len(first)]
+        places = np.concatenate(parts)
+        truth, beamlets = self._truth(places)
+        done = [together(parts, first)]
         for _ in range(rounds - 1):
-            again = self._round(kept, until=1.0, first=first)
-            if len(again) < len(kept):
+            again = self._round(parts, until=1.0, first=first)
+            if len(again) < len(parts):
                 break
-            timed = self._gathered(kept, again)
-            measured.seconds = np.column_stack([measured.seconds, timed.seconds])
-            measured.planning = np.column_stack([measured.planning, timed.planning])
-        return measured
-
-    def _completed(self, rungs: Ladder) -> Ladder:
-        """The ladder, with the effects that tolerances call for fixed at every point."""
-        at = {
-            float(rung.overrides["accuracy.tolerance"]): rung
-            for rung in rungs.rungs
-            if rung.kind == ADAPTIVE
-        }
-        if not any(rung.kind == ALL_ON for rung in rungs.rungs):
-            return rungs  # of draws
-        sets = {t: self._bench.effects(at[t]) for t in FIXED_AS_AT if t in at}
-        self._bench.forget()
-        return rungs.with_fixed(sets)
+            done.append(together(parts, again))
+        seconds, planning = (
+            np.array([[getattr(trial, name) for trial in trials] for trials in done]).T
+            for name in ("seconds", "planning")
+        )
+        return Measured(
+            ladder=self._ladder, seen=[trial.seen for trial in done[0]], done=places,
+            seconds=seconds, planning=planning, times=self._times, truth=truth,
+            truth_beamlets=beamlets, stopped=stopped,
+        )  # fmt: skip
 
     def _part_points(self) -> int:
         """Points of a part: a few parts, and more where a point takes its time."""
@@ -316,8 +300,7 @@ class Measurement:
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
         """Rounds that fit in; before that, how long the stretches are to time rungs well.
 
-        As long for all of them, but for those that would take far longer. Where the study has no
-        more points, they are run so many times in a row.
+        As long for all of them, but for those that would take far longer.
         """
         times, enough = 1, LONG_ENOUGH * self._limit
         while self._timed(0, parts[0]) < enough / 2 and times < self._bench.most_times:
@@ -331,15 +314,11 @@ class Measurement:
         self._times[:] = cut
         spent = took * cut / shorter
         self._once = spent > LONG
-        runs = np.clip(enough / SHORT / np.median(spent), 1, MOST_RUNS)
-        self._runs[~self._once] = int(runs)
-        spent = spent * self._runs
         left = 0.75 * (self._limit - (time.monotonic() - self._begun)) / len(parts)
         after_truth = (1 - UNTIL_TRUTH) * self._limit / len(parts)
         again = max(float(spent[~self._once].sum()), 1e-9)
         further = max(left - float(spent.sum()), after_truth) / again
-        most = MANY_ROUNDS if runs > MOST_RUNS / 2 else MOST_ROUNDS
-        return 1 + max(0, min(most - 1, int(further)))
+        return 1 + max(0, min(MOST_ROUNDS - 1, int(further)))
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
         begun = time.monotonic()
@@ -350,10 +329,7 @@ class Measurement:
         return time.monotonic() - begun
 
     def _try(self, rung: int, part: np.ndarray) -> Trial:
-        """A rung on a part, in the best of its runs."""
-        times = int(self._times[rung])
-        runs = [self._bench.try_on(self._rungs[rung], part, times) for _ in range(self._runs[rung])]
-        return min(runs, key=lambda trial: trial.seconds)
+        return self._bench.try_on(self._rungs[rung], part, int(self._times[rung]))
 
     def _round(
         self, parts: list[np.ndarray], *, until: float, first: list[list[Trial]] | None = None
@@ -379,39 +355,49 @@ class Measurement:
             done.append([trials[rung] for rung in range(len(self._rungs))])
         return done
 
-    def _gathered(self, parts: list[np.ndarray], trials: list[list[Trial]]) -> Measured:
-        """A round, with its parts put together."""
-        places = np.concatenate(parts)
-        share = np.array([len(part) for part in parts]) / len(places)
-
-        def mean(value: Callable[[Trial], float]) -> np.ndarray:
-            return np.array([[value(t) for t in row] for row in trials]).T @ share
-
-        by_rung = zip(*trials, strict=True)
-        seen = [
-            Seen(*map(np.concatenate, zip(*(t.seen for t in row), strict=True))) for row in by_rung
-        ]
-        return Measured(
-            ladder=self._ladder, seen=seen, done=places, times=self._times,
-            seconds=mean(lambda t: t.seconds)[:, None],
-            planning=mean(lambda t: t.planning)[:, None],
-        )  # fmt: skip
-
-    def _add_truth(self, measured: Measured) -> None:
-        """Points of the sample in the time domain, as many as there is time for."""
-        rung, beamlets = self._ladder.reference, "footprint.beamlets"
-        if beamlets in rung.overrides:
-            measured.truth_beamlets = TRUTH_BEAMLETS
-            overrides = {**rung.overrides, beamlets: TRUTH_BEAMLETS}
-            rung = replace(rung, name="in time", overrides=overrides)
-        for place in measured.done[spread(measured.done.shape, TRUTH_POINTS)].tolist():
+    def _truth(self, places: np.ndarray) -> tuple[dict[int, tuple[Seen, Seen]], int]:
+        """Some of these points in the time domain, as many as there is time for; their beamlets."""
+        rung, number = self._ladder.reference, "footprint.beamlets"
+        found: dict[int, tuple[Seen, Seen]] = {}
+        beamlets = TRUTH_BEAMLETS if number in rung.overrides else 0
+        if beamlets:
+            overrides = {**rung.overrides, number: beamlets}
+            rung = replace(rung, name="in time", overrides=overrides, rays_error=0.0)
+        for place in places[spread(places.shape, TRUTH_POINTS)].tolist():
             late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
-            if self._interrupts.stopping or (late and len(measured.truth) >= LEAST_IN_TRUTH):
+            if self._interrupts.stopping or (late and len(found) >= LEAST_IN_TRUTH):
                 break
             in_time, reference = self._bench.truth(rung, place)
             if np.isfinite(in_time.pd).any():
-                measured.truth[place] = in_time, reference
+                found[place] = in_time, reference
         self._bench.forget()
+        return found, beamlets
+
+
+def completed(rungs: Ladder, bench: Bench, tolerances: Iterable[float] = ()) -> Ladder:
+    """The ladder, with the effects that tolerances call for fixed at every point.
+
+    ``tolerances``: as of :meth:`sweep.tasks.accuracy.rungs.Ladder.with_fixed`.
+    """
+    if not any(rung.kind == ALL_ON for rung in rungs.rungs):
+        return rungs  # of draws
+    at = {tolerance_of(rung): rung for rung in rungs.rungs if rung.kind == ADAPTIVE}
+    sets = {t: bench.effects(at[t]) for t in FIXED_AS_AT if t in at}
+    bench.forget()
+    return rungs.with_fixed(sets, tolerances)
+
+
+def together(parts: list[np.ndarray], trials: list[list[Trial]]) -> list[Trial]:
+    """Trials of rungs on the parts of a sample, each as one."""
+    share = np.array([len(part) for part in parts]) / sum(map(len, parts))
+    return [
+        Trial(
+            Seen(*map(np.concatenate, zip(*(t.seen for t in each), strict=True))),
+            float(share @ [t.seconds for t in each]),
+            float(share @ [t.planning for t in each]),
+        )
+        for each in zip(*trials, strict=True)
+    ]
 
 
 ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error", "leakage_error")
@@ -511,7 +497,7 @@ class Content:
         errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
         by_rung, by_round, by_point = ("rung",), ("rung", "round"), ("rung", "point")
         told = {
-            "tolerance": (by_rung, np.array([_tolerance(rung) for rung in rungs]), "1",
+            "tolerance": (by_rung, np.array([tolerance_of(rung) for rung in rungs]), "1",
                           "tolerance of an adaptive setting"),
             "times": (by_rung, measured.times, "1", "points of each stretch that is timed"),
             "seconds": (by_round, measured.seconds, "s",
@@ -539,6 +525,7 @@ class Content:
         ]
 
 
-def _tolerance(rung: Rung) -> float:
+def tolerance_of(rung: Rung) -> float:
+    """Tolerance of an adaptive setting; nan of others."""
     value = rung.overrides.get("accuracy.tolerance", np.nan)
     return float(value) if rung.kind != REFERENCE else np.nan

@@ -6,12 +6,13 @@ import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec, Spec
+from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.ground import powers_add
+from sweep.spec import SceneSpec, Spec
 
-    Declared = Spec | SceneSpec
+Declared = Spec | SceneSpec
 
 WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE = (
     "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line"
@@ -142,14 +143,9 @@ class Ladder:
     def with_fixed(
         self, sets: Mapping[float, frozenset[str]], tolerances: Iterable[float] = ()
     ) -> Ladder:
-        """The ladder with rungs that simulate the same effects at every point.
+        """The ladder with rungs that simulate at every point what a tolerance calls for anywhere.
 
-        Parameters
-        ----------
-        sets
-            Effects that a tolerance calls for anywhere.
-        tolerances
-            For lines and leakage, each tried with each set; those of the effects by default.
+        ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
         """
         as_at: dict[frozenset[str], float] = {}
         for tolerance, names in sets.items():
@@ -169,15 +165,11 @@ class Ladder:
 
 def _modes(on: frozenset[str]) -> dict[str, str]:
     """Some effects forced on, all others off."""
-    from sweep.model.effects.catalogue import NAMES
-
     return {f"effects.{name}": "on" if name in on else "off" for name in NAMES}
 
 
 def ladder(spec: Declared) -> Ladder:
     """The rungs of a study, without those whose effects are fixed."""
-    from sweep.model.ground import powers_add
-
     if _draws(spec):
         return _drawn_ladder(spec)
     notes: list[str] = []
@@ -196,13 +188,13 @@ def ladder(spec: Declared) -> Ladder:
     finest, about, rays_error = every | _EXACTLY, "all effects on", 0.0
     if why:
         notes.append(f"the number of beamlets is left alone: {why}")
-    elif _is_flight(spec):
+    elif isinstance(spec, SceneSpec):
         finest, rays_error = finest | {_BEAMLETS: FINEST_RAYS}, FINEST_RAYS_TOLERANCE
         about += f", {FINEST_RAYS} beamlets or more"
     else:
         finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
-    rungs += () if why else _numbers(_is_flight(spec))
+    rungs += () if why else _numbers(isinstance(spec, SceneSpec))
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS}, powers_add(spec.parameters()))
     rungs.append(Rung(name="reference", kind=REFERENCE, overrides=finest, rays_error=rays_error))
     return Ladder(tuple(rungs), about, tuple(notes), partial(_fixed_beamlets, spec, bool(why)))
@@ -212,7 +204,7 @@ def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, 
     """Beamlets that a study whose effects are fixed might have, if their number is not given."""
     if given:
         return {}
-    if not _is_flight(spec):
+    if not isinstance(spec, SceneSpec):
         return {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE}
     least = max(FEWEST_RAYS, RAYS_ERROR / tolerance)
     return {_BEAMLETS: min(next((n for n in NUMBERS if n >= least), MOST_RAYS), MOST_RAYS)}
@@ -276,21 +268,15 @@ def _drawn_ladder(spec: Declared) -> Ladder:
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
     """All effects on, each with the scene's own parameters."""
-    from sweep.model.effects.catalogue import EFFECTS
-
     random = _draws(spec)
     return {f"effects.{e.name}": "on" for e in EFFECTS if random or not e.is_random}
 
 
-def _is_flight(spec: Declared) -> bool:
-    from sweep.spec import SceneSpec
-
-    return isinstance(spec, SceneSpec)
-
-
 def _draws(spec: Declared) -> bool:
     """True where probabilities are means over draws: of a flight they are not."""
-    return not _is_flight(spec) and (spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0)
+    return not isinstance(spec, SceneSpec) and (
+        spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0
+    )
 
 
 def _on_axis(spec: Declared, path: str) -> bool:

@@ -74,10 +74,7 @@ class _PBSCluster(_TriedAgain, PBSCluster):  # type: ignore[misc]
 def start(cluster: Batch, bounds: Bounds) -> Any:
     """The cluster, with jobs for its least number of workers submitted.
 
-    Raises
-    ------
-    RuntimeError, OSError
-        Where the batch system takes no jobs.
+    RuntimeError, OSError where the batch system takes no jobs.
     """
     kind = _SlurmCluster if isinstance(cluster, Slurm) else _PBSCluster
     started = kind(**options(cluster))

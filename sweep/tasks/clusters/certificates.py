@@ -36,10 +36,7 @@ class Files(NamedTuple):
 def make(directory: Path, days: int) -> Files:
     """New certificates in a directory, which only their owner may read.
 
-    Raises
-    ------
-    ClusterError
-        Where there are some already, or the directory can't be written.
+    ClusterError where there are some already, or the directory can't be written.
     """
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -34,10 +34,7 @@ ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 def deployed(cluster: Kubernetes, bounds: Bounds) -> Iterator[str]:
     """Address of the scheduler, while the cluster is there.
 
-    Raises
-    ------
-    ClusterError
-        Where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
+    ClusterError where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
     """
     try:
         from httpx import HTTPError
@@ -141,8 +138,17 @@ def resource(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any]:
         resources={"requests": size, "limits": size},
     )
     scheduler, workers = asked["spec"]["scheduler"]["spec"], asked["spec"]["worker"]["spec"]
-    _fill(scheduler, _scheduler_words(cluster), _scheduler_environment(), cluster)
-    _fill(workers, _worker_words(cluster), _worker_environment(cluster), cluster)
+    words = ["--host", "0.0.0.0", "--port", str(PORT), "--dashboard-address", ":8787"]
+    variables = {
+        "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": machines.WORK_AHEAD,
+        "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": str(ROUTES),
+    }
+    _fill(scheduler, ["scheduler", *words], variables, cluster)
+    words = ["--name", "$(DASK_WORKER_NAME)", "--no-dashboard", "--preload", machines.PRELOAD]
+    words += ["--nthreads", size["cpu"], "--memory-limit", size["memory"]]
+    address = f"{protocol(cluster)}://{host(cluster)}:{PORT}"
+    variables = {"DASK_SCHEDULER_ADDRESS": address, **machines.environment(cluster.environment)}
+    _fill(workers, ["worker", *words], variables, cluster)
     workers["containers"][0].pop("ports")  # a worker shows no pages
     return asked
 
@@ -152,7 +158,7 @@ def _fill(
 ) -> None:
     """Put command, environment and volumes into a pod's only container."""
     (container,) = pod["containers"]
-    container["args"] = words
+    container["args"] = ["dask", *words, *_tls(cluster)]
     container["env"] = [{"name": name, "value": value} for name, value in variables.items()]
     volumes: list[dict[str, Any]] = []
     mounts: list[dict[str, Any]] = []
@@ -167,33 +173,9 @@ def _fill(
         pod["volumes"], container["volumeMounts"] = volumes, mounts
 
 
-def _scheduler_words(cluster: Kubernetes) -> list[str]:
-    listening = ["--host", "0.0.0.0", "--port", str(PORT), "--dashboard-address", ":8787"]
-    return ["dask", "scheduler", *listening, *_tls(cluster)]
-
-
-def _worker_words(cluster: Kubernetes) -> list[str]:
-    worker = cluster.worker
-    size = ["--nthreads", str(worker.threads), "--memory-limit", str(int(worker.memory))]
-    name = ["--name", "$(DASK_WORKER_NAME)", "--no-dashboard"]
-    return ["dask", "worker", *name, *size, "--preload", machines.PRELOAD, *_tls(cluster)]
-
-
 def _tls(cluster: Kubernetes) -> list[str]:
     if not cluster.security:
         return []
     files = {"ca-file": "ca", "cert": "certificate", "key": "key"}
     words = [(f"--tls-{option}", f"{CERTIFICATES}/{name}.pem") for option, name in files.items()]
     return ["--protocol", "tls", *(word for pair in words for word in pair)]
-
-
-def _scheduler_environment() -> dict[str, str]:
-    return {
-        "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": machines.WORK_AHEAD,
-        "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": str(ROUTES),
-    }
-
-
-def _worker_environment(cluster: Kubernetes) -> dict[str, str]:
-    address = f"{protocol(cluster)}://{host(cluster)}:{PORT}"
-    return {"DASK_SCHEDULER_ADDRESS": address, **machines.environment(cluster.environment)}

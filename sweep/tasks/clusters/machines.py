@@ -124,10 +124,7 @@ def spawning() -> Iterator[None]:
 def start_here(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
     """Workers of this machine, as processes or as threads of this one.
 
-    Raises
-    ------
-    OSError, RuntimeError, ImportError
-        Where they can't be started.
+    OSError, RuntimeError, ImportError where they can't be started.
     """
     import dask
     from distributed import LocalCluster, Security
@@ -168,10 +165,7 @@ def _memory(cluster: Local, bounds: Bounds) -> int:
 def start_by_ssh(cluster: SSH, bounds: Bounds) -> Any:
     """Workers on all machines.
 
-    Raises
-    ------
-    OSError, RuntimeError
-        Where a machine can't be reached, or starts no worker.
+    OSError, RuntimeError where a machine can't be reached, or starts no worker.
     """
     import asyncssh
     from distributed import Scheduler, SpecCluster
