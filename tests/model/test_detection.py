@@ -32,22 +32,6 @@ def test_the_threshold_counts_standard_deviations_of_a_bins_magnitude():
 # Detection
 
 
-def test_the_mean_over_a_fluctuating_target_is_swerlings_closed_form(table_4_1):
-    """Exponential power of mean SNR S: exp(-Th^2 / (2 sigma^2 (1 + S))), PHYSICS section 8.
-
-    The pd of single shots, from evaluate(), averaged over the reflectance that makes the power.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(200)
-    cumulative = (nodes + 1) / 2
-    scene = table_4_1(beamlets=1, fft_size=4096, tnr=6.0, range=3000.0)
-    mean = shot.evaluate(scene)["snr_down"][0]
-    drawn = shot.evaluate(scene | {"target.reflectance": -0.1 * np.log1p(-cumulative)})
-    averaged = drawn["pd_down"] @ weights / 2
-    crossing = 0.5 * 6.0**2 * RAYLEIGH_DEVIATION**2
-    assert averaged == pytest.approx(np.exp(-crossing / (1 + mean)), rel=1e-5)
-    assert 0.2 < averaged < 0.8
-
-
 @pytest.mark.parametrize("target_range", [1500.0, 3000.0, 4000.0, 6000.0])
 def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_range, table_4_1):
     """SNR = Re P / (q B) n / (2 ENBW) less detector and amplifier noise; pd = Q_1 by ncx2."""

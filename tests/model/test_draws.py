@@ -60,14 +60,7 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         assert counts["n_detected_up"].sum() == 50
 
 
-RANDOM = {
-    "nothing": (),
-    "speckle": ("speckle",),
-    "scintillation": ("scintillation",),
-    "jitter": ("pointing_jitter",),
-    "all three": ("speckle", "scintillation", "pointing_jitter"),
-    "all three on a pedestal": ("speckle", "scintillation", "pointing_jitter", "line_width"),
-}
+RANDOM = ("speckle", "scintillation", "pointing_jitter")
 UNSTEADY = {
     "target.roughness": 1e-5,
     "target.pointing_jitter": 1e-5,
@@ -79,15 +72,7 @@ UNSTEADY = {
 
 
 @pytest.mark.parametrize(
-    "method, effects",
-    [
-        pytest.param(method, effects, id=f"{method}, {name}", marks=[pytest.mark.slow] * more)
-        for number, (name, effects) in enumerate(RANDOM.items())
-        for method, more in (
-            ("probabilities", number % 2 == 1 or name == "scintillation"),
-            ("noise", number % 2 == 0 or name == "jitter"),
-        )
-    ],
+    "method, effects", [("probabilities", RANDOM), ("noise", (*RANDOM, "line_width"))]
 )
 def test_counts_over_random_effects_have_the_means_over_their_draws(effects, method, table_4_1):
     """A draw's Bernoulli variance is p (1 - p) of its own p: 5 sigma of their sum.
@@ -123,13 +108,13 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
-@pytest.mark.parametrize("random", ["nothing", "all three"])
+@pytest.mark.parametrize("random", [(), RANDOM])
 def test_batches_split_the_same_draws(method, random, table_4_1):
     parameters = _points(table_4_1, tnr=6.0) | UNSTEADY
     parameters |= {"instrument.processing.fft_size": 4096, "instrument.laser.power": 1.5}
     parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
     arguments = {"keys": _keys(6), "method": method}
-    effects = (*CORE, *RANDOM[random])
+    effects = (*CORE, *random)
     whole = simulate(parameters, effects, batch_sizes=[300], **arguments)
     parts = simulate(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
     later = simulate(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)

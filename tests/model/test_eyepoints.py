@@ -139,17 +139,6 @@ def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(ta
         prepare_eyepoints(seen, table_4_1(), [])
 
 
-def test_surfaces_scatter_by_their_own_reflectance_and_law(table_4_1):
-    seen = observed(flight(), beams=cone(1, half_angle=1.0))
-    bright, dark = (
-        prepare_eyepoints(seen, table_4_1(), [Surface("s", reflectance, law)])
-        for reflectance, law in ((0.4, "thesis"), (0.1, "lambert"))
-    )
-    ratio = (bright.amplitude / dark.amplitude) ** 2
-    # 4 times the reflectance; 1/(2 pi) against cos(incidence)/pi
-    np.testing.assert_allclose(ratio, 4 / (2 * seen.cos_incidence), rtol=1e-12)
-
-
 def _turning(rate, arm=(0.0, 0.0, 0.0)):
     """A falling instrument on an arm of a body that turns."""
     path = ConstantAcceleration((0.0, 0.0, 900.0), (35.0, -10.0, -60.0), (1.0, 2.0, 11.4), 10.0)

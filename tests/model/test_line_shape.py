@@ -8,7 +8,7 @@ from engine import shape_of
 
 from sweep.model.line_shape import has_modes
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.segments import tangents, tones
+from sweep.model.segments import tangents
 from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
 from sweep.model.window import COSINE_SUMS, samples, window
 
@@ -79,16 +79,6 @@ def test_few_modes_serve_small_phase_errors_and_tables_of_all_bins_the_large(nam
     assert numbers[0] == 1 and numbers[-1] == 0
     assert numbers[:4] == sorted(numbers[:4]) and numbers[1] < 24 < numbers[3]
     assert not has_modes(window(name, 512), 512) and not has_modes(shape, 65536)
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_tones_are_the_transform_of_the_window(name):
-    for fft_size, length in ((4096, 4096), (700, 512)):
-        place = np.array([0.0, 0.25, -0.5, 0.999])
-        found = tones(window(name, length), fft_size, place, -40, 81)
-        y = np.arange(-40, 41)[:, None] - place
-        exact = abs(transform(name, (fft_size, length), np.zeros_like, y.ravel())).reshape(y.shape)
-        assert abs(found - exact).max() < ACCURACY * exact.max()
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hann", "flattop", "kaiser(8)"])

@@ -16,24 +16,6 @@ LENGTH = 128
 WINDOWS = ("hamming", "hann", "rectangular", "blackman", "flattop", "kaiser(8.6)")
 
 
-@pytest.mark.parametrize("number", COUNTS.tolist())
-def test_rules_have_the_gaussians_mean_and_variance(number):
-    nodes, weights = gaussian_rule(number)
-    assert nodes.shape == weights.shape == (number,)
-    assert weights.sum() == pytest.approx(1, abs=1e-14)
-    assert abs((weights * nodes).sum()) < 1e-14
-    assert (weights * nodes**2).sum() == pytest.approx(1, abs=1e-13)
-
-
-@pytest.mark.parametrize("number", [2, 3, 7, 15])
-def test_gauss_and_hermites_rule_is_exact_for_polynomials(number):
-    """E x^(2k) = (2k - 1)!!, exact up to degree 2 number - 1."""
-    nodes, weights = gaussian_rule(number)
-    for k in range(1, number):
-        moment = np.prod(np.arange(1.0, 2 * k, 2))
-        assert (weights * nodes ** (2 * k)).sum() == pytest.approx(moment, rel=1e-11)
-
-
 def needed(window, deviation, tolerance, curve=0.0):
     """Lines, nodes and error where all segments are alike."""
     s, tolerance = np.broadcast_arrays(deviation, np.asarray(tolerance, float))
@@ -69,14 +51,6 @@ def test_power_is_within_the_tolerance_of_the_continuum_wherever_lines_lie(windo
                 found = power_of_bins(window, offset, deviation, gaussian_rule(int(number[0])))
                 assert abs(found - exact).max() <= tolerance * exact.max() + 1e-13
     assert min(counts) == 2 and max(counts) > 100
-
-
-@pytest.mark.parametrize("number", [22, 109, 1234])
-def test_even_steps_are_exact_but_for_their_reach_and_where_they_alias(number):
-    nodes, weights = gaussian_rule(number)
-    turn = np.linspace(0, 2 * np.pi / (nodes[1] - nodes[0]) - 7, 2000)
-    mean = np.array([(weights * np.cos(t * nodes)).sum() for t in turn])
-    assert abs(mean - np.exp(-(turn**2) / 2)).max() < 1e-10
 
 
 def test_narrow_spreads_need_few_nodes_and_more_accuracy_costs_few_more():

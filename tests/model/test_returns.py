@@ -465,17 +465,6 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
     assert (got.flags[0, 0, 1:] & SIDELOBE > 0).all()
 
 
-def test_noise_peaks_make_false_alarms(table_4_1):
-    """No detection at all, and a threshold so low that noise always crosses."""
-    shots = _surfaces(table_4_1, [9000.0], [12.0], tnr=3.0, power=1e-3)
-    got = _drawn(shots, _certain(groups(shots), 0.0), draws=200)
-    assert (got.flags[..., 0] | UNCONFIRMED == FALSE_ALARM | UNCONFIRMED).all()
-    assert (got.flags[..., 0] & UNCONFIRMED > 0).mean() > 0.9
-    assert np.isnan(got.pd[..., 0]).all()
-    assert (got.snr[..., 0] >= shots.threshold[0] ** 2 / shots.bin_deviation[0] ** 2 / 2).all()
-    assert (got.group == -1).all()
-
-
 def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 400.3], [12.0, 12.0])
     got = _drawn(shots)

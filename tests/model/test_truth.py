@@ -103,13 +103,13 @@ def velocity_for(frequency, *, sign, parameters):
     return (frequency + range_beat) / (carrier - range_beat) * speed_of_light / 2
 
 
-@pytest.mark.parametrize("window", ["rectangular", "hann", "hamming", "flattop", "chebwin(80)"])
+@pytest.mark.parametrize("window", ["rectangular", "hamming", "chebwin(80)"])
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 @pytest.mark.parametrize("fft_size", [1024, 625])
 def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
     window, phases, fft_size, table_4_1
 ):
-    for beamlets, grazing_angle in ((1, np.pi / 2), (19, np.pi / 2), (109, 1.0)):
+    for beamlets, grazing_angle in ((1, np.pi / 2), (109, 1.0)):
         scene = table_4_1(
             window=window, phases=phases, fft_size=fft_size, beamlets=beamlets, range=3210.0,
             grazing_angle=grazing_angle,

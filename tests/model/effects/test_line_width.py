@@ -71,21 +71,6 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
     assert np.abs(found - expected).max() < 10 * line_width.TOLERANCE * top
 
 
-def test_shifts_of_many_points_are_those_of_each():
-    fwhm = np.array([0.0, 3.0, 20.0]) / DURATION
-    together = line_width.gaussian_shifts(fwhm=fwhm, duration=DURATION)
-    assert (together.weight >= 0).all()
-    np.testing.assert_allclose(together.weight.sum(axis=1), 1)
-    variance = (together.weight * together.offset**2).sum(axis=1)
-    np.testing.assert_allclose(variance, np.array([0.0, 9.0, 400.0]) / (8 * np.log(2)), rtol=1e-9)
-    assert (together.weight[0] > 0).sum() == 1  # no width, one shift
-    for i, width in enumerate(fwhm):
-        alone = line_width.gaussian_shifts(fwhm=fwhm[[i]], duration=DURATION)
-        for one, other in zip(alone, together, strict=True):
-            kept = alone.weight[0] > 0, together.weight[i] > 0
-            assert one[0, kept[0]].tobytes() == other[i, kept[1]].tobytes(), width
-
-
 def wiener_records(rng, number, laser_width, delay):
     """Beats of a laser whose phase walks randomly, with itself ``delay`` samples before."""
     steps = rng.standard_normal((number, LENGTH + delay)) * np.sqrt(2 * np.pi * laser_width / RATE)

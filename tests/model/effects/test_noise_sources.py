@@ -79,11 +79,3 @@ def test_a_milliampere_has_as_much_of_it_as_shot_noise_at_minus_155_decibels():
         **LASER | {"relative_intensity_noise": level, "local_oscillator_power": 1e-3 / 1.1}
     )
     assert seen == pytest.approx(2 * ELECTRON * 1e-3 * 400e6, rel=2e-3)
-
-
-def test_it_outgrows_shot_noise_with_power_and_direct_detection_has_none():
-    one, two = (current_variance(**LASER | {"local_oscillator_power": p}) for p in (1e-3, 2e-3))
-    assert two == pytest.approx(4 * one, rel=1e-14)
-    assert current_variance(**LASER | {"local_oscillator_power": 0.0}) == 0.0
-    balanced = current_variance(**LASER | {"common_mode_rejection": 10**2.5})
-    assert 10 * np.log10(one / balanced) == pytest.approx(25.0, rel=1e-12)
