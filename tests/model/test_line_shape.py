@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from engine import shape_of
 
-from sweep.model.line_shape import has_modes
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.segments import tangents
 from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
@@ -70,15 +69,6 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
         form = shape[1]
         envelope = form[1, np.searchsorted(form[0], abs(away), "right").clip(1) - 1]
         assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * whole ** (1 / (1 + power))).all()
-
-
-@pytest.mark.parametrize("name", COSINE_SUMS)
-def test_few_modes_serve_small_phase_errors_and_tables_of_all_bins_the_large(name):
-    shape = window(name, 4096)
-    numbers = [shape_of(shape, 4096, phase=partial(wandering, d))[4] for d in (0, 0.1, 3, 20, 900)]
-    assert numbers[0] == 1 and numbers[-1] == 0
-    assert numbers[:4] == sorted(numbers[:4]) and numbers[1] < 24 < numbers[3]
-    assert not has_modes(window(name, 512), 512) and not has_modes(shape, 65536)
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hann", "flattop", "kaiser(8)"])

@@ -101,6 +101,7 @@ def test_shot_limited_snr_is_linear_in_light_and_ignores_the_local_oscillator(sh
     for path, factor, expected in (
         ("instrument.laser.power", 2.0, 2.0),
         ("instrument.telescope.aperture", 2.0, 4.0),
+        ("instrument.telescope.optical_efficiency", 0.3, 0.3),
         ("target.range", 2.0, 1 / 4),
         ("instrument.receiver.mixing_efficiency", 0.5, 0.5),
         ("instrument.receiver.excess_noise_factor", 3.0, 1 / 3),

@@ -221,7 +221,7 @@ def surfaces(number, **parameters):
     return np.stack([fractal(np.random.default_rng(seed), **parameters) for seed in range(number)])
 
 
-@pytest.mark.parametrize("hurst", [0.2, 0.5, 0.75, 0.8, 0.95])
+@pytest.mark.parametrize("hurst", [0.2, 0.75, 0.95])
 def test_differences_of_height_follow_the_power_law_at_every_distance_and_direction(hurst):
     """From one step to the grid's diagonal: single pairs of nodes over many surfaces.
 
