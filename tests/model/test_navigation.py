@@ -122,31 +122,6 @@ def test_beams_in_a_plane_leave_the_velocity_across_undetermined():
     assert found.status == UNDETERMINED and np.isnan(found.value).all()
 
 
-def test_directions_of_a_cycle_serve_all_its_draws():
-    rng = np.random.default_rng(5)
-    turns = Rotation.from_rotvec(rng.normal(0, 0.1, (3, 3))).as_matrix()
-    directions = FOUR @ turns.swapaxes(1, 2)
-    measured = (directions @ MOVING)[:, None, :] + rng.normal(0, 0.1, (3, 5, 4))
-    measured[rng.random((3, 5, 4)) >= 0.8] = np.nan
-    error = rng.uniform(0.01, 0.1, (3, 1, 4))
-    together = velocity(
-        direction=directions[:, None],
-        radial_velocity=measured,
-        standard_error=error,
-        level=0.5,
-    )
-    assert together.value.shape == (3, 5, 3) and together.used.shape == (3, 5, 4)
-    for i, j in np.ndindex(3, 5):
-        alone = velocity(
-            direction=directions[i],
-            radial_velocity=measured[i, j],
-            standard_error=error[i, 0],
-            level=0.5,
-        )
-        for name, value in alone._asdict().items():
-            np.testing.assert_array_equal(getattr(together, name)[i, j], value, err_msg=name)
-
-
 # ---- one false beam ----
 
 LEVEL = 0.02

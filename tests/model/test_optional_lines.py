@@ -13,7 +13,6 @@ from sweep.model import philox, returns, segments, truth
 from sweep.model.effects.catalogue import CORE
 from sweep.model.effects.line_width import DEVIATION_OF_FWHM
 from sweep.model.groups import groups
-from sweep.model.preparation import PhaseError
 from sweep.model.sampling import simulate
 from sweep.model.segments import POINTS
 from sweep.model.shot import evaluate, find, prepare
@@ -285,22 +284,6 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
 
 
 # What is not there, and company
-
-
-@pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("window", ["hamming", "kaiser(8.6)"])
-def test_no_drift_and_no_width_are_what_is_without_them(window, phases, table_4_1):
-    shots = prepared(scene(table_4_1, window=window, phases=phases, leakage_floor=1e-12))
-    none = PhaseError(lambda x, sign, rate: np.outer(rate, x), {"rate": np.zeros(1)})
-    for still in (
-        replace(shots, phase_errors=(none,)),
-        replace(shots, gaussian_width=np.zeros(1)),
-        replace(shots, phase_errors=(none, none), gaussian_width=np.zeros(1)),
-    ):
-        a, b = find(shots), find(still)
-        np.testing.assert_allclose(a[:, MAGNITUDE], b[:, MAGNITUDE], rtol=1e-10)
-        np.testing.assert_allclose(a[:, LEAKAGE], b[:, LEAKAGE], rtol=2e-6, atol=1e-20)
-        np.testing.assert_array_equal(a[:, FREQUENCY], b[:, FREQUENCY])
 
 
 @pytest.mark.parametrize("phases", PHASES)

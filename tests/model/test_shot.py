@@ -61,7 +61,7 @@ def test_points_together_are_the_same_bits_as_point_by_point(table_4_1):
     assert same_bits(together, apart) == set()
 
 
-@pytest.mark.parametrize("number", [2, 3, 9, 33])
+@pytest.mark.parametrize("number", [2, 33])
 def test_it_does_not_matter_which_parameters_come_as_arrays(number, table_4_1):
     scenes = mixed_points(24, seed=1)
     for i in range(24):

@@ -46,16 +46,6 @@ def test_sum_and_energy_are_those_of_the_samples(name, length):
     assert shape.length == length
 
 
-@pytest.mark.parametrize("name", [*COSINE_SUMS, *OTHERS])
-@pytest.mark.parametrize("length", [64, 65])
-def test_windows_are_periodic_and_peak_at_the_middle(name, length):
-    """DFT-even: symmetric about sample L/2, the first sample without a partner."""
-    w = samples(name, length)
-    assert np.allclose(w[1:], w[:0:-1], rtol=0, atol=1e-12)
-    assert w[length // 2] == pytest.approx(w.max(), abs=1e-12)
-    assert w.max() == pytest.approx(1.0, abs=1 / length)
-
-
 @pytest.mark.parametrize(
     "name, same",
     [("hanning", "hann"), (" Boxcar", "rectangular"), ("rect", "rectangular"),
