@@ -6,7 +6,6 @@ Places, phases and far sidelobes in many digits are cases of `tests/stability`.
 import numpy as np
 import pytest
 from engine import shape_of
-from scipy.constants import c as speed_of_light
 
 from sweep.model.lines import (
     AMPLITUDE_TOLERANCES,
@@ -22,7 +21,7 @@ from sweep.model.lines import (
 )
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.segments import tangents
-from sweep.model.shot import CORE, prepare
+from sweep.model.shot import prepare
 from sweep.model.spectrum import A_IM, A_RE, MOST_CELLS, OUT, ROOM
 from sweep.model.spectrum import magnitudes as magnitudes_of
 from sweep.model.window import COSINE_SUMS, samples, window
@@ -95,16 +94,6 @@ def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
             )
             fast = magnitudes(name, sizes, origin, delta, weights, power=True)
             assert np.abs(fast**2 - exact).max() < accuracy * unit**2
-
-
-def test_any_run_of_bins_is_that_part_of_all_of_them():
-    delta, weights = bundle(np.random.default_rng(42), 7, 2.0)
-    for name in ("hann", "kaiser(8.6)"):
-        for sizes in ((512, 512), (500, 333)):
-            whole = magnitudes(name, sizes, 100, delta, weights)
-            for low, high in ((0, 0), (95, 105), (99, 99), (250, 250), (3, 200)):
-                part = magnitudes(name, sizes, 100, delta, weights, low=low, high=high)
-                assert part == pytest.approx(whole[low : high + 1], rel=1e-13)
 
 
 # Few lines for many
@@ -200,15 +189,3 @@ def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
                 # Line and image are each below the level.
                 both = np.sqrt(2) if phases == "incoherent" else 2.0
                 assert left_out.size == 0 or left_out.max() < both * level
-
-
-@pytest.mark.parametrize("delta", [0.02, 0.3, 0.48, 0.52])
-def test_without_images_a_beat_beside_dc_shows_alike_in_either_chirp(table_4_1, delta):
-    """Range beats of resting targets are each other's negatives; |X| is that of the positive."""
-    p = table_4_1(beamlets=1, radial_velocity=0.0)
-    rate = p["instrument.chirp.bandwidth"] / p["instrument.chirp.duration"]
-    width = p["instrument.processing.sample_rate"] / p["instrument.processing.fft_size"]
-    p["target.range"] = delta * width / rate * speed_of_light / 2
-    ((_, shots),) = prepare(p, set(CORE) - {"image"})
-    up, down = (segment_spectrum(shots, 0, segment)[1] for segment in (0, 2))
-    np.testing.assert_allclose(up[:40], down[:40], rtol=1e-6)
