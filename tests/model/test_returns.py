@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from engine import DRAWS, prepared, within_5_sigma
+from engine import DRAWS, keys, prepared, within_5_sigma
 from scipy import ndimage, stats
 
-from sweep.model import philox, truth, waveform
+from sweep.model import truth, waveform
 from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
 from sweep.model.groups import groups
@@ -56,17 +56,13 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     )
 
 
-def _keys(n=1, seed=5):
-    return philox.point_keys(np.arange(float(n))[:, None], domain="returns", seed=seed)
-
-
 def _certain(found, sure=1.0):
     return found._replace(pd=np.where(np.isnan(found.pd), np.nan, sure))
 
 
 def _drawn(shots, found=None, **keywords):
     found = groups(shots) if found is None else found
-    return draw_returns(shots, found, keys=_keys(shots.range.size), **keywords)
+    return draw_returns(shots, found, keys=keys(shots.range.size), **keywords)
 
 
 # Groups
@@ -167,7 +163,7 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
     parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
     shots = prepared(parameters)
     counts = simulate(
-        parameters, CORE, keys=_keys(4), first_draw=3, batch_sizes=[2000], method=method
+        parameters, CORE, keys=keys(4), first_draw=3, batch_sizes=[2000], method=method
     )
     got = _drawn(shots, first_draw=3, draws=2000, method=method)
     both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
@@ -254,7 +250,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     )  # fmt: skip
     seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
-    (key,) = _keys()
+    (key,) = keys(1)
 
     def drawn(number):
         address = key[0], key[1], number

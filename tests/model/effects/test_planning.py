@@ -196,15 +196,6 @@ def test_effects_come_after_those_they_are_within():
         assert not effect.within or names.index(effect.within) < names.index(effect.name)
 
 
-def test_a_point_s_plan_does_not_depend_on_its_neighbours(table_4_1):
-    parameters = scene(table_4_1, 24, 3, fft_size=4096)
-    whole, some = planned(points_of(parameters), {}, 1e-3), slice(5, 17)
-    part = {path: v[some] if np.ndim(v) else v for path, v in parameters.items()}
-    alone = planned(points_of(part), {}, 1e-3)
-    assert np.array_equal(whole.kept[:, some], alone.kept)
-    assert np.array_equal(whole.change[:, some], alone.change)
-
-
 @given(st.integers(0, 2**32), st.lists(st.floats(-8, -1), min_size=2, max_size=5))
 def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, exponents):
     rng = np.random.default_rng(seed)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from engine import keys
 from scipy import special, stats
 from scipy.integrate import quad
 
-from sweep.model import philox
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.scintillation import (
@@ -123,10 +123,6 @@ def draws_of(law, legs, points, draws, first=0):
     return factors(
         law, spread, Realisation(np.repeat(keys(points), draws, axis=0), number)
     ).reshape(points, draws)
-
-
-def keys(number):
-    return philox.point_keys(np.arange(number, dtype=float)[:, None], domain="twinkle", seed=3)
 
 
 LEGS = (leg(0.2, 0.3), leg(0.05, 0.1))
