@@ -520,7 +520,7 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
     (here / "long.yaml").write_text(STUDY.replace("number: 40", "number: 4000"))
     command = [sys.executable, "-c", "from sweep.cli import main; main()"]
     long = subprocess.Popen(
-        [*command, "run", "long.yaml", "--workers", "2"],
+        [*command, "run", "long.yaml", "--workers", "1"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

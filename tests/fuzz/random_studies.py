@@ -34,7 +34,6 @@ CHEAP: dict[str, Any] = {
 
 PARTS = Parts(CHEAP, {}, {"Footprint.beamlets"})
 SECTIONS = tuple(name for name in Spec.model_fields if name not in ("axes", "figures"))
-MOST_POINTS = 40
 
 
 @cache

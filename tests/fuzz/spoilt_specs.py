@@ -8,10 +8,8 @@ from typing import Any, NamedTuple
 import yaml
 from hypothesis import strategies as st
 
-from sweep.spec import SceneSpec, Spec
 from sweep.spec.fields import parameter_rules
-from sweep.spec.parts import all_parts, rule_of, written_name
-from sweep.spec.rules import Choice, Numeric
+from sweep.spec.rules import Numeric
 
 
 class Spoilt(NamedTuple):
@@ -86,12 +84,6 @@ NUMERIC = {
     tail for path, rule in parameter_rules().items() if isinstance(rule, Numeric)
     for tail in [path.rsplit(".", 1)[-1]] if rule.si_unit
 }  # fmt: skip
-WORDS = {
-    written_name(name, field)
-    for model in all_parts(Spec, SceneSpec)
-    for name, field in model.model_fields.items()
-    if isinstance(rule_of(field), Choice)
-}
 
 
 @st.composite

@@ -42,8 +42,9 @@ def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
     judge(file)
 
 
-def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
-    @settings(FEW, max_examples=25)
+@pytest.mark.parametrize("number", [8, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder, number):
+    @settings(FEW, max_examples=number)
     @given(written=flights(folder))
     def holds(written):
         (folder / "now.yaml").write_text(dumped(written), encoding="utf-8")

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from engine import keys
 
-from sweep.model import philox
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
 from sweep.model.realisations import realise
@@ -26,10 +26,6 @@ def _points(table_4_1, tnr):
     }
 
 
-def _keys(n, seed=7):
-    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
-
-
 def _within_5_sigma(counts, probability):
     sigma = np.sqrt(DRAWS * probability * (1 - probability))
     return np.abs(counts - DRAWS * probability) <= 5 * sigma + 1e-9 * DRAWS
@@ -40,7 +36,7 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
     parameters = _points(table_4_1, tnr=7.0)
     outputs = evaluate(parameters)
     assert ((outputs["pd_up"] > 0.02) & (outputs["pd_up"] < 0.98)).sum() >= 2
-    counts = simulate(parameters, CORE, keys=_keys(6), batch_sizes=[DRAWS], method=method)
+    counts = simulate(parameters, CORE, keys=keys(6), batch_sizes=[DRAWS], method=method)
     for segment in ("up", "down", "doppler", "shot"):
         found = counts[f"n_detected_{segment}"][:, 0]
         assert _within_5_sigma(found, outputs[f"pd_{segment}"]).all(), segment
@@ -55,19 +51,12 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         "target.range": np.array([20.0]),
     }
     for method in ("probabilities", "noise"):
-        counts = simulate(parameters, CORE, keys=_keys(1), batch_sizes=[50], method=method)
+        counts = simulate(parameters, CORE, keys=keys(1), batch_sizes=[50], method=method)
         assert counts["n_detected_doppler"].sum() == 0
         assert counts["n_detected_up"].sum() == 50
 
 
-RANDOM = {
-    "nothing": (),
-    "speckle": ("speckle",),
-    "scintillation": ("scintillation",),
-    "jitter": ("pointing_jitter",),
-    "all three": ("speckle", "scintillation", "pointing_jitter"),
-    "all three on a pedestal": ("speckle", "scintillation", "pointing_jitter", "line_width"),
-}
+RANDOM = ("speckle", "scintillation", "pointing_jitter")
 UNSTEADY = {
     "target.roughness": 1e-5,
     "target.pointing_jitter": 1e-5,
@@ -79,15 +68,7 @@ UNSTEADY = {
 
 
 @pytest.mark.parametrize(
-    "method, effects",
-    [
-        pytest.param(method, effects, id=f"{method}, {name}", marks=[pytest.mark.slow] * more)
-        for number, (name, effects) in enumerate(RANDOM.items())
-        for method, more in (
-            ("probabilities", number % 2 == 1 or name == "scintillation"),
-            ("noise", number % 2 == 0 or name == "jitter"),
-        )
-    ],
+    "method, effects", [("probabilities", RANDOM), ("noise", (*RANDOM, "line_width"))]
 )
 def test_counts_over_random_effects_have_the_means_over_their_draws(effects, method, table_4_1):
     """A draw's Bernoulli variance is p (1 - p) of its own p: 5 sigma of their sum.
@@ -103,10 +84,10 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         "footprint.beamlets": 7,
     }
     chosen, draws = (*CORE, *effects), 8000
-    found = simulate(parameters, chosen, keys=_keys(6), batch_sizes=[5000, 3000], method=method)
+    found = simulate(parameters, chosen, keys=keys(6), batch_sizes=[5000, 3000], method=method)
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
     table = {name: np.empty((6, draws)) for name in names}
-    for point, number, shots in realise(parameters, chosen, keys=_keys(6), draws=draws):
+    for point, number, shots in realise(parameters, chosen, keys=keys(6), draws=draws):
         outputs = statistics(shots)
         quiet = (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
         for name, values in (outputs | {"alarm": 1 - quiet}).items():
@@ -123,13 +104,13 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
-@pytest.mark.parametrize("random", ["nothing", "all three"])
+@pytest.mark.parametrize("random", [(), RANDOM])
 def test_batches_split_the_same_draws(method, random, table_4_1):
     parameters = _points(table_4_1, tnr=6.0) | UNSTEADY
     parameters |= {"instrument.processing.fft_size": 4096, "instrument.laser.power": 1.5}
     parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
-    arguments = {"keys": _keys(6), "method": method}
-    effects = (*CORE, *RANDOM[random])
+    arguments = {"keys": keys(6), "method": method}
+    effects = (*CORE, *random)
     whole = simulate(parameters, effects, batch_sizes=[300], **arguments)
     parts = simulate(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
     later = simulate(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)
@@ -142,4 +123,4 @@ def test_batches_split_the_same_draws(method, random, table_4_1):
 
 def test_an_unknown_method_is_refused(table_4_1):
     with pytest.raises(ValueError, match="probabilities, noise"):
-        simulate(table_4_1(), CORE, keys=_keys(1), batch_sizes=[1], method="guess")
+        simulate(table_4_1(), CORE, keys=keys(1), batch_sizes=[1], method="guess")

@@ -20,14 +20,6 @@ def test_any_number_of_beamlets_keeps_power_and_pointing_and_size(pattern):
             assert np.abs(covariance - np.eye(2)).max() < 1e-13, number
 
 
-@pytest.mark.parametrize("pattern", ["hexagonal", "sunflower"])
-def test_no_two_beamlets_are_the_same(pattern):
-    for number in (2, 3, 19, 109, 400):
-        offsets, _ = beamlets(number, pattern)
-        apart = np.hypot(*(offsets[:, :, None] - offsets[:, None, :]))
-        assert (apart + np.eye(number) * 9).min() > 0.15
-
-
 def test_one_beamlet_is_the_beams_axis_and_two_lie_along_the_slope():
     offsets, weights = beamlets(1)
     assert np.array_equal(offsets, [[0.0], [0.0]]) and np.array_equal(weights, [1.0])

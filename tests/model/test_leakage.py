@@ -6,7 +6,6 @@ import mpmath
 import numpy as np
 import pytest
 from engine import difference, run_of_bins, shape_of
-from scipy.stats import ncx2
 
 from sweep.model import truth
 from sweep.model.crossings import (
@@ -18,12 +17,11 @@ from sweep.model.crossings import (
 )
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
-from sweep.model.leakage import _all_beyond, _at_most
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.segments import spectrum
 from sweep.model.shot import find, prepare, prepare_cast
-from sweep.model.spectrum import OUT, ROOM, SOURCE_DIGITS, take_sources, weight_afar
-from sweep.model.window import COSINE_SUMS, samples, transform, window
+from sweep.model.spectrum import ROOM, SOURCE_DIGITS, take_sources, weight_afar
+from sweep.model.window import COSINE_SUMS, transform, window
 
 PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
 
@@ -58,26 +56,6 @@ def held(shots):
     assert error[MAGNITUDE] < 1e-9 and error[PD] < 1e-7
     assert error[FREQUENCY] == 0 and error[EXEMPTED] == 0
     return slow[:, LEAKAGE]
-
-
-@pytest.mark.parametrize("name", CLOSED_FORMS)
-@pytest.mark.parametrize("nearest,most", [(0.05, 4.0), (0.7, 12.0)])
-def test_what_a_tone_leaks_far_from_it_is_bounded_and_not_by_much_more(name, nearest, most):
-    """Against each bin of the window's own FFT, from 200 bins on, wherever the tone."""
-    size, first, level = 4096, 200.0, np.sqrt(20.0)
-    shape, n = window(name, size), np.arange(size)
-    _, form, _, _, _ = shape_of(shape, size)
-    envelope = form[1, np.searchsorted(form[0], first, "right") - 1]
-    weight = nearest / envelope
-    alarm, leaked = np.exp(-(level**2) / 2), []
-    for offset in (0.25, 0.5):
-        tone = np.exp(2j * np.pi * offset * n / size)
-        magnitude = np.abs(np.fft.fft(samples(name, size) * tone))
-        away = np.minimum(np.abs(n - offset), np.abs(n - offset - size))
-        a = weight * magnitude[away >= first]
-        leaked.append(((ncx2.sf(level**2, 2, a**2) - alarm) / (1 - alarm)).sum())
-    bound = _all_beyond(weight, first, np.inf, (1.0, level, 0.0), form)
-    assert max(leaked) <= bound <= most * max(leaked)
 
 
 def strengths_without_moments(places, degree, generator):
@@ -135,26 +113,6 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
     np.testing.assert_allclose(some[:, others], whole[:, others], rtol=1e-9, atol=1e-300)
     assert (missed > 0).any()
-
-
-@pytest.mark.parametrize("beta", [2.1, 4.0, 6.55, 12.0, 25.0])
-def test_what_bins_of_a_run_add_at_most_is_more_than_they_add(beta):
-    generator = np.random.default_rng(14)
-    series, chance = np.empty(MOST_TERMS), np.empty(64)
-    crossing_series(beta, series)
-    room, some = np.zeros((ROOM, 64)), 0
-    for _ in range(500):
-        count = int(generator.integers(1, 40))
-        a = beta * generator.uniform(0.0, 1.0) * generator.uniform(0.0, 1.0, count) ** 3
-        exempt = generator.uniform(size=count) < 0.2
-        room[OUT, :count] = 0.3 * a
-        most = _at_most(count, (0.3, 0.3 * beta, 0.0), exempt, room)
-        x = np.zeros(64)
-        x[:count] = np.where(exempt, 0.0, 0.5 * a**2)
-        added_crossings(x, count, beta, series, chance)
-        assert chance[:count].sum() <= most
-        some += most < np.inf
-    assert some > 100
 
 
 @pytest.mark.parametrize("phases", ["coherent", pytest.param("incoherent", marks=pytest.mark.slow)])

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from engine import shape_of
 
-from sweep.model.line_shape import has_modes
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.segments import tangents, tones
+from sweep.model.segments import tangents
 from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
 from sweep.model.window import COSINE_SUMS, samples, window
 
@@ -70,25 +69,6 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
         form = shape[1]
         envelope = form[1, np.searchsorted(form[0], abs(away), "right").clip(1) - 1]
         assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * whole ** (1 / (1 + power))).all()
-
-
-@pytest.mark.parametrize("name", COSINE_SUMS)
-def test_few_modes_serve_small_phase_errors_and_tables_of_all_bins_the_large(name):
-    shape = window(name, 4096)
-    numbers = [shape_of(shape, 4096, phase=partial(wandering, d))[4] for d in (0, 0.1, 3, 20, 900)]
-    assert numbers[0] == 1 and numbers[-1] == 0
-    assert numbers[:4] == sorted(numbers[:4]) and numbers[1] < 24 < numbers[3]
-    assert not has_modes(window(name, 512), 512) and not has_modes(shape, 65536)
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_tones_are_the_transform_of_the_window(name):
-    for fft_size, length in ((4096, 4096), (700, 512)):
-        place = np.array([0.0, 0.25, -0.5, 0.999])
-        found = tones(window(name, length), fft_size, place, -40, 81)
-        y = np.arange(-40, 41)[:, None] - place
-        exact = abs(transform(name, (fft_size, length), np.zeros_like, y.ravel())).reshape(y.shape)
-        assert abs(found - exact).max() < ACCURACY * exact.max()
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hann", "flattop", "kaiser(8)"])

@@ -42,24 +42,6 @@ def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, pha
     assert changed > 100
 
 
-def test_points_stay_their_own_whatever_the_tolerance_of_lines(table_4_1):
-    rng = np.random.default_rng(9)
-    parameters = DEFAULTS | table_4_1(
-        phases="coherent", fft_size=2**12, range=10 ** rng.uniform(0.5, 4, 8), power=1e-2,
-        grazing_angle=np.radians(rng.uniform(2, 90, 8)), radial_velocity=150.0,
-    )  # fmt: skip
-
-    def found(part):
-        some = {path: v[part] if np.ndim(v) else v for path, v in parameters.items()}
-        ((_, shots),) = prepare(some, (*CORE, "range_walk"))
-        return find(replace(shots, line_tolerance=np.asarray(1e-2)))
-
-    whole = found(slice(None))
-    assert np.isfinite(whole[:, PD]).all()
-    for part in (slice(0, 3), slice(3, None)):
-        np.testing.assert_array_equal(found(part), whole[..., part])
-
-
 def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
     parameters = DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
     given = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}

@@ -65,47 +65,6 @@ def _agrees(reported, target):
 # One triple
 
 
-def _resolved_plainly(up, doppler, down, *, carrier, bandwidth, duration, width):
-    """Range and velocity by whichever of the sixteen readings predicts the Doppler peak best."""
-    penalty = waveform.FOLD_PENALTY * width
-    at_start = carrier / (carrier + bandwidth / 2)
-    least = np.full(up.shape, np.inf)
-    f_d, f_r = np.zeros((2, *up.shape))
-    for folds in itertools.product((0, 1), repeat=3):
-        u, p, d = (FS - x if f else x for x, f in zip((up, doppler, down), folds, strict=True))
-        half_sum, half_difference = (u + d) / 2, np.abs(d - u) / 2
-        for shift, beat in ((half_sum, half_difference), (half_difference, half_sum)):
-            cost = np.abs(shift * at_start - p) + sum(folds) * penalty
-            better = cost < least
-            least = np.where(better, cost, least)
-            f_d = np.where(better, np.where(d >= u, shift, -shift), f_d)
-            f_r = np.where(better, beat, f_r)
-    beta = f_d / (carrier + bandwidth / 2)
-    delay = (f_r - bandwidth * beta / 2) / (bandwidth / duration * (1 + beta))
-    return 299792458.0 * delay / 2, 299792458.0 * beta / 2
-
-
-@pytest.mark.parametrize("width", [WIDTH, 1e-3 * WIDTH])
-def test_one_triple_is_resolved_as_by_plain_arrays_to_the_last_bit(width):
-    """Targets of all signs and folds, and peaks anywhere; narrow bins make folds cheap.
-
-    The other seven readings are mirror images of these and never better.
-    """
-    generator = np.random.default_rng(1)
-    targets = np.stack([generator.uniform(0, 12e3, 4000), generator.uniform(-240, 240, 4000)])
-    physical = np.array(_beats(*targets)) * WIDTH
-    peaks = np.concatenate([physical, generator.uniform(0, FS / 2, (3, 4000))], axis=1)
-    resolved = waveform.resolve(
-        up=peaks[0], doppler=peaks[1], down=peaks[2], sample_rate=np.array(FS),
-        bin_width=np.array(width), **{k: np.array(v) for k, v in OPTICS.items()},
-    )  # fmt: skip
-    np.testing.assert_array_equal(resolved, _resolved_plainly(*peaks, **OPTICS, width=width))
-    bins = peaks.T / FS * N
-    assert len({_confirmed(*p, np.inf)[0] for p in bins}) >= 6
-    assert (np.sign(resolved.radial_velocity) == 1).any()
-    assert (np.sign(resolved.radial_velocity) == -1).any()
-
-
 def test_a_tolerance_takes_the_cheapest_reading_among_those_within_it():
     up, doppler, down = _beats(9000.0, 170.0)  # the down beat lies past Nyquist
     up, doppler, down = float(up), float(doppler), float(down)

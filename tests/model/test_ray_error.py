@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from small_scenes import flight, instrument, observed, plate
 
-from sweep.model import philox, window
+from sweep.model import philox
 from sweep.model.accuracy import Accuracy
 from sweep.model.clouds import cloud
-from sweep.model.eyepoints import prepare_eyepoints, seen_ground
 from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
-from sweep.model.groups import groups
-from sweep.model.ray_error import folded, ray_error
+from sweep.model.ray_error import folded
 from sweep.model.resolution import more_rays, rays_needed
 from sweep.scenes.meshes import clean
 
@@ -118,60 +116,6 @@ def test_numbers_are_whole_shells(number):
 
 
 # What they leave
-
-
-def _by_hand(seen, parameters, number):
-    """The formula of the module in numpy: windows by their samples, pairs by their distances."""
-    _, ground = seen_ground(seen, parameters, SURFACES)
-    shots = prepare_eyepoints(seen, parameters, SURFACES, ["footprint"])
-    found = groups(shots)
-    (x, y), weight = beamlets(number)
-    apart = np.hypot(x[:, None] - x, y[:, None] - y)
-    near = np.argwhere(np.triu(apart < 1.3 * apart[0, 1:].min(), 1))
-    degrees = (0, 2, 4)[: 2 if number < 37 else 3]
-    fit = np.stack([x ** (d - i) * y**i for d in degrees
-                    for i in range(d + 1)], axis=1)  # fmt: skip
-    taken = (number + 1) / (number + 1 - 2 * fit.shape[1])
-    opposite = np.hypot(x[:, None] + x, y[:, None] + y).argmin(axis=1)
-    rate, fs, window_length = shots.chirp_rate, float(shots.sample_rate[0]), shots.window.length
-    errors, of_magnitude = np.zeros((2, seen.time.size))
-    for i in range(errors.size):
-        for s in (2, 0):
-            metres = seen.range[i] * ground.beamlets.offset[i]
-            beat = 2 / 299792458.0 * rate * (seen.range[i] + metres)
-            where = (beat - found.bin[i, s, 0] * fs / shots.fft_size) * window_length / fs
-            lobe = np.abs(window.transform(shots.window, where)) ** 2
-            g = ground.beamlets.echo[i] * lobe
-            g = (g + g[opposite]) / (2 * weight * g.sum())
-            root = np.sqrt(weight)
-            g = g - fit @ np.linalg.lstsq(fit * root[:, None], g * root, rcond=None)[0]
-            a, b = found.magnitude[i, s, 0], shots.threshold[i]
-            a, b = a / shots.line_deviation[i], b / shots.line_deviation[i]
-            apart = g[near[:, 0]] - g[near[:, 1]]
-            relative = np.sqrt((np.prod(weight[near], axis=1) * apart**2).sum() * taken)
-            away = max(abs(a - b) - relative * a / 2, 0.0)
-            errors[i] += relative / 2 * np.sqrt(a * b / (2 * np.pi)) * np.exp(-(away**2) / 2)
-        of_magnitude[i] = relative / 2 * min(a, 1)  # of the up-chirp, the last
-    return np.maximum(errors, of_magnitude)
-
-
-@pytest.mark.parametrize("number", [19, pytest.param(109, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("power", [6e-5, 0.006, 1.0])
-def test_it_is_what_the_formula_gives(table_4_1, number, power):
-    """Up and down alone: the still ground's Doppler segment is at 0 Hz, and its pd is 1 or 0.
-
-    Of faint shots and of bright ones, whose pd is decided, it is the magnitude's.
-    """
-    parameters = _parameters(table_4_1, power)
-    seen = _seen("rough ground", number).some(np.arange(0, SHOTS, 40))
-    _, ground = seen_ground(seen, parameters, SURFACES)
-    shots = prepare_eyepoints(seen, parameters, SURFACES, ["footprint"])
-    found = groups(shots)
-    found.bin[:, 1] = -1  # no Doppler segment
-    got = ray_error(shots, ground.beamlets, found.bin[:, :, 0], found.magnitude[:, :, 0])
-    expected = _by_hand(seen, parameters, number)
-    assert expected.max() > 1e-4
-    np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("number", [19, 109, pytest.param(439, marks=pytest.mark.slow)])

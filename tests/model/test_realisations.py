@@ -158,14 +158,6 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
     assert (means["pfa_shot"] == 0).all() == (tnr == 60)
 
 
-def test_direct_detection_has_no_doppler_segment_in_any_draw(table_4_1):
-    parameters = table_4_1(architecture="direct", range=np.array([30.0]), beamlets=7) | AIR
-    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=20)
-    for name in ("pd_doppler", "miss_doppler", "snr_doppler", "pd_doppler_error"):
-        assert np.isnan(means[name]).all()
-    assert np.isfinite(means["pd_up_error"]).all()
-
-
 @pytest.mark.parametrize("law", ["log_normal", "gamma_gamma"])
 @pytest.mark.parametrize("architecture", ["homodyne", "direct"])
 def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, table_4_1):

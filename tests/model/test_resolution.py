@@ -33,8 +33,11 @@ def scenes(table_4_1, seed, **fixed):
     return DEFAULTS | table | {"target.transverse_velocity": across}
 
 
-@pytest.mark.parametrize("window", ["hamming", "rectangular"])
-@pytest.mark.parametrize("law", ["thesis", "lambert"])
+@pytest.mark.parametrize(
+    ("window", "law"),
+    [("hamming", "lambert"), ("rectangular", "thesis"), ("flattop", "lambert"),
+     ("kaiser(8.6)", "thesis"), ("blackman", "thesis")],
+)  # fmt: skip
 def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, window, law):
     parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)
     exact = shot.evaluate(parameters | FINE)

@@ -50,13 +50,6 @@ def same_bits(one, other):
     return {name for name in OUTPUTS if one[name].tobytes() != other[name].tobytes()}
 
 
-def test_every_output_and_no_other_is_there_once_for_each_point(table_4_1):
-    results = shot.evaluate(table_4_1(**mixed_points(23)))
-    assert set(results) == set(OUTPUTS)
-    assert {values.shape for values in results.values()} == {(23,)}
-    assert {values.dtype for values in results.values()} == {np.dtype(float)}
-
-
 def test_points_together_are_the_same_bits_as_point_by_point(table_4_1):
     points = mixed_points(60)
     together = shot.evaluate(table_4_1(**points))
@@ -68,16 +61,7 @@ def test_points_together_are_the_same_bits_as_point_by_point(table_4_1):
     assert same_bits(together, apart) == set()
 
 
-def test_the_order_and_the_company_of_points_change_no_bit(table_4_1):
-    points = mixed_points(60)
-    together = shot.evaluate(table_4_1(**points))
-    for seed in range(3):
-        chosen = np.random.default_rng((31, seed)).permutation(60)[: 60 - 20 * seed]
-        shuffled = shot.evaluate(table_4_1(**{name: v[chosen] for name, v in points.items()}))
-        assert same_bits(shuffled, {name: v[chosen] for name, v in together.items()}) == set()
-
-
-@pytest.mark.parametrize("number", [2, 3, 9, 33])
+@pytest.mark.parametrize("number", [2, 33])
 def test_it_does_not_matter_which_parameters_come_as_arrays(number, table_4_1):
     scenes = mixed_points(24, seed=1)
     for i in range(24):
@@ -88,40 +72,6 @@ def test_it_does_not_matter_which_parameters_come_as_arrays(number, table_4_1):
         repeated = shot.evaluate(arrays)
         for k in range(number):
             assert same_bits({n: v[k : k + 1] for n, v in repeated.items()}, alone) == set()
-
-
-def test_a_window_by_any_spelling_is_the_same_window(table_4_1):
-    names = np.array(["hann", "hanning", "Hann", " HANN "])
-    results = shot.evaluate(table_4_1(window=names, fft_size=1024, beamlets=7))
-    for name, values in results.items():
-        assert np.unique(values).size == 1, name
-
-
-def test_probabilities_lie_in_their_range_and_misses_complement_them(table_4_1):
-    results = shot.evaluate(table_4_1(**mixed_points(200, seed=2)))
-    direct = np.isnan(results["pd_doppler"])
-    assert 0 < direct.sum() < 200
-    for name, values in results.items():
-        kept = values[~direct] if name.endswith("doppler") else values
-        if name.startswith("log10"):  # -inf where the detection occupies every bin
-            assert (kept <= 0).all(), name
-        else:
-            assert np.isfinite(kept).all(), name
-        if name.startswith(("pd_", "miss_", "pfa_", "p_leakage")):
-            assert ((kept >= 0) & (kept <= 1)).all(), name
-    for which in ("up", "down", "shot"):
-        total = results[f"pd_{which}"] + results[f"miss_{which}"]
-        assert np.abs(total - 1).max() < 1e-15
-    shot_pd = results["pd_up"] * results["pd_down"]
-    assert np.abs(results["pd_shot"] - shot_pd).max() < 1e-15
-
-
-def test_direct_detection_has_no_doppler_segment_and_only_it(table_4_1):
-    points = mixed_points(40, seed=3)
-    results = shot.evaluate(table_4_1(**points))
-    direct = points["architecture"] == "direct"
-    for name in ("pd_doppler", "miss_doppler", "snr_doppler"):
-        assert np.array_equal(np.isnan(results[name]), direct)
 
 
 def test_reported_range_and_velocity_err_by_the_rounding_to_bins_and_by_no_bias(table_4_1):
@@ -170,32 +120,3 @@ def test_in_phase_coherent_beamlets_raise_the_snr_in_proportion_to_their_number(
         gain = snr_of(table_4_1, beamlets=number, **changes) / one
         expected = 8 / 9 * (1 - np.exp(-9 / 4)) ** 2 / (1 - np.exp(-9 / 2))
         assert gain / number == pytest.approx(expected, rel=0.05)
-
-
-def test_incoherent_beamlets_give_the_snr_of_their_light_whatever_their_number(table_4_1):
-    changes = {"phases": "incoherent", "beam_divergence": 1e-6, "fft_size": 4096}
-    one = snr_of(table_4_1, beamlets=1, **changes)
-    for number in (2, 3, 37, 109, 397):
-        assert snr_of(table_4_1, beamlets=number, **changes) == pytest.approx(one, rel=1e-9)
-
-
-def test_incoherent_spectra_converge_with_the_number_of_beamlets(table_4_1):
-    """Footprint spread over a bin or so: 61 beamlets are within 1 %, and more are nearer still."""
-    scene = {
-        "phases": "incoherent", "range": 500.0, "fft_size": 2**16, "window": "hann",
-        "radial_velocity": 20.0, "grazing_angle": np.radians([30.0, 10.0]),
-    }  # fmt: skip
-    # Spread: 500 m 12.5 urad cot(angle) / 0.69 m a bin = 0.016 and 0.05 bins; 20 times the
-    # divergence makes it 0.31 and 1.03.
-    reference = shot.evaluate(table_4_1(beamlets=2401, beam_divergence=1e-3, **scene))["snr_up"]
-    errors = [
-        np.abs(
-            shot.evaluate(table_4_1(beamlets=n, beam_divergence=1e-3, **scene))["snr_up"]
-            / reference
-            - 1
-        ).max()
-        for n in (7, 19, 61, 217, 817)
-    ]
-    assert errors[2] < 0.01
-    assert errors[-1] < errors[0] / 20
-    assert errors[-1] < 1e-3

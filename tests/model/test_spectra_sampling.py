@@ -212,16 +212,6 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
     assert found == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
 
 
-def test_direct_detection_has_no_doppler_segment(table_4_1):
-    changes = {
-        "instrument.receiver.architecture": "direct",
-        "target.range": np.array([50.0]),
-        "target.radial_velocity": 0.0,
-    }
-    found = _drawn(_points(table_4_1, **changes), 20, ())
-    assert np.isnan(found["pd_doppler"]) and np.isfinite(found["pd_up"])
-
-
 def test_methods_may_be_ones_own(table_4_1):
     """A detector that flags everything but the signal, and an estimator half a bin too high."""
 

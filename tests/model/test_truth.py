@@ -69,31 +69,6 @@ def test_the_fast_path_is_the_truth_over_the_whole_range_of_every_parameter(batc
         assert disagreement(prepared(table_4_1(**scene))) < AGREEMENT, scene
 
 
-def test_the_drawn_scenes_meet_every_case_of_sign_order_folding_and_padding():
-    scenes = [drawn_scene(number) for number in range(BATCHES * BATCH)]
-    assert len(scenes) >= 200
-    optical = [s for s in scenes if s["architecture"] != "direct"]
-    f_d = np.array([2 * s["radial_velocity"] / s["wavelength"] for s in optical])
-    f_r = np.array(
-        [s["bandwidth"] / s["duration"] * 2 * s["range"] / speed_of_light for s in optical]
-    )
-    nyquist = np.array([s["sample_rate"] / 2 for s in optical])
-    padded = [
-        s["fft_size"] > (s["duration"] - s["acquisition_delay"]) * s["sample_rate"] for s in scenes
-    ]
-    cases = {
-        "closing, Doppler above range beat": (f_d > f_r),
-        "closing, Doppler below range beat": (f_d > 0) & (f_d < f_r),
-        "receding": f_d < 0,
-        "at rest": f_d == 0,
-        "Doppler folded": np.abs(f_d) > nyquist,
-        "down beat folded": (np.abs(f_d) < nyquist) & (f_d + f_r > nyquist),
-        "folded more than once": f_d + f_r > 4 * nyquist,
-        "zero-padded": padded,
-    }
-    assert {case for case, met in cases.items() if np.sum(met) < 8} == set()
-
-
 def velocity_for(frequency, *, sign, parameters):
     """Radial velocity that puts a segment's beat exactly on a frequency."""
     carrier = speed_of_light / parameters["instrument.laser.wavelength"]
@@ -103,13 +78,13 @@ def velocity_for(frequency, *, sign, parameters):
     return (frequency + range_beat) / (carrier - range_beat) * speed_of_light / 2
 
 
-@pytest.mark.parametrize("window", ["rectangular", "hann", "hamming", "flattop", "chebwin(80)"])
+@pytest.mark.parametrize("window", ["rectangular", "hamming", "chebwin(80)"])
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 @pytest.mark.parametrize("fft_size", [1024, 625])
 def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
     window, phases, fft_size, table_4_1
 ):
-    for beamlets, grazing_angle in ((1, np.pi / 2), (19, np.pi / 2), (109, 1.0)):
+    for beamlets, grazing_angle in ((1, np.pi / 2), (109, 1.0)):
         scene = table_4_1(
             window=window, phases=phases, fft_size=fft_size, beamlets=beamlets, range=3210.0,
             grazing_angle=grazing_angle,
@@ -261,18 +236,6 @@ def test_incoherent_truth_is_the_root_mean_square_over_independent_phases(table_
             power += np.abs(np.fft.rfft(weights * turned.real)) ** 2 / 125
         exact = truth.spectrum(shots, 0, segment)
         assert np.abs(np.sqrt(power) - exact).max() < 1e-12 * exact.max()
-
-
-def test_range_walk_smears_the_line_and_keeps_its_energy(table_4_1):
-    """Parseval: the record's energy does not depend on the drift of its frequency."""
-    scene = table_4_1(**ONE_WAY | {"fft_size": 2**16}, radial_velocity=400.0, window="rectangular")
-    shots = prepared(scene)
-    with_walk, without = (
-        truth.spectrum(shots, 0, 0, range_walk=walk) ** 2 for walk in (True, False)
-    )
-    assert with_walk.sum() == pytest.approx(without.sum(), rel=1e-3)
-    # 2 S beta T = 1.17 kHz = 0.13 bins of 9155 Hz: a few per mil of the power leave the peak.
-    assert 1e-3 < 1 - with_walk.max() / without.max() < 0.3
 
 
 @pytest.mark.parametrize("velocity", [-40.0, 0.02, 90.0])

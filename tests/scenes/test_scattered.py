@@ -194,12 +194,6 @@ def test_a_crater_lies_where_it_should_on_a_grid_that_runs_southwards():
     assert np.unravel_index(z.argmin(), z.shape) == (30, 50)
 
 
-def test_the_profile_is_continuous_at_the_rim_and_at_its_end():
-    r = np.array([30 - 1e-9, 30 + 1e-9, 120 - 1e-9, 120 + 1e-9])
-    z = scattered.profile(r, diameter=60.0, freshness=1.0)
-    assert z[0] == pytest.approx(z[1], abs=1e-7) and z[2:] == pytest.approx(0, abs=1e-7)
-
-
 def test_the_volume_dug_is_that_of_a_paraboloid():
     depth, rim = scattered.fresh_depth(60.0), scattered.fresh_rim_height(60.0)
 

@@ -51,20 +51,6 @@ def test_a_grid_becomes_upward_facets_that_tile_its_plan(spacing):
     assert plan_area(vertices, faces) == pytest.approx(4 * 6 * 6.0, rel=1e-12)
 
 
-def test_the_facets_of_a_whole_grid_form_a_disc():
-    vertices, faces = heightfield(hilly(5, 7), spacing=(1.0, 1.0))
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(pairs, axis=1), axis=0)
-    assert len(vertices) - len(edges) + len(faces) == 1  # Euler
-
-
-def test_a_tilted_plane_has_the_area_of_a_tilted_plane():
-    rows, columns = np.mgrid[:9, :4]
-    vertices, faces = heightfield(0.3 * columns * 2.0 - 0.4 * rows, spacing=(2.0, 1.0))
-    stretch = math.sqrt(1 + 0.3**2 + 0.4**2)
-    assert areas(vertices, faces).sum() == pytest.approx(8 * 6 * stretch, rel=1e-12)
-
-
 @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_a_cell_without_one_corner_keeps_the_triangle_of_the_others(corner):
     z = np.zeros((2, 2))
@@ -73,14 +59,6 @@ def test_a_cell_without_one_corner_keeps_the_triangle_of_the_others(corner):
     assert len(faces) == 1 and len(vertices) == 3
     assert normals(vertices, faces)[0, 2] == 1.0
     assert not any((vertices[:, :2] == corner[::-1]).all(axis=1))
-
-
-def test_a_missing_node_takes_half_of_each_of_its_four_cells():
-    z = hilly(5, 5)
-    z[2, 2] = np.nan
-    vertices, faces = heightfield(z, spacing=(1.0, 1.0))
-    assert plan_area(vertices, faces) == pytest.approx(16 - 2)
-    assert np.isfinite(vertices).all() and len(vertices) == 24
 
 
 @given(st.integers(0, 2**32), st.sampled_from([(2.0, 3.0), (2.0, -3.0), (-1.0, 0.5)]))
@@ -221,7 +199,7 @@ def surfaces(number, **parameters):
     return np.stack([fractal(np.random.default_rng(seed), **parameters) for seed in range(number)])
 
 
-@pytest.mark.parametrize("hurst", [0.2, 0.5, 0.75, 0.8, 0.95])
+@pytest.mark.parametrize("hurst", [0.2, 0.75, 0.95])
 def test_differences_of_height_follow_the_power_law_at_every_distance_and_direction(hurst):
     """From one step to the grid's diagonal: single pairs of nodes over many surfaces.
 
@@ -250,13 +228,6 @@ def test_the_embedding_is_a_covariance(hurst, shape):
     assert -power[power < 0].sum() <= 1e-9 * power.sum()
 
 
-def test_opposite_edges_have_nothing_to_do_with_each_other():
-    """On a torus the first and last column would be neighbours."""
-    z = surfaces(300, shape=(8, 64), spacing=(1, 1), hurst=0.8, rms_slope=1.0, baseline=1.0)
-    across = ((z[:, 0, -1] - z[:, 0, 0]) ** 2).mean()
-    assert across > 0.5 * 63**1.6
-
-
 def test_the_same_seed_gives_the_same_ground_and_another_seed_another():
     parameters = {
         "shape": (20, 30), "spacing": (1.0, -1.0), "hurst": 0.7, "rms_slope": 0.1, "baseline": 5.0,
@@ -264,13 +235,6 @@ def test_the_same_seed_gives_the_same_ground_and_another_seed_another():
     once, again, other = (fractal(np.random.default_rng(seed), **parameters) for seed in (1, 1, 2))
     np.testing.assert_array_equal(once, again)
     assert once.shape == (20, 30) and np.abs(once - other).max() > 0.1
-
-
-def test_the_ground_scales_with_its_slope():
-    parameters = {"shape": (9, 9), "spacing": (1.0, 1.0), "hurst": 0.6, "baseline": 2.0}
-    gentle = fractal(np.random.default_rng(3), rms_slope=0.1, **parameters)
-    steep = fractal(np.random.default_rng(3), rms_slope=0.3, **parameters)
-    np.testing.assert_allclose(steep, 3 * gentle, rtol=1e-12)
 
 
 def test_hills_have_the_height_slope_and_correlation_they_were_asked_for():

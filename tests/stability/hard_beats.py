@@ -111,27 +111,6 @@ def ten_kilometres_a_second() -> float:
     )
 
 
-@FAMILY.case("Doppler and range beat equal, closing and receding", **of_the_peak(8e7, 1e-12, 178))
-def equal_beats() -> float:
-    range_beat = 2e12 * 2 * 2000.0 / SPEED_OF_LIGHT
-    return max(
-        departure(
-            shots(radial_velocity=sense * range_beat * 1550e-9 / 2, window=window, fft_size=SIZE)
-        )
-        for sense in (1, -1)
-        for window in WINDOWS
-    )
-
-
-@FAMILY.case("zero velocity: the Doppler line on DC and on its image", **of_the_peak(3e7, 1e-12))
-def at_rest() -> float:
-    return max(
-        departure(shots(radial_velocity=0.0, window=window, fft_size=SIZE, **scene))
-        for window in WINDOWS
-        for scene in ({}, {"acquisition_delay": 1e-5}, {"range": 2000.0000003})
-    )
-
-
 @FAMILY.case("receding faster than the range beat", **of_the_peak(3e8, 1e-12))
 def receding() -> float:
     return max(
@@ -159,38 +138,6 @@ def between_bins() -> float:
 
 
 @FAMILY.case(
-    "19 beamlets over 20 bins, as amplitudes",
-    reference="exact delay and transform, 40 digits",
-    measure="abs(X), of the peak",
-    allowed=1e-8,
-    limit=4 * np.pi / 1550e-9 * 75.0 * EPS / 2,
-    because="ranges of up to 75 m about the beam's centre, rounded, as optical phase",
-)
-def amplitudes_of_many() -> float:
-    return departure(shots(**spread(), phases="coherent"))
-
-
-@FAMILY.case(
-    "19 beamlets over 20 bins, as powers",
-    reference="exact delay and transform, 40 digits",
-    measure="abs(X), of the peak",
-    allowed=1e-10,
-    limit=EPS**0.5,
-    because="a rounding of the peak's power, in a null",
-)
-def powers_of_many() -> float:
-    return departure(shots(**spread(), phases="incoherent"))
-
-
-def spread() -> dict[str, Any]:
-    """A footprint of 19 beamlets that spreads over bins, its Doppler line next to DC."""
-    return {
-        "beamlets": 19, "fft_size": SIZE, "window": "hann", "range": 3000.0,
-        "grazing_angle": 0.01, "beam_divergence": 1e-3, "radial_velocity": 0.2,
-    }  # fmt: skip
-
-
-@FAMILY.case(
     "every window, closed form or table, at DC, on a bin, half-way and folded",
     reference="time-domain record and its FFT",
     measure="abs(X), of the peak",
@@ -209,25 +156,6 @@ def time_domain() -> float:
                 _, found = segments.spectrum(one, 0, segment)
                 exact = truth.spectrum(one, 0, segment, range_walk=False)
                 worst = max(worst, float(np.abs(found - exact).max()) / peak(one, 0, segment))
-    return worst
-
-
-@FAMILY.case(
-    "what the time-domain record itself holds",
-    reference="exact delay and transform, 40 digits",
-    measure="abs(X), of the peak",
-    allowed=1e-12,
-    limit=2 * np.pi * 1144 * EPS / 2,
-    because="phases f t of up to 1144 cycles, rounded sample by sample",
-)
-def floor_of_the_truth() -> float:
-    worst = 0.0
-    for window in ("rectangular", "hann"):
-        one = shots(window=window, fft_size=SIZE)
-        for segment in range(3):
-            bins = looked_at(one, segment)
-            record = truth.spectrum(one, 0, segment, range_walk=False)
-            worst = max(worst, departure_of(one, segment, bins, record[bins]))
     return worst
 
 

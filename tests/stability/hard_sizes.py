@@ -66,12 +66,6 @@ def odd_sizes() -> float:
     )
 
 
-@FAMILY.case("an FFT of 2^20 points", allowed=2e-10, limit=place(2e8, 2**20),
-             because="beats of 2e8 Hz, rounded", **EXACT)  # fmt: skip
-def a_million() -> float:
-    return long_fft(2**20)
-
-
 @FAMILY.case("an FFT of 2^24 points", allowed=3e-9, limit=place(2e8, 2**24),
              because="beats of 2e8 Hz, rounded", **EXACT)  # fmt: skip
 def sixteen_million() -> float:
@@ -107,29 +101,19 @@ def one_sample() -> float:
     )
 
 
-def record_error(size: int, window: str) -> float:
-    """Worst error of the time-domain truth's bins next to the lines and far off."""
-    one, worst = shots(fft_size=size, window=window, duration=2 * size / RATE), 0.0
+@FAMILY.case("the time-domain record itself, 2^20 samples", allowed=1e-11,
+             limit=2 * math.pi * 2e8 / RATE * 2**20 * EPS / 2,
+             because="phases f t of up to 3e5 cycles, each sample's rounded", **EXACT)  # fmt: skip
+def floor_of_a_long_record() -> float:
+    """Of bins next to the lines and far off."""
+    size, worst = 2**20, 0.0
+    one = shots(fft_size=size, window="hann", duration=2 * size / RATE)
     for segment in range(3):
         found = truth.spectrum(one, 0, segment, range_walk=False)
         top = int(np.argmax(found))
         chosen = [1, size // 5, *range(top - 4, top + 5)]
         worst = max(worst, departure_of(one, segment, chosen, found[chosen]))
     return worst
-
-
-@FAMILY.case("the time-domain record itself, 2^17 samples", allowed=1e-12,
-             limit=2 * math.pi * 2e8 / RATE * 2**17 * EPS / 2,
-             because="phases f t of up to 4e4 cycles, each sample's rounded", **EXACT)  # fmt: skip
-def floor_of_the_record() -> float:
-    return max(record_error(2**17, window) for window in ("hann", "rectangular"))
-
-
-@FAMILY.case("the time-domain record itself, 2^20 samples", allowed=1e-11,
-             limit=2 * math.pi * 2e8 / RATE * 2**20 * EPS / 2,
-             because="phases f t of up to 3e5 cycles, each sample's rounded", **EXACT)  # fmt: skip
-def floor_of_a_long_record() -> float:
-    return record_error(2**20, "hann")
 
 
 def of_one(phases: str, number: int) -> float:

@@ -99,19 +99,6 @@ def near_equal() -> float:
 
 
 @FAMILY.case(
-    "numbers equal but for their last bit, 1000 of them",
-    reference="fractions",
-    measure="standard error",
-    allowed=1.0,
-    limit=1.0,
-    because="deviations of half a step about a mean that is a float",
-)
-def last_bit() -> float:
-    values = [np.nextafter(1.0, 2.0) if k % 2 else 1.0 for k in range(1000)]
-    return moment_errors(values)[1]
-
-
-@FAMILY.case(
     "a million equal numbers, of 1/3, 0.1 and 1e-300",
     reference="the number, and no deviation",
     measure="mean; standard error in units of the number",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sweep.model import philox
-from sweep.model.alarms import neighbour_correlation
 from sweep.model.detection import Fading, fading_together, found_pair
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
 from sweep.model.effects.catalogue import CORE
@@ -16,7 +15,6 @@ from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.realisations import realise
 from sweep.model.returns import draw_returns
 from sweep.model.shot import find, prepare, statistics
-from sweep.model.window import samples, window
 
 FADING = (*CORE, "fading")
 COUNTS = list(DRAW_OUTPUTS)
@@ -64,31 +62,6 @@ def test_printed_values_of_swerlings_first_case(snr, pd):
 def test_printed_values_without_fading(snr, pd):
     level = np.sqrt(-2 * np.log(1e-8))
     assert marcum_q1(np.sqrt(2 * db(snr)), level).q == pytest.approx(pd, abs=6e-5)
-
-
-@pytest.mark.parametrize("width", [0.0, 1.0, 3.0, 8.0])
-@pytest.mark.parametrize(("name", "pad"), [("hamming", 1), ("hann", 2)])
-def test_any_bin_of_an_echo_is_found_as_often_as_in_drawn_records(name, pad, width):
-    """Lines of random amplitudes, in white noise, windowed and transformed."""
-    rng, size, level, number = np.random.default_rng(8), 64, 4.0, 20_000
-    shape, lines = window(name, size // pad), 25
-    taper, place = samples(name, size // pad), 20.3 + np.linspace(-0.5, 0.5, lines) * width
-    turns = np.outer(place, np.arange(taper.size)) / size
-    kernel = np.fft.fft(taper * np.exp(2j * np.pi * turns), size)
-    noise = (taper**2).sum()
-    kernel *= np.sqrt(db(15) * noise / (np.abs(kernel) ** 2).sum(axis=0).max())
-    magnitude = np.sqrt((np.abs(kernel) ** 2).sum(axis=0))
-    loud = np.flatnonzero(magnitude >= 0.5 * magnitude.max())
-    echo = np.zeros(size, bool)
-    echo[loud[0] - 2 * pad : loud[-1] + 2 * pad + 1] = True
-    record = taper * amplitudes(rng, (number, taper.size))
-    drawn = amplitudes(rng, (number, lines)) @ kernel + np.fft.fft(record, size)
-    share = (np.abs(drawn[:, echo]).max(axis=1) > level * np.sqrt(noise)).mean()
-    rule = 0, 2 * pad, np.empty((3, 0)), neighbour_correlation(shape, size)
-    levels = np.sqrt(noise / 2), level * np.sqrt(noise)
-    found, missed = found_pair(magnitude, echo, int(magnitude.argmax()), 0, rule, levels)
-    assert abs(found - share) < 0.015 + 4 * np.sqrt(share * (1 - share) / number)
-    assert found + missed == pytest.approx(1.0, abs=1e-12)
 
 
 def prepared(parameters, effects=FADING):

@@ -8,14 +8,12 @@ from effect_points import kept_in, planned, points_of, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model import shot
-from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Size
 from sweep.model.effects.planning import changes, plan
 from sweep.model.marcum import log_at_least_one, marcum_q1
 
 TILES = 40
-CERTAIN = [effect.name for effect in EFFECTS if not effect.is_random]
 
 
 class Given:
@@ -198,15 +196,6 @@ def test_effects_come_after_those_they_are_within():
         assert not effect.within or names.index(effect.within) < names.index(effect.name)
 
 
-def test_a_point_s_plan_does_not_depend_on_its_neighbours(table_4_1):
-    parameters = scene(table_4_1, 24, 3, fft_size=4096)
-    whole, some = planned(points_of(parameters), {}, 1e-3), slice(5, 17)
-    part = {path: v[some] if np.ndim(v) else v for path, v in parameters.items()}
-    alone = planned(points_of(part), {}, 1e-3)
-    assert np.array_equal(whole.kept[:, some], alone.kept)
-    assert np.array_equal(whole.change[:, some], alone.change)
-
-
 @given(st.integers(0, 2**32), st.lists(st.floats(-8, -1), min_size=2, max_size=5))
 def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, exponents):
     rng = np.random.default_rng(seed)
@@ -226,48 +215,3 @@ def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, e
     ]
     for tighter, looser in pairwise(kept):
         assert (tighter >= looser).all()
-
-
-def smeared(table_4_1, phases, law, **changes):
-    """A single line straight down: what `auto` at 1e-3 makes of it, and what all effects do."""
-    asked = changes.pop("asked", {})
-    own = {name: value for name, value in changes.items() if "." not in name}
-    further = {path: value for path, value in changes.items() if "." in path}
-    straight = {"beamlets": 1, "grazing_angle": np.pi / 2, "phases": phases}
-    steady = {"footprint.speckle": "none"}
-    parameters = DEFAULTS | table_4_1(**straight, reflectance_law=law, **own) | steady | further
-    names = kept_in(planned(points_of(parameters), asked, 8e-4), 0)
-    return shot.evaluate(parameters, names), shot.evaluate(parameters, CERTAIN)
-
-
-def test_an_image_is_kept_where_acceleration_smears_the_line_towards_it(table_4_1):
-    found, every = smeared(
-        table_4_1, "incoherent", "lambert", power=0.02, range=1500.0, radial_velocity=15.49654,
-        **{"target.acceleration": 300.0},
-    )  # fmt: skip
-    assert found["pd_up"] == pytest.approx(0.4164, abs=1e-3)
-    assert found["pd_up"] == pytest.approx(every["pd_up"], abs=1e-3)
-
-
-@pytest.mark.parametrize("phases", ["incoherent", "coherent"])
-def test_an_image_is_kept_where_a_crooked_sweep_smears_the_line_towards_it(table_4_1, phases):
-    found, every = smeared(
-        table_4_1, phases, "lambert", power=3e-3, range=150.0, radial_velocity=4.480,
-        fft_size=2**14, tnr=6.0, sample_rate=100e6, window="hann",
-        **{"instrument.chirp.quadratic_error": 4e6, "instrument.chirp.duration": 172.032e-6},
-    )  # fmt: skip
-    assert found["pd_up"] > 0.997
-    assert found["pd_up"] == pytest.approx(every["pd_up"], abs=1e-3)
-
-
-def test_leakage_of_a_line_that_is_smeared_over_bins_is_kept(table_4_1):
-    line = {
-        "range": 40.0, "radial_velocity": 20.0, "target.acceleration": 300.0,
-        "asked": {"leakage": "on"},
-    }  # fmt: skip
-    _, every = smeared(table_4_1, "coherent", "thesis", power=1e-9, **line)
-    faint = np.sqrt(2 * every["snr_up"]) / np.sqrt(-2 * np.log(every["pfa_bin"]))
-    power = 1e-9 * float(0.95 / faint[0]) ** 2
-    found, every = smeared(table_4_1, "coherent", "thesis", power=power, **line)
-    assert found["p_leakage_up"] == pytest.approx(0.4189, abs=1e-3)
-    assert found["p_leakage_up"] == pytest.approx(every["p_leakage_up"], abs=1e-3)

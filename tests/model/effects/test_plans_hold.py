@@ -178,39 +178,6 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
     assert kept > 100 and dropped > 100
 
 
-@pytest.mark.parametrize("velocity", [20.0, 70.0])
-@pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3])
-def test_leakage_that_is_asked_for_keeps_the_tolerance_too(table_4_1, velocity, tolerance):
-    """Sidelobes beside strong echoes may lack what changes next to nothing of these."""
-    parameters = DEFAULTS | table_4_1(
-        range=np.geomspace(50, 3000, 400), radial_velocity=velocity, phases="incoherent",
-        beamlets=19,
-    )  # fmt: skip
-    truth, worst = shot.evaluate(parameters), {}
-    for mode in ("on", "auto"):
-        made, worst[mode] = planned(points_of(parameters), {"leakage": mode}, tolerance, CHOICE), 0
-        for column in np.unique(made.kept, axis=1).T:
-            names = [name for name, there in zip(made.names, column, strict=True) if there]
-            here = (made.kept == column[:, None]).all(axis=0)
-            of_kept = shot.evaluate(parameters, names)
-            for name in ("p_leakage_up", "p_leakage_down"):
-                error = abs(of_kept[name] - truth[name])[here].max()
-                worst[mode] = max(worst[mode], error)
-    assert worst["on"] < min(1e-4, tolerance / 10) and worst["on"] <= worst["auto"]
-
-
-def test_the_image_of_a_still_target_is_kept_for_the_magnitude_s_sake(table_4_1):
-    parameters = DEFAULTS | table_4_1(
-        range=np.geomspace(20, 300, 8), radial_velocity=0.0, phases="incoherent", beamlets=19
-    )
-    made = planned(points_of(parameters), {}, 1e-3, CHOICE)
-    with_it, without = (found(parameters, names) for names in ({"image"}, set()))
-    assert (with_it[:, 1] == 0).all() and (without[:, 1] == 0).all()  # no miss: pd is 1
-    image = np.sqrt(2)  # power of the line at DC, and of its image there
-    assert with_it[1, 2] == pytest.approx(image * without[1, 2])
-    assert made.kept[made.names.index("image")].all()
-
-
 def cast_scene(rng, shots, beamlets, beside_chance):
     """Footprints on steps: offsets, closing speeds and echoes as rays might find them."""
     surface = rng.random((shots, beamlets)) < beside_chance * rng.random((shots, 1))

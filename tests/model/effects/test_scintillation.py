@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from engine import keys
 from scipy import special, stats
 from scipy.integrate import quad
 
-from sweep.model import philox
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.scintillation import (
@@ -125,23 +125,7 @@ def draws_of(law, legs, points, draws, first=0):
     ).reshape(points, draws)
 
 
-def keys(number):
-    return philox.point_keys(np.arange(number, dtype=float)[:, None], domain="twinkle", seed=3)
-
-
 LEGS = (leg(0.2, 0.3), leg(0.05, 0.1))
-
-
-@pytest.mark.parametrize("distribution", ["log_normal", "gamma_gamma"])
-def test_draws_have_unit_mean_and_the_index_of_both_ways(distribution):
-    """4e5 draws; the spread of mean and variance from the draws' own moments, 5 sigma."""
-    drawn = draws_of(distribution, LEGS, 4, 100_000, 0).ravel()
-    assert drawn.min() > 0
-    root = np.sqrt(drawn.size)
-    assert drawn.mean() == pytest.approx(1, abs=5 * drawn.std() / root)
-    square = (drawn - 1) ** 2
-    assert square.mean() == pytest.approx(index(LEGS), abs=5 * square.std() / root)
-    assert index(LEGS) == pytest.approx(np.exp(0.65) - 1, rel=1e-14)
 
 
 SURE = np.sqrt(-0.5 * np.log(5.7e-7 / 2))

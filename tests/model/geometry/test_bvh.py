@@ -147,12 +147,6 @@ def test_every_triangle_lies_in_just_one_leaf_and_inside_its_box():
     assert seen == 5000
 
 
-def test_the_same_mesh_gives_the_same_tree():
-    vertices, faces = soup(np.random.default_rng(5), 2000, "plain")
-    for one, other in zip(build(vertices, faces), build(vertices, faces), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_triangles_that_no_plane_can_part_are_still_divided():
     """Thousands about one centre, and a cascade of sizes over twelve decades."""
     ring = np.exp(2j * np.pi * np.arange(3) / 3)

@@ -254,10 +254,10 @@ def test_a_movement_in_slow_motion_turns_the_same_way(law, power):
 
 
 @pytest.mark.parametrize("law", [AlongTrack(), Nadir(None)])
-def test_what_turns_at_next_to_no_speed_has_no_heading(law):
-    velocity, acceleration = np.array([[1e-320, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+@pytest.mark.parametrize("velocity", [[1e-320, 0.0, 0.0], [0.0, 0.0, -5.0]])
+def test_next_to_no_speed_and_a_vertical_descent_have_no_heading(law, velocity):
     with pytest.raises(ValueError, match="has no heading to follow"):
-        law.turn(np.zeros(1), velocity, acceleration)
+        law.turn(np.zeros(1), np.array([velocity]), np.array([[0.0, 1.0, 0.0]]))
 
 
 def test_a_bank_lifts_the_left_wing_by_its_angle():
@@ -292,12 +292,6 @@ def test_a_mounted_instrument_is_turned_first():
     # Tilted about -y by 45 deg, the nadir beam looks half forward.
     forward = quat.rotate(q, -UP)[0]
     np.testing.assert_allclose(forward, [math.sqrt(0.5), 0, -math.sqrt(0.5)], atol=1e-12)
-
-
-@pytest.mark.parametrize("law", [Nadir(None), AlongTrack()])
-def test_a_vertical_descent_has_no_heading_to_follow(law):
-    with pytest.raises(ValueError, match="no heading"):
-        law.turn(np.zeros(1), np.array([[0.0, 0.0, -5.0]]), np.zeros((1, 3)))
 
 
 def test_transverse_axes_complete_a_right_handed_frame():

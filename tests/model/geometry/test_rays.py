@@ -18,6 +18,7 @@ from sweep.model.geometry import quaternion
 from sweep.model.geometry.mesh import merge
 from sweep.model.geometry.rays import Caster, Pose
 from sweep.scenes.meshes import clean
+from sweep.scenes.terrain import Terrain
 
 GALE = Path(__file__).parents[4] / "shared" / "data" / "gale_crater_hirise_1m.tif"
 PHASE_PER_METRE = 4.0 * np.pi / 1.55e-6
@@ -84,14 +85,10 @@ def icosphere(subdivisions):
     return vertices, faces
 
 
-def heightfield(z, spacing=1.0):
-    """Two triangles to each cell of a grid of heights."""
-    rows, columns = z.shape
-    x, y = np.meshgrid(spacing * np.arange(columns), spacing * np.arange(rows))
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    lower = np.stack([corner, corner + 1, corner + columns], axis=1)
-    upper = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3), np.concatenate([lower, upper])
+def facets(heights):
+    """Vertices and faces of ground of steps of 1 m."""
+    ground = Terrain(heights, (1.0, 1.0), np.zeros(3)).facets()
+    return ground.vertices + ground.origin, ground.faces
 
 
 @pytest.fixture(scope="module")
@@ -113,19 +110,18 @@ def closed():
     return vertices, faces, Caster(mesh)
 
 
-@pytest.mark.parametrize("offset", [[0.0, 0.0, 0.0], [4e6, -3e6, 2e6]])
-def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale, offset):
+def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
     """From 2 km off, steeply and at 20 degrees of grazing angle; worst phase 2e-6 rad."""
-    vertices, faces = heightfield(gale)
-    vertices = vertices + offset
-    rng = np.random.default_rng(2)
-    target = vertices[rng.integers(0, len(vertices), 120)] + [[0.3, 0.2, 0.0]]
-    target += rng.uniform(-0.4, 0.4, (120, 3))
-    origins = target + 2000.0 * unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(120) % 2]
+    vertices, faces = facets(gale)
+    rng, number = np.random.default_rng(2), 36
+    target = vertices[rng.integers(0, len(vertices), number)] + [[0.3, 0.2, 0.0]]
+    target += rng.uniform(-0.4, 0.4, (number, 3))
+    away = unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(number) % 2]
+    origins = target + 2000.0 * away
     directions = unit(target - origins)
     hits = cast(Caster(clean(vertices, faces, 0)[0]), origins, directions)
     worst = 0.0
-    for i in range(120):
+    for i in range(number):
         truth = nearest(vertices, faces, origins[i], directions[i])
         if truth is None:  # passes beside the terrain's rim
             assert hits.face[i] == -1
@@ -133,7 +129,7 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale, offset):
         assert hits.face[i] == truth[1]
         assert last_places(hits.range[i], truth[0]) <= 1.0
         worst = max(worst, abs(float(Fraction(hits.range[i]) - truth[0])) * PHASE_PER_METRE)
-    assert (hits.face >= 0).sum() > 100
+    assert (hits.face >= 0).sum() > 30
     assert worst < 2e-6
 
 
@@ -154,54 +150,6 @@ def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offs
     hits = cast(caster, origins, unit(targets - origins))
     assert (hits.face >= 0).all()
     assert (hits.range < 3.0).all()
-
-
-def test_a_plane_is_met_where_its_closed_form_says_down_to_a_degree_of_grazing_angle():
-    half = 2e5
-    square = [[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]]
-    caster = Caster(clean(square, [[0, 1, 2], [0, 2, 3]], 5)[0])
-    rng = np.random.default_rng(6)
-    grazing = np.radians(np.repeat(np.arange(1.0, 91.0), 20))
-    azimuth = rng.uniform(0, 2 * np.pi, grazing.size)
-    directions = unit(
-        np.stack(
-            [
-                np.cos(grazing) * np.cos(azimuth),
-                np.cos(grazing) * np.sin(azimuth),
-                -np.sin(grazing),
-            ],
-            axis=1,
-        )
-    )
-    origins = np.stack([*rng.uniform(-100, 100, (2, grazing.size)), 2000 * np.sin(grazing)], axis=1)
-    hits = cast(caster, origins, directions)
-    for r, o, d in zip(hits.range, origins, directions, strict=True):
-        assert last_places(r, Fraction(o[2]) / -Fraction(d[2])) <= 1.0
-    np.testing.assert_allclose(hits.cos_incidence, np.sin(grazing), atol=1e-15)
-    np.testing.assert_array_equal(hits.normal, np.tile([0.0, 0.0, 1.0], (len(origins), 1)))
-    assert (hits.surface == 5).all()
-
-
-def test_a_sphere_of_facets_is_met_exactly_and_lies_as_near_the_sphere_as_its_facets_do():
-    vertices, faces = icosphere(5)
-    caster = Caster(clean(vertices, faces, 0)[0])
-    rng = np.random.default_rng(8)
-    origins = 2000.0 * unit(rng.normal(size=(2000, 3)))
-    directions = unit(0.7 * rng.uniform(-1, 1, (2000, 3)) - origins)
-    along = -np.einsum("ij,ij->i", origins, directions)
-    miss = np.einsum("ij,ij->i", origins, origins) - along**2
-    hits = cast(caster, origins, directions)
-    outside = miss > 1.0
-    assert (hits.face[outside] == -1).all()
-    inner = np.linalg.norm(vertices[faces].mean(axis=1), axis=1).min()
-    through = miss < 0.9
-    shell = np.sqrt(np.outer([1.0, inner**2], np.ones(through.sum())) - miss[through])
-    assert (hits.range[through] > along[through] - shell[0] - 1e-9).all()
-    assert (hits.range[through] < along[through] - shell[1] + 1e-9).all()
-    for i in np.flatnonzero(through)[:100]:
-        t, inside = met(vertices[faces[hits.face[i]]], origins[i], directions[i])
-        assert inside
-        assert last_places(hits.range[i], t) <= 1.0
 
 
 def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
@@ -305,8 +253,8 @@ def test_ranges_within_a_bundle_keep_digits_that_their_difference_has_lost(offse
     Subtracting two ranges of 2 km would leave up to 2e-13 m.
     """
     rng = np.random.default_rng(13)
-    vertices, faces = heightfield(0.3 * rng.normal(size=(30, 30)))
-    vertices += offset
+    vertices, faces = facets(0.3 * rng.normal(size=(30, 30)))
+    vertices = vertices + offset
     mesh, _ = clean(vertices, faces, 0)
     centre = 30 * rng.integers(5, 25, 15) + rng.integers(5, 25, 15)
     origins = vertices[centre] + [[0.1, 0.2, 0.0]] + 2000.0 * unit([0.3, 0.2, 1])
