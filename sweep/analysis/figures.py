@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import canvas, charts, labels, tables, tabular
-from sweep.analysis.drawing import sheet_of
 from sweep.analysis.opening import ACCURACY, SCENE, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import GRAZING_ANGLE, RANGE, Points, confined, cuts
@@ -91,7 +90,7 @@ class Study:
             return f"no point of the study has {held(figure)}"
         title = "\n".join(filter(None, [self.spec.title, figure.title]))
         note = labels.joined([held(figure), labels.source(self.dataset.attrs, "points")])
-        return sheet_of(chart, title=title, note=note)
+        return canvas.sheet_of(chart, title, note)
 
 
 def held(figure: Surface | Slices) -> str:

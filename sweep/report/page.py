@@ -23,8 +23,8 @@ from plotly.io.json import to_json_plotly
 from plotly.offline import get_plotlyjs
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.charts import LOG, Axis, Chart, Line, Map, Panel, Scale
-from sweep.analysis.drawing import MARKED
+from sweep.analysis.canvas import MARKED
+from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel, Scale
 
 LINES = {
     "light": ("#0072B2", "#C44E00", "#005A4B", "#A51E78", "#78784B", "#003CD2", "#000000",
@@ -115,7 +115,7 @@ def plot(chart: Chart) -> Plot:
     """A chart to choose from, hover and zoom."""
     first = chart.panels[0]
     further: dict[str, Any] = {}
-    areas = [line for line in first.layers if isinstance(line, Line) and line.look == "area"]
+    areas = [line for line in first.lines if line.look == "area"]
     if areas:
         further = {"barmode": "stack"}
         further["hovermode"] = "x unified" if areas[0].x.size > 1 else "closest"
@@ -155,19 +155,14 @@ def _relaid(axis: Axis) -> dict[str, Any]:
 
 def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
     """Traces of a panel's lines, or of its map."""
-    for layer in panel.layers:
-        if isinstance(layer, Map):
-            assert scale is not None
-            yield _heat_map(panel, layer, scale)
-        else:
-            yield from _line(panel, layer)
-
-
-def _heat_map(panel: Panel, layer: Map, scale: Scale) -> go.Heatmap:
+    for line in panel.lines:
+        yield from _line(panel, line)
+    if (layer := panel.map) is None or scale is None:
+        return
     values, ends = layer.values, (scale.low, scale.high)
     if scale.decades:
         values, ends = np.log10(np.where(values > 0, values, np.nan)), tuple(np.log10(ends))
-    return go.Heatmap(
+    yield go.Heatmap(
         x=_short(layer.x), y=_short(layer.y), z=_short(values), zmin=ends[0], zmax=ends[1],
         colorscale="Viridis", colorbar=COLOUR_BAR, name=panel.when["part"],
         meta=when(None, **panel.when),

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from drawn_scenes import MAPPING, cut_short, flown, scene
 
-from sweep.analysis.drawing import sheet_of
+from sweep.analysis.canvas import sheet_of
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import navigation
 from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
@@ -105,7 +105,7 @@ def test_a_level_flight_has_one_bin_and_a_scanner_of_two_beams_no_curve(
 
 def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_store, spec):
     (curve,) = curves(recordings(scene_store, spec, "1 W"), quantity="velocity", bins=4)
-    sheet = sheet_of(navigation_chart([curve, curve], "all"), title="T", note="note")
+    sheet = sheet_of(navigation_chart([curve, curve], "all"), "T", "note")
     panels = {axes.get_title(loc="left"): axes for axes in sheet.axes if axes.get_visible()}
     error, stated = panels["RMS error of the velocity, z"].lines[:2]
     assert np.array_equal(error.get_ydata(), curve.rmse[:, 2])

@@ -380,13 +380,12 @@ LEAST = 1e-16
 def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
     """Draw the shares of points that differ by more than some amount, a colour a scanner."""
     from sweep.analysis import canvas
-    from sweep.analysis.drawing import sheet_of
 
     with canvas.style():
         chart = figure(found)
         if chart is None:
             return canvas.save(canvas.empty("Nothing that both stores have is computed yet"), path)
-        return canvas.save(sheet_of(chart, title=chart.heading, note=""), path)
+        return canvas.save(canvas.sheet_of(chart, chart.heading, ""), path)
 
 
 def figure(found: Mapping[str, xr.Dataset]) -> Chart | None:

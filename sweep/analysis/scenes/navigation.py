@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Map, Panel
+from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Panel
 from sweep.analysis.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
 from sweep.analysis.tabular import Block, Cell, Page
@@ -292,7 +292,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
     component = names[part] if part < len(names) else LENGTH
     of = f"of the {quantity}" + (f", {component}" if len(names) > 1 else "")
     units, middle = UNITS[quantity], curves[0].middle
-    lines: list[Line | Map] = []
+    lines: list[Line] = []
     if statistic == AVAILABILITY:
         title, up = f"{quantity} available", Axis("share of cycles (%)", limits=(-4, 104))
         lines += [Line(middle, 100 * curve.tally.availability, curve.words, k)
