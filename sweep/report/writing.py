@@ -21,8 +21,8 @@ from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_a
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
-from sweep.analysis.tabular import Page as TablePage
-from sweep.analysis.tabular import outputs_page
+from sweep.analysis.tables import Page as TablePage
+from sweep.analysis.tables import outputs_page
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.report import detector, flights
 from sweep.report.flights import Seen

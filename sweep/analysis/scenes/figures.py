@@ -25,9 +25,8 @@ from sweep.analysis.scenes.recording import (
     several_surfaces,
 )
 from sweep.analysis.selection import parameters_at
-from sweep.analysis.shot_figure import scene_shot_sheet
-from sweep.analysis.shot_spectra import simulated_shot
-from sweep.analysis.tabular import Page
+from sweep.analysis.shot_figure import scene_shot_sheet, simulated_shot
+from sweep.analysis.tables import Page
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.spec import SceneSpec

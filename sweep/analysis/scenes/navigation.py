@@ -14,7 +14,7 @@ from sweep.analysis import labels
 from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Panel
 from sweep.analysis.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
-from sweep.analysis.tabular import Block, Cell, Page
+from sweep.analysis.tables import Block, Cell, Page
 from sweep.model.navigation import EXCLUDED, SOLVED
 
 VELOCITY, ALTITUDE = "velocity", "altitude"
