@@ -108,22 +108,10 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Contents of a figure.
+    """Contents of a figure: words over it, for those who do not see it, and under it; panels.
 
-    Attributes
-    ----------
-    heading, alt
-        What stands over it; what it shows, in words, for those who do not see it.
-    caption
-        Sentences under it.
-    panels
-        In the order of the choices.
-    facets
-        What stands beside each choice, by its name.
-    scale
-        Colours of maps.
-    rows
-        Numbers of panels in the rows of a sheet; by default the sheet decides.
+    Panels are in the order of the choices; facets tell what stands beside each choice. `rows` are
+    numbers of panels in the rows of a sheet, which decides by default.
     """
 
     heading: str
@@ -376,14 +364,8 @@ def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list
     A line of many points is cut into stretches: their means, in a band from the lowest to the
     highest of their points; else the band is the interval of each point.
 
-    Parameters
-    ----------
-    found
-        Points of each line, and its variable; where coordinates beside `x` vary, their first place
-        is taken. A variable has intervals where it is a probability of detection that is drawn,
-        or has variables of its own for them, ``.._low`` and ``.._high``.
-    x
-        The coordinate.
+    Where coordinates beside `x` vary, their first place is taken. A variable has intervals where
+    it is a probability of detection that is drawn, or has ``.._low`` and ``.._high`` beside it.
     """
     lazy: list[list[Any]] = []
     made: list[tuple[Side, int, float, bool]] = []

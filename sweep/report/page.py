@@ -54,16 +54,9 @@ COLOUR_BAR: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Control:
-    """A choice that a plot offers.
+    """A choice that a plot offers: its name as traces call it, and what stands beside it.
 
-    Attributes
-    ----------
-    name, label
-        What traces call it (see :func:`when`), and what stands beside it.
-    options
-        What can be chosen, the first at the start.
-    relayout
-        What an option changes of the plot's layout, by option; nothing by default.
+    The first option is chosen at the start; `relayout` is what each changes of the layout.
     """
 
     name: str
@@ -74,22 +67,10 @@ class Control:
 
 @dataclass(frozen=True)
 class Plot:
-    """A chart as a page shows it.
+    """A chart as a page shows it, with its choices; one of a single option is left out.
 
-    Attributes
-    ----------
-    heading, alt
-        What stands over it; what it shows, in words, for those who do not see it.
-    caption
-        Sentences under it.
-    figure
-        Traces and layout; `meta` of a trace says when it is shown and which colour it takes.
-    controls
-        Choices; one with a single option is left out.
-    cut
-        Whether the first heat map that is shown can be cut along either of its sides.
-    tall
-        Whether it needs the height of a solid view.
+    `meta` of a trace says when it is shown and which colour it takes (see :func:`when`). The first
+    heat map shown may be `cut` along either side; a solid view is `tall`.
     """
 
     heading: str

@@ -102,11 +102,6 @@ class Curve:
         return (self.edges[1:] + self.edges[:-1]) / 2
 
     @property
-    def bias(self) -> np.ndarray:
-        """Mean error of each component, (bins, m)."""
-        return self.tally.bias
-
-    @property
     def bias_error(self) -> np.ndarray:
         """Standard error of the bias (bins, m); nan with fewer than two solutions."""
         variance = np.diagonal(self.tally.covariance, axis1=-2, axis2=-1)
@@ -301,7 +296,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
         title, up = f"bias {of}", Axis(f"bias ({units})")
         lines.append(Line(middle[[0, -1]], np.zeros(2), look="level"))
         for k, curve in enumerate(curves):
-            bias, error = curve.bias[:, part], curve.bias_error[:, part]
+            bias, error = curve.tally.bias[:, part], curve.bias_error[:, part]
             lines.append(
                 Line(middle, bias, curve.words, k, low=bias - error, high=bias + error,
                      look="bars")
@@ -357,7 +352,7 @@ def _record(curve: Curve, i: int, shown: Sequence[str]) -> dict[str, Cell]:
         record["available"] = float(curve.tally.availability[i])
     if BIAS in shown:
         for k, name in enumerate(names):
-            record[f"bias {name}".strip()] = float(curve.bias[i, k])
+            record[f"bias {name}".strip()] = float(curve.tally.bias[i, k])
             record[f"error of bias {name}".strip()] = float(curve.bias_error[i, k])
     if RMSE in shown:
         for k, name in enumerate((*names, LENGTH) if len(names) > 1 else names):
