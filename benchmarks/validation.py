@@ -14,8 +14,7 @@ from shared import DOCS, EXPERIMENTS, ROOT
 import sweep
 from sweep.analysis import labels, noise_only
 from sweep.analysis.figures import Study
-from sweep.analysis.shot_figure import chosen
-from sweep.analysis.shot_spectra import simulated
+from sweep.analysis.shot_figure import chosen, simulated
 from sweep.analysis.tables import entries
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec import load

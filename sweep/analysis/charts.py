@@ -1,6 +1,6 @@
 """Charts as data, and those of grids: a variable over two coordinates, or along one.
 
-Files of them are drawn by :mod:`sweep.analysis.drawing`, pages by :mod:`sweep.report.page`.
+Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.page`.
 
 A chart has panels, each for one choice of every facet: a sheet shows them side by side, a page one
 at a time::
@@ -97,7 +97,8 @@ class Panel:
     when: Mapping[str, str]
     x: Axis
     y: Axis
-    layers: Sequence[Line | Map]
+    lines: Sequence[Line] = ()
+    map: Map | None = None
 
     @property
     def title(self) -> str:
@@ -107,22 +108,10 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Contents of a figure.
+    """Contents of a figure: words over it, for those who do not see it, and under it; panels.
 
-    Attributes
-    ----------
-    heading, alt
-        What stands over it; what it shows, in words, for those who do not see it.
-    caption
-        Sentences under it.
-    panels
-        In the order of the choices.
-    facets
-        What stands beside each choice, by its name.
-    scale
-        Colours of maps.
-    rows
-        Numbers of panels in the rows of a sheet; by default the sheet decides.
+    Panels are in the order of the choices; facets tell what stands beside each choice. `rows` are
+    numbers of panels in the rows of a sheet, which decides by default.
     """
 
     heading: str
@@ -277,7 +266,7 @@ def surface(
         words,
         f"Heat map of {words} over {' and '.join(spans)}: {labels.extent(layers[0])}.",
         remarks,
-        [Panel(when, rulers[0].axis, rulers[1].axis, [one])
+        [Panel(when, rulers[0].axis, rulers[1].axis, map=one)
          for when, one in zip(choices, maps, strict=True)],
         {"part": "Shown for", "cell": "Each cell shows the"},
         scale_of(variable, words, layers),
@@ -356,7 +345,7 @@ def panels_of(
 ) -> list[Panel]:
     """A panel for each part, with its lines; the same name has the same colour everywhere."""
     numbers = {name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named))}
-    found: dict[str, list[Line | Map]] = {}
+    found: dict[str, list[Line]] = {}
     for (part, name, _), line in zip(named, drawn, strict=True):
         own = replace(line, x=ruler.shown(line.x), name=name, number=numbers[name])
         found.setdefault(part, []).append(own)
@@ -365,8 +354,7 @@ def panels_of(
 
 def alternative(words: str, span: str, panel: Panel) -> str:
     """Extent of the lines of a panel, in words."""
-    told = [f"{line.name or 'the line'}: {labels.extent(line.y)}"
-            for line in panel.layers if isinstance(line, Line)]  # fmt: skip
+    told = [f"{line.name or 'the line'}: {labels.extent(line.y)}" for line in panel.lines]
     return f"Lines of {words} over {span}. {'; '.join(told)}."
 
 
@@ -376,14 +364,8 @@ def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list
     A line of many points is cut into stretches: their means, in a band from the lowest to the
     highest of their points; else the band is the interval of each point.
 
-    Parameters
-    ----------
-    found
-        Points of each line, and its variable; where coordinates beside `x` vary, their first place
-        is taken. A variable has intervals where it is a probability of detection that is drawn,
-        or has variables of its own for them, ``.._low`` and ``.._high``.
-    x
-        The coordinate.
+    Where coordinates beside `x` vary, their first place is taken. A variable has intervals where
+    it is a probability of detection that is drawn, or has ``.._low`` and ``.._high`` beside it.
     """
     lazy: list[list[Any]] = []
     made: list[tuple[Side, int, float, bool]] = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +24,7 @@ from sweep.analysis.scenes.recording import (
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
+from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import Location
 
 ROW = np.dtype(
@@ -40,8 +40,7 @@ ROW = np.dtype(
 """Every column, in the order of files; returns of a shot and draw are numbered from 1."""
 
 COLUMNS: tuple[str, ...] = ROW.names or ()
-UNITS = {name: QUANTITIES[name].units for name in COLUMNS if name in QUANTITIES}
-UNITS = {name: units for name, units in UNITS.items() if units != "1"}
+UNITS = {n: QUANTITIES[n].units for n in COLUMNS if n in QUANTITIES and QUANTITIES[n].units != "1"}
 """Units of the columns that have any."""
 
 
@@ -250,14 +249,8 @@ def export(
     recording = at.recording(study.tree, scanner or study.scanners[0])
     origin = np.asarray(study.tree.attrs.get("origin", np.zeros(3)), float)
     table = PointTable(recording, draw, ranges, origin)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.partial")
-    try:
-        number = WRITERS[file.suffix.lower()](table, unfinished, _remarks(study, table, at))
-        os.replace(unfinished, file)
-    finally:
-        unfinished.unlink(missing_ok=True)
-    return number
+    with draft(file, replace=True) as made:
+        return WRITERS[file.suffix.lower()](table, made, _remarks(study, table, at))
 
 
 def _mistakes(

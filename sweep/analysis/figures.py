@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import canvas, charts, labels, tables, tabular
-from sweep.analysis.drawing import sheet_of
+from sweep.analysis import canvas, charts, labels, tables
 from sweep.analysis.opening import ACCURACY, SCENE, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.selection import GRAZING_ANGLE, RANGE, Points, confined, cuts
@@ -72,17 +71,17 @@ class Study:
             return charts.surface(found, y=figure.y, room=room, **options)
         return charts.slices(found, by=figure.by, **options)
 
-    def page(self, figure: Table | FalseAlarmTable | ThresholdTable) -> tabular.Page:
+    def page(self, figure: Table | FalseAlarmTable | ThresholdTable) -> tables.Page:
         """Tables of one that it asks for."""
         title = figure.title or self.spec.title
         if isinstance(figure, Table):
             units = str(self.dataset[figure.variable].attrs.get("units", ""))
-            return tabular.mean_page(self.points, self.spec, figure, units, title)
+            return tables.mean_page(self.points, self.spec, figure, units, title)
         threshold = isinstance(figure, ThresholdTable)
         make = tables.threshold_page if threshold else tables.false_alarm_page
         return make(self.points, self.spec, by=figure.by, printed=figure.printed, title=title)
 
-    def made(self, figure: Figure) -> canvas.Sheet | tabular.Page | str:
+    def made(self, figure: Figure) -> canvas.Sheet | tables.Page | str:
         """The sheet or the page of a figure; why there is none."""
         if not isinstance(figure, Surface | Slices):
             return self.page(figure)
@@ -91,7 +90,7 @@ class Study:
             return f"no point of the study has {held(figure)}"
         title = "\n".join(filter(None, [self.spec.title, figure.title]))
         note = labels.joined([held(figure), labels.source(self.dataset.attrs, "points")])
-        return sheet_of(chart, title=title, note=note)
+        return canvas.sheet_of(chart, title, note)
 
 
 def held(figure: Surface | Slices) -> str:
@@ -151,11 +150,11 @@ def _drawn(store_path: Location, directory: str | Path | None, form: str) -> lis
     else:
         study = Study.of(store_path)
         if not study.figures:
-            return tabular.outputs_page(study.dataset).save(directory, "outputs")
+            return tables.outputs_page(study.dataset).save(directory, "outputs")
     files = []
     for figure in study.figures:
         made = study.made(figure)
-        if isinstance(made, tabular.Page):
+        if isinstance(made, tables.Page):
             files += made.save(directory, figure.stem)
         else:
             sheet = canvas.empty(f"{study.spec.title}: {made}") if isinstance(made, str) else made

@@ -57,16 +57,8 @@ def coarsened(
 ) -> xr.DataArray:
     """An array in cells along some sides, at one place along its other dimensions; not computed.
 
-    Parameters
-    ----------
-    array
-        Of a store, in its chunks; or in memory.
-    sides
-        Each with the largest number of its cells.
-    at
-        Places along the other dimensions.
-    kind
-        ``mean``, ``lowest`` or ``highest`` of the values in a cell; nan only where all are.
+    Sides come with the largest number of their cells; of the values in a cell it has the
+    ``mean``, ``lowest`` or ``highest``, nan only where all are.
     """
     array = array.isel(dict(at))
     for side, _ in sides:
@@ -251,14 +243,9 @@ def confined(found: Points, spec: Spec, where: Mapping[str, object]) -> Points:
 
 
 def split(found: Points, names: Sequence[str], most: int) -> tuple[list[tuple[str, Points]], int]:
-    """Points apart by the values of some coordinates.
+    """Points apart by the values of some coordinates, in words; and the number of parts left out.
 
-    Returns
-    -------
-    parts : list of (str, Points)
-        What each part is, and its points: at most `most`, spread over all.
-    left_out : int
-        Number of parts left out.
+    At most so many parts are kept, spread over all.
     """
     parts = [("", found)]
     for name in names:

@@ -99,15 +99,8 @@ def tallied(groups: Sequence[Points], variable: str) -> list[Tally]:
 
 
 class Search:
-    """The values at which those up to them come to some weights.
+    """The values at which those up to them come to some cumulated weights.
 
-    Parameters
-    ----------
-    weights
-        Cumulated weights that are looked for; none where there are no values.
-
-    Notes
-    -----
     Floats are in the order of their bits (with a sign's bit turned over, with all of them where
     it is set). A reading adds up the weights of those values that begin with the bits that are
     known, by their next bits.

@@ -116,7 +116,7 @@ def tracks(study: Study) -> tuple[list[Track], int]:
 def roc(study: Study, found: Sequence[Track], fewer: int) -> Chart:
     """Probability of detection over that of a false alarm, as the threshold moves."""
     panels = [panel for track in found for panel in _characteristics(study, track)]
-    told = [line.name for line in panels[0].layers if isinstance(line, Line) and line.name]
+    told = [line.name for line in panels[0].lines if line.name]
     return Chart(
         heading="Receiver operating characteristic",
         alt=(
@@ -232,8 +232,7 @@ def budget_panel(
 
 def budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
     """Shares of sources of noise, a panel at a time."""
-    told = ", ".join(f"{line.name} {line.y[0]:.3g} % at first" for line in panels[0].layers
-                     if isinstance(line, Line))  # fmt: skip
+    told = ", ".join(f"{line.name} {line.y[0]:.3g} % at first" for line in panels[0].lines)
     alt = f"Shares of noise sources in the noise variance at the ADC. {told}."
     return Chart("Noise by source", alt, caption, panels, {"part": "Shown for"})
 

@@ -284,7 +284,7 @@ def along(found: Sequence[Seen]) -> Chart | None:
     if not panels:
         return None
     told = [
-        f"{panel.y.words}: {labels.extent(np.concatenate([line.y for line in panel.layers]))}"
+        f"{panel.y.words}: {labels.extent(np.concatenate([line.y for line in panel.lines]))}"
         for panel in panels[: len(quantities)]
     ]
     return Chart(
@@ -338,7 +338,7 @@ def navigation(found: Sequence[Seen]) -> Chart | None:
 def noise_budget(study: SceneStudy, found: Sequence[Seen]) -> Chart | None:
     """Share of each source in the noise along the flight; none where eyepoints are gone."""
     try:
-        panels = [panel for seen in found if (panel := _budget(study, seen)).layers]
+        panels = [panel for seen in found if (panel := _budget(study, seen)).lines]
     except NotAStoreError:
         return None
     if not panels:

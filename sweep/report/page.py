@@ -23,8 +23,8 @@ from plotly.io.json import to_json_plotly
 from plotly.offline import get_plotlyjs
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.charts import LOG, Axis, Chart, Line, Map, Panel, Scale
-from sweep.analysis.drawing import MARKED
+from sweep.analysis.canvas import MARKED
+from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel, Scale
 
 LINES = {
     "light": ("#0072B2", "#C44E00", "#005A4B", "#A51E78", "#78784B", "#003CD2", "#000000",
@@ -54,16 +54,9 @@ COLOUR_BAR: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Control:
-    """A choice that a plot offers.
+    """A choice that a plot offers: its name as traces call it, and what stands beside it.
 
-    Attributes
-    ----------
-    name, label
-        What traces call it (see :func:`when`), and what stands beside it.
-    options
-        What can be chosen, the first at the start.
-    relayout
-        What an option changes of the plot's layout, by option; nothing by default.
+    The first option is chosen at the start; `relayout` is what each changes of the layout.
     """
 
     name: str
@@ -74,22 +67,10 @@ class Control:
 
 @dataclass(frozen=True)
 class Plot:
-    """A chart as a page shows it.
+    """A chart as a page shows it, with its choices; one of a single option is left out.
 
-    Attributes
-    ----------
-    heading, alt
-        What stands over it; what it shows, in words, for those who do not see it.
-    caption
-        Sentences under it.
-    figure
-        Traces and layout; `meta` of a trace says when it is shown and which colour it takes.
-    controls
-        Choices; one with a single option is left out.
-    cut
-        Whether the first heat map that is shown can be cut along either of its sides.
-    tall
-        Whether it needs the height of a solid view.
+    `meta` of a trace says when it is shown and which colour it takes (see :func:`when`). The first
+    heat map shown may be `cut` along either side; a solid view is `tall`.
     """
 
     heading: str
@@ -115,7 +96,7 @@ def plot(chart: Chart) -> Plot:
     """A chart to choose from, hover and zoom."""
     first = chart.panels[0]
     further: dict[str, Any] = {}
-    areas = [line for line in first.layers if isinstance(line, Line) and line.look == "area"]
+    areas = [line for line in first.lines if line.look == "area"]
     if areas:
         further = {"barmode": "stack"}
         further["hovermode"] = "x unified" if areas[0].x.size > 1 else "closest"
@@ -155,19 +136,14 @@ def _relaid(axis: Axis) -> dict[str, Any]:
 
 def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
     """Traces of a panel's lines, or of its map."""
-    for layer in panel.layers:
-        if isinstance(layer, Map):
-            assert scale is not None
-            yield _heat_map(panel, layer, scale)
-        else:
-            yield from _line(panel, layer)
-
-
-def _heat_map(panel: Panel, layer: Map, scale: Scale) -> go.Heatmap:
+    for line in panel.lines:
+        yield from _line(panel, line)
+    if (layer := panel.map) is None or scale is None:
+        return
     values, ends = layer.values, (scale.low, scale.high)
     if scale.decades:
         values, ends = np.log10(np.where(values > 0, values, np.nan)), tuple(np.log10(ends))
-    return go.Heatmap(
+    yield go.Heatmap(
         x=_short(layer.x), y=_short(layer.y), z=_short(values), zmin=ends[0], zmax=ends[1],
         colorscale="Viridis", colorbar=COLOUR_BAR, name=panel.when["part"],
         meta=when(None, **panel.when),

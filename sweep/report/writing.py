@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import os
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import pandas
 import xarray as xr
+import yaml
 
 from sweep.analysis import labels
 from sweep.analysis.charts import Chart, Room
@@ -19,12 +21,15 @@ from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_a
 from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
-from sweep.analysis.tabular import Page as TablePage
-from sweep.analysis.tabular import outputs_page
-from sweep.report import detector, flights, provenance
+from sweep.analysis.tables import Page as TablePage
+from sweep.analysis.tables import outputs_page
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.report import detector, flights
 from sweep.report.flights import Seen
 from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
+from sweep.spec.fields import parameter_rules
+from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import Location, located
 
 PAGE = Room(parts=detector.MOST_PARTS, columns=500, rows=180, cells=400_000, abreast=1)
@@ -79,17 +84,14 @@ def write(store: str | Location, file: str | Path, say: Say = lambda text: None)
     page = _scene_page(store, say) if kind == SCENE else _grid_page(store, say)
     say("the page")
     text = rendered(page)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, file)
-    finally:
-        partial.unlink(missing_ok=True)
+    with draft(file, replace=True) as made:
+        made.write_text(text, encoding="utf-8")
     return file
 
 
 Made = Chart | Item | None
+
+Declared = Spec | SceneSpec
 
 
 def _grid_page(store: Location, say: Say) -> Page:
@@ -119,16 +121,14 @@ def _grid_page(store: Location, say: Say) -> Page:
     return _page(spec, dataset.attrs, "points", facts, sections, store)
 
 
-def _asked(spec: Spec | SceneSpec, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
+def _asked(spec: Declared, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
     """Section on the study's fields, the effects simulated and the accuracy reached."""
-    made = [provenance.axes(spec), provenance.effects(flags, spec.modes()),
-            provenance.fields(spec)]  # fmt: skip
-    told = provenance.accuracy(dataset, spec)
-    return _section("asked", "What was asked and simulated", made, told)
+    made = [_axes(spec), _effects(flags, spec.modes()), _fields(spec)]
+    return _section("asked", "What was asked and simulated", made, accuracy(dataset, spec))
 
 
 def _page(
-    spec: Spec | SceneSpec, attributes: Mapping[Any, Any], unit: str,
+    spec: Declared, attributes: Mapping[Any, Any], unit: str,
     counted: Sequence[tuple[str, str]], sections: Sequence[Section], store: Location,
 ) -> Page:  # fmt: skip
     """The page: what a reader wants to know first, its sections, and how to make it again."""
@@ -149,7 +149,7 @@ def _page(
         spec.question,
         [(name, value) for name, value in facts if value],
         [remark] if done < number else [],
-        [*sections, provenance.reproduction(attributes, spec, str(store))],
+        [*sections, _reproduction(attributes, spec, str(store))],
     )
 
 
@@ -274,3 +274,158 @@ def _cloud_points(found: list[Seen]) -> Table:
             frames.append(pandas.DataFrame({"recorded by": seen.words or "the scanner"} | columns))
     frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
     return Table("Points", _told(len(frame), total), frame, "points")
+
+
+def _fields(spec: Declared) -> Table:
+    """Every field of the spec with what it means."""
+    rules = parameter_rules()
+    written = spec.to_yaml_mapping()
+    rows = [
+        (path, _shown(value), rules[path].about if path in rules else "")
+        for path, value in _leaves(written)
+        if path.split(".")[0] not in ("title", "question", "figures", "axes", "effects")
+    ]
+    frame = pandas.DataFrame(rows, columns=["field", "value", "meaning"])
+    return Table("Every field", ["Defaults included."], frame, "fields")
+
+
+def _leaves(written: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in written.items():
+        path = f"{prefix}{name}"
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{path}.")
+        else:
+            yield path, value
+
+
+def _shown(value: object) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
+def _axes(spec: Declared) -> Table | None:
+    """Axes with their values."""
+    rows = [
+        (axis.name, member.path, axis.size, _values(member.display, member.units))
+        for axis in spec.axes
+        for member in axis.members
+    ]
+    if not rows:
+        return None
+    frame = pandas.DataFrame(rows, columns=["axis", "parameter", "values", "which"])
+    return Table("What varies", [], frame, "axes")
+
+
+def _values(values: np.ndarray, units: str) -> str:
+    told = [labels.quantity(v, units) for v in values[:4]]
+    if len(values) > 5:
+        return ", ".join([*told[:2], "...", labels.quantity(values[-1], units)])
+    return ", ".join(labels.quantity(v, units) for v in values)
+
+
+def _effects(arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> Table:
+    """Effects that were simulated: at how many points, and in which part of the study."""
+    lazy = []
+    for k in range(len(EFFECTS)):
+        present = [array // 2**k % 2 > 0 for array in arrays]
+        lazy.append(
+            [(own.sum(), [own.any(set(own.dims) - {dim}) for dim in own.dims]) for own in present]
+        )
+    (found,) = dask.compute(lazy)
+    size = sum(array.size for array in arrays)
+    rows = []
+    for effect, every in zip(EFFECTS, found, strict=True):
+        number = sum(int(own) for own, _ in every)
+        spans = [_span(along) for _, own in every for along in own]
+        where = ", ".join(dict.fromkeys(filter(None, spans))) if number < size else "everywhere"
+        rows.append(
+            (effect.name.replace("_", " "), modes[effect.name], round(100 * number / size, 2),
+             where, effect.about)
+        )  # fmt: skip
+    rows.sort(key=lambda row: -row[2])
+    names = ["effect", "asked", "% of points", "within", "what it is"]
+    caption = [
+        "Asked: auto simulates an effect where leaving it out could change a probability, or the "
+        "magnitude of a bin, by more than the tolerance allows.",
+        "Within: the smallest part of the study that holds all points with the effect.",
+    ]
+    return Table("Effects", caption, pandas.DataFrame(rows, columns=names), "effects")
+
+
+def _span(present: xr.DataArray) -> str:
+    """Ends of the coordinates along a dimension between which an effect is present."""
+    there, told = present.values, []
+    for name, coordinate in present.coords.items():
+        if coordinate.ndim != 1 or there.all() or not there.any():
+            continue
+        if labels.is_words(coordinate.values):
+            continue
+        chosen = coordinate.values[there]
+        units = coordinate.attrs.get("units", "")
+        ends = [labels.quantity(v, units) for v in (chosen.min(), chosen.max())]
+        told.append(f"{labels.coordinate(str(name))} {ends[0]} to {ends[1]}")
+    return ", ".join(told)
+
+
+def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
+    """Accuracy of the results, in sentences."""
+    tolerance = spec.accuracy.tolerance
+    told = [
+        f"Asked for: no probability of detection off by more than {tolerance:g}"
+        + (f", with a confidence of {spec.accuracy.confidence:g}" if "n_draws" in dataset else "")
+        + "."
+    ]
+    if "effects_error" in dataset:
+        told.append(
+            "What was left out changes a probability by "
+            f"{float(dataset['effects_error'].max()):.2g} at the most, at any point."
+        )
+    left = float(dataset["beamlets_error"].max()) if "beamlets_error" in dataset else 0.0
+    if left > 0:
+        told.append(f"More beamlets would change one by {left:.2g} at the most.")
+    if "n_draws" in dataset:
+        missed = dataset["accuracy_missed"]
+        known = int(missed.notnull().sum())
+        met = int((missed <= 0).sum())
+        told.append(
+            f"Drawn to that accuracy at {met:,} of {known:,} points; the largest half-width of "
+            f"pd_shot is {float(dataset['pd_shot_half_width'].max()):.2g}, and "
+            f"{int(dataset['n_draws'].where(dataset['n_draws'] > 0).sum()):,} draws were made."
+        )
+    return told
+
+
+def _reproduction(attributes: Mapping[Any, Any], spec: Declared, store: str) -> Section:
+    """Citation of the study, and commands that make it again."""
+    software = attributes["software"]
+    version = software["sweep"]
+    year = str(attributes.get("finished") or attributes.get("started") or "")[:4]
+    identity = f"study {attributes['study_id']}, model {attributes['model_version']}"
+    cite = (
+        f"{attributes['title']}. Simulated with sweep {version}, {identity}"
+        f"{f', {year}' if year else ''}."
+    )
+    bibtex = (
+        f"@misc{{sweep-{attributes['study_id'][:8]},\n"
+        f"  title = {{{{{attributes['title']}}}}},\n"
+        f"  howpublished = {{Simulated with sweep {version}}},\n"
+        f"  note = {{{identity}}},\n" + (f"  year = {{{year}}},\n" if year else "") + "}"
+    )
+    text = yaml.safe_dump(spec.to_yaml_mapping(), sort_keys=False, allow_unicode=True, width=100)
+    commands = f"sweep run study.yaml --store {store}\nsweep figures {store}\nsweep report {store}"
+    versions = ", ".join(f"{name} {number}" for name, number in software.items())
+    words = [
+        f"Made with {versions}, on a processor {attributes['processor']}. The same spec, seed and "
+        "versions give the same numbers, bit for bit, on any number of workers."
+    ]
+    return Section(
+        "reproduce",
+        "Cite and reproduce",
+        words,
+        [
+            Text("Citation", [], cite),
+            Text("BibTeX", [], bibtex, "study.bib"),
+            Text("Commands", ["With the spec below saved as study.yaml."], commands),
+            Text("Spec", ["As it was computed, every default written out."], text, "study.yaml"),
+        ],
+    )

@@ -5,7 +5,7 @@ import xarray as xr
 from drawn_studies import study
 from scipy.special import ndtr
 
-import sweep.analysis.answers.accessor  # noqa: F401
+import sweep.analysis.opening  # noqa: F401
 
 PATHS = {"range": "target.range", "grazing_angle": "target.grazing_angle"}
 UNITS = {"range": "m", "grazing_angle": "deg"}

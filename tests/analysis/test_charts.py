@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
 
-from sweep.analysis import charts, drawing
+from sweep.analysis import canvas, charts
 from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, coarsened, confined
 
 BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
@@ -44,12 +44,12 @@ def slices(found, by=""):
 
 
 def sheet(chart):
-    return drawing.sheet_of(chart, title="", note="")
+    return canvas.sheet_of(chart, "", "")
 
 
 def map_of(found):
     (panel,) = surface(found).panels
-    return panel.layers[0]
+    return panel.map
 
 
 def painted(chart, value):
@@ -57,7 +57,7 @@ def painted(chart, value):
     drawn = sheet(chart)
     drawn.canvas.draw()
     pixels = np.asarray(drawn.canvas.buffer_rgba())[..., :3].astype(int)
-    colour = np.round(np.array(drawing.colours()(value)[:3]) * 255).astype(int)
+    colour = np.round(np.array(canvas.colours()(value)[:3]) * 255).astype(int)
     return int((np.abs(pixels - colour).max(axis=-1) <= 2).sum())
 
 
@@ -146,18 +146,18 @@ def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
 
 
 def test_cells_meet_half_way_between_points_and_in_the_logarithm_where_points_do():
-    assert drawing.edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
+    assert canvas.edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
     expected = np.array([0.1, 1.0, 10.0, 100.0]) * np.sqrt(10)
-    assert drawing.edges(np.array([1.0, 10.0, 100.0]), True) == pytest.approx(expected)
+    assert canvas.edges(np.array([1.0, 10.0, 100.0]), True) == pytest.approx(expected)
     assert charts.is_geometric(np.geomspace(1, 1e4, 30))
     assert not charts.is_geometric(np.linspace(1, 1e4, 30))
 
 
 def test_probabilities_of_detection_span_0_to_1_and_tiny_chances_a_logarithm():
-    chance = drawing.norm_of(charts.scale_of("pd_shot", "pd", [np.array([0.4, 0.6])]))
+    chance = canvas.norm_of(charts.scale_of("pd_shot", "pd", [np.array([0.4, 0.6])]))
     assert (chance.vmin, chance.vmax) == (0.0, 1.0)
     tiny = charts.scale_of("p_leakage_up", "leakage", [np.geomspace(1e-12, 0.1, 40)])
-    assert isinstance(drawing.norm_of(tiny), LogNorm)
+    assert isinstance(canvas.norm_of(tiny), LogNorm)
 
 
 def test_words_stand_one_after_the_other_along_an_axis():

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import sweep
 from sweep.analysis import canvas, shot_figure
 from sweep.analysis.answers import comparison
-from sweep.analysis.drawing import sheet_of
+from sweep.analysis.canvas import sheet_of
 from sweep.analysis.figures import draw
 from sweep.report import writing
 from sweep.report.page import Plot
@@ -92,7 +92,7 @@ def pictures(tmp_path_factory):
         opened = sweep.open(stores["powers"])
         less = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
         chart = comparison.figure(comparison.compared(opened, less))
-        sheets["comparison"] = sheet_of(chart, title="T", note="")
+        sheets["comparison"] = sheet_of(chart, "T", "")
     for name, page in (("grid", writing._grid_page), ("scene", writing._scene_page)):
         items = (i for s in page(stores[name], lambda text: None).sections for i in s.items)
         plots = [item for item in items if isinstance(item, Plot)]

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from drawn_scenes import MAPPING, cut_short, flown, scene
 
-from sweep.analysis.drawing import sheet_of
+from sweep.analysis.canvas import sheet_of
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import navigation
 from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
@@ -51,12 +51,12 @@ def test_statistics_are_plain_averages_over_the_solutions_of_a_bin(
         assert curve.tally.availability[i] == pytest.approx(solved.mean())
         seen += own.shape[0]
         if not solved.any():
-            assert np.isnan(curve.bias[i]).all()
+            assert np.isnan(curve.tally.bias[i]).all()
             continue
         own = own[solved]
         spread = own.std(axis=0, ddof=1) / np.sqrt(len(own))
         predicted = variance[inside].reshape(-1, size)[solved].mean(axis=0)
-        assert curve.bias[i] == pytest.approx(own.mean(axis=0), rel=1e-9, abs=1e-13)
+        assert curve.tally.bias[i] == pytest.approx(own.mean(axis=0), rel=1e-9, abs=1e-13)
         assert curve.bias_error[i] == pytest.approx(spread, rel=1e-9)
         rmse = np.sqrt((own**2).mean(axis=0))
         assert curve.rmse[i, :size] == pytest.approx(rmse, rel=1e-9)
@@ -105,7 +105,7 @@ def test_a_level_flight_has_one_bin_and_a_scanner_of_two_beams_no_curve(
 
 def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_store, spec):
     (curve,) = curves(recordings(scene_store, spec, "1 W"), quantity="velocity", bins=4)
-    sheet = sheet_of(navigation_chart([curve, curve], "all"), title="T", note="note")
+    sheet = sheet_of(navigation_chart([curve, curve], "all"), "T", "note")
     panels = {axes.get_title(loc="left"): axes for axes in sheet.axes if axes.get_visible()}
     error, stated = panels["RMS error of the velocity, z"].lines[:2]
     assert np.array_equal(error.get_ydata(), curve.rmse[:, 2])
@@ -124,7 +124,7 @@ def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp
     text, table = page.save(tmp_path, "navigation")
     rows = list(csv.DictReader(table.open()))
     assert [float(row["rmse"]) for row in rows] == curve.rmse[:, 0].tolist()
-    assert [float(row["bias"]) for row in rows] == curve.bias[:, 0].tolist()
+    assert [float(row["bias"]) for row in rows] == curve.tally.bias[:, 0].tolist()
     assert [float(row["from"]) for row in rows] == curve.edges[:-1].tolist()
     assert sum(int(row["cycles"]) for row in rows) == curve.tally.attempts.sum()
     said = text.read_text()

@@ -9,7 +9,7 @@ from sweep.analysis import shot_figure
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes.recording import eyepoints_of, place, read_eyepoints, several_surfaces
 from sweep.analysis.selection import parameters_at
-from sweep.analysis.shot_spectra import Group, Segment, simulated_shot
+from sweep.analysis.shot_figure import Group, Segment, simulated_shot
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from drawn_studies import INSTRUMENT, SURFACE, TARGET, study
 
-from sweep.analysis import shot_figure, shot_spectra
+from sweep.analysis import shot_figure
 from sweep.model import shot as model
 from sweep.spec import SpecError
 
 
 @pytest.fixture(scope="module")
 def one():
-    return shot_spectra.simulated(study({}).parameters())
+    return shot_figure.simulated(study({}).parameters())
 
 
 def test_the_text_tells_noise_segments_range_velocity_and_false_alarms(tmp_path):
@@ -84,7 +84,7 @@ def test_drawn_noise_has_the_noise_level_and_crosses_the_threshold_as_rarely_as_
         "instrument.processing.tnr": 4.0,
         "target.reflectance": 0.0,
     }
-    shot = shot_spectra.simulated(parameters, seed=5)
+    shot = shot_figure.simulated(parameters, seed=5)
     inner = np.concatenate([segment.magnitude[1:-1] for segment in shot.segments])
     # 3 x 65,535 exponential powers; a Hamming window correlates neighbours: half as many count
     independent = inner.size / 2
@@ -97,7 +97,7 @@ def test_drawn_noise_has_the_noise_level_and_crosses_the_threshold_as_rarely_as_
 
 def test_noise_is_the_seeds_alone():
     parameters = study({}).parameters()
-    a, b, c = (shot_spectra.simulated(parameters, seed=seed).segments[0] for seed in (1, 1, 2))
+    a, b, c = (shot_figure.simulated(parameters, seed=seed).segments[0] for seed in (1, 1, 2))
     assert np.array_equal(a.magnitude, b.magnitude)
     assert not np.array_equal(a.magnitude, c.magnitude)
     assert np.array_equal(a.signal, c.signal)
@@ -105,9 +105,9 @@ def test_noise_is_the_seeds_alone():
 
 def test_groups_are_runs_of_bins_above_threshold_with_their_highest():
     magnitude = np.array([5.0, 1.0, 6.0, 7.0, 6.5, 1.0, 1.0, 5.0])
-    found = shot_spectra.groups(magnitude, 5.0)
+    found = shot_figure.groups(magnitude, 5.0)
     assert [(g.first, g.last, g.peak) for g in found] == [(0, 0, 0), (2, 4, 3), (7, 7, 7)]
-    assert shot_spectra.groups(magnitude, 8.0) == ()
+    assert shot_figure.groups(magnitude, 8.0) == ()
 
 
 @pytest.mark.parametrize("distance", [500.0, 9500.0])
@@ -120,10 +120,10 @@ def test_the_upper_axis_reads_true_range_and_velocity_at_the_beats_folded_or_not
         "target.radial_velocity": velocity,
         "target.grazing_angle": np.pi / 2,
     }
-    shot = shot_spectra.simulated(parameters)
+    shot = shot_figure.simulated(parameters)
     for segment in shot.segments:
         at_peak = segment.frequency[segment.peak]
-        found = float(shot_spectra.quantity_at(shot, segment, np.array(at_peak)))
+        found = float(shot_figure.quantity_at(shot, segment, np.array(at_peak)))
         # a bin is 0.343 m of range and 3.55 mm/s of velocity; the peak is within one
         if segment.sign:
             assert found == pytest.approx(distance, abs=0.35)

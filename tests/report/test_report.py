@@ -105,7 +105,7 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     (place, *_) = detector._places_of_interest(track)
     point = study.dataset.isel(track.position(place))
     curve = point.sweep.roc(detector.IN_A_BIN)
-    by_alarm = {panel.when["alarm"]: panel.layers[0] for panel in chart.panels}
+    by_alarm = {panel.when["alarm"]: panel.lines[0] for panel in chart.panels}
     for line in by_alarm.values():
         np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
     position = track.position(place)

@@ -38,7 +38,7 @@ def drawn(tmp_path_factory):
 def drawn_lines(chart, **choices):
     """Lines of a chart that are shown at some choices, by name."""
     (panel, *_) = (p for p in chart.panels if choices.items() <= p.when.items())
-    return {line.name: line for line in panel.layers}
+    return {line.name: line for line in panel.lines}
 
 
 @pytest.mark.parametrize("choice,answer", detector.ANSWERS.items())

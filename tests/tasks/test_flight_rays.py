@@ -15,7 +15,7 @@ from sweep.analysis.opening import open_scene
 from sweep.cli import main
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
-from sweep.report.provenance import accuracy
+from sweep.report.writing import accuracy
 from sweep.spec import SceneSpec
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import extend

@@ -292,19 +292,10 @@ SHOWN = (
 def compared(ours: Store, other: Store) -> dict[str, xr.Dataset]:
     """Differences of what a table shows, computed: by scanner, or of a grid under no name."""
     found = ours.sweep.compare(other)
-    parts = {"": found} if isinstance(found, xr.Dataset) else _groups(found)
-    return {part: _shown(dataset).compute() for part, dataset in parts.items()}
-
-
-def _groups(tree: xr.DataTree) -> dict[str, xr.Dataset]:
-    return {name: group.to_dataset() for name, group in tree.children.items()}
-
-
-def _shown(found: xr.Dataset) -> xr.Dataset:
-    return found[
-        [n for n in found.data_vars if str(n).removesuffix("_allowed").removesuffix("_agrees")
-         in SHOWN]
-    ]  # fmt: skip
+    one = isinstance(found, xr.Dataset)
+    parts = {"": found} if one else {n: group.to_dataset() for n, group in found.children.items()}
+    shown = {f"{name}{end}" for name in SHOWN for end in ("", "_allowed", "_agrees")}
+    return {n: own[[v for v in own if v in shown]].compute() for n, own in parts.items()}
 
 
 def rows(found: xr.Dataset) -> list[list[str]]:
@@ -380,13 +371,12 @@ LEAST = 1e-16
 def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
     """Draw the shares of points that differ by more than some amount, a colour a scanner."""
     from sweep.analysis import canvas
-    from sweep.analysis.drawing import sheet_of
 
     with canvas.style():
         chart = figure(found)
         if chart is None:
             return canvas.save(canvas.empty("Nothing that both stores have is computed yet"), path)
-        return canvas.save(sheet_of(chart, title=chart.heading, note=""), path)
+        return canvas.save(canvas.sheet_of(chart, chart.heading, ""), path)
 
 
 def figure(found: Mapping[str, xr.Dataset]) -> Chart | None:

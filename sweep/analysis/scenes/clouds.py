@@ -139,14 +139,9 @@ STEEPEST = 1.5
 
 @dataclass(frozen=True)
 class Ground:
-    """Heights of the ground on an even grid.
+    """Heights of the ground (rows, columns) on an even grid; nan where there is none.
 
-    Attributes
-    ----------
-    x, y : (columns,), (rows,) ndarray
-        World coordinates [m], rising.
-    height : (rows, columns) ndarray
-        [m]; nan where there is none.
+    World coordinates x (columns,) and y (rows,) rise; all in metres.
     """
 
     x: np.ndarray

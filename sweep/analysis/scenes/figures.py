@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.drawing import sheet_of
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import pictures
 from sweep.analysis.scenes.clouds import AXES, Ground, gathered
@@ -26,9 +25,8 @@ from sweep.analysis.scenes.recording import (
     several_surfaces,
 )
 from sweep.analysis.selection import parameters_at
-from sweep.analysis.shot_figure import scene_shot_sheet
-from sweep.analysis.shot_spectra import simulated_shot
-from sweep.analysis.tabular import Page
+from sweep.analysis.shot_figure import scene_shot_sheet, simulated_shot
+from sweep.analysis.tables import Page
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.spec import SceneSpec
@@ -228,10 +226,10 @@ def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canva
     found = _curves(study, figure, at)
     if not found:
         return "no measurement cycle of three shots or more"
-    return sheet_of(
+    return canvas.sheet_of(
         navigation_chart(found, figure.show),
-        title=study.titled(figure, f"Navigation: {figure.quantity}"),
-        note=labels.joined([at.words, study.note]),
+        study.titled(figure, f"Navigation: {figure.quantity}"),
+        labels.joined([at.words, study.note]),
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Map, Panel
+from sweep.analysis.charts import LINEAR, LOG, Axis, Chart, Line, Panel
 from sweep.analysis.opening import chunk, stretches
 from sweep.analysis.scenes.recording import Recording
-from sweep.analysis.tabular import Block, Cell, Page
+from sweep.analysis.tables import Block, Cell, Page
 from sweep.model.navigation import EXCLUDED, SOLVED
 
 VELOCITY, ALTITUDE = "velocity", "altitude"
@@ -100,11 +100,6 @@ class Curve:
     def middle(self) -> np.ndarray:
         """Altitudes in the middle of the bins [m]."""
         return (self.edges[1:] + self.edges[:-1]) / 2
-
-    @property
-    def bias(self) -> np.ndarray:
-        """Mean error of each component, (bins, m)."""
-        return self.tally.bias
 
     @property
     def bias_error(self) -> np.ndarray:
@@ -292,7 +287,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
     component = names[part] if part < len(names) else LENGTH
     of = f"of the {quantity}" + (f", {component}" if len(names) > 1 else "")
     units, middle = UNITS[quantity], curves[0].middle
-    lines: list[Line | Map] = []
+    lines: list[Line] = []
     if statistic == AVAILABILITY:
         title, up = f"{quantity} available", Axis("share of cycles (%)", limits=(-4, 104))
         lines += [Line(middle, 100 * curve.tally.availability, curve.words, k)
@@ -301,7 +296,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
         title, up = f"bias {of}", Axis(f"bias ({units})")
         lines.append(Line(middle[[0, -1]], np.zeros(2), look="level"))
         for k, curve in enumerate(curves):
-            bias, error = curve.bias[:, part], curve.bias_error[:, part]
+            bias, error = curve.tally.bias[:, part], curve.bias_error[:, part]
             lines.append(
                 Line(middle, bias, curve.words, k, low=bias - error, high=bias + error,
                      look="bars")
@@ -357,7 +352,7 @@ def _record(curve: Curve, i: int, shown: Sequence[str]) -> dict[str, Cell]:
         record["available"] = float(curve.tally.availability[i])
     if BIAS in shown:
         for k, name in enumerate(names):
-            record[f"bias {name}".strip()] = float(curve.bias[i, k])
+            record[f"bias {name}".strip()] = float(curve.tally.bias[i, k])
             record[f"error of bias {name}".strip()] = float(curve.bias_error[i, k])
     if RMSE in shown:
         for k, name in enumerate((*names, LENGTH) if len(names) > 1 else names):

@@ -196,18 +196,9 @@ WIDEST, TALLEST, LEAST = 7.4, 7.0, 1.5
 
 
 class Flat(_Picture):
-    """A picture along one of the world's axes.
+    """A picture along one of the world's axes: those across, up and along the look.
 
-    Parameters
-    ----------
-    cloud
-        What to show.
-    along : (across, up, depth) of str
-        The world's axes across, up and along the look.
-    nearest : int
-        1 where the eye is at the upper end of `depth`, -1 at its lower one.
-    title, note
-        Over the sheet and at its foot.
+    `nearest` is 1 where the eye is at the upper end of the last, -1 at its lower one.
     """
 
     def __init__(

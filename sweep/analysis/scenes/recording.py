@@ -408,8 +408,7 @@ def _values(spec: SceneSpec, name: str) -> str:
 
 def _words(spec: SceneSpec, index: Mapping[str, int]) -> str:
     return ", ".join(
-        f"{labels.coordinate(member.name)} "
-        f"{labels.quantity(member.display[index[axis.name]], member.units)}"
+        labels.valued(member.name, member.display[index[axis.name]], member.units)
         for axis in spec.axes
         if axis.size > 1
         for member in axis.members
