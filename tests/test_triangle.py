@@ -7,9 +7,21 @@ import pytest
 import yaml
 
 import sweep
-from sweep.spec import Spec
+from sweep.model.pairing import TRUE
+from sweep.spec import SceneSpec, Spec
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+STREET = {
+    "ground": {"kind": "plane", "size": "400 m", "reflectance": 0.3},
+    **{
+        f"house_{side}_{number}": {
+            "kind": "box", "size": ["18 m", "9 m", f"{8 + 3 * number} m"], "reflectance": 0.4,
+            "position": [f"{25 * number - 50} m", f"{12 * sign} m", f"{4 + 1.5 * number} m"],
+        }
+        for number in range(4)
+        for side, sign in (("left", 1), ("right", -1))
+    },
+}  # fmt: skip
 
 
 def instrument(**chirp):
@@ -42,3 +54,32 @@ def test_a_grid_lists_its_segments_and_may_vary_them(tmp_path):
     assert 10 ** (bits[0] - bits[1]) == pytest.approx(1.5, rel=1e-2)
     rates = found.sweep.false_alarms_per_second()
     assert float(rates[1] / rates[0]) == pytest.approx(1.5, rel=1e-2)
+
+
+def test_no_point_of_a_street_is_lost_for_want_of_a_third_segment(tmp_path):
+    """Range and velocity stray by their standard errors: z-scores within 1 +- 0.1."""
+    clouds = {}
+    for order in ("up down", "up doppler down"):
+        spec = SceneSpec.from_mapping({
+            "title": "A street", "instrument": instrument(segments=order),
+            "scene": {"origin": "ground", "objects": STREET},
+            "platform": {"path": {
+                "kind": "straight", "from": ["0 m", "0 m", "90 m"], "to": ["0 m", "0 m", "60 m"],
+                "initial_speed": "15 m/s", "final_speed": "15 m/s",
+            }},
+            "scanners": {"frame": {"kind": "raster", "columns": 20, "rows": 20,
+                                   "half_angles": ["12 deg", "12 deg"], "rate": "200 Hz"}},
+            "footprint": {"beamlets": 1, "speckle": "none"}, "draws": {"number": 2},
+        })  # fmt: skip
+        store = tmp_path / f"{order.replace(' ', '_')}.zarr"
+        assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
+        clouds[order] = sweep.open_scene(store)["frame"].to_dataset().load()
+    triangle, three = clouds.values()
+    kept, before = ((each["flags"] & TRUE > 0).sum().item() for each in (triangle, three))
+    assert kept >= before > 500
+    for name in ("range", "radial_velocity"):
+        error = triangle[f"{name}_interpolated"] - triangle[f"true_{name}"]
+        scores = (error / triangle[f"{name}_interpolated_standard_error"]).to_numpy()
+        scores = scores[np.isfinite(scores)]
+        spread = np.diff(np.percentile(scores, [15.865, 84.135]))[0] / 2
+        assert abs(spread - 1) < 0.1, (name, spread, scores.std())
