@@ -97,11 +97,16 @@ def test_it_is_what_drawn_speckle_comes_to(sloping):
         assert -5 * error - 0.004 < outputs[name][0] - values.mean() < 5 * error
 
 
-def test_correlations_are_the_sum_over_the_beamlets(sloping):
-    shots = prepared(sloping)
-    turn = 2j * np.pi * 299792458 / 1550e-9 * shots.doppler[0] * 500e-6
+@pytest.mark.parametrize(
+    "order, apart", [("up doppler down", (1, 2, 1)), ("down doppler up", (-1, -2, -1)),
+                     ("up down doppler", (2, 1, -1))],
+)  # fmt: skip
+def test_correlations_are_the_sum_over_the_beamlets(order, apart, sloping):
+    """Of up and Doppler, up and down, Doppler and down segment, so many segments and gaps apart."""
+    shots = prepared(sloping | {"instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6})
+    turn = 2j * np.pi * 299792458 / 1550e-9 * shots.doppler[0] * 550e-6
     power = shots.amplitude[0] ** 2 / (shots.amplitude[0] ** 2).sum()
-    for found, segments in ((shots.fading.next, 1), (shots.fading.over, 2)):
+    for found, segments in zip(shots.fading, apart, strict=True):
         assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=1e-4)
 
 
