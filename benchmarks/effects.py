@@ -1,8 +1,9 @@
 """All effects on against those that are called for: what it changes, what it saves.
 
-Run with `make effects`, some three minutes: every experiment in the repository, whole, with each
-effect forced on, and with effects on demand at three tolerances. All in one process, one variant
-of an experiment after the other; quote the ratios. Writes docs/effects_table.md.
+Run with `make effects`, an hour or more, most of it descents with their draws: every experiment in
+the repository, whole, with each effect forced on, and with effects on demand at three tolerances.
+All in one process, one variant of an experiment after the other; quote the ratios. Writes
+docs/effects_table.md.
 """
 
 import sys

@@ -495,3 +495,9 @@ def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
         else 108 - taken
     )
     assert sum(computed) == 108 - taken - done
+
+
+def test_its_own_place_named_is_its_own_place(tmp_path, undisturbed, computed):
+    path, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
+    assert larger(path, spec, to=path, overwrite=True).complete and sum(computed) == 36
+    assert tree(path) == at_once(spec, tmp_path)
