@@ -207,7 +207,7 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
         np.empty((count, place.size)),
     )
     table = np.empty((2, line_shape.places_of(shapes.sizes)))
-    form = np.zeros((7, shapes.reach.size))
+    form = np.zeros((7, shapes.reach.shape[1]))
     modes = np.zeros((1, 1, 2, 1))
     modes[..., 0, :] = 1.0
     parts = np.zeros((1, 1)), modes, np.ones((1, 1), np.int64), np.empty((1, 2, 0))
@@ -352,8 +352,8 @@ def _some(
     values = np.full((4, segments, m), np.nan)
     magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
     shapes = together.shapes
-    places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.size))
-    form[:, 0] = shapes.reach
+    places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.shape[1]))
+    form[:, 0] = shapes.reach[0]
     rule = shots.echo_rule
     done = _inspect_points(
         np.ascontiguousarray(table[:, part].T),
