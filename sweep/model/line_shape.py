@@ -231,7 +231,7 @@ def _places(bins: int, power: bool) -> np.ndarray:
 
 
 def _in_table(values: np.ndarray, cells: int) -> np.ndarray:
-    """Values at :func:`_places` with the kernel divided out, by cell of a bin as tables have them."""
+    """Values at :func:`_places` with the kernel divided out, in rows by cell of a bin."""
     inner = values.shape[1] - 2 * _BEYOND
     filtered = TAPS[0] * values[:, _BEYOND : _BEYOND + inner]
     for k in range(1, TAPS.size):

@@ -352,7 +352,8 @@ def _some(
     values = np.full((4, segments, m), np.nan)
     magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
     shapes = together.shapes
-    places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.shape[1]))
+    places = line_shape.places_of(shapes.sizes)
+    form = np.zeros((segments, 7, shapes.reach.shape[1]))
     form[:, 0] = shapes.reach[0]
     rule = shots.echo_rule
     done = _inspect_points(
