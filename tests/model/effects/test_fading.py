@@ -101,13 +101,28 @@ def test_it_is_what_drawn_speckle_comes_to(sloping):
     "order, apart", [("up doppler down", (1, 2, 1)), ("down doppler up", (-1, -2, -1)),
                      ("up down doppler", (2, 1, -1))],
 )  # fmt: skip
-def test_correlations_are_the_sum_over_the_beamlets(order, apart, sloping):
-    """Of up and Doppler, up and down, Doppler and down segment, so many segments and gaps apart."""
-    shots = prepared(sloping | {"instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6})
-    turn = 2j * np.pi * 299792458 / 1550e-9 * shots.doppler[0] * 550e-6
-    power = shots.amplitude[0] ** 2 / (shots.amplitude[0] ** 2).sum()
+@pytest.mark.parametrize(
+    "changed, near",
+    [
+        ({}, 1e-7),
+        ({"target.radial_velocity": 150.0, "instrument.laser.beam_divergence": 2e-3,
+          "target.transverse_velocity": 0.0}, 1e-5),
+        ({"target.radial_velocity": 150.0, "instrument.laser.beam_divergence": 5e-3,
+          "target.transverse_velocity": 0.08, "target.grazing_angle": 0.6}, 1e-3),
+    ],
+)  # fmt: skip
+def test_correlations_are_the_sum_over_many_beamlets(order, apart, changed, near, sloping):
+    """Of up and Doppler, up and down, Doppler and down segment, so many segments and gaps apart.
+
+    However few the beamlets that the power of a bin needs: here two.
+    """
+    several = {"instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6}
+    shots = prepared(sloping | several | changed | {"footprint.beamlets": 2})
+    fine = prepared(sloping | changed | {"footprint.beamlets": 4096, "footprint.pattern": "square"})
+    turn = 2j * np.pi * 299792458 / 1550e-9 * fine.doppler[0] * 550e-6
+    power = fine.amplitude[0] ** 2 / (fine.amplitude[0] ** 2).sum()
     for found, segments in zip(shots.fading, apart, strict=True):
-        assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=1e-4)
+        assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=near)
 
 
 @pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])
