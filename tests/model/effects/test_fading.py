@@ -9,12 +9,14 @@ from sweep.model import philox
 from sweep.model.detection import Fading, fading_together, found_pair
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
 from sweep.model.effects.catalogue import CORE
+from sweep.model.footprint import plane_footprint
+from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.realisations import realise
 from sweep.model.returns import draw_returns
-from sweep.model.shot import find, prepare, statistics
+from sweep.model.shot import find, prepare, prepare_cast, statistics
 
 FADING = (*CORE, "fading")
 COUNTS = list(DRAW_OUTPUTS)
@@ -123,6 +125,36 @@ def test_correlations_are_the_sum_over_many_beamlets(order, apart, changed, near
     power = fine.amplitude[0] ** 2 / (fine.amplitude[0] ** 2).sum()
     for found, segments in zip(shots.fading, apart, strict=True):
         assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=near)
+
+
+@pytest.mark.parametrize("transverse", [1.0, 12.0, 20.0, 32.0])
+def test_segments_of_a_cast_footprint_do_not_agree_by_few_rays(transverse, sloping):
+    """Nineteen rays of a hexagon repeat themselves where the Doppler shifts turn by 5 rad."""
+    p = sloping | {"target.radial_velocity": 30.0}
+    offset, cosine, weight, closing = plane_footprint(
+        grazing_angle=np.array([np.pi / 2]), beam_divergence=np.array([50e-6]), number=19,
+        radial=30.0, transverse=transverse,
+    )  # fmt: skip
+    cast = Cast(Footprints(np.zeros(1, int), offset, 2 * closing / 299792458, weight * cosine))
+    shots = prepare_cast(p, cast, FADING)
+    turn = 2 * np.pi * 2 / 1550e-9 * transverse * 12.5e-6 * 1e-3
+    assert abs(shots.fading.over[0]) == pytest.approx(np.exp(-0.5 * turn**2), abs=1e-4)
+
+
+@pytest.mark.parametrize("angle", [np.pi / 2, np.pi / 4])
+@pytest.mark.parametrize("divergence", [1e-4, 1e-3, 5e-3])
+def test_drawn_speckle_has_as_many_beamlets_as_its_segments_need(divergence, angle, sloping):
+    """Two are enough for the power of a bin; their Doppler shifts turn until the last segment."""
+    p = sloping | {
+        "footprint.beamlets": 0, "footprint.pattern": "auto", "target.transverse_velocity": 0.0,
+        "target.radial_velocity": 150.0, "accuracy.tolerance": 1e-3, "target.range": 100.0,
+        "instrument.laser.beam_divergence": divergence, "target.grazing_angle": angle,
+    }  # fmt: skip
+    drawn = prepared(p | {"target.roughness": np.inf})
+    turn = 2j * np.pi * 299792458 / 1550e-9 * drawn.doppler[0] * 1e-3
+    power = drawn.amplitude[0] ** 2 / (drawn.amplitude[0] ** 2).sum()
+    alike = abs((power * np.exp(turn)).sum()) ** 2
+    assert alike == pytest.approx(abs(prepared(p).fading.over[0]) ** 2, abs=1e-3)
 
 
 @pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])
