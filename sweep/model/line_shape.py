@@ -92,7 +92,7 @@ class Shapes(NamedTuple):
     that does not come from the record's first sample. Of amplitudes then, in further places, what
     this comes to in a table."""
     edges: np.ndarray
-    """(2, places): half of the window's first sample times cos and sin of pi r y, and likewise."""
+    """(2, places): the window's first sample times cos and sin of pi r y, and likewise."""
     ends: np.ndarray
     """(modes, 4, DERIVATIVES + 2): real and imaginary parts of A and of B, lowest power first."""
     reach: np.ndarray
@@ -124,7 +124,7 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
     modes = _integrals(strength, x, ratio * y)
     taylor = _taylor(COSINE_SUMS[window.name], number)
     modes += _corrections(taylor, ratio * y, length)
-    edges = 0.5 * taylor[0, 0] * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)])
+    edges = taylor[0, 0] * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)])
     if not power:
         modes, edges = (np.hstack([one, _in_table(one, CELLS[power])]) for one in (modes, edges))
     return Shapes(
@@ -393,19 +393,17 @@ def build(segment, numbers, parts, shapes, table, form):
             for k in range(envelope.shape[1]):
                 envelope[i, k] = shapes[6][segment, i, k]
         return
-    at_first_re, at_first_im, at_last_re, at_last_im = 0.0, 0.0, 0.0, 0.0
+    even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
     size = modes.shape[1]
     raw = np.zeros((2, size))
     ends[:] = 0.0
     for j in range(number):
         a, b = re[j], im[j]
-        sign = -1.0 if j & 1 else 1.0
-        at_first_re += sign * a
-        at_first_im += sign * b
-        at_last_re += a
-        at_last_im += b
         if j & 1:
+            odd_re, odd_im = odd_re + a, odd_im + b
             a, b = -b, a
+        else:
+            even_re, even_im = even_re + a, even_im + b
         for i in range(size):
             raw[0, i] += a * modes[j, i]
             raw[1, i] += b * modes[j, i]
@@ -415,12 +413,10 @@ def build(segment, numbers, parts, shapes, table, form):
                 ends[k, d] += re[j] * one - im[j] * other
                 ends[k + 1, d] += re[j] * other + im[j] * one
     # The record's first sample counts whole, its end not at all.
-    a, b = at_first_re - at_last_re, at_first_im - at_last_im
-    c, d = at_first_re + at_last_re, at_first_im + at_last_im
     for i in range(size):
         cosine, sine = edges[0, i], edges[1, i]
-        raw[0, i] += a * cosine - d * sine
-        raw[1, i] += b * cosine + c * sine
+        raw[0, i] -= odd_re * cosine + even_im * sine
+        raw[1, i] += even_re * sine - odd_im * cosine
     number = size if power else size - table.shape[1]  # places on either side of the line
     for i in range(table.shape[1] * (not power)):
         table[0, i], table[1, i] = raw[0, number + i], raw[1, number + i]

@@ -32,6 +32,9 @@ Parameters = Mapping[str, float | int | str | np.ndarray]
 LASER, CHIRP, TELESCOPE, RECEIVER, PROCESSING = (
     f"instrument.{part}." for part in ("laser", "chirp", "telescope", "receiver", "processing")
 )
+RECORD = RECEIVER + "record"
+"""Samples of a record: ``real``, or ``complex`` from I and Q."""
+
 BEAMLETS_ERROR = "footprint.beamlets_error"
 """Error of pd that the number of beamlets leaves, where that followed from the tolerance."""
 
@@ -164,6 +167,8 @@ class Shots:
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
     """Whether the record is I and Q, and its spectrum has signed bins and no images."""
+    image_gain: np.ndarray | float = 0.0
+    """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
     """Of echoes in developed speckle."""
     image: bool = False
@@ -175,6 +180,11 @@ class Shots:
     def size(self) -> int:
         """Number of points."""
         return self.range.size
+
+    @property
+    def bins(self) -> int:
+        """Bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
+        return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
     @property
     def chirp_rate(self) -> np.ndarray:
@@ -253,7 +263,7 @@ class Shots:
         """Signal over sigma below which bins that are taken one by one count as noise alone."""
         from sweep.model import detection
 
-        given, bins = self.leakage_floor, self.fft_size // 2 + 1
+        given, bins = self.leakage_floor, self.bins
         if not np.any(given == AUTOMATIC):
             return given
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
@@ -324,7 +334,7 @@ class Shots:
         return waveform.segment_starts(self.order, duration=self.duration, gap=self.gap)
 
     def point_table(self) -> np.ndarray:
-        """Numbers of each point as compiled code takes them, (16 + 6 segments, n).
+        """Numbers of each point as compiled code takes them, (COMMON + OWN segments, n).
 
         What all segments share, and of each segment the signed chirp rate [Hz/s], the carrier,
         the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
@@ -333,7 +343,7 @@ class Shots:
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
-            self.line_deviation, self.leakage_tolerance, self.line_tolerance,
+            self.line_deviation, self.leakage_tolerance, self.line_tolerance, self.image_gain,
         )  # fmt: skip
         further = (
             x
@@ -386,7 +396,7 @@ class Shots:
         points
             Which points these are.
         """
-        searched = self.fft_size // 2
+        searched = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_ends:
             searched += 1 - 2 * self.searched_from
         bins = np.maximum(searched - exempted, 0.0)
@@ -461,7 +471,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
-    per_ampere, per_watt, sources = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
+    in_quadrature = str(p[RECORD]) == "complex"
+    noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
+    per_ampere, per_watt, sources = link.noise_in_quadrature(noise) if in_quadrature else noise
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy = np.zeros(size), Accuracy.of(p)
     return Shots(
@@ -505,6 +517,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
+        complex_record=in_quadrature,
     )
 
 

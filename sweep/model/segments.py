@@ -26,6 +26,7 @@ from sweep.model.lines import (
     PLACE,
     RE,
     X,
+    add_images,
     fold_lines,
     nodes_for,
     place_lines,
@@ -73,7 +74,8 @@ class Runs(NamedTuple):
     part: np.ndarray
     """(m,): which points of the shots these are."""
     low: np.ndarray
-    """First bin; N more or less where a complex record's run passes its ends."""
+    """First bin; of complex records N more than its frequency says, or twice as many, so that no
+    bin of a run is below 0."""
     bins: np.ndarray
     """Bins in the run."""
     peak: np.ndarray
@@ -343,9 +345,9 @@ def _some(
     """Runs of as many points from ``first`` on as there is room for; how many these are."""
     part = together.part[first:]
     segments, m = len(shots.waveform), part.size
-    bins = shots.fft_size // 2 + 1 if view(shots) != COMPLEX else shots.fft_size
+    bins = shots.bins
     shifts = _shifts(shots, part)
-    lines = max(shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
+    lines = max(2 * shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
     width = max(lines, bins, 2 * MOST_POINTS, LEAST_WIDTH, MOST_CELLS) + 16
     size = max(ROOM_FOR_RUNS, segments * bins) if keep else 0
     numbers = np.zeros((5, segments, m), np.int64)
@@ -406,6 +408,8 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     apart = centre * sizes[0] / sizes[1]
     for b in range(n):
         room[PLACE, b] += apart
+    if p[16] > 0.0:
+        n = add_images(room, n, origin, p[16], power)
     whole, squares, lowest, highest = survey(room, n, power)
     if max(-lowest, highest) > 0.5 * sizes[0]:  # lines further apart than there are bins
         fold_lines(room, n, sizes)
@@ -523,7 +527,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
-            numbers[0, s, i], numbers[1, s, i] = low, count
+            turn = sizes[0] if sizes[7] == COMPLEX else 0  # never below 0
+            numbers[0, s, i], numbers[1, s, i] = low + turn, count
             numbers[2, s, i], numbers[3, s, i] = peak, exempted
             values[0, s, i], values[1, s, i] = found, missed
             values[2, s, i], values[3, s, i] = room[OUT, peak], leakage

@@ -180,6 +180,7 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
         duration=shots.duration,
         sample_rate=shots.sample_rate,
         bin_width=shots.sample_rate / shots.fft_size,
+        signed=shots.complex_record,
     )
 
 

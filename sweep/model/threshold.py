@@ -119,6 +119,8 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
     """
     size = int(np.max(p[PROCESSING + "fft_size"]))
     is_all = str(p[PROCESSING + "bins_counted"]) == "all"
+    in_quadrature = str(p.get("instrument.receiver.record", "real")) == "complex"
+    is_all |= in_quadrature
     if str(p[PROCESSING + "noise_bins"]) == "independent":
         return np.full(np.shape(level), float(size if is_all else size // 2))
     record = record_length(

@@ -18,10 +18,12 @@ import numpy as np
 
 from sweep.model import beam
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
+from sweep.model.effects import iq_imbalance
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.model.preparation import RECORD
 from sweep.spec.axes import Axis, place_on_grid
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding
@@ -156,7 +158,7 @@ def _is(word: str) -> Condition:
     return lambda values: values == word
 
 
-def _is_not(word: str) -> Condition:
+def _is_not(word: str | float) -> Condition:
     return lambda values: values != word
 
 
@@ -176,6 +178,7 @@ def grid_findings(grid: Grid) -> list[Finding]:
         *_beam_findings(grid),
         *_nesting_findings(grid),
         *_need_findings(grid),
+        *_record_findings(grid),
     ]
 
 
@@ -367,6 +370,17 @@ NEEDS = (
         for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
         for other, word in ((beam.COUPLING, beam.APERTURE), (beam.ARCHITECTURE, "direct"))
     ),
+    *(
+        Need(
+            path,
+            _is_not(default),
+            RECORD,
+            _is("real"),
+            "is one of I and Q, and the record is real",
+            "set instrument.receiver.record: complex",
+        )
+        for path, default in ((iq_imbalance.GAIN, 1.0), (iq_imbalance.PHASE, 0.0))
+    ),
     _above_zero("instrument.processing.bits", _given, FULL_SCALE),
     _above_zero(
         "atmosphere.profile", lambda profile: np.isin(profile, ("exponential", "layer")), EXTINCTION
@@ -420,6 +434,13 @@ def _need_findings(grid: Grid) -> Iterator[Finding]:
             yield grid.finding(need.path, need.rule, remedy)
         elif need.if_on and mode == ON and grid.has_point({need.other: need.lacks}):
             yield _of_mode(owner.name, need.rule, remedy)
+
+
+def _record_findings(grid: Grid) -> Iterator[Finding]:
+    """Complex records of direct detection, which has one detector and no phase to tell."""
+    if grid.has_point({RECORD: _is("complex"), beam.ARCHITECTURE: _is("direct")}):
+        rule = "samples I and Q, of which direct detection has one"
+        yield grid.finding(RECORD, rule, "take a coherent receiver, or record: real")
 
 
 def without_draws(grid: Grid) -> Iterator[Finding]:
@@ -486,6 +507,10 @@ def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
             yield grid.finding(path, rule, remedy)
     elif not draws.any:
         rule, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
+        yield Finding(("draws", "method"), rule, remedy, draws.method)
+    elif grid.has_point({RECORD: _is("complex")}):
+        rule = "draws whole spectra of real records, and the record is complex"
+        remedy = "take draws.method: noise, or instrument.receiver.record: real"
         yield Finding(("draws", "method"), rule, remedy, draws.method)
     else:
         yield from _misfits(grid)

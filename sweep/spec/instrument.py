@@ -118,6 +118,13 @@ class Receiver(Part):
         "receiver",
     )
     architecture: str = of.choice("How the echo is detected", ARCHITECTURES, "homodyne")
+    record: str = of.choice(
+        "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
+        "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
+        "coherent receivers only",
+        ("real", "complex"),
+        "real",
+    )
     local_oscillator_power: float = of.quantity(
         "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
         default=1e-3,

@@ -28,6 +28,7 @@ from sweep.model.preparation import (
     LASER,
     PROCESSING,
     RECEIVER,
+    RECORD,
     approach,
     link_scales,
     relative_amplitude,
@@ -229,7 +230,8 @@ class Points:
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
         values = {name: self[RECEIVER + name] for name in link.NOISY}
-        return link.receiver_noise(self.architecture, values)
+        found = link.receiver_noise(self.architecture, values)
+        return link.noise_in_quadrature(found) if self.word(RECORD) == "complex" else found
 
     @cached_property
     def noise_variance(self) -> np.ndarray:

@@ -38,7 +38,7 @@ import numpy as np
 from sweep.model.effects.effect import Effect, Scene, Size
 from sweep.model.effects.lobes import lobe
 from sweep.model.effects.points import Points
-from sweep.model.preparation import PROCESSING, Shots
+from sweep.model.preparation import PROCESSING, RECORD, Shots
 from sweep.model.window import window
 
 _LN_10 = math.log(10)
@@ -47,12 +47,14 @@ _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
 
 
-def image_size(points: Points) -> Size:
-    """Change of the largest bin by images.
+def image_size(points: Points) -> Size | None:
+    """Change of the largest bin by images; complex records have none.
 
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
+    if points.word(RECORD) == "complex":
+        return None
     alarms, form, apart = _alarm_change(points), points.lobe, points.apart
     beside = _beside(points)
     if points.adds_amplitudes:
@@ -102,8 +104,8 @@ def _alarm_change(points: Points) -> np.ndarray | float:
 
 
 def add_images(shots: Shots, scene: Scene) -> Shots:
-    """Images summed with the lines."""
-    return replace(shots, image=True)
+    """Images summed with the lines, where the record is real."""
+    return replace(shots, image=not shots.complex_record)
 
 
 IMAGE = Effect(
