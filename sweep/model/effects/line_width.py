@@ -222,14 +222,23 @@ def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarr
 
 
 def seen_line(
-    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
+    *,
+    line_width: np.ndarray,
+    delay: np.ndarray,
+    duration: np.ndarray,
+    window: Window,
+    looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
+
+    Of looks that are added in amplitude the phase of a record counts too: each has its own.
 
     Parameters
     ----------
     line_width, delay, duration, window
         As of :func:`power_under_line`.
+    looks : int
+        Records that are added in amplitude.
 
     Returns
     -------
@@ -259,7 +268,7 @@ def seen_line(
     mean = gamma[:, None] * (integral(x + apart) - 2 * at + integral(x - apart))
     mean -= 0.5 * (w * mean).sum(axis=1)[:, None]
     # a line that is gone needs no care
-    mean = np.where(variance[:, None] < _GONE, mean, 0.0)
+    mean = np.where((variance[:, None] < _GONE) & (looks == 1), mean, 0.0)
     once, double = np.exp(mean), w * np.exp(2 * mean)
     sums = (w * once).sum(axis=1), double.sum(axis=1)
     nodes, weight = _gauss_legendre(128)
@@ -407,7 +416,7 @@ def act(shots: Shots, scene: Scene) -> Shots:
         "delay": delay,
         "duration": shots.record_duration,
     }
-    share, in_phase = seen_line(window=shots.window, **timing)
+    share, in_phase = seen_line(window=shots.window, looks=shots.looks.added, **timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
         shots,
