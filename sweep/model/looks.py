@@ -128,7 +128,7 @@ class Looks(NamedTuple):
                 missed = np.where(real, 0.5 * (special.erfc(-near) - special.erfc(far)), missed)
             return self._votes(found, missed) if self.several else (found, missed)
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, level))
-        found, missed = (a > b).astype(float), (a <= b).astype(float)
+        found, missed = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
         near = np.asarray((a - b < _SURE) & (b - a < _SURE + math.sqrt(2 * self.number)))
         degrees, share = (np.where(real, n, 2 * n)[near] for n in (self.number, 1.0))
         values = 0.5 * share * b[near] ** 2, degrees, 0.5 * share * a[near] ** 2
@@ -411,7 +411,7 @@ def _gauss(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=4096)
 def _excess_table(looks: Looks, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of signals and of what :meth:`Looks.excess` has for them."""
-    signal = np.geomspace(1e-3, max(level, 1e-3) + 1.0, 300) / math.sqrt(looks.number)
+    signal = np.geomspace(1e-3 / math.sqrt(looks.number), level + 1.0, 300)
     quiet, stays = looks.steady(np.zeros(1), np.array([level]))
     crosses = looks.steady(signal, np.full(signal.shape, level))[0]
     added = np.maximum(crosses - quiet, 1e-300) / np.maximum(stays, 1e-300)

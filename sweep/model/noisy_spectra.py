@@ -152,13 +152,14 @@ def drawn_of(
     record = fft.ifft(both)[:length]
     per_sample, spectra = 2 * math.pi * float(laser["line_width"]) / rate, []
     for draw in draws:
-        steps, further = walk_steps(delay=delay, length=length), 2 * (shots.looks.added > 1)
-        numbers = normals(
-            uniforms(key[None], draw[None], STREAM_LASER_PHASE[segment], steps + further)
-        )[0]  # fmt: skip
-        phase = walked_phase(numbers[:steps], per_sample=per_sample, delay=delay)
-        if further:  # the phase that it begins with, which |X| of one does not tell
-            phase += numbers[steps] * math.sqrt(per_sample * delay)
+        numbers = uniforms(
+            key[None], draw[None], STREAM_LASER_PHASE[segment],
+            walk_steps(delay=delay, length=length),
+        )  # fmt: skip
+        # |X| does not tell the phase that a record begins with, and their sum does.
+        phase = walked_phase(
+            normals(numbers)[0], per_sample=per_sample, delay=delay, whole=shots.looks.added > 1
+        )
         spectra.append(fft.rfft((record * np.exp(1j * phase)).real, size))
     return np.array(spectra)
 

@@ -305,7 +305,9 @@ def walk_steps(*, delay: float, length: int) -> int:
     return 2 * (length + min(math.floor(delay), length))
 
 
-def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.ndarray:
+def walked_phase(
+    steps: np.ndarray, *, per_sample: float, delay: float, whole: bool = False
+) -> np.ndarray:
     """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
 
     Parameters
@@ -316,11 +318,13 @@ def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.nd
         Variance of theta's change from sample to sample, Gamma / fs.
     delay : float
         tau [samples].
+    whole : bool
+        With the first sample's as well, for a delay shorter than the record.
 
     Returns
     -------
     (L,) ndarray
-        0 at first.
+        0 at first, or all of it.
 
     Notes
     -----
@@ -337,7 +341,11 @@ def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.nd
     length = max(length, before.size // 2)
     now = (before + after)[before.size - length + 1 :]
     then = before[1:length] + after[: length - 1]
-    return np.concatenate([[0.0], np.cumsum(now - then)])
+    phase = np.concatenate([[0.0], np.cumsum(now - then)])
+    if whole:
+        both = (before + after)[1 : math.floor(delay) + 1]
+        phase += after[0] + both.sum()
+    return phase
 
 
 @lru_cache(maxsize=16)
@@ -416,6 +424,13 @@ def act(shots: Shots, scene: Scene) -> Shots:
         "delay": delay,
         "duration": shots.record_duration,
     }
+    if shots.looks.added > 1 and np.any(delay > shots.record_duration):
+        raise UnsupportedShot(
+            f"{_WIDTH} leaves of looks that are added what their phases have in common, which is "
+            f"known for echoes that come back within a record, of "
+            f"{np.min(shots.record_duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
+            "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
+        )
     share, in_phase = seen_line(window=shots.window, looks=shots.looks.added, **timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
