@@ -154,10 +154,15 @@ def simulated_shot(
 def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None) -> Segment:
     bins, signal = segment_spectrum(prepared, 0, k)
     bins = bins - prepared.fft_size if prepared.complex_record else bins
-    magnitude = signal
+    magnitude, looks = np.abs(signal), prepared.looks
     if seed is not None:
-        noise = drawn_noise(prepared, seed=seed, segment=k)
-        magnitude = np.abs(signal + noise.take(bins, mode="wrap"))
+        noise = np.array([
+            drawn_noise(prepared, seed=seed, segment=k, look=look).take(bins, mode="wrap")
+            for look in range(looks.number)
+        ])  # fmt: skip
+        noise = noise if looks.added == 1 else noise.mean(axis=0, keepdims=True)
+        each = np.abs(signal + noise)
+        magnitude = looks.shown(each) if looks.several else each[0]
     segment = prepared.waveform[k]
     carrier = np.asarray(segment.carrier).item()
     beat = waveform.beat_frequency(
@@ -181,15 +186,16 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     )
 
 
-def drawn_noise(prepared: model.Shots, *, seed: int, segment: int) -> np.ndarray:
-    """Spectrum (N/2 + 1,) of a record of white Gaussian noise, windowed [V]; (N,) if complex.
+def drawn_noise(prepared: model.Shots, *, seed: int, segment: int, look: int = 0) -> np.ndarray:
+    """Noise of a look's windowed record, spectrum (N/2 + 1,) [V]; (N,) of a complex record.
 
     The bins' noise is complex Gaussian, and alike in neighbours as far as the window makes it.
     It is added to the signal's |X|: a common phase changes nothing in a bin, and the signal's
     phase from bin to bin is lost.
     """
     shape = prepared.window
-    stream = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(segment,)))
+    key = (segment, look) if look else (segment,)
+    stream = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
     deviation = float(np.sqrt(prepared.noise_variance[0]))
     record = stream.normal(0.0, deviation, shape.length)
     taper = window.samples(shape.name, shape.length)

@@ -60,6 +60,10 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
             runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
             (mirror, shots.echo_rule), bins, neighbours, pd,
         )  # fmt: skip
+        if shots.looks.several:
+            seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
+            chances = shots.detected(middle.T, seen.T, runs.part)[0]
+            pd[runs.part] = chances.T
         some = np.where(runs.bins > 0, runs.exempted, np.nan)
         exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)

@@ -55,6 +55,7 @@ from sweep.model.footprint import (
     plane_moments,
     velocity_to_bins,
 )
+from sweep.model.looks import Looks
 from sweep.model.preparation import (
     BEAMLETS_ERROR,
     CHIRP,
@@ -232,6 +233,7 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     from sweep.model import detection
 
     b = detection.threshold(tnr=tnr_of(p), bin_deviation=np.asarray(1.0))
+    b = Looks.of(p).sharper * b
     a = 0.5 * (b + np.sqrt(b * b + 2))
     steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
     return np.asarray(_SEGMENTS * steepest / 2)

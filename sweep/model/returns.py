@@ -47,10 +47,12 @@ from sweep.model.draws import (
     fading_factors,
     is_noisy,
     noise_levels,
+    require_one_record,
     seen_spectra,
 )
 from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
+from sweep.model.looks import faded_ratio, largest_of
 from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
     ABSENT,
@@ -134,6 +136,8 @@ def draw_returns(
         `method` is neither of the two.
     """
     noisy = is_noisy(method)
+    if noisy:
+        require_one_record(shots)
     n, _, most = found.bin.shape
     drawn = Drawn(
         np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
@@ -141,11 +145,12 @@ def draw_returns(
         np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
     )  # fmt: skip
     known = _known(shots, found)
-    one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
+    one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how = How(
         int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
         shots.complex_record,
         shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
+        shots.looks.number if shots.looks.several else 1, shots.looks.independent,
     )  # fmt: skip
     tables = interpolator(shots.window, shots.fft_size)
     counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
@@ -181,6 +186,10 @@ class How(NamedTuple):
     """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
     rule: tuple[np.ndarray, np.ndarray, int]
     """:func:`sweep.model.draws.echo_filter`"""
+    looks: int
+    """Records whose powers are averaged."""
+    apart: bool
+    """Each has its own speckle."""
 
 
 class Known(NamedTuple):
@@ -253,7 +262,7 @@ def _known(shots: Shots, found: Groups) -> Known:
 def _beside(shots: Shots, found: Groups) -> np.ndarray:
     """Chances of groups in the down segment, as of :class:`Known`."""
     up, down = found.pd[:, 0], found.pd[:, 2]
-    both = shots.both(up.T, down.T).T
+    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
     with np.errstate(divide="ignore", invalid="ignore"):
         detected = np.where(up > 0, np.minimum(both / up, 1.0), down)
         missed = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
@@ -414,10 +423,10 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
             if there:
                 m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
                 delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
-                if known.mixing.shape[1]:  # powers above the threshold are exponential
-                    power = 2.0 * under_lines * under_lines + ratio * ratio
-                    ratio = math.sqrt(beta * beta - power * math.log(uniform / chance))
-                error = sub_bin_error(delta, ratio / under_lines, tables)
+                if known.mixing.shape[1]:
+                    chances, levels = (uniform / chance, known.pd[i, s, g]), (beta, under_lines)
+                    ratio = faded_ratio(ratio, levels, chances, how.looks, how.apart)
+                error = sub_bin_error(delta, ratio / under_lines, tables) / math.sqrt(how.looks)
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
@@ -436,12 +445,12 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
     words = philox.words4(a, b, draw, stream, philox.FIRST_BLOCK)
     chance = philox.to_uniform(words[0])
     if chance < known.alarm[i, s]:
-        ratio = max(largest_of(seen.others[i, s], chance), beta)
+        ratio = max(largest_of(seen.others[i, s], chance, how.looks), beta)
         if place < 0 or ratio > largest:
             place = free_bin(philox.to_uniform(words[1]), bins, how.half, how.signed)
             largest = ratio
     if place >= 0:
-        error = sub_bin_error(0.0, largest, tables)
+        error = sub_bin_error(0.0, largest, tables) / math.sqrt(how.looks)
         put(peaks[count], place, place, error, largest, 0.0, how, tables)
         which[count] = FALSE
         count += 1
@@ -535,14 +544,6 @@ def put(peak, whole, fine, error, ratio, spread, how, tables):
         peak[FINE] = end - fine if fine > how.half else fine
     wide = spread_error(peak[FINE] - peak[WHOLE], spread, how.powers or not how.doppler, tables)
     peak[ERROR], peak[RATIO] = math.hypot(error, wide), ratio
-
-
-@njit(cache=True, error_model="numpy")
-def largest_of(number, chance):
-    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance."""
-    if not number > 0.0:
-        return 0.0
-    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
 
 
 @njit(cache=True, error_model="numpy")

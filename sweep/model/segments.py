@@ -34,6 +34,7 @@ from sweep.model.lines import (
     relative_error,
     survey,
 )
+from sweep.model.looks import MOST_PLACES
 from sweep.model.preparation import LINE_STEPS, Shots
 from sweep.model.spectrum import (
     A_IM,
@@ -169,9 +170,27 @@ def runs_of(
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
-            runs, number = _some(shots, table, lowest, together, leaks, done, keep)
-            yield runs
+            held = keep or (shots.looks.several and bool(leaks))
+            runs, number = _some(shots, table, lowest, together, leaks, done, held)
+            yield _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
             done += number
+
+
+def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
+    """Runs with the chances that several looks have for one record's."""
+    floor, sigma, level = (
+        np.broadcast_to(v, shots.size)[runs.part]
+        for v in (shots.floor, shots.bin_deviation, shots.threshold)
+    )
+    leaked = runs.leakage.copy()
+    for s, i in np.argwhere(runs.bins > 0) if leakage and shots.leakage else ():
+        if shots.waveform[s].leaks:
+            start, end = runs.start[s, i] + np.array([0, runs.bins[s, i]])
+            signal = runs.magnitudes[start:end][~runs.exempt[start:end]] / sigma[i]
+            more = shots.looks.excess(signal[signal >= floor[i]], level[i] / sigma[i])
+            leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
+    pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
+    return runs._replace(pd=pd, miss=miss, leakage=leaked)
 
 
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
@@ -241,8 +260,9 @@ def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
     if not shots.leakage:
         return NO_LEAKAGE
     averaged = shots.gaussian_width is not None and not shots.incoherent
+    averaged |= shots.looks.several or every_bin
     smooth = shapes.sizes[0] == shapes.sizes[1] and not shapes.sizes[5]
-    if smooth and not averaged and not every_bin and view(shots) != COMPLEX:
+    if smooth and not averaged and view(shots) != COMPLEX:
         return INTEGRAL
     return BIN_BY_BIN
 
@@ -259,7 +279,8 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
         modes[:, :, 0] = 1.0
         number = np.ones((segments, 1), np.int64)
         centre = np.zeros((segments, 1))
-        step = max(points.size if shots.gaussian_width is None else POINTS, 1)
+        plainly = shots.gaussian_width is None and not np.any(shots.look_drift)
+        step = max(points.size if plainly else POINTS, 1)
         for first in range(0, points.size, step):
             some = points[first : first + step]
             yield Together(some, 0 * some, shapes, centre, modes, number)
@@ -347,7 +368,7 @@ def _some(
     segments, m = len(shots.waveform), part.size
     bins = shots.bins
     shifts = _shifts(shots, part)
-    lines = max(2 * shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
+    lines = max(2 * shots.offset.shape[1], MOST_NODES) * max(shifts.shape[3], 1)
     width = max(lines, bins, 2 * MOST_POINTS, LEAST_WIDTH, MOST_CELLS) + 16
     size = max(ROOM_FOR_RUNS, segments * bins) if keep else 0
     numbers = np.zeros((5, segments, m), np.int64)
@@ -386,16 +407,33 @@ def tangents(fft_size: int) -> np.ndarray:
 
 
 def _shifts(shots: Shots, part: np.ndarray) -> np.ndarray:
-    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, 2, shifts)."""
+    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, segments, 2, k)."""
+    segments = len(shots.waveform)
     if shots.gaussian_width is None:
-        return np.empty((part.size, 2, 0))
-    duration = np.broadcast_to(shots.record_duration, shots.size)[part]
-    shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
-    bins = shots.fft_size / shots.window.length
-    found = np.stack([bins * shifts.offset, shifts.weight], axis=1)
-    # Those of no weight, which wider lines beside a point bring, go to the end.
-    order = np.argsort(found[:, 1:] == 0, axis=2, kind="stable")
-    return np.take_along_axis(found, np.broadcast_to(order, found.shape), axis=2)
+        found = np.empty((part.size, 2, 0))
+    else:
+        duration = np.broadcast_to(shots.record_duration, shots.size)[part]
+        shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
+        bins = shots.fft_size / shots.window.length
+        found = np.stack([bins * shifts.offset, shifts.weight], axis=1)
+        # Those of no weight, which wider lines beside a point bring, go to the end.
+        order = np.argsort(found[:, 1:] == 0, axis=2, kind="stable")
+        found = np.take_along_axis(found, np.broadcast_to(order, found.shape), axis=2)
+    by_segment = np.repeat(found[:, None], segments, axis=1)
+    drift = np.broadcast_to(shots.look_drift, (segments, shots.size))[:, part].T
+    if shots.looks.averaged == 1 or not drift.any():
+        return by_segment
+    if not by_segment.shape[3]:
+        by_segment = np.tile([[0.0], [1.0]], (*drift.shape, 1, 1))
+    # Of looks that follow each other closely some stand for all, of the same mean square.
+    number = shots.looks.number
+    few = min(number, MOST_PLACES)
+    place = (np.arange(few) - (few - 1) / 2) * math.sqrt((number**2 - 1) / (few**2 - 1))
+    moved = (by_segment[..., :1, :, None] + drift[..., None, None, None] * place).reshape(
+        *drift.shape, 1, -1
+    )
+    weight = np.repeat(by_segment[..., 1:, :] / few, few, axis=3)
+    return np.concatenate([moved, weight], axis=2)
 
 
 @njit(cache=True, error_model="numpy")
@@ -470,8 +508,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         Rows in the footprints; shapes.
     footprint : (3 or 3 + segments, rows, beamlets) float64
     modes, shapes
-        Of :class:`Together`, with shifts (m, 2, k); sizes with the view and half of the echo's
-        main lobe at their end.
+        Of :class:`Together`, with shifts (m, segments, 2, k); sizes with the view and half of the
+        echo's main lobe at their end.
     tables : tuple
         Limits of nodes; tangents.
     how : tuple
@@ -492,7 +530,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     keep, at = magnitudes.size > 0, np.int64(0)
     before, made_of = -1.0, np.int64(-1)  # a literal would compile what takes it once more
     for i in range(points.shape[0]):
-        p, row, which, shift = points[i], where[0, i], where[1, i], _used(shifts[i])
+        p, row, which = points[i], where[0, i], where[1, i]
         if which != made_of:
             for s in range(segments.size):
                 if segments[s]:
@@ -505,6 +543,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         for s in range(segments.size):
             if not segments[s]:
                 continue
+            shift = _used(shifts[i, s])
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )

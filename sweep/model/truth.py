@@ -13,6 +13,7 @@ import numpy as np
 from sweep.model import link, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
+from sweep.model.effects.segment_motion import looks_of
 from sweep.model.preparation import Shots
 from sweep.model.waveform import SIGNS
 
@@ -79,7 +80,11 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
     for i in range(shots.size):
         bins = shots.bins - 1, float(shots.sample_rate[i]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.segments)):
-            magnitude, out = spectrum(shots, i, segment, range_walk=range_walk), np.empty((6, 1))
+            each = [
+                spectrum(look, i, segment, range_walk=range_walk)
+                for look in (looks_of(shots) if np.any(shots.look_drift) else [shots])
+            ]
+            magnitude, out = np.sqrt(np.mean(np.square(each), axis=0)), np.empty((6, 1))
             detect_rows(
                 magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, table[13, [i]],
                 table[11, [i]], out,
@@ -87,6 +92,9 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
             found[segment, :, i] = out[:, 0]
             if shots.complex_record:
                 found[segment, 3, i] -= float(shots.sample_rate[i]) / 2
+    if shots.looks.several:
+        peak = np.rint(found[:, 3] / (shots.sample_rate / shots.fft_size))
+        found[:, 0], found[:, 1] = shots.detected(found[:, 2], peak)
     return found
 
 

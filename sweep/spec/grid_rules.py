@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam
+from sweep.model import beam, looks
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
+from sweep.model.detectors import FIXED
 from sweep.model.effects import iq_imbalance
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
@@ -40,6 +41,9 @@ WINDOW = "instrument.processing.window"
 RESPONSIVITY = "instrument.receiver.responsivity"
 EXTINCTION = "atmosphere.extinction"
 FULL_SCALE = "instrument.processing.full_scale"
+DETECTION = "instrument.processing.detection"
+LINE_WIDTH, LINE_SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
+ROUGHNESS = "target.roughness"
 TRAINING, GUARD, RANK = (DETECTOR + name for name in ("training", "guard", "rank"))
 
 _TRIED = 16
@@ -179,6 +183,7 @@ def grid_findings(grid: Grid) -> list[Finding]:
         *_nesting_findings(grid),
         *_need_findings(grid),
         *_record_findings(grid),
+        *_looks_findings(grid),
     ]
 
 
@@ -337,6 +342,60 @@ def _log_power(power: float, values: np.ndarray) -> np.ndarray:
         return np.asarray(power * np.log(values))
 
 
+# Looks
+
+MOST_VOTES = 64
+
+
+def _several(number: np.ndarray) -> np.ndarray:
+    return number > 1
+
+
+def _looks_findings(grid: Grid) -> Iterator[Finding]:
+    """Looks whose chances are not known, or that contradict each other."""
+    several: dict[str, Condition] = {looks.NUMBER: _several}
+    by_bin: dict[str, Condition] = {looks.COMBINE: _is_not(looks.COHERENT), **several}
+    added: dict[str, Condition] = {looks.COMBINE: _is(looks.COHERENT), **several}
+    voted: dict[str, Condition] = {looks.COMBINE: _is(looks.BINARY), **several}
+    if grid.has_point(by_bin | {DETECTION: _is("any_bin")}):
+        rule = "detects by the largest bin of an echo where several records are not added in "
+        rule += "amplitude: the chance that any of its bins does is known for one record alone"
+        yield grid.finding(DETECTION, rule, "write 'detection: peak_bin', or combine: coherent")
+    if grid.has_point(voted | {looks.NUMBER: lambda number: number > MOST_VOTES}):
+        rule = f"counts the votes of at most {MOST_VOTES} records"
+        yield grid.finding(looks.NUMBER, rule, "take fewer, or combine: power")
+    least = grid.least({looks.NUMBER: lambda n: n, looks.VOTES: lambda m: -m}, voted)
+    if least and least[looks.VOTES] > least[looks.NUMBER]:
+        rule = f"asks for more than the {least[looks.NUMBER]:g} records of instrument.looks.number"
+        yield grid.finding(looks.VOTES, rule, "lower it, or take more looks")
+    if grid.has_point(added | {looks.SPECKLE: _is(looks.INDEPENDENT)}):
+        rule = "gives each record a phase of its own, in which amplitudes do not add up"
+        yield grid.finding(looks.SPECKLE, rule, "take common, or combine: power")
+    if grid.has_point(added | {LINE_WIDTH: _given, LINE_SHAPE: _is("gaussian")}):
+        rule = "tells nothing of the phase from one record to the next, of which the sum is made"
+        yield grid.finding(LINE_SHAPE, rule, "take lorentzian, or combine: power")
+    if grid.has_point(by_bin | {looks.SPECKLE: _is(looks.INDEPENDENT), ROUGHNESS: _given}):
+        rule = "is drawn once a shot for a surface of stated roughness, for all its records"
+        remedy = "take common, or footprint.speckle: developed without target.roughness"
+        yield grid.finding(looks.SPECKLE, rule, remedy)
+    if grid.has_point(
+        {looks.COMBINE: _is(looks.POWER), **several, DETECTOR + "kind": _is_not(FIXED)}
+    ):
+        rule = "sets its threshold by the noise of one record, and here powers are averaged"
+        remedy = "take fixed, or combine: binary or coherent"
+        yield grid.finding(DETECTOR + "kind", rule, remedy)
+
+
+def _noise_of_looks(grid: Grid, method: str) -> Iterator[Finding]:
+    """Noise added to the bins of several records."""
+    if method == "noise" and grid.has_point(
+        {looks.NUMBER: _several, looks.COMBINE: _is_not(looks.COHERENT)}
+    ):
+        rule = "adds noise to the bins of one record, and instrument.looks.number asks for several"
+        remedy = "take probabilities or spectra, or combine: coherent"
+        yield Finding(("draws", "method"), rule, remedy, method)
+
+
 # Effects
 
 
@@ -457,7 +516,7 @@ def without_draws(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(parameter.path, rule, remedy)
 
 
-def not_in_flights(grid: Grid) -> Iterator[Finding]:
+def not_in_flights(grid: Grid, method: str) -> Iterator[Finding]:
     """Random effects and methods that are asked for in a flight, and that only grids draw.
 
     All other random effects are drawn; a target's own parameters are told where they stand.
@@ -468,6 +527,11 @@ def not_in_flights(grid: Grid) -> Iterator[Finding]:
         if (effect.turn or of_target) and effect.is_random and grid.modes.get(effect.name) == ON:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
+    yield from _noise_of_looks(grid, method)
+    voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
+    if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
+        rule = "counts records, and flights draw no powers of echoes that fade in several"
+        yield grid.finding(looks.COMBINE, rule, "take power, or footprint.speckle: none")
     rule = "looks at whole spectra, which flights over scenes do not draw"
     for path in _methods(grid):
         if path in grid.values:
@@ -500,6 +564,7 @@ def is_method(path: str) -> bool:
 
 def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
     """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
+    yield from _noise_of_looks(grid, draws.method)
     if not draws.whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA}, number: 1000}}, or leave it out"
         rule = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"

@@ -12,6 +12,7 @@ import numpy as np
 
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+from sweep.model.looks import NUMBER, Looks
 from sweep.model.preparation import RECORD
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.atomic_replace import draft
@@ -54,6 +55,11 @@ def spectra(
         raise UnsupportedShot(
             "instrument.receiver.record is complex, and spectra are drawn of real records: set it "
             "to real"
+        )
+    if Looks.of(parameters).number > 1:
+        raise ValueError(
+            f"a file of spectra holds one record of each segment, and {NUMBER} takes "
+            f"{Looks.of(parameters).number}: export a point of one look"
         )
     modes, key = spec.modes(), draw_keys(spec, parameters, 1)
     arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}

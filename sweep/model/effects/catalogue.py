@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import beam, waveform
+from sweep.model import beam, looks, waveform
 from sweep.model.effects import (
     atmosphere,
     doppler,
@@ -66,10 +66,11 @@ SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.DEFAULTS
     | waveform.DEFAULTS
+    | looks.DEFAULTS
     | {RECORD: "real"}
     | {parameter.path: parameter.default for parameter in PARAMETERS}
 )
-"""Of the beams' parameters, the waveform's, the record's and the effects'."""
+"""Of the beams' parameters, the waveform's, the looks', the record's and the effects'."""
 
 CORE = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
