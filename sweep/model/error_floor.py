@@ -50,8 +50,8 @@ INSTRUMENT = -1.0
 class ErrorFloor(NamedTuple):
     """Standard deviations of an instrument's errors; all 0 for an instrument without any.
 
-    >>> ErrorFloor(clock=3e-6, wavelength=4e-6).scale
-    5e-06
+    >>> ErrorFloor(clock=0.03, wavelength=0.04).scale
+    0.05
     """
 
     pointing: float = 0.0
