@@ -20,7 +20,7 @@ from sweep.spec.identity import digest, geometry_of, leaf_values
 from sweep.spec.mistakes import Finding, Location
 from sweep.spec.parts import Files, named_files, read_as
 from sweep.spec.reading import Document
-from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
     Arrangement,
     axis_findings,
@@ -47,6 +47,7 @@ class SceneSpec(Study):
     platform: Platform
     scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
     draws: SceneDraws = SceneDraws()
+    error_floor: ErrorFloor = ErrorFloor()
     navigation: Navigation = Navigation()
     storage: SceneStorage = SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
