@@ -192,9 +192,9 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -
 def plan(spec: Path, workers: int | None) -> None:
     """Say what SPEC would take, and which effects it calls for. Nothing is written.
 
-    The time comes from about a second of computing points of the study itself. Of each effect the
-    table says at how many points and where it is simulated, how much it may change pd, log10
-    pfa or |X| (a bound), and the share of a point's time that it takes there.
+    The time comes from about a second of computing points of the study itself. For each effect a
+    table gives the points at which it is simulated, a bound on its change of pd, log10 pfa or
+    magnitude, and its share of a point's time.
     """
     from sweep.spec import load
     from sweep.tasks.progress import working
