@@ -23,7 +23,7 @@ instrument's file or on an axis.
 
 
 def text() -> str:
-    """The whole page."""
+    """Return the whole page."""
     definitions = json_schema()["$defs"]
     order: dict[str, None] = {}
     for first in FIRST:
@@ -76,14 +76,14 @@ def _names(node: Any, definitions: dict[str, Any]) -> Iterator[str]:
 
 
 def _value(described: dict[str, Any]) -> str:
-    """A field's default, else an example of a good value."""
+    """Return a field's default, else an example of a good value."""
     if described.get("default") not in (None, "", [], {}):
         return f"default `{described['default']}`"
     return f"e.g. `{described['examples'][0]}`" if described.get("examples") else ""
 
 
 def _words(name: str) -> str:
-    """A model's name in words."""
+    """Return a model's name in words."""
     return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name).strip()
 
 

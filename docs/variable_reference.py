@@ -66,12 +66,12 @@ SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [
 
 
 def text() -> str:
-    """The whole page."""
+    """Return the whole page."""
     return HEAD + "".join(_section(*section) for section in SECTIONS)
 
 
 def _section(title: str, about: str, axes: str, tables: list[Mapping[str, Output]]) -> str:
-    """A table of variables; those of grids have the study's axes and no shots."""
+    """Return a table of variables; those of grids have the study's axes and no shots."""
     rows = []
     for name, output in ((n, o) for table in tables for n, o in table.items()):
         own = [dim for dim in output.dims if title.startswith("Fl") or axes == "" or dim != "shot"]

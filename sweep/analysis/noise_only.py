@@ -118,7 +118,7 @@ def variance_excess_of_bin(probability: float, tnr: float) -> float:
 
 
 def variance_excess_of_shot(probability: float, tnr: float, bins: float) -> float:
-    """The same from the probability of a false alarm in both segments of a shot.
+    """Return the noise from the probability of a false alarm in both segments of a shot.
 
     (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability, solved for e; nan where no e does.
     """

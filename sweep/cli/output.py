@@ -383,7 +383,7 @@ def _effect_cells(row: EffectRow) -> list[str]:
 
 
 def in_bytes(count: int) -> str:
-    """A number of bytes for a reader: `1.5 MB`."""
+    """Format a number of bytes: `1.5 MB`."""
     size, unit = float(count), "B"
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":

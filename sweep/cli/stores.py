@@ -207,7 +207,7 @@ def report(store: Location, output: Path | None) -> None:
 
 @contextmanager
 def bar(begin: str) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error while its block runs, gone at its end, which is told what is next."""
+    """Show a bar on standard error while its block runs."""
     from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -290,7 +290,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 
 def _opened(path: Location) -> Store:
-    """A store of a grid as a dataset, of a flight as a tree."""
+    """Return a store of a grid as a dataset, of a flight as a tree."""
     from sweep.analysis.opening import SCENE, open_scene, read_attributes
     from sweep.analysis.opening import open as open_grid
 

@@ -197,7 +197,7 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
 
 
 def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
-    """The part of a terrain within a square about (x, y) [m], widened to whole grid steps.
+    """Cut out a square of a terrain about (x, y) [m], widened to whole grid steps.
 
     Raises
     ------

@@ -43,7 +43,7 @@ _LEFT = re.compile(
 
 
 def real(location: Location) -> Location:
-    """A place with symbolic links followed: what is renamed must be the folder, not the link."""
+    """Follow symbolic links: the folder is renamed, not the link."""
     if not isinstance(location, Path):
         return location
     return location.resolve() if location.is_symlink() else location.absolute()
@@ -55,14 +55,14 @@ def beside(path: Path) -> Path:
 
 
 def replaced_by(path: Path) -> Path:
-    """The place that a store is made for: its own, but where it is made `beside` another."""
+    """Return the place that a store is made for: its own, or that of the store it replaces."""
     made = re.fullmatch(rf"\.(.+){re.escape(NEXT)}", path.name)
     return path.with_name(made[1]) if made else path
 
 
 @contextmanager
 def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A hidden place in which a file or folder is made; it is put in its own place at the end.
+    """Make a file or folder in a hidden place, and put it in its own place at the end.
 
     What is there stays, with an OSError, unless it may be replaced.
     """

@@ -397,7 +397,7 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
 
 
 def _locked(path: Location, eyepoints: EyepointStudy, pool: Pool) -> Lock | None:
-    """The lock of an eyepoint store, made if need be, once no other run casts the same rays.
+    """Lock an eyepoint store, made if need be, once no other run casts its rays.
 
     None where the run is interrupted before.
     """

@@ -61,7 +61,7 @@ class Selected(NamedTuple):
     """Largest change of a probability that all that is left out may make."""
 
     def some(self, index: slice | np.ndarray) -> Selected:
-        """The same of some of the points."""
+        """Select some of the points."""
         return Selected(self.flags[index], self.error[index])
 
     def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
@@ -182,7 +182,7 @@ class EffectSelection:
         return Selected(flags[place] & ~absent, errors[place])
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
-        """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
+        """Return the flags of effects absent from points, whatever their tiles have."""
         flags = np.zeros(count, np.uint32)
         for k, effect in enumerate(ALL):
             absent = effect.absent(DEFAULTS | dict(parameters))
@@ -213,7 +213,7 @@ class EffectSelection:
             rest = np.concatenate(left) if left else rest[:0]
 
     def _plan(self, alike: Alike) -> Plan:
-        """The plan of tiles that share words and sizes."""
+        """Return the plan of tiles that share words and sizes."""
         from sweep.model.effects.planning import plan
 
         parameters, number = alike.parameters, len(alike.tiles)

@@ -115,7 +115,7 @@ class GridStudy(GrowingStudy):
         return arrays
 
     def outputs(self) -> list[ArrayLayout]:
-        """An array for each output of the model, and those that say what was simulated."""
+        """Return an array for each output of the model, and for the effects simulated."""
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
         found = []
         for name, output in outputs_of(self.spec).items():
@@ -140,7 +140,7 @@ class GridStudy(GrowingStudy):
         begun: Known = Known(),  # noqa: B008
         stop: Stop | None = None,
     ) -> Results:
-        """Outputs of a block; fills, where all of a point is beyond the model."""
+        """Return the outputs of a block; fill values where a point is beyond the model."""
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
         extent, size = self.grid.extent(block), self.grid.block_size(block)
@@ -234,7 +234,7 @@ DOMAIN = "sweep.draws"
 def evaluated(
     spec: Spec, grid: Grid, block: int, selected: Selected, known: Known, begun: Known, stop: Stop
 ) -> Iterator[Found]:
-    """Outputs of a block's points that are not done, those together that call for the same.
+    """Compute a block's points that are not done, grouped by their effects.
 
     Those that need not be computed are ``known``, of another study, or ``begun`` by a call that
     was stopped. Raises Unfinished where it is stopped, with at least some draws taken; the next
@@ -375,12 +375,12 @@ def _drawn(
 
 
 def no_sums(spec: Spec, count: int) -> Results:
-    """Running sums of points that have none, where any point of the study may have some."""
+    """Return empty running sums, if any point of the study may have some."""
     some = spec.has_random_effects and not spec.draws.whole_spectra
     return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}
 
 
 def with_few_draws(spec: Spec, most: int) -> Spec:
-    """The same study with so many draws at the most, where it has any."""
+    """Limit the draws of a study, if it has any."""
     fewer = {"number": min(spec.draws.number, most), "limit": min(spec.draws.limit, most)}
     return spec.model_copy(update={"draws": spec.draws.model_copy(update=fewer)})

@@ -274,7 +274,7 @@ def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _is_chunk(found: os.stat_result) -> bool:
-    """True for a file with something in it; a directory in a chunk's place has a size, too."""
+    """Tell whether a path is a file with something in it, and no directory."""
     return stat.S_ISREG(found.st_mode) and found.st_size > 0
 
 
@@ -346,7 +346,7 @@ def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None
 
 
 def read_begun(path: Location, study_id: str, block: int) -> Begun:
-    """The saved part of a block of a study."""
+    """Return the saved part of a block of a study."""
     try:
         line, _, content = _begun_file(path, block).read_bytes().partition(b"\n")
     except (FileNotFoundError, NotADirectoryError):

@@ -71,7 +71,7 @@ def create(
     recipe: Mapping[str, Any] | None = None,
     durable: bool = False,
 ) -> Location:
-    """A new store without results: every array's metadata, what is known beforehand, and the spec.
+    """Make a new store without results: metadata, known arrays, and the spec.
 
     It is built beside its place and renamed into it, so that a creation cut short leaves nothing
     that looks like a store; one in an object store is built here and sent, its root last. It may
@@ -117,7 +117,7 @@ def _send(built: Path, path: ObjectPath) -> None:
 
 @contextmanager
 def making(path: ObjectPath) -> Iterator[None]:
-    """A place while a store is made there: nobody else's, and marked as half made till the end.
+    """Reserve a place while a store is made there, marked as half made till the end.
 
     StoreError where something is there, or somebody makes a store there.
     """
@@ -252,7 +252,7 @@ class Chunked(NamedTuple):
 
     @classmethod
     def of(cls, array: zarr.Array[Any]) -> Self:
-        """That of an array."""
+        """Return the owners of the chunks of an array."""
         return cls(array.shape, array.chunks, array.dtype, array.fill_value)
 
     @property
@@ -495,7 +495,7 @@ def refuse_to_replace(path: Location) -> None:
 
 
 def under_way(path: Location) -> Path | None:
-    """The store that is to take the place of the one at a path, where one was begun.
+    """Return the unfinished store that is to replace the one at a path, if any.
 
     StoreError where it was begun to take the place of another store than is there now.
     """

@@ -111,7 +111,7 @@ def methods(parameters: Mapping[str, Any]) -> Methods:
 
 @lru_cache(maxsize=64)
 def guarded(role: str, name: str) -> Callable[..., np.ndarray]:
-    """A function of the user's, given arrays that it can't write to, its answers checked."""
+    """Wrap a function of the user: read-only arrays, checked answers."""
     function = _imported(name)
 
     def detect(power: np.ndarray, setting: Setting) -> np.ndarray:
@@ -152,7 +152,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _whole(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An answer of the right kind."""
+    """Return an answer of the right kind."""
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
     if answer.shape != shape or answer.dtype != dtype:

@@ -130,7 +130,7 @@ def false_alarms_per_kilometre(
     *,
     leakage: bool = False,
 ) -> xr.DataArray:
-    """The same for a kilometre of flight.
+    """Return the rate per kilometre of flight.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _reduced(array: xr.DataArray) -> dask.array.Array:
-    """The statistics of an array, (4,)."""
+    """Return the statistics of an array, (4,)."""
     data = array.chunk().data if array.chunks is None else array.data
     axis = data.ndim
     parts = data.map_blocks(
@@ -215,7 +215,7 @@ def _of_block(block: np.ndarray) -> np.ndarray:
 
 
 def _of_all(parts: np.ndarray) -> np.ndarray:
-    """The statistics of all blocks together, from (blocks, 4)."""
+    """Return the statistics of all blocks together, from (blocks, 4)."""
     number = parts[:, 3].sum()
     if not number:
         return np.array([np.nan, np.nan, np.nan, 0.0])
@@ -320,7 +320,7 @@ def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
 def _closed(
     dataset: xr.Dataset, segment: str, level: xr.DataArray
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Closed form of pd at each level, and where it holds."""
+    """Return closed form of pd at each level, and where it holds."""
     own = _own_level(dataset)
     pd = xr.ones_like(level)
     exact = (dataset["effects"] & _RANDOM) == 0
@@ -334,12 +334,12 @@ def _closed(
 
 
 def _own_level(dataset: xr.Dataset) -> xr.DataArray:
-    """The study's own threshold over the noise per quadrature."""
+    """Return the study's own threshold over the noise per quadrature."""
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
 
 
 def _own_tnr(dataset: xr.Dataset) -> xr.DataArray:
-    """The study's own threshold-to-noise ratio at each point."""
+    """Return the study's own threshold-to-noise ratio at each point."""
     spec, like = spec_of(dataset), dataset["log10_pfa_bin"]
     if TNR in spec.parameters():
         return parameter(dataset, TNR, spec)

@@ -227,7 +227,7 @@ def merge(tallies: Sequence[Tally]) -> Tally:
 
 
 def _add_up(values: np.ndarray, cell: np.ndarray, size: int) -> np.ndarray:
-    """Sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
+    """Return sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(cell, weights=column, minlength=size) for column in columns]
     return np.stack(sums, axis=-1).reshape(size, *values.shape[1:])
@@ -319,7 +319,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
 def navigation_page(
     curves: Sequence[Curve], *, show: str, title: str, remarks: Sequence[str]
 ) -> Page:
-    """A block for each curve of a quantity, a row for each bin of altitude."""
+    """Return a block for each curve of a quantity, a row for each bin of altitude."""
     shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     blocks, records = [], []
     for curve in curves:

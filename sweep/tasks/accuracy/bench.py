@@ -123,15 +123,15 @@ class Bench(ABC):
 
     @abstractmethod
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many points: places in it."""
+        """Return the sample in parts of about so many points: places in it."""
 
     @abstractmethod
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample, timed on stretches of so many points, if it can be."""
+        """Compute a rung on a part of the sample, timed on so many points if possible."""
 
     @abstractmethod
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        """Compute a point in the time domain, and with the rung's effects that the truth has."""
 
     @abstractmethod
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
@@ -231,11 +231,11 @@ class GridBench(Bench):
         self.most_times = min(MOST_TIMES, self._block_points)
 
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many points."""
+        """Return the sample in parts of about so many points."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample; timed on stretches of so many points, or on the part.
+        """Compute a rung on a part of the sample, timed on so many points or on the part.
 
         What a point costs depends on those beside it, as they share what is worked out for them:
         a stretch is what the point's block computes next to it.
@@ -257,7 +257,7 @@ class GridBench(Bench):
         return Trial(seen, spent / timed + planning, planning)
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        """Compute a point in the time domain, and with the rung's effects that the truth has."""
         lacking = NOT_IN_TRUTH | {effect.name for effect in EFFECTS if effect.is_random}
         number = self._numbers[[place]]
         flags, _ = self._planned(rung, number)
@@ -268,7 +268,7 @@ class GridBench(Bench):
         return seen_in(in_time), seen_in(shot.evaluate(parameters, effects))
 
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-        """Number of each point in C order, and its place along each axis."""
+        """Return the number of each point in C order, and its place along each axis."""
         found = {"number": (self._numbers, {"long_name": "number of the point of the study"})}
         index = np.unravel_index(self._numbers, self._grid.shape) if self._grid.shape else ()
         return found | along_axes(self.spec.axes, index)
@@ -283,7 +283,7 @@ class GridBench(Bench):
         return self._calling[rung.name]
 
     def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
-        """Outputs of points, the time they take together, and that of planning one of them."""
+        """Compute points: outputs, the time of all, and that of planning one of them."""
         grid = self._selection_of(rung).tiles.grid
         flags, planning = self._planned(rung, numbers)
         selected = Selected(flags, np.zeros(flags.size)).groups()
@@ -305,7 +305,7 @@ class GridBench(Bench):
         return outputs, spent, planning
 
     def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
-        """A point and those that its block computes after it, round the block's end."""
+        """Return a point and those that its block computes after it, round the block's end."""
         grid = self._selection_of(rung).tiles.grid
         (block,), (own,) = (each.tolist() for each in grid.locate(np.array([number])))
         order = grid.geometry_order(block)
@@ -313,7 +313,7 @@ class GridBench(Bench):
         return grid.numbers(block, order.take(follows, mode="wrap"))
 
     def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
-        """Flags of points (n,), and the time that planning takes one.
+        """Return flags of points (n,), and the time that planning takes one.
 
         A plan serves a whole tile, so that a point takes its share.
         """
@@ -425,7 +425,7 @@ def magnitudes(
 
 
 def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """The convolution of amplitudes at every sixteenth cell."""
+    """Return the convolution of amplitudes at every sixteenth cell."""
     transform = fft.fft(grid, axis=1, overwrite_x=True)
     transform *= kernel
     if not folded:
@@ -435,7 +435,7 @@ def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndar
 
 
 def _real_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """The same of powers, by half of their transforms."""
+    """Convolve powers, by half of their transforms."""
     half = fft.rfft(grid, axis=1)
     half *= kernel
     if not folded:
@@ -508,7 +508,7 @@ def _deposit(p, row, footprint, segment, sizes, image, weights, origin, grid):
 
 @njit(cache=True, error_model="numpy")
 def _share_out(grid, i, at, re, im, weights, share):
-    """Adds a line to the nearest cell, or to ten by Lagrange's polynomial amid them."""
+    """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
     if weights.size == 1:
         _add(grid, i, int(np.rint(at)), re, im)
         return
