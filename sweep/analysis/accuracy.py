@@ -64,9 +64,9 @@ class Setting:
 
     @property
     def error(self) -> float:
-        """That which counts: the largest over the points, of all that a tolerance promises.
+        """The error that counts is the largest over the points, of all that a tolerance promises.
 
-        Where it is random, that of pd at most of the points.
+        If errors are random, it is that of pd at most of the points.
         """
         if self.likely < 1.0:
             return self.quantile(self.likely)
@@ -167,7 +167,7 @@ class Duel:
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
     """For each error that adaptive settings have: the fastest of them, the fastest fixed one.
 
-    What leaves leakage out, where there is some, does less than they do, and is none of these.
+    A setting that skips leakage, if there is any, does less than they do, and is none of these.
     """
     adaptive = of_kinds(settings, ADAPTIVE)
     fixed = [setting for setting in of_kinds(settings, *FIXED) if setting.is_whole]

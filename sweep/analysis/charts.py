@@ -110,8 +110,8 @@ class Panel:
 class Chart:
     """Contents of a figure: words over it, for those who do not see it, and under it; panels.
 
-    Panels are in the order of the choices; facets tell what stands beside each choice. `rows` are
-    numbers of panels in the rows of a sheet, which decides by default.
+    Panels are in the order of the choices; facets have the name of each choice. `rows` are numbers
+    of panels in the rows of a sheet, which decides by default.
     """
 
     heading: str
@@ -361,7 +361,7 @@ def alternative(words: str, span: str, panel: Panel) -> str:
 def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list[str]]:
     """Variables along a coordinate, all in one reading, and remarks on how they are drawn.
 
-    A line of many points is cut into stretches: their means, in a band from the lowest to the
+    A line of many points is cut into intervals: their means, in a band from the lowest to the
     highest of their points; else the band is the interval of each point.
 
     Where coordinates beside `x` vary, their first place is taken. A variable has intervals where

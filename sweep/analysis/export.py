@@ -54,7 +54,7 @@ class PointTable:
     origin: np.ndarray
 
     def parts(self) -> Iterator[np.ndarray]:
-        """Rows (m,) of ROW, stretch by stretch."""
+        """Rows (m,) of ROW, part by part."""
         names = [name for name in COLUMNS if name != "number_of_returns"]
         for part in self.recording.stretches():
             table = self.recording.points([*names, "returns"], part, self.draw, self.ranges)
@@ -209,8 +209,8 @@ def export(
     """Write the points of one scanner and draw to a file.
 
     Coordinates are those of the scene's files: the scene's origin is added to what is stored.
-    Points are written stretch by stretch, in the order of shots and returns; what is not computed
-    yet is left out. Nothing is at the file's place before it is whole.
+    Points are written in the order of shots and returns, part by part; those not computed yet are
+    left out. Nothing is at the file's place before it is whole.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ def bin_probability(tnr: float) -> float:
 
 
 def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
-    """Independent bins that raise as many false alarms as a segment's, by a bin's chance of one.
+    """Independent bins with the false alarms of a segment, from the probability of one in a bin.
 
     From SI values by dotted path; :func:`sweep.model.threshold.segment_bins`.
     """
@@ -108,7 +108,7 @@ def shot_with_leakage(
 
 
 def variance_excess_of_bin(probability: float, tnr: float) -> float:
-    """Noise variance over the one that the threshold was set by, less one, from a bin's chance.
+    """Excess of the noise variance over the threshold's, from the probability in a bin.
 
     exp(-x / (1 + e)) = probability, solved for e; nan where no e does.
     """

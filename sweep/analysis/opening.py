@@ -46,7 +46,7 @@ def open(path: str | Location) -> xr.Dataset:
 
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
     written in, and every variable has its units and what it is. Arrays are read when they are
-    needed, as Dask arrays in pieces of whole chunks of the store. What is not computed yet is nan;
+    needed, as Dask arrays in pieces of whole chunks of the store. Points not computed yet are nan;
     -1 for counts of draws, which are summed over their batches, and for their number `n_draws`.
 
     Parameters
@@ -84,8 +84,8 @@ def open(path: str | Location) -> xr.Dataset:
 def open_scene(path: str | Location) -> xr.DataTree:
     """Open the store of a scene's point clouds as a tree: a group for each scanner.
 
-    Arrays are read when they are needed, as Dask arrays in the chunks of the store. What is not
-    computed yet is nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
+    Arrays are read when they are needed, as Dask arrays in the chunks of the store. Values not
+    computed yet are nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
 
     Parameters
     ----------

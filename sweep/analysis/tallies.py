@@ -1,7 +1,7 @@
 """Means, extremes and medians of any number of values, which are read piece by piece.
 
-All are exact, rounded once, so that they do not depend on the pieces: a mean comes from integer
-sums, a median from its digits, the leading ones first, each in a reading of its own.
+All are exact, rounded once, and do not depend on the pieces: a mean comes from integer sums, a
+median from its digits, the leading ones first, each in a reading of its own.
 """
 
 from __future__ import annotations

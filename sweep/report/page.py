@@ -54,7 +54,7 @@ COLOUR_BAR: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Control:
-    """A choice that a plot offers: its name as traces call it, and what stands beside it.
+    """A choice that a plot offers: its name as traces call it, and the text next to it.
 
     The first option is chosen at the start; `relayout` is what each changes of the layout.
     """
@@ -260,7 +260,7 @@ def layout(**further: Any) -> dict[str, Any]:
 
 
 def broken(words: str, width: int = 44) -> str:
-    """Words in lines that fit beside a plot."""
+    """Words in lines that fit next to a plot."""
     return "<br>".join(textwrap.wrap(words, width, break_on_hyphens=False))
 
 

@@ -57,7 +57,7 @@ Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
 def lunar_craters(*, equilibrium_diameter: float = math.inf) -> PowerLaws:
     """Craters in equilibrium up to a diameter [m], and as they were produced beyond it.
 
-    That diameter, at which the two laws cross, grows with the age of the ground.
+    The diameter at which the two laws cross grows with the age of the ground.
     """
     if math.isinf(equilibrium_diameter):
         return PowerLaws((TRASK,))
@@ -345,7 +345,7 @@ class Tree:
     """Mean measures of the trees of a clump.
 
     Leaves lie at random, with the spherical distribution of leaf angles (every direction of the
-    leaf's normal is as likely as any other), so that the chance of a gap along a ray is Beer's law,
+    leaf's normal is as likely as any other), so the probability of a gap along a ray is Beer's law,
     ``exp(-G * density * path)`` with ``G = 1/2``: de Wit, Photosynthesis of Leaf Canopies (1965);
     Ross, The Radiation Regime and Architecture of Plant Stands (1981).
     """

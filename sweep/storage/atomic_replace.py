@@ -1,7 +1,7 @@
 """Files and folders put in the place of others, whole, by whoever may be killed meanwhile.
 
-Everything is made beside its place, under a hidden name, and renamed into it. What is replaced is
-renamed aside and removed last. The hidden names in the folder of ``NAME`` are
+Everything is made in the same folder, under a hidden name, and renamed into its place. The old one
+is renamed aside and removed last. The hidden names in the folder of ``NAME`` are
 
     .NAME.next                           a store that is to take the place of NAME, under way
     .NAME.creating-HOST-PID-ab12cd34     half made by a process
@@ -64,7 +64,7 @@ def replaced_by(path: Path) -> Path:
 def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Make a file or folder in a hidden place, and put it in its own place at the end.
 
-    What is there stays, with an OSError, unless it may be replaced.
+    An existing one stays, with an OSError, unless it may be replaced.
     """
     settle(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,9 +112,9 @@ def discard(path: Path) -> None:
 def settle(location: Location) -> None:
     """Finish or undo what processes that died have left in the folder of a store.
 
-    What was being replaced when its process died is replaced, where its successor is whole, or is
-    put back. What is half made or half removed is removed. The work of living processes is left
-    alone, and so is everything where the folder can't be written.
+    A store whose replacement was interrupted is replaced if its successor is whole, or is put back.
+    Half made and half removed ones are removed. The work of living processes is left alone, and so
+    is everything where the folder can't be written.
     """
     path = real(location)
     if not isinstance(path, Path):

@@ -1,7 +1,7 @@
 """Places of stores: a folder on disk, or a key in an object store, and files put there whole.
 
-Which credentials and which endpoint an object store takes is for the environment to say
-(AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
+The environment gives the credentials and the endpoint of an object store (AWS_ACCESS_KEY_ID,
+AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Logs of lines that tell whether they are as they were written, and digests of stored objects.
 
 A line is JSON with its own digest at the end. A log is a file that is appended to; objects can't be
-appended to, so in an object store it is a row of them, numbered, each written whole and holding
-the lines of some seconds. The log of receipts, some 300 bytes a line, is read a million lines in a
-few seconds, into a few bytes a block.
+appended to. In an object store it is a row of numbered objects, each written whole, with the lines
+of some seconds. The log of receipts, some 300 bytes a line, is read a million lines in a few
+seconds, into a few bytes a block.
 """
 
 from __future__ import annotations

@@ -61,9 +61,9 @@ class RunOptions:
     Parameters
     ----------
     client
-        Dask client to compute with; without one, `scheduler` and `workers` say what to use. Where
-        nothing is said, little work is done here, in a plain loop, and more of it by workers on
-        all cores of this machine.
+        Dask client to compute with; without one, `scheduler` and `workers` say what to use. By
+        default little work is done here, in a plain loop, and more of it by workers on all cores of
+        this machine.
     workers, processes
         Workers to start on this machine, as processes or as threads.
     scheduler

@@ -144,8 +144,8 @@ def extend(
     """Turn a store into that of a larger study, and compute only what is new.
 
     The larger study has further values on its axes, further axes, more draws or a tighter
-    tolerance. It is computed beside the store and takes its place when it is complete; its bytes
-    are those of the larger study run at once.
+    tolerance. It is computed in the same folder and replaces the store when it is complete; its
+    bytes are those of the larger study run at once.
 
     Parameters
     ----------

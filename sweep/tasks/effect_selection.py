@@ -1,4 +1,4 @@
-"""Effects that points call for: planned tile by tile, told point by point.
+"""Effects that points need: planned tile by tile, told point by point.
 
 Tiles are boxes of neighbouring points of a grid, or shots of a flight that follow each other. They
 are fixed by the study alone, not by its blocks: what is simulated at a point does not depend on how
@@ -65,7 +65,7 @@ class Selected(NamedTuple):
         return Selected(self.flags[index], self.error[index])
 
     def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        """Points that call for the same effects, and these."""
+        """Points with the same effects, and these."""
         for flags in np.unique(self.flags):
             yield np.flatnonzero(self.flags == flags), names_of(int(flags))
 
@@ -192,8 +192,8 @@ class EffectSelection:
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these.
 
-        A few of the points are looked at first: where these call for all that there is, the others
-        cannot call for more.
+        A few of the points are looked at first: if these need all effects, the others cannot need
+        more.
         """
         sides = [side for side in self.tiles.block_shape if side > 1]
         few = max(int((math.prod(sides) / FEW_POINTS) ** (1 / max(len(sides), 1))), 1)

@@ -237,7 +237,7 @@ def refine(
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
 
-    How many that are follows from each shot alone. What the ``rays`` of each so far leave is its
+    Their number follows from each shot alone. What the ``rays`` of each so far leave is its
     ``error``, (n,); ``again`` looks at shots, by place, with more, and says what these leave.
     """
     needed = more_rays(rays, error, accuracy)

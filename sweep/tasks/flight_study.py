@@ -120,7 +120,7 @@ class KnownCloud(NamedTuple):
 class FlightStudy(GrowingStudy):
     """The point clouds of a flight, a group of arrays for each scanner.
 
-    Its eyepoints are beside its store. The scene, built, is by default that of the spec.
+    Its eyepoints are in the folder of its store. The scene, built, is by default that of the spec.
     """
 
     unit = "shots"
@@ -306,7 +306,7 @@ class FlightStudy(GrowingStudy):
         rows: np.ndarray,
         cloud: Cloud,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Results of some of the shots, those together that call for much the same.
+        """Results of some of the shots, those together that need much the same.
 
         With more rays of those whose own tell that they are too few.
         """

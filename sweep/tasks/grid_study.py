@@ -190,8 +190,8 @@ class GridStudy(GrowingStudy):
     def compile(self) -> None:
         """Compile what the model compiles, once, before workers find it on disk.
 
-        One draw of a point with every effect that may be called for, and one with none. Random
-        effects are not for every instrument: of these, only what the point itself calls for.
+        One draw of a point with every effect that may be needed, and one with none. Random effects
+        are not for every instrument: of these, only those that the point itself needs.
         """
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]

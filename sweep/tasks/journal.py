@@ -6,12 +6,12 @@ store's lock; a receipt whose chunks were later found damaged is withdrawn by a 
 line carries its own digest, and one that is damaged counts for nothing.
 
 Chunks are seen by listing folders, one look a folder. Sizes of files are asked of the operating
-system one by one, some 3 us each: 27 arrays of a million blocks take more than a minute. The look
-goes on in threads, beside what else there is to do; its memory is a few bytes a block.
+system one by one, some 3 us each: 27 arrays of a million blocks take more than a minute. The check
+runs in threads, concurrently with the work; its memory is a few bytes a block.
 
-The recipe beside the logs is what a store's own bytes do not say: where its study's files are, and
-which store it extends. A study is the same wherever its files are, and however much of it was
-computed before. It is written anew by whoever runs the study from its spec.
+The recipe is the part that a store's own bytes do not say: where its study's files are, and which
+store it extends. A study is the same wherever its files are, and however much of it was computed
+before. It is written anew by whoever runs the study from its spec.
 
 Blocks that take long are computed in pieces. A worker draws for some seconds, saves what it has in
 a file of the journal, and whoever takes up the block next goes on from there, to the same bytes.

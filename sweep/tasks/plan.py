@@ -89,7 +89,7 @@ def plan(
     spec
         The study.
     store
-        Where it would be stored: eyepoints are looked for beside it.
+        Where it would be stored: eyepoints are searched for in its folder.
     workers
         Workers it would run on; default those of the spec, else all cores.
     """
@@ -129,9 +129,8 @@ def plan(
 def measured(study: GridStudy) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
-    Whole sets of points that share a geometry are taken, so that sharing shows as it will. Where
-    points are drawn until their accuracy is met, those that are not after few draws are taken to
-    reach their limit.
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will. With an
+    accuracy to be met, points that miss it after few draws are taken to reach their limit.
     """
     grid = study.grid
     blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))

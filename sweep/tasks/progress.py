@@ -234,7 +234,7 @@ class Bar(_Counting):
             self._bar.update(self._task, completed=self._done, **self._words)
 
     def at_work(self, *, workers: int, stored: int) -> None:
-        """Shown beside the rate."""
+        """Shown next to the rate."""
         super().at_work(workers=workers, stored=stored)
         if self._task is not None:
             self._bar.update(self._task, **self._words)

@@ -1,9 +1,9 @@
-"""Detectors and estimators that are functions of the user's: allowed, imported, held to their word.
+"""Detectors and estimators that are functions of the user's: allowed, imported, checked.
 
-A spec names them as ``module:function``. Reading a spec or a store imports nothing. What a study
-computes is imported by the processes that compute it, and only from modules that whoever started
-them has allowed: by ``--allow-code MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``,
-which workers on this machine inherit and others need set where they run.
+A spec names them as ``module:function``. Reading a spec or a store imports nothing. Processes that
+compute a study import its functions only from modules that the user has allowed: by ``--allow-code
+MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``, which workers on this machine inherit
+and others need set where they run.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ more than LONGEST words. Code, tables, headings and link targets are not prose.
 import ast
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -77,8 +78,21 @@ def docstrings(source: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if node is tree or (isinstance(node, kinds) and not node.name.startswith("_")):
             doc = ast.get_docstring(node) or ""
-            doc = re.sub(r"^\s*>>>.*?(?=\n\s*\n|\Z)", "", doc, flags=re.S | re.M)
-            yield re.sub(r":\w+:`", "`", doc)
+            doc = re.sub(r"^\s*(>>>|\x08).*?(?=\n\s*\n|\Z)", "", doc, flags=re.S | re.M)
+            about, *parts = re.split(r"^\w+\n-{3,}\n", doc, flags=re.M)
+            # In sections lines without an indent are names; "Whether to", as NumPy has it after a
+            # name, is the rest of a sentence.
+            described = [
+                re.sub(
+                    r"^(?=\S).*\n(\s+(Whether|Where|How|Which) )?",
+                    "\n    ",
+                    f"{part}\n",
+                    flags=re.M,
+                )
+                for part in parts
+            ]
+            text = "\n\n".join([about, *map(textwrap.dedent, described)])
+            yield re.sub(r":\w+:`", "`", text)
 
 
 def files() -> dict[str, list[str]]:

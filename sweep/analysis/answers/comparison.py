@@ -30,8 +30,8 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ----------
     ours, other
         As `sweep.open` gives them, or parts of them. Points are matched by the values of their
-        coordinates, whatever these are written in. Where a parameter is on an axis of one study
-        only, the value that the other has is taken, if it is there; else the axis stays.
+        coordinates, whatever these are written in. A parameter on an axis of one study only takes
+        the value of the other, if it is there; else the axis stays.
 
     Returns
     -------

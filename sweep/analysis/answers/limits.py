@@ -5,7 +5,7 @@ Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is ne
 where pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
 
 Everything is a reduction of pairs of neighbours: of those within a piece first, then of those that
-lie in two, so that it is lazy, and a store larger than memory goes through piece by piece.
+lie in two. It is lazy, and a store larger than memory goes through piece by piece.
 """
 
 from __future__ import annotations

@@ -109,9 +109,9 @@ def select(
         As `sweep.open` gives it, or a part of it.
     wanted
         By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
-        units), a list of values, or a slice from one value to another, both included. One value
-        of a coordinate with a dimension of its own takes that dimension away; a coordinate along
-        a zipped axis keeps the points of the axis that have it.
+        units), a list of values, or a slice from one value to another, both included. One value of
+        a coordinate with a dimension of its own removes that dimension. A coordinate along a zipped
+        axis keeps the points of the axis that have it.
     method
         ``nearest`` takes the nearest value; by default it must be there, to 1e-9 of it.
 

@@ -50,8 +50,8 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     xarray.Dataset
         `pd`, `low` and `high`, 0..1, lazy as the store's arrays are. The interval is pd plus and
         minus the half-width that is stored, within 0..1; its attribute `confidence` says how sure
-        it is. Where a study draws nothing pd is a closed form and the interval has no width.
-        What effects that were left out may change is apart, in `effects_error`.
+        it is. Without draws pd is a closed form, and the interval has no width. The change that
+        skipped effects may make is apart, in `effects_error`.
     """
     pd = dataset[named("pd", segment)]
     reach = half_width(dataset, segment)
@@ -276,8 +276,8 @@ def roc(
     -------
     xarray.Dataset
         `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold to noise ratio that
-        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. Where
-        draws are made, `half_width` with the study's confidence; 0 where pd is exact.
+        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. With
+        draws, `half_width` with the study's confidence; 0 where pd is exact.
 
     Raises
     ------

@@ -221,7 +221,7 @@ def mark_size(places: np.ndarray, width: float, height: float) -> float:
 
 
 def false_marks(size: float) -> dict[str, Any]:
-    """Look of false points beside true ones of a size."""
+    """Look of false points among true ones of a size."""
     return {"marker": "x", "s": max(1.2 * size, 9.0), "linewidths": 0.7}
 
 

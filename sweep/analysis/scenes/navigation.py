@@ -129,8 +129,8 @@ def _with_length(parts: np.ndarray) -> np.ndarray:
 def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) -> list[Curve]:
     """Errors of scanners that navigate, all over the same bins of altitude.
 
-    Solutions are read chunk by chunk; each stretch has a tally of its own, and the tallies are
-    merged in the order of the stretches, so that the result is the same to the last bit.
+    Solutions are read chunk by chunk. Each part has a tally of its own, and the tallies are merged
+    in order, which gives the same result to the last bit.
     """
     able = [(name, own.dataset) for name, own in named if "velocity_status" in own.dataset]
     edges = _edges([dataset for _, dataset in able], bins)

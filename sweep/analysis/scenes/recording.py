@@ -1,4 +1,4 @@
-"""Recordings of scanners: quantities of shots and points, read stretch by stretch; eyepoints."""
+"""Recordings of scanners: quantities of shots and points, read part by part; eyepoints."""
 
 from __future__ import annotations
 
@@ -145,14 +145,14 @@ class Recording:
         return int(self.dataset.sizes["shot"])
 
     def stretches(self, time: Interval | None = None) -> Iterator[slice]:
-        """Stretches of shots, without those that are not computed or lie outside of an interval."""
+        """Ranges of shots, without those that are not computed or lie outside of an interval."""
         for part in stretches(self.dataset["flags"], "shot"):
             at = self.read("time", part)
             if np.isfinite(at).any() and (time is None or time.holds(at).any()):
                 yield part
 
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
-        """Mask (k,) of the shots of a stretch of which the points of a draw are computed.
+        """Mask (k,) of the shots of a range of which the points of a draw are computed.
 
         Geometry is stored with a study's first place and draw: that a shot's time is known says
         nothing of the others, and no point looks like none found. Only its chunk tells.
@@ -176,7 +176,7 @@ class Recording:
     def points(
         self, names: Sequence[str], part: slice, draw: int = 0, ranges: str = QUANTISED
     ) -> Table:
-        """Quantities of every point of a stretch, (m,) each, in the order of shots and returns.
+        """Quantities of every point of a range of shots, (m,) each, in order.
 
         Names are those of :data:`QUANTITIES`, ``return_number``, and ``returns`` (points of the
         same shot). Positions follow from the ranges taken, quantised or interpolated.

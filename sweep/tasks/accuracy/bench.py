@@ -7,14 +7,14 @@ size 2^11 or 2^12", and samples what comes out at the bins. Here: a grid of 16 c
 the beam's centre, each beamlet's line put into the nearest cell, one FFT, a product with the
 transform of the window's own, and back.
 
-It can be done better, which is here too. Where powers add, the grid holds real numbers, and half of
+It can be done better, which is here too. If powers add, the grid holds real numbers, and half of
 their transforms is enough (`real`). Only the bins are asked for, so that a transform of one
-sixteenth of the size is enough for the way back (`folded`). And a line in the nearest cell is up
-to 1/32 bin off: 2e-2 of the peak at worst. Shared out among ten cells by Lagrange's polynomial of
+sixteenth of the size is enough for the way back (`folded`). And a line in the nearest cell is up to
+1/32 bin off: 2e-2 of the peak at worst. Shared out among ten cells by Lagrange's polynomial of
 degree 9 it is where it belongs, to 1e-12 for a window that falls off to its ends.
 
-It is here to be compared with (`sweep accuracy`), and is as fast as it can fairly be made. What
-befalls lines within a record (range walk, line width) it leaves out, and leakage beyond the grid.
+It is here to be compared with (`sweep accuracy`), and is as fast as it can fairly be made. It skips
+changes of lines within a record (range walk, line width), and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Bench(ABC):
         self._names: dict[str, frozenset[str]] = {}
 
     def effects(self, rung: Rung) -> frozenset[str]:
-        """Effects that a rung calls for anywhere in the sample."""
+        """Effects that a rung simulates anywhere in the sample."""
         if rung.name not in self._names:
             flags = np.unique(self._flags(rung)).tolist()
             self._names[rung.name] = frozenset(name for flag in flags for name in names_of(flag))
@@ -148,8 +148,8 @@ class Bench(ABC):
 def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
     """Numbers of points of a grid, in C order over it, spread evenly along every axis.
 
-    Any stretch from the first is spread as well, so that a part of the sample stands for all. They
-    follow Halton's sequence, without repetition; all are taken where there are fewer.
+    Any first part of it is spread as well, so that a part of the sample stands for all. They follow
+    Halton's sequence, without repetition; all are taken where there are fewer.
     """
     total = math.prod(shape)
     if not shape or total <= 1:
@@ -237,8 +237,8 @@ class GridBench(Bench):
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """Compute a rung on a part of the sample, timed on so many points or on the part.
 
-        What a point costs depends on those beside it, as they share what is worked out for them:
-        a stretch is what the point's block computes next to it.
+        The cost of a point depends on its neighbours, as they share intermediate results. So points
+        are timed together with those that the block computes next.
         """
         numbers = self._numbers[part]
         outputs, spent, planning = self._run(rung, numbers)
@@ -384,7 +384,7 @@ def find_on_grid(
 
 
 def grid_sizes(shots: Shots, least: int = SIZE) -> np.ndarray:
-    """Cells of each point's grid, (n,) int64: the lines in its middle, and room beside them."""
+    """Cells of each point's grid, (n,) int64: the lines in its middle, and room on both sides."""
     per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
     carrier = np.max([np.max(c) for c in shots.carriers])
     offset = np.abs(shots.offset).max(axis=1)[shots.row]

@@ -79,7 +79,7 @@ class Tiles:
 class FlightBench(Bench):
     """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
-    What counts is rays, plans, spectra and probabilities; draws, points and navigation cost the
+    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost the
     same whatever the accuracy, and are left out.
     """
 

@@ -440,7 +440,7 @@ class Content:
 
     @property
     def id(self) -> str:
-        """That of the study."""
+        """The spec of the study."""
         return self._spec.id
 
     def attributes(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Workers in pods, which the Dask operator of a Kubernetes cluster starts.
 
-What is asked for is one custom resource, a `DaskCluster`, and where workers are to be kept between
-bounds a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
+The request is one custom resource, a `DaskCluster`, and where workers are to be kept between bounds
+a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
 """
 
 from __future__ import annotations
