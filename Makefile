@@ -139,6 +139,7 @@ docs: $(READY)
 
 fields: $(READY)
 	$(BIN)/python docs/field_reference.py
+	$(BIN)/python docs/variable_reference.py
 
 forget-kernels:
 	find sweep -name '*.nb[ci]' -delete

@@ -6,7 +6,10 @@ project = "sweep"
 release = version = version_of("sweep")
 author = copyright = "the authors of sweep"
 
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_click"]
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+napoleon_use_rtype = False
 html_theme = "furo"
 html_title = f"sweep {version}"
 html_show_sphinx = False

@@ -16,17 +16,28 @@ FIRST = {"Spec": "A study of a flat target", "SceneSpec": "A study of a scene"}
 HEAD = """\
 # Fields of a spec
 
-Written by `make fields` from the models that read specs; `sweep schema` prints the same for
-editors. What has no default has to be given: in the spec, in an instrument's file or on an axis.
+Written by `make fields` from the models that read specs, in the order of a spec. `sweep schema`
+prints the same for editors. A field without a default has to be given: in the spec, in an
+instrument's file or on an axis.
 """
 
 
 def text() -> str:
-    """The whole page."""
+    """Return the whole page."""
     definitions = json_schema()["$defs"]
-    models = [name for name, own in definitions.items() if "properties" in own]
-    order = [*FIRST, *sorted(set(models) - set(FIRST))]
+    order: dict[str, None] = {}
+    for first in FIRST:
+        _reached(first, definitions, order)
     return HEAD + "".join(_model(name, definitions) for name in order)
+
+
+def _reached(name: str, definitions: dict[str, Any], order: dict[str, None]) -> None:
+    """Add a model to the order, then those that its fields refer to, as a spec is written."""
+    if name not in order:
+        order[name] = None
+        for described in definitions[name]["properties"].values():
+            for own in _names(described, definitions):
+                _reached(own, definitions, order)
 
 
 def _model(name: str, definitions: dict[str, Any]) -> str:
@@ -39,7 +50,8 @@ def _model(name: str, definitions: dict[str, Any]) -> str:
 
 
 def _row(field: str, described: dict[str, Any], definitions: dict[str, Any]) -> str:
-    links = ", ".join(dict.fromkeys(_links(described, definitions)))
+    names = dict.fromkeys(_names(described, definitions))
+    links = ", ".join(f"[{_words(name)}](#{_words(name).replace(' ', '-')})" for name in names)
     about = described.get("description", "")
     if not about and "const" in described:
         about = f"always `{described['const']}`"
@@ -49,29 +61,29 @@ def _row(field: str, described: dict[str, Any], definitions: dict[str, Any]) -> 
     return f"| `{field}` | {shown} | {_value(described)} |"
 
 
-def _links(node: Any, definitions: dict[str, Any]) -> Iterator[str]:
-    """Links to the models that a field may hold."""
+def _names(node: Any, definitions: dict[str, Any]) -> Iterator[str]:
+    """Models that a field may hold."""
     if isinstance(node, dict):
         name = str(node.get("$ref", "")).rsplit("/", 1)[-1]
         if "properties" in definitions.get(name, {}):
-            yield f"[{_words(name)}](#{_words(name).replace(' ', '-')})"
+            yield name
         for key, part in node.items():
             if key not in ("properties", "discriminator"):
-                yield from _links(part, definitions)
+                yield from _names(part, definitions)
     elif isinstance(node, list):
         for part in node:
-            yield from _links(part, definitions)
+            yield from _names(part, definitions)
 
 
 def _value(described: dict[str, Any]) -> str:
-    """A field's default, else an example of a good value."""
+    """Return a field's default, else an example of a good value."""
     if described.get("default") not in (None, "", [], {}):
         return f"default `{described['default']}`"
     return f"e.g. `{described['examples'][0]}`" if described.get("examples") else ""
 
 
 def _words(name: str) -> str:
-    """A model's name in words."""
+    """Return a model's name in words."""
     return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name).strip()
 
 

@@ -45,7 +45,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _own_folder() -> str:
-    """A temporary folder that nobody else can write: the kernels in it are run."""
+    """Return a temporary folder that nobody else can write: the kernels in it are run."""
     import tempfile
 
     folder = Path(tempfile.gettempdir()) / f"sweep-kernels-{os.getuid()}"
@@ -58,8 +58,9 @@ def _own_folder() -> str:
 
 
 def _keep_kernels() -> None:
-    """Have numba keep kernels in a temporary folder where it can neither beside this package nor in
-    the user's own cache, as in containers and shared installations.
+    """Have numba cache kernels in a temporary folder if no other is writable.
+
+    Neither the package's folder nor the user's cache is in some containers and shared installs.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     places = Path(__file__).parent / "model" / "__pycache__", cache / "numba"

@@ -139,7 +139,7 @@ def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fract
 
 @lru_cache(maxsize=4096)
 def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
-    """Unit of the given text, which must measure what `si_unit` measures."""
+    """Parse a unit that must measure what `si_unit` measures."""
     if DECIBEL in (si_unit, text):
         if si_unit == text:
             return Unit(DECIBEL)
@@ -193,7 +193,7 @@ def _spelled(text: str) -> str:
 
 
 def _show(value: Fraction) -> str:
-    """A number as a user would write it."""
+    """Format a number as a user would write it."""
     try:
         return f"{float(value):.4g}"
     except OverflowError:
@@ -252,7 +252,7 @@ def _root(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ..
 
 
 def by_pint(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
-    """The same, as pint has it."""
+    """Return the unit as pint has it."""
     registry = _registry()
     try:
         unit = registry.parse_units("percent" if name == "%" else name)

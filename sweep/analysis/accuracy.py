@@ -64,9 +64,9 @@ class Setting:
 
     @property
     def error(self) -> float:
-        """That which counts: the largest over the points, of all that a tolerance promises.
+        """The error that counts is the largest over the points, of all that a tolerance promises.
 
-        Where it is random, that of pd at most of the points.
+        If errors are random, it is that of pd at most of the points.
         """
         if self.likely < 1.0:
             return self.quantile(self.likely)
@@ -96,7 +96,7 @@ class Setting:
 
 
 def settings_in(dataset: xr.Dataset) -> list[Setting]:
-    """The settings of a store that `sweep accuracy` made, in its order."""
+    """Return the settings of a store that `sweep accuracy` made, in its order."""
     found = []
     likely = LIKELY if np.isfinite(dataset.standard_error.values).any() else 1.0
     for i in range(dataset.sizes["rung"]):
@@ -122,7 +122,7 @@ def settings_in(dataset: xr.Dataset) -> list[Setting]:
 
 
 def of_kinds(settings: Iterable[Setting], *kinds: str) -> list[Setting]:
-    """Settings of some kinds."""
+    """Return settings of some kinds."""
     return [setting for setting in settings if setting.kind in kinds]
 
 
@@ -132,7 +132,7 @@ def candidates(settings: Iterable[Setting]) -> list[Setting]:
 
 
 def front(settings: Sequence[Setting]) -> list[Setting]:
-    """Settings that no other is both as fast and as accurate as, the fastest first."""
+    """Return the settings on the front of time and error, the fastest first."""
     best: list[Setting] = []
     for setting in sorted(settings, key=lambda s: (s.seconds, s.error)):
         if not best or max(setting.error, EXACT) < max(best[-1].error, EXACT):
@@ -141,7 +141,7 @@ def front(settings: Sequence[Setting]) -> list[Setting]:
 
 
 def cheapest(settings: Sequence[Setting], error: float) -> Setting | None:
-    """The fastest setting whose error is no larger."""
+    """Return the fastest setting whose error is no larger."""
     allowed = max(error, EXACT)
     fitting = [setting for setting in settings if setting.error <= allowed]
     return min(fitting, key=lambda s: s.seconds, default=None)
@@ -160,14 +160,14 @@ class Duel:
         return self.with_besides(0.0)
 
     def with_besides(self, seconds: float) -> float:
-        """The same, with what both take besides [s], a point."""
+        """Compare both with a time added to each [s], a point."""
         return self.adaptive.times_faster(self.other, seconds) if self.other else float("inf")
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
     """For each error that adaptive settings have: the fastest of them, the fastest fixed one.
 
-    What leaves leakage out, where there is some, does less than they do, and is none of these.
+    A setting that skips leakage, if there is any, does less than they do, and is none of these.
     """
     adaptive = of_kinds(settings, ADAPTIVE)
     fixed = [setting for setting in of_kinds(settings, *FIXED) if setting.is_whole]
@@ -177,7 +177,7 @@ def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
 
 
 def against_thesis(settings: Sequence[Setting], kind: str = THESIS) -> list[Duel]:
-    """The fastest adaptive setting that is as accurate as the thesis's way, for each form of it.
+    """Return the fastest adaptive setting as accurate as each form of the thesis's way.
 
     `kind`: as it is described, or improved.
     """
@@ -201,7 +201,7 @@ STORING = "storing_seconds"
 
 
 def rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """A row for each setting, by COLUMNS."""
+    """Return a row for each setting, by COLUMNS."""
     best = front(candidates(settings))
     return [
         [
@@ -217,7 +217,7 @@ def rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def short_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """The same by SHORT: those on the front have a star before their names."""
+    """Return the rows by SHORT: settings on the front have a star before their names."""
     return [
         [f"{star or ' '} {name}", f"{time} us", *errors]
         for name, time, _, _, *errors, star in rows(settings)
@@ -225,7 +225,7 @@ def short_rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def cheapest_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """The cheapest setting for each tolerance: tolerance, setting, its time, its error."""
+    """Return the cheapest setting for each tolerance: tolerance, setting, its time, its error."""
     found = []
     for tolerance in TOLERANCES:
         best = cheapest(candidates(settings), tolerance)
@@ -337,7 +337,7 @@ def _name(duel: Duel) -> str:
 
 
 def _like_for_like(settings: Sequence[Setting]) -> list[str]:
-    """The same beamlets with the same effects: the closed form against the thesis's way."""
+    """Compare the closed form with the thesis's way: same beamlets, same effects."""
     told = [
         f"{closed.times_faster(thesis):.2g} times as fast as {thesis.name}"
         for closed in of_kinds(settings, CLOSED_FORM)
@@ -380,13 +380,13 @@ def _time(seconds: float) -> str:
 
 
 def microseconds(seconds: float) -> str:
-    """A time in microseconds, in three digits."""
+    """Return a time in microseconds, in three digits."""
     value = 1e6 * seconds
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def error(value: float) -> str:
-    """An error in two digits; 0 below what counts, nothing for nan."""
+    """Return an error in two digits; 0 below what counts, nothing for nan."""
     if math.isnan(value):
         return "-"
     return f"{value:.1e}" if value >= EXACT else f"<{EXACT:.0e}".replace("e-0", "e-")

@@ -58,7 +58,7 @@ MARK_SIZE = 7
 
 
 def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
-    """The figure of a store that `sweep accuracy` made."""
+    """Return the figure of a store that `sweep accuracy` made."""
     drawn = of.candidates(settings)
     sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
     axes.step(
@@ -83,7 +83,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
 
 
 def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
-    """A mark at the error that counts, a line down to pd's of 90 %, a dot at its median."""
+    """Draw a mark at the largest error, a line down to pd's of 90 %, a dot at its median."""
     time, worst = _place(setting)
     most, half = (max(setting.quantile(share), FLOOR) for share in (0.9, 0.5))
     if most > FLOOR:
@@ -122,7 +122,7 @@ def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotat
 
 
 def _put(name: Annotation, place: tuple[float, float]) -> None:
-    """A name so far to the right of its mark, and above it [points]."""
+    """Draw a name so far to the right of its mark, and above it [points]."""
     name.set_position(place)
     name.set_horizontalalignment("left" if place[0] > 0 else "right")
 
@@ -144,7 +144,7 @@ def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Sett
 
 
 def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
-    """Settings by time, those together whose marks are too close to be named each."""
+    """Group settings by time, if their marks are too close for names of their own."""
     clusters: list[list[Setting]] = []
     for setting in sorted(settings, key=lambda each: each.seconds):
         near = (cluster for cluster in clusters if _alike(setting, cluster[-1]))
@@ -189,7 +189,7 @@ def _finish(axes: Axes, least: float) -> None:
 
 
 def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
-    """Notes that it takes to read the figure."""
+    """Return the notes that explain the figure."""
     attributes = dataset.attrs
     likely = settings[0].likely
     worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} %"
@@ -210,7 +210,7 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
 
 
 def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
-    """The store as a dataset, read whole, and its settings.
+    """Return the store as a dataset, read whole, and its settings.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
 
 
 def draw(store: Location, directory: Path | None = None, form: str = "png") -> list[Path]:
-    """The figure as NAME.png (pdf, svg), the tables as NAME.txt, beside NAME.zarr or elsewhere."""
+    """Write the figure as NAME.png (pdf, svg) and the tables as NAME.txt."""
     dataset, settings = opened(store)
     stem = store.name.removesuffix(".zarr")
     place = beside(store) if directory is None else directory

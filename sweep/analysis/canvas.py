@@ -58,7 +58,7 @@ _NO_TRACES = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """The one style of all pictures, whatever its user has set."""
+    """Return the one style of all pictures, whatever its user has set."""
     with rc_context():
         rcdefaults()
         rcParams.update(STYLE)
@@ -66,7 +66,7 @@ def style() -> Iterator[None]:
 
 
 def sheet(width: float, height: float) -> Sheet:
-    """An empty sheet, width and height in inches."""
+    """Return an empty sheet, width and height in inches."""
     figure = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -75,14 +75,14 @@ def sheet(width: float, height: float) -> Sheet:
 def panels(
     width: float, height: float, rows: int, columns: int, **options: Any
 ) -> tuple[Sheet, list[Axes]]:
-    """A sheet with a grid of axes, listed row by row."""
+    """Return a sheet with a grid of axes, listed row by row."""
     figure = sheet(width, height)
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, list(axes.ravel())
 
 
 def empty(message: str) -> Sheet:
-    """A sheet that says why there is nothing on it."""
+    """Return a sheet that says why there is nothing on it."""
     figure = sheet(8.0, 2.0)
     figure.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
     return figure
@@ -104,7 +104,7 @@ def caption(figure: Sheet, text: str) -> None:
 
 
 def save(figure: Sheet, path: Path) -> Path:
-    """The sheet as a file of the format that its suffix names; the same sheet, the same bytes."""
+    """Write the sheet in the format of the suffix; the same sheet gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     kind = path.suffix.removeprefix(".")
     dpi = DPI if kind == "png" else PRINTED_DPI
@@ -126,7 +126,7 @@ MAP, HIGH_LINES, LOW_LINES, SMALL = (9.5, 4.4), (10.0, 3.6), (10.0, 1.75), (4.3,
 
 
 def sheet_of(chart: Chart, heading: str, note: str) -> Sheet:
-    """The sheet of a chart, with what stands over it and what is added at its foot."""
+    """Return the sheet of a chart, with what stands over it and what is added at its foot."""
     figure = _sheet_of_maps(chart, chart.scale) if chart.scale else _sheet_of_lines(chart)
     title(figure, heading)
     caption(figure, labels.joined([*chart.caption, note]))
@@ -134,7 +134,7 @@ def sheet_of(chart: Chart, heading: str, note: str) -> Sheet:
 
 
 def _sheet_of_maps(chart: Chart, scale: Scale) -> Sheet:
-    """Maps in one column, or in two where there is more than one part."""
+    """Arrange maps in one column, or in two if there are several parts."""
     columns = min(2, len({panel.when["part"] for panel in chart.panels}))
     rows = -(-len(chart.panels) // columns)
     sheet, axes = panels(

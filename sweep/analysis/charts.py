@@ -110,8 +110,8 @@ class Panel:
 class Chart:
     """Contents of a figure: words over it, for those who do not see it, and under it; panels.
 
-    Panels are in the order of the choices; facets tell what stands beside each choice. `rows` are
-    numbers of panels in the rows of a sheet, which decides by default.
+    Panels are in the order of the choices; facets have the name of each choice. `rows` are numbers
+    of panels in the rows of a sheet, which decides by default.
     """
 
     heading: str
@@ -155,7 +155,7 @@ class Ruler:
 
     @classmethod
     def of(cls, found: Points, name: str) -> Ruler:
-        """The ruler of a coordinate."""
+        """Return the ruler of a coordinate."""
         values, units = np.unique(found.values(name)), found.units(name)
         if labels.is_words(values):
             return cls(Axis(labels.coordinate(name), WORDS), 1.0, "")
@@ -198,7 +198,7 @@ def scale_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Scale:
 
 
 def axis_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Axis:
-    """The axis of a variable: probabilities of detection from 0 to 1, wide spans by decades."""
+    """Return the axis of a variable: pd from 0 to 1, wide spans by decades."""
     if variable.startswith("pd_"):
         return Axis(words, limits=CHANCE)
     return Axis(words, LOG if scale_of(variable, words, layers).decades else LINEAR)
@@ -232,7 +232,7 @@ def not_shown(number: int) -> str:
 def surface(
     found: Points, *, x: str, y: str, variable: str, words: str, room: Room = SHEET
 ) -> Chart:
-    """A variable over two coordinates, a panel for each value of what else varies."""
+    """Return a variable over two coordinates, a panel for each value of what else varies."""
     parts, left_out = facets_of(found, [x, y], room.parts)
     planes = [_plane(part, variable, x, y) for _, part in parts]
     kinds = [MEAN, worst(variable)] if worst(variable) else [MEAN]
@@ -309,7 +309,7 @@ def _reduction(each: int, sides: Sequence[Side], kinds: Sequence[str]) -> str:
 
 
 def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: int = 6) -> Chart:
-    """A variable along a coordinate, a line for each value of another."""
+    """Return a variable along a coordinate, a line for each value of another."""
     lines_by = [by] if by else []
     parts, left_out = facets_of(found, [x, *lines_by], most)
     named, lacking = lines_of(parts, lines_by)
@@ -343,7 +343,7 @@ def lines_of(parts: Sequence[tuple[str, Points]], by: Sequence[str]) -> tuple[li
 def panels_of(
     named: Sequence[Named], drawn: Sequence[Line], ruler: Ruler, up: Axis, **choices: str
 ) -> list[Panel]:
-    """A panel for each part, with its lines; the same name has the same colour everywhere."""
+    """Return a panel for each part; a name has the same colour in all of them."""
     numbers = {name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named))}
     found: dict[str, list[Line]] = {}
     for (part, name, _), line in zip(named, drawn, strict=True):
@@ -361,7 +361,7 @@ def alternative(words: str, span: str, panel: Panel) -> str:
 def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list[str]]:
     """Variables along a coordinate, all in one reading, and remarks on how they are drawn.
 
-    A line of many points is cut into stretches: their means, in a band from the lowest to the
+    A line of many points is cut into intervals: their means, in a band from the lowest to the
     highest of their points; else the band is the interval of each point.
 
     Where coordinates beside `x` vary, their first place is taken. A variable has intervals where

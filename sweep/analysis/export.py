@@ -54,7 +54,7 @@ class PointTable:
     origin: np.ndarray
 
     def parts(self) -> Iterator[np.ndarray]:
-        """Rows (m,) of ROW, stretch by stretch."""
+        """Rows (m,) of ROW, part by part."""
         names = [name for name in COLUMNS if name != "number_of_returns"]
         for part in self.recording.stretches():
             table = self.recording.points([*names, "returns"], part, self.draw, self.ranges)
@@ -68,7 +68,7 @@ class PointTable:
             yield rows
 
     def number(self) -> int:
-        """Number of points."""
+        """Return the number of points."""
         return sum(
             int((self.recording.read("flags", part, self.draw) > 0).sum())
             for part in self.recording.stretches()
@@ -93,7 +93,7 @@ _PLY_TYPES = {
 
 
 def write_ply(table: PointTable, path: Path, remarks: Remarks) -> int:
-    """A binary PLY file of vertices whose properties are the columns; how many there are."""
+    """Write a binary PLY file with the columns as properties; return the number of points."""
     number = table.number()
     comments = list(remarks)
     for unit in dict.fromkeys(UNITS.values()):
@@ -114,7 +114,7 @@ def write_ply(table: PointTable, path: Path, remarks: Remarks) -> int:
 
 
 def write_csv(table: PointTable, path: Path, remarks: Remarks) -> int:
-    """A CSV file with names and units in its first line, and digits that give the same numbers."""
+    """Write a CSV file with names and units in its first line, and all digits."""
     number = 0
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
@@ -139,7 +139,7 @@ UNCLASSIFIED, NOISE = 1, 7
 
 
 def write_las(table: PointTable, path: Path, remarks: Remarks, *, compressed: bool = False) -> int:
-    """A LAS 1.4 file, point format 6, with the other columns as extra bytes.
+    """Write a LAS 1.4 file, point format 6, with the other columns as extra bytes.
 
     Times since the flight's start stand as GPS times; false points have the class of noise;
     intensity is the signal-to-noise ratio in hundredths of a decibel.
@@ -206,11 +206,11 @@ def export(
     ranges: str = INTERPOLATED,
     where: Mapping[str, object] | None = None,
 ) -> int:
-    """The points of one scanner and draw as a file.
+    """Write the points of one scanner and draw to a file.
 
     Coordinates are those of the scene's files: the scene's origin is added to what is stored.
-    Points are written stretch by stretch, in the order of shots and returns; what is not computed
-    yet is left out. Nothing is at the file's place before it is whole.
+    Points are written in the order of shots and returns, part by part; those not computed yet are
+    left out. Nothing is at the file's place before it is whole.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class Study:
 
     @classmethod
     def of(cls, store_path: str | Location) -> Study:
-        """The study in a store."""
+        """Return the study in a store."""
         dataset = open_store(store_path)
         return cls(dataset, Spec.from_stored(dataset.attrs["spec"]))
 
@@ -55,12 +55,12 @@ class Study:
         return list(self.spec.figures) or default_figures(self.spec)
 
     def words(self, variable: str) -> str:
-        """A variable's name in words, with its units."""
+        """Return a variable's name in words, with its units."""
         attributes = self.dataset[variable].attrs
         return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
 
     def chart(self, figure: Surface | Slices, room: charts.Room) -> charts.Chart | None:
-        """The chart of a figure; none where no point is within its limits."""
+        """Return the chart of a figure, or None if no point is within its limits."""
         found = confined(self.points, self.spec, figure.where)
         if not found.size:
             return None
@@ -82,7 +82,7 @@ class Study:
         return make(self.points, self.spec, by=figure.by, printed=figure.printed, title=title)
 
     def made(self, figure: Figure) -> canvas.Sheet | tables.Page | str:
-        """The sheet or the page of a figure; why there is none."""
+        """Return the sheet or the page of a figure; why there is none."""
         if not isinstance(figure, Surface | Slices):
             return self.page(figure)
         chart = self.chart(figure, charts.SHEET)

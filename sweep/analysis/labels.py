@@ -40,7 +40,7 @@ def with_brackets(name: str, units: str) -> str:
 
 
 def quantity(value: object, units: str = "") -> str:
-    """A value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
+    """Return a value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
     text = str(value) if isinstance(value, str | np.str_) else number(float(value))  # type: ignore[arg-type]
     symbol = _SYMBOLS.get(units, units)
     if units in _UNITLESS:
@@ -49,12 +49,12 @@ def quantity(value: object, units: str = "") -> str:
 
 
 def valued(name: str, value: object, units: str = "") -> str:
-    """A coordinate with a value of it: ``grazing angle 15°``."""
+    """Return a coordinate with a value of it: ``grazing angle 15°``."""
     return f"{coordinate(name)} {quantity(value, units)}"
 
 
 def prefixed(value: float, units: str) -> str:
-    """A value in SI units with the prefix that suits it: ``25 mm``, ``50 µrad``, ``2 km``."""
+    """Format a value in SI units with a prefix: ``25 mm``, ``50 µrad``, ``2 km``."""
     if units in _UNITLESS or units not in _TAKE_PREFIXES or value == 0:
         return quantity(value, units)
     power = min(max(3 * math.floor(math.log10(abs(value)) / 3 + 1e-12), -12), 12)
@@ -62,19 +62,19 @@ def prefixed(value: float, units: str) -> str:
 
 
 def number(value: float) -> str:
-    """A number in few digits; large powers of two as such."""
+    """Return a number in few digits; large powers of two as such."""
     if value >= 1024 and value == int(value) and int(value).bit_count() == 1:
         return f"2^{int(math.log2(value))}"
     return f"{value:.6g}"
 
 
 def counted(number: int, thing: str) -> str:
-    """A number of things: ``1 shot``, ``1,200 shots``."""
+    """Return a number of things: ``1 shot``, ``1,200 shots``."""
     return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
 def coordinate(name: str) -> str:
-    """A coordinate's name in words."""
+    """Return a coordinate's name in words."""
     return {"tnr": "TNR", "fft_size": "FFT size"}.get(name, name.replace("_", " "))
 
 

@@ -44,7 +44,7 @@ def bin_probability(tnr: float, looks: Looks = ONE) -> float:
 
 
 def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
-    """Independent bins that raise as many false alarms as a segment's, by a bin's chance of one.
+    """Independent bins with the false alarms of a segment, from the probability of one in a bin.
 
     From SI values by dotted path; :func:`sweep.model.threshold.segment_bins`.
     """
@@ -112,7 +112,7 @@ def shot_with_leakage(
 
 
 def variance_excess_of_bin(probability: float, tnr: float) -> float:
-    """Noise variance over the one that the threshold was set by, less one, from a bin's chance.
+    """Excess of the noise variance over the threshold's, from the probability in a bin.
 
     exp(-x / (1 + e)) = probability, solved for e; nan where no e does.
     """
@@ -122,7 +122,7 @@ def variance_excess_of_bin(probability: float, tnr: float) -> float:
 
 
 def variance_excess_of_shot(probability: float, tnr: float, bins: float) -> float:
-    """The same from the probability of a false alarm in both segments of a shot.
+    """Return the noise from the probability of a false alarm in both segments of a shot.
 
     (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability, solved for e; nan where no e does.
     """

@@ -42,11 +42,11 @@ _HOLDS = {
 
 
 def open(path: str | Location) -> xr.Dataset:
-    """The store of a study as a dataset.
+    """Open the store of a study as a dataset.
 
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
     written in, and every variable has its units and what it is. Arrays are read when they are
-    needed, as Dask arrays in pieces of whole chunks of the store. What is not computed yet is nan;
+    needed, as Dask arrays in pieces of whole chunks of the store. Points not computed yet are nan;
     -1 for counts of draws, which are summed over their batches, and for their number `n_draws`.
 
     Parameters
@@ -82,10 +82,10 @@ def open(path: str | Location) -> xr.Dataset:
 
 
 def open_scene(path: str | Location) -> xr.DataTree:
-    """The store of a scene's point clouds as a tree: a group for each scanner.
+    """Open the store of a scene's point clouds as a tree: a group for each scanner.
 
-    Arrays are read when they are needed, as Dask arrays in the chunks of the store. What is not
-    computed yet is nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
+    Arrays are read when they are needed, as Dask arrays in the chunks of the store. Values not
+    computed yet are nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
 
 
 def _blocks(array: xr.DataArray) -> int:
-    """Number of chunks that an array is stored in."""
+    """Return the number of chunks that an array is stored in."""
     return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
 
 
@@ -183,7 +183,7 @@ def in_pieces(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:
-    """Counts of draws summed over their batches; -1 where any of these is."""
+    """Sum counts of draws over their batches; -1 if any of these is."""
     counts = {name: array for name, array in dataset.data_vars.items() if BATCH in array.dims}
     sums = {
         name: array.sum(BATCH, keep_attrs=True).where(
@@ -195,7 +195,7 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def progress(path: Location, points: int, blocks: int) -> dict[str, Any]:
-    """Times and amount of what is committed of all points and blocks, as attributes."""
+    """Return times and amount of what is committed of all points and blocks, as attributes."""
     receipts = read_receipts(path, blocks)
     sessions = read_lines(path / JOURNAL / "sessions.jsonl")
     started = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
@@ -218,7 +218,7 @@ ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two 
 
 
 def _of_dataset(answer: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a dataset as a method, with its words and arguments."""
+    """Return a function of a dataset as a method, with its words and arguments."""
 
     @wraps(answer)
     def method(self: SweepAccessor, *given: Any, **options: Any) -> Any:

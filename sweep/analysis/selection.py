@@ -34,7 +34,7 @@ class Side:
     values: np.ndarray
 
     def together(self, most: int) -> int:
-        """Number of neighbours in a cell, so that there are `most` cells or fewer."""
+        """Return the number of neighbours in a cell, so that there are `most` cells or fewer."""
         return 1 if labels.is_words(self.values) else -(-self.values.size // most)
 
     def middles(self, most: int) -> np.ndarray:
@@ -48,14 +48,14 @@ class Side:
 
 
 def known(array: xr.DataArray) -> xr.DataArray:
-    """An array as floats; nan where a count is not made yet."""
+    """Return an array as floats; nan where a count is not made yet."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
 def coarsened(
     array: xr.DataArray, sides: Sequence[tuple[Side, int]], at: Mapping[str, int], kind: str
 ) -> xr.DataArray:
-    """An array in cells along some sides, at one place along its other dimensions; not computed.
+    """Return an array in cells along some sides, at one place along the others; lazy.
 
     Sides come with the largest number of their cells; of the values in a cell it has the
     ``mean``, ``lowest`` or ``highest``, nan only where all are.
@@ -115,11 +115,11 @@ class Points:
         return int(np.prod([own.size for own in self.positions.values()], dtype=np.int64))
 
     def dim_of(self, name: str) -> str:
-        """The dimension of a coordinate."""
+        """Return the dimension of a coordinate."""
         return str(self.dataset.coords[name].dims[0]) if name in self.dataset.coords else name
 
     def values(self, name: str) -> np.ndarray:
-        """A coordinate at each place along its dimension."""
+        """Return a coordinate at each place along its dimension."""
         positions = self.positions[self.dim_of(name)]
         if name not in self.dataset.coords:
             return positions
@@ -201,7 +201,7 @@ class Points:
         return found
 
     def spread(self, name: str) -> np.ndarray:
-        """A coordinate at every point, (n,)."""
+        """Return a coordinate at every point, (n,)."""
         shape = [own.size for own in self.positions.values()]
         along = [n if d == self.dim_of(name) else 1
                  for d, n in zip(self.positions, shape, strict=True)]  # fmt: skip
@@ -214,12 +214,12 @@ class Points:
         return Side(dim, self.positions[dim][first], values)
 
     def first(self, *sides: Side) -> dict[str, int]:
-        """The first place along every dimension but those of some sides."""
+        """Return the first place along every dimension but those of some sides."""
         shown = {side.dim for side in sides}
         return {dim: int(own[0]) for dim, own in self.positions.items() if dim not in shown}
 
     def cells(self, variable: str, sides: Sequence[tuple[Side, int]], kind: str) -> xr.DataArray:
-        """A variable in cells along some sides, as :func:`coarsened` makes them."""
+        """Return a variable in cells along some sides, as :func:`coarsened` makes them."""
         at = self.first(*(side for side, _ in sides))
         return coarsened(self.dataset[variable], sides, at, kind)
 
@@ -266,7 +266,7 @@ def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, 
 
 
 def coordinate_of(spec: Spec, path: str) -> Member | None:
-    """The parameter of a path where it is on an axis."""
+    """Return the parameter of a path where it is on an axis."""
     try:
         return spec.member(path)
     except KeyError:
@@ -346,7 +346,7 @@ def _pieces(axis: Axis) -> list[tuple[Member, object]]:
 
 
 def _constant(values: np.ndarray) -> int:
-    """Number of leading values that are equal."""
+    """Return the number of leading values that are equal."""
     different = values != values[0]
     return int(np.argmax(different)) if different.any() else values.size
 

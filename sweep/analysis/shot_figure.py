@@ -206,7 +206,7 @@ def drawn_noise(prepared: model.Shots, *, seed: int, segment: int, look: int = 0
 
 
 def groups(magnitude: np.ndarray, threshold: float) -> tuple[Group, ...]:
-    """Runs of adjacent bins at or above the threshold."""
+    """Find runs of adjacent bins at or above the threshold."""
     above = np.flatnonzero(magnitude >= threshold)
     runs = np.split(above, np.flatnonzero(np.diff(above) > 1) + 1) if above.size else []
     return tuple(

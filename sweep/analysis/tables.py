@@ -65,14 +65,14 @@ class Page:
     records: Sequence[dict[str, Cell]]
 
     def text(self) -> str:
-        """The page as plain text."""
+        """Return the page as plain text."""
         parts = [f"{self.title}\n{'=' * len(self.title)}"]
         parts += [f"{b.heading}\n\n{aligned(b.columns, b.rows)}" for b in self.blocks]
         parts += ["\n".join(self.notes)] if self.notes else []
         return "\n\n".join(parts) + "\n"
 
     def save(self, directory: Path, stem: str) -> list[Path]:
-        """The page as `stem`.txt and `stem`.csv."""
+        """Write the page as `stem`.txt and `stem`.csv."""
         directory.mkdir(parents=True, exist_ok=True)
         text, table = directory / f"{stem}.txt", directory / f"{stem}.csv"
         text.write_text(self.text(), encoding="utf-8")
@@ -84,14 +84,14 @@ class Page:
 
 
 def written(cell: Cell) -> str:
-    """A cell's text; nothing for nan."""
+    """Return a cell's text; nothing for nan."""
     if isinstance(cell, float):
         return "-" if math.isnan(cell) else f"{cell:.5g}"
     return str(cell)
 
 
 def percent(value: float, form: str = ".3f") -> str:
-    """A fraction in percent; nothing for nan."""
+    """Return a fraction in percent; nothing for nan."""
     return "-" if math.isnan(value) else f"{100 * value:{form}} %"
 
 
@@ -120,7 +120,7 @@ def _numeric(cell: Cell) -> bool:
 
 
 def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -> Page:
-    """A variable's mean and median over all but rows and columns."""
+    """Return a variable's mean and median over all but rows and columns."""
     found = confined(found, spec, asked.where)
     if asked.minimum_range:
         found = beyond(found, spec, f"{asked.minimum_range!r} m", included=True)
@@ -159,7 +159,7 @@ def _column(found: Points, name: str, value: object) -> str:
 
 
 def _published(printed: Any, row: int, column: int) -> float:
-    """The printed figure of a row and column; of one row of numbers, that of the row."""
+    """Return the printed figure of a row and column; of one row of numbers, that of the row."""
     if row >= len(printed):
         return math.nan
     values = printed[row] if isinstance(printed[row], tuple | list) else (printed[row],)
@@ -495,7 +495,7 @@ _COMMON_NOTES = (
 def _block(
     heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, Cell]]
 ) -> Block:
-    """A table of some figures of each record."""
+    """Return a table of some figures of each record."""
     rows = [[_written(record[key], form) for key, form in columns.values()] for record in records]
     return Block(heading, tuple(columns), rows)
 

@@ -1,7 +1,7 @@
 """Means, extremes and medians of any number of values, which are read piece by piece.
 
-All are exact, rounded once, so that they do not depend on the pieces: a mean comes from integer
-sums, a median from its digits, the leading ones first, each in a reading of its own.
+All are exact, rounded once, and do not depend on the pieces: a mean comes from integer sums, a
+median from its digits, the leading ones first, each in a reading of its own.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _ordered(values: np.ndarray) -> np.ndarray:
 
 
 def _value(key: int) -> float:
-    """The float of a key."""
+    """Return the float of a key."""
     top = 1 << (_WORD - 1)
     bits = key ^ top if key & top else ~key & ((1 << _WORD) - 1)
     return float(np.uint64(bits).view(np.float64))
@@ -174,12 +174,12 @@ def search(
 
 
 def for_median(number: int) -> Search:
-    """The search for the median of so many values."""
+    """Return the search for the median of so many values."""
     return Search([(number + 1) // 2, number // 2 + 1] if number else [])
 
 
 def median(found: Search) -> float:
-    """The median that a search for it has found; nan where there are no values."""
+    """Return the median that a search for it has found; nan where there are no values."""
     low, high = found.values or (math.nan, math.nan)
     return (low + high) / 2
 

@@ -172,8 +172,8 @@ def _default_store(spec: Path) -> Path:
 def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -> None:
     """Compute what STORE lacks: what was interrupted, what was lost.
 
-    Blocks that failed twice are left out, lest they cost every later run a worker, until
-    --retry-failed asks for them; sweep status lists them with their errors.
+    Blocks that failed twice are skipped, since they might cost every later run a worker, unless
+    --retry-failed is given; sweep status lists them with their errors.
 
     \b
       sweep resume results/range_angle.zarr
@@ -191,11 +191,11 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -
 @WORKERS
 @ALLOW_CODE
 def plan(spec: Path, workers: int | None) -> None:
-    """Say what SPEC would take, and which effects it calls for. Nothing is written.
+    """Print the size and time of SPEC, and the effects it simulates. Nothing is written.
 
-    The time comes from about a second of computing points of the study itself. Of each effect the
-    table says at how many points and where it is simulated, how much it may change pd, log10
-    pfa or |X| (a bound), and the share of a point's time that it takes there.
+    The time comes from about a second of computing points of the study itself. For each effect a
+    table gives the points at which it is simulated, a bound on its change of pd, log10 pfa or
+    magnitude, and its share of a point's time.
     """
     from sweep.spec import load
     from sweep.tasks.progress import working
@@ -280,16 +280,16 @@ def accuracy(
 ) -> None:
     """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
 
-    A sample of the study's own points, the same every time, is computed with the spec as it is
-    written, with effects on demand at tolerances from 0.1 to 1e-6, with all effects on, with the
-    same effects everywhere, with fixed numbers of beamlets or draws, and in the way of the thesis.
-    Errors are taken against the finest of them all, and that is held against the time domain.
-    All settings take turns on parts of the sample, round after round, so that whatever slows the
-    machine slows them alike; the best round counts. Planning is counted, storing is not.
+    A sample of the study's own points, the same every time, is computed with many settings: the
+    spec as written, effects on demand at tolerances from 0.1 to 1e-6, all effects on, the same
+    effects everywhere, fixed numbers of beamlets or draws, and the thesis's way. Errors are taken
+    against the finest of them all, and that is held against the time domain. All settings take
+    turns on parts of the sample, round after round, so that whatever slows the machine slows them
+    alike; the best round counts. Planning is counted, storing is not.
 
     The table has the time a point on one core and the errors; * marks settings that no other is
     both as fast and as accurate as. The store holds errors by setting and point, and opens with
-    xarray; the figure is beside it, and `sweep figures` draws it anew. Ctrl-C keeps what is done.
+    xarray; the figure is next to it, and `sweep figures` draws it anew. Ctrl-C keeps what is done.
 
     \b
       sweep accuracy experiments/quickstart.yaml
@@ -359,9 +359,9 @@ def export(
 def certificates(directory: Path, days: int) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
 
-    What is printed goes into the cluster's file: scheduler, workers and client then talk TLS, and
-    refuse whoever has no such certificate. Keep the directory to yourself, where all machines of
-    the cluster see it.
+    Put the output into the cluster's file: scheduler, workers and client then talk TLS, and refuse
+    whoever has no such certificate. Keep the directory to yourself, where all machines of the
+    cluster see it.
     """
     from sweep.tasks.clusters.certificates import make
 
@@ -445,12 +445,12 @@ def extend(
 ) -> None:
     """Extend STORE to a larger study, and compute only what is new.
 
-    The larger study is the one in the file SPEC, or the one in STORE with fields --set anew: more
-    values on an axis, a new axis, more draws, a tighter tolerance, more scanners of a flight. What
-    STORE has of it is taken from there; what comes out is, byte for byte, the larger study run at
-    once.
+    The larger study is the one in the file SPEC, or the one in STORE with fields --set anew. It may
+    have more values on an axis, a new axis, more draws, a tighter tolerance, more scanners of a
+    flight. Points that STORE has are reused; the result is byte for byte that of the larger study
+    run at once.
 
-    The larger store is made beside STORE and takes its place once it is complete. Until then
+    The larger store is made in the same folder and replaces STORE once it is complete. Until then
     nothing in STORE changes; sweep extend, or sweep resume STORE, goes on after an interruption.
 
     \b

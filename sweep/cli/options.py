@@ -20,7 +20,7 @@ class LocalPath(click.Path):
         super().__init__(path_type=Path, **rules)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path, as click checks it."""
+        """Return the path, as click checks it."""
         return super().convert(os.path.expanduser(value), param, ctx)
 
 
@@ -32,7 +32,7 @@ class StorePath(click.ParamType):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
-        """The place that is meant."""
+        """Return the place that is meant."""
         return located(str(value))
 
     def shell_complete(
@@ -43,7 +43,7 @@ class StorePath(click.ParamType):
 
 
 def shown(path: Location) -> Location:
-    """A place as short as it can be written from here."""
+    """Return a place as short as it can be written from here."""
     here = Path.cwd()
     if isinstance(path, Path) and path.is_relative_to(here):
         return path.relative_to(here)

@@ -32,7 +32,7 @@ LEAST_WORDS, BETWEEN = 14, 3
 
 
 def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
-    """What the file of an instrument of the library says."""
+    """Yield what the file of an instrument of the library says."""
     import yaml
 
     yield own["title"]
@@ -49,7 +49,7 @@ def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
 def conclude(outcome: Outcome, store: Location) -> None:
     """Say what a run has come to, and leave with its exit code.
 
-    The store is the one that the user named: one that is being extended lies beside it.
+    The store is the one that the user named: one that is being extended lies next to it.
     """
     from sweep.tasks.progress import duration
 
@@ -278,7 +278,7 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
 
 
 def tell_effects(table: EffectsTable) -> None:
-    """Print which effects a study calls for, where, and what they cost; warn of what is off."""
+    """Print the effects that a study simulates, where, and their costs; warn of what is off."""
     there = [row for row in table.rows if row.bound > 0 or row.share > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
     print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
@@ -369,7 +369,7 @@ def warn_before(study: Spec | SceneSpec, store: Location) -> None:
 
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
-    """Table of the effects that a study calls for, where, and their costs if asked for."""
+    """Table of the effects that a study simulates, where, and their costs if asked for."""
     from sweep.tasks.plan import effects_table
     from sweep.tasks.studies import study_of
 
@@ -398,7 +398,7 @@ def _effect_cells(row: EffectRow) -> list[str]:
 
 
 def in_bytes(count: int) -> str:
-    """A number of bytes for a reader: `1.5 MB`."""
+    """Format a number of bytes: `1.5 MB`."""
     size, unit = float(count), "B"
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":

@@ -29,7 +29,7 @@ MOST_LISTED = 20
 def status(store: Location) -> None:
     """Say how far STORE is, also while it runs somewhere else.
 
-    Where it draws, a table says at how many points accuracy.tolerance is met.
+    With draws, a table has the number of points within accuracy.tolerance.
     """
     from sweep.tasks.progress import amount, duration
     from sweep.tasks.summary import status as read
@@ -95,9 +95,9 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
     """Check every byte of STORE against the digests taken as it was written.
 
     Names every object that has a flipped, missing or surplus byte: results block by block,
-    metadata, coordinates, the spec, the journal; of a flight the eyepoints, too; and files and
-    arrays that are no part of it. Damaged blocks are marked, so that sweep resume computes just
-    them, to the same bytes as before.
+    metadata, coordinates, the spec, the journal, and the eyepoints of a flight. It names files and
+    arrays that are no part of the store as well. Damaged blocks are marked, so that sweep resume
+    computes just them, to the same bytes as before.
 
     \b
       sweep verify results/range_angle.zarr
@@ -127,7 +127,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
 @STORE
 @click.argument("output", type=StorePath(), required=False)
 def finalize(store: Location, output: Location | None) -> None:
-    """Copy the complete STORE into OUTPUT as few large files [NAME_final.zarr beside NAME.zarr].
+    """Copy the complete STORE into OUTPUT as few large files [NAME_final.zarr next to NAME.zarr].
 
     A store has a file for every array and block, so that any number of processes can write it. The
     copy has the same values, attributes and names in files (shards) of up to 64 MB: quick to move,
@@ -207,7 +207,7 @@ def report(store: Location, output: Path | None) -> None:
 
 @contextmanager
 def bar(begin: str) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error while its block runs, gone at its end, which is told what is next."""
+    """Show a bar on standard error while its block runs."""
     from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -290,7 +290,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 
 def _opened(path: Location) -> Store:
-    """A store of a grid as a dataset, of a flight as a tree."""
+    """Return a store of a grid as a dataset, of a flight as a tree."""
     from sweep.analysis.opening import SCENE, open_scene, read_attributes
     from sweep.analysis.opening import open as open_grid
 

@@ -77,7 +77,7 @@ class Track:
         return Ruler.of(self.part, self.name)
 
     def places(self, most: int) -> np.ndarray:
-        """Some of its places, spread over all."""
+        """Return some of its places, spread over all."""
         if self.side is None:
             return np.zeros(1, int)
         size = self.side.values.size
@@ -90,7 +90,7 @@ class Track:
         return self.part.first(self.side) | {self.side.dim: int(self.side.positions[place])}
 
     def values(self, variable: str, places: np.ndarray) -> np.ndarray:
-        """A variable at some of its places."""
+        """Return a variable at some of its places."""
         array = self.part.dataset[variable]
         if self.side is None:
             return np.ravel(array.isel(self.part.first()).values)
@@ -148,7 +148,7 @@ _ALARM_OF = {
 
 
 def _characteristics(study: Study, track: Track) -> list[Panel]:
-    """A panel for each kind of false alarm: line and dot of some points."""
+    """Return a panel for each kind of false alarm: line and dot of some points."""
     layers: dict[str, list[Line]] = {alarm: [] for alarm in _ALARM_OF}
     for number, place in enumerate(_places_of_interest(track)):
         point = study.dataset.isel(track.position(place)).compute()
@@ -239,7 +239,7 @@ def budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
 
 
 def false_alarms(study: Study, found: Sequence[Track], fewer: int) -> Chart | None:
-    """False alarms of noise and of leakage along the main coordinate; none without one."""
+    """Return false alarms of noise and leakage along the main coordinate, if there is one."""
     if found[0].side is None:
         return None
     name = found[0].name
@@ -319,7 +319,7 @@ def maximum_range(study: Study) -> Chart | Table | None:
 
 
 def _reach(piece: Points, name: str, factor: float) -> Points:
-    """The maximum range in the units shown, with what it varies over; not computed."""
+    """Return the maximum range in the units shown, and its coordinates; lazy."""
     dim = piece.dim_of(name)
     positions = np.sort(piece.side(name).positions)
     dataset = piece.dataset
@@ -335,7 +335,7 @@ def _reach(piece: Points, name: str, factor: float) -> Points:
 
 
 def _along(study: Study, found: Points) -> str:
-    """The grazing angle where it varies, else the longest coordinate of numbers; empty for none."""
+    """Return the grazing angle if it varies, or the longest coordinate of numbers."""
     varying = found.varying()
     angle = coordinate_of(study.spec, GRAZING_ANGLE)
     if angle is not None and angle.name in varying:

@@ -182,7 +182,7 @@ def _traces(words: str, cloud: Cloud, ground: Ground | None) -> Iterator[go.Scat
 
 
 def _terrain(words: str, cloud: Cloud, ground: Ground) -> Iterator[go.Surface]:
-    """The ground around what is seen of it, shaded, just below itself."""
+    """Draw the ground around the points seen, shaded, just below itself."""
     around = {}
     for axis in ("x", "y"):
         values = np.concatenate([cloud.points[axis], cloud.path[axis]])
@@ -206,7 +206,7 @@ def _camera(view: str) -> dict[str, dict[str, float]]:
 
 
 def _hidden(view: str) -> dict[str, bool]:
-    """The axis that a view looks along, whose labels would lie over each other, is not drawn."""
+    """Hide the axis that a view looks along, whose labels would overlap."""
     low, _, high = sorted(AXES, key=lambda axis: abs(VIEWS[view][axis]))
     return {f"scene.{high}axis.visible": False} if VIEWS[view][low] == 0 else {}
 
@@ -298,7 +298,7 @@ def along(found: Sequence[Seen]) -> Chart | None:
 
 
 def _by_beam(table: dict[str, np.ndarray], name: str) -> list[Line]:
-    """Marks of each beam; of all together where there are more than colours."""
+    """Return marks of each beam; of all together where there are more than colours."""
     values = shown(name, table[name])
     beams = np.unique(table["beam"])
     if beams.size > len(canvas.LINES):
@@ -365,7 +365,7 @@ def noise_budget(study: SceneStudy, found: Sequence[Seen]) -> Chart | None:
 
 
 def _budget(study: SceneStudy, seen: Seen) -> Panel:
-    """Sources of noise of some of the shots that see something."""
+    """Return sources of noise of some of the shots that see something."""
     recording = seen.recording
     number = recording.shots
     shots = np.unique(np.linspace(0, number - 1, min(PLACES, number)).round().astype(int))

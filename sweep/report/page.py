@@ -54,7 +54,7 @@ COLOUR_BAR: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Control:
-    """A choice that a plot offers: its name as traces call it, and what stands beside it.
+    """A choice that a plot offers: its name as traces call it, and the text next to it.
 
     The first option is chosen at the start; `relayout` is what each changes of the layout.
     """
@@ -93,7 +93,7 @@ def sentences(parts: Sequence[str]) -> list[str]:
 
 
 def plot(chart: Chart) -> Plot:
-    """A chart to choose from, hover and zoom."""
+    """Return a chart to choose from, hover and zoom."""
     first = chart.panels[0]
     further: dict[str, Any] = {}
     areas = [line for line in first.lines if line.look == "area"]
@@ -117,7 +117,7 @@ def plot(chart: Chart) -> Plot:
 
 
 def _control(panels: Sequence[Panel], name: str, label: str) -> Control:
-    """The choice of a facet's options; it changes the upright axis where that depends on it."""
+    """Return the choice of a facet's options, which may change the upright axis."""
     axes: dict[str, set[Axis]] = {}
     for panel in panels:
         axes.setdefault(panel.when[name], set()).add(panel.y)
@@ -128,7 +128,7 @@ def _control(panels: Sequence[Panel], name: str, label: str) -> Control:
 
 
 def _relaid(axis: Axis) -> dict[str, Any]:
-    """Changes of a layout for another upright axis."""
+    """Return changes of a layout for another upright axis."""
     made = _axis(axis)
     changes = {f"yaxis.{key}": made[key] for key in ("type", "range", "rangemode") if key in made}
     return changes | {"yaxis.title.text": broken(axis.words, 36)}
@@ -160,7 +160,7 @@ def _short(values: np.ndarray) -> np.ndarray:
 
 
 def _line(panel: Panel, line: Line) -> Iterator[go.Scatter | go.Bar]:
-    """The line, over its band where it has one."""
+    """Return the line, over its band where it has one."""
     meta = when(line.number, **panel.when)
     if panel.y.kind == LOG:
         line = _above_zero(line)
@@ -201,7 +201,7 @@ def _line(panel: Panel, line: Line) -> Iterator[go.Scatter | go.Bar]:
 
 
 def _above_zero(line: Line) -> Line:
-    """The line where it is above zero, which an axis of decades has no place for."""
+    """Return the line where it is above zero, as an axis of decades needs."""
     ends: dict[str, Any] = {
         name: np.where(values > 0, values, np.nan)
         for name, values in (("y", line.y), ("low", line.low), ("high", line.high))
@@ -213,7 +213,7 @@ def _above_zero(line: Line) -> Line:
 def _band(
     line: Line, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
 ) -> go.Scatter:
-    """The area between the ends of a line's band."""
+    """Return the area between the ends of a line's band."""
     known = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     back = known[::-1]
     return go.Scatter(
@@ -260,12 +260,12 @@ def layout(**further: Any) -> dict[str, Any]:
 
 
 def broken(words: str, width: int = 44) -> str:
-    """Words in lines that fit beside a plot."""
+    """Words in lines that fit next to a plot."""
     return "<br>".join(textwrap.wrap(words, width, break_on_hyphens=False))
 
 
 def _axis(axis: Axis, **further: Any) -> dict[str, Any]:
-    """An axis with its name, kind and ends."""
+    """Return an axis with its name, kind and ends."""
     words = broken(axis.words) if further else axis.words
     made = {"title": {"text": words, "standoff": 12}, "zeroline": False, "type": axis.kind}
     if axis.limits is not None:
@@ -334,7 +334,7 @@ LONG = 40
 
 
 def rendered(page: Page) -> str:
-    """The page as the text of a file."""
+    """Return the page as the text of a file."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sweep.report"),
         autoescape=True,
@@ -370,7 +370,7 @@ def _chart_json(plot: Plot) -> Markup:
 
 
 def _table(table: Table, number: int) -> Markup:
-    """A table with its sorting, searching and downloading."""
+    """Return a table with its sorting, searching and downloading."""
     csv = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
     with pandas.option_context("display.float_format", "{:.6g}".format):
         made = to_html_datatable(
@@ -392,5 +392,5 @@ def _long(frame: pandas.DataFrame) -> list[int]:
 
 
 def _download(text: Text) -> str:
-    """A text as an address that can be saved."""
+    """Return a text as an address that can be saved."""
     return f"data:text/plain;charset=utf-8;base64,{b64encode(text.text.encode()).decode()}"

@@ -57,7 +57,7 @@ Say = Callable[[str], None]
 
 
 def write(store: str | Location, file: str | Path, say: Say = lambda text: None) -> Path:
-    """The report of a study as one page that needs nothing else.
+    """Write the report of a study as one page that needs nothing else.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def _page(
     spec: Declared, attributes: Mapping[Any, Any], unit: str,
     counted: Sequence[tuple[str, str]], sections: Sequence[Section], store: Location,
 ) -> Page:  # fmt: skip
-    """The page: what a reader wants to know first, its sections, and how to make it again."""
+    """Return the page: a summary, its sections, and how to make it again."""
     facts = [
         *counted,
         ("study", attributes["study_id"][:8]),
@@ -169,7 +169,7 @@ def _figures(study: Study, say: Say) -> Iterator[Made]:
 
 
 def _tables(study: Study, say: Say) -> Iterator[Table]:
-    """The tables that a study asks for; every output of a single point."""
+    """Return the tables that a study asks for; every output of a single point."""
     if not study.spec.axes:
         yield from _sheets(outputs_page(study.dataset), "outputs")
     for figure in study.figures:
@@ -353,7 +353,7 @@ def _effects(arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> Table:
 
 
 def _span(present: xr.DataArray) -> str:
-    """Ends of the coordinates along a dimension between which an effect is present."""
+    """Return ends of the coordinates along a dimension between which an effect is present."""
     there, told = present.values, []
     for name, coordinate in present.coords.items():
         if coordinate.ndim != 1 or there.all() or not there.any():

@@ -91,7 +91,7 @@ def join(parts: Sequence[Facets]) -> Facets:
 
 
 def _count(words: str) -> int:
-    """A count of `Report`, with its words for people."""
+    """Return a count of `Report`, with its words for people."""
     return field(default=0, metadata={"words": words})  # type: ignore[no-any-return]
 
 
@@ -199,7 +199,7 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _edge_counts(mesh: Mesh) -> dict[str, int]:
-    """Counts of `Report` that are about edges and winding."""
+    """Return counts of `Report` that are about edges and winding."""
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end)
     key = low * len(mesh.vertices) + high
@@ -281,7 +281,7 @@ def _metres(path: Path, unit: str | None) -> float:
 
 
 def sphere(*, radius: float, subdivisions: int) -> Facets:
-    """An icosahedron, refined; its corners lie on the sphere and its faces within.
+    """Return a refined icosahedron; its corners lie on the sphere and its faces within.
 
     Each of `subdivisions` cuts every face in four: n of them make 20 * 4^n faces, which lie within
     ``0.3 radius / 4^n`` of the sphere.
@@ -293,7 +293,7 @@ def sphere(*, radius: float, subdivisions: int) -> Facets:
 
 
 def box(*, size: Sequence[float]) -> Facets:
-    """A box of 12 facets, facing outwards, of these lengths along x, y and z [m]."""
+    """Return a box of 12 facets, facing outwards, of these lengths along x, y and z [m]."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):

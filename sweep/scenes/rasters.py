@@ -269,7 +269,7 @@ def read_array(
 
 
 def _member(path: Path, loaded: Any, name: str | None) -> np.ndarray:
-    """The array of an archive that holds the heights."""
+    """Return the array of an archive that holds the heights."""
     choose = f"name one of: {', '.join(loaded.files)}"
     if name is None:
         grids = [key for key in loaded.files if loaded[key].ndim == 2]

@@ -31,7 +31,7 @@ class PowerLaws:
     laws: tuple[tuple[float, float], ...]
 
     def cumulative(self, diameter: np.ndarray) -> np.ndarray:
-        """Number per area of this diameter or larger [1/m^2]."""
+        """Return the number per area of this diameter or larger [1/m^2]."""
         d = np.asarray(diameter, float)
         return np.min([c * d**-b for c, b in self.laws], axis=0)
 
@@ -57,7 +57,7 @@ Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
 def lunar_craters(*, equilibrium_diameter: float = math.inf) -> PowerLaws:
     """Craters in equilibrium up to a diameter [m], and as they were produced beyond it.
 
-    That diameter, at which the two laws cross, grows with the age of the ground.
+    The diameter at which the two laws cross grows with the age of the ground.
     """
     if math.isinf(equilibrium_diameter):
         return PowerLaws((TRASK,))
@@ -88,7 +88,7 @@ class MartianRocks:
         return 1.79 + 0.152 / self.cover
 
     def cumulative(self, diameter: np.ndarray) -> np.ndarray:
-        """Number per area of this diameter or larger [1/m^2]."""
+        """Return the number per area of this diameter or larger [1/m^2]."""
         d = np.asarray(diameter, float)
         q = self.decay
         return np.asarray(4 * self.cover * q / math.pi * (np.exp(-q * d) / d - q * exp1(q * d)))
@@ -303,7 +303,7 @@ def draw_boulders(
 
 
 def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit dome above z = 0 with a skirt down to z = -1, facing outwards: vertices, faces.
+    """Return a unit dome above z = 0 with a skirt down to z = -1: vertices, faces.
 
     The outline's area is pi exactly, its corners lying a little outside the unit circle. The top is
     the first vertex. Each subdivision cuts every facet of the half-octahedron into four.
@@ -345,7 +345,7 @@ class Tree:
     """Mean measures of the trees of a clump.
 
     Leaves lie at random, with the spherical distribution of leaf angles (every direction of the
-    leaf's normal is as likely as any other), so that the chance of a gap along a ray is Beer's law,
+    leaf's normal is as likely as any other), so the probability of a gap along a ray is Beer's law,
     ``exp(-G * density * path)`` with ``G = 1/2``: de Wit, Photosynthesis of Leaf Canopies (1965);
     Ross, The Radiation Regime and Architecture of Plant Stands (1981).
     """
@@ -388,7 +388,7 @@ def clump(
     number: int,
     tree: Tree,
 ) -> Facets:
-    """A clump of trees on a terrain, their trunks at least half a crown apart.
+    """Plant a clump of trees on a terrain, their trunks at least half a crown apart.
 
     They stand no farther than `radius` [m] from a world position (x, y).
 
@@ -471,6 +471,6 @@ def crown(generator: np.random.Generator, tree: Tree, size: float = 1.0) -> Face
 
 
 def _directions(generator: np.random.Generator, number: int) -> np.ndarray:
-    """Unit vectors, evenly over the sphere, (number, 3)."""
+    """Return unit vectors, evenly over the sphere, (number, 3)."""
     vectors = generator.standard_normal((number, 3))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

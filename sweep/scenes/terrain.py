@@ -7,8 +7,8 @@ other three.
 
 Random ground, fractal or smooth hills, is exact in its statistics. Both are Gaussian fields on a
 grid, drawn by circulant embedding: the covariance is laid on a torus at least twice as large, where
-the FFT diagonalises it, and only a corner of the torus is kept, so that opposite edges of the
-ground have nothing to do with each other.
+the FFT diagonalises it. Only a corner of the torus is kept, so that opposite edges of the ground
+have nothing to do with each other.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
 
 
 def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
-    """The part of a terrain within a square about (x, y) [m], widened to whole grid steps.
+    """Cut out a square of a terrain about (x, y) [m], widened to whole grid steps.
 
     Raises
     ------

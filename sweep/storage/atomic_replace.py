@@ -1,7 +1,7 @@
 """Files and folders put in the place of others, whole, by whoever may be killed meanwhile.
 
-Everything is made beside its place, under a hidden name, and renamed into it. What is replaced is
-renamed aside and removed last. The hidden names in the folder of ``NAME`` are
+Everything is made in the same folder, under a hidden name, and renamed into its place. The old one
+is renamed aside and removed last. The hidden names in the folder of ``NAME`` are
 
     .NAME.next                           a store that is to take the place of NAME, under way
     .NAME.creating-HOST-PID-ab12cd34     half made by a process
@@ -43,7 +43,7 @@ _LEFT = re.compile(
 
 
 def real(location: Location) -> Location:
-    """A place with symbolic links followed: what is renamed must be the folder, not the link."""
+    """Follow symbolic links: the folder is renamed, not the link."""
     if not isinstance(location, Path):
         return location
     return location.resolve() if location.is_symlink() else location.absolute()
@@ -55,16 +55,16 @@ def beside(path: Path) -> Path:
 
 
 def replaced_by(path: Path) -> Path:
-    """The place that a store is made for: its own, but where it is made `beside` another."""
+    """Return the place that a store is made for: its own, or that of the store it replaces."""
     made = re.fullmatch(rf"\.(.+){re.escape(NEXT)}", path.name)
     return path.with_name(made[1]) if made else path
 
 
 @contextmanager
 def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A hidden place in which a file or folder is made; it is put in its own place at the end.
+    """Make a file or folder in a hidden place, and put it in its own place at the end.
 
-    What is there stays, with an OSError, unless it may be replaced.
+    An existing one stays, with an OSError, unless it may be replaced.
     """
     settle(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,9 +112,9 @@ def discard(path: Path) -> None:
 def settle(location: Location) -> None:
     """Finish or undo what processes that died have left in the folder of a store.
 
-    What was being replaced when its process died is replaced, where its successor is whole, or is
-    put back. What is half made or half removed is removed. The work of living processes is left
-    alone, and so is everything where the folder can't be written.
+    A store whose replacement was interrupted is replaced if its successor is whole, or is put back.
+    Half made and half removed ones are removed. The work of living processes is left alone, and so
+    is everything where the folder can't be written.
     """
     path = real(location)
     if not isinstance(path, Path):

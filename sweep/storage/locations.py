@@ -1,7 +1,7 @@
 """Places of stores: a folder on disk, or a key in an object store, and files put there whole.
 
-Which credentials and which endpoint an object store takes is for the environment to say
-(AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
+The environment gives the credentials and the endpoint of an object store (AWS_ACCESS_KEY_ID,
+AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class ObjectPath:
         return ObjectPath(self.root, "/".join(filter(None, [self.key, str(other).strip("/")])))
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """The key below this one."""
+        """Return the key below this one."""
         return self / "/".join(others)
 
     @property
@@ -98,7 +98,7 @@ class ObjectPath:
         return ObjectPath(self.root, self.key.rpartition("/")[0])
 
     def with_name(self, name: str) -> ObjectPath:
-        """A key beside this one."""
+        """Return a key in the same folder."""
         return self.parent / name
 
     def absolute(self) -> ObjectPath:
@@ -107,9 +107,7 @@ class ObjectPath:
 
     @property
     def client(self) -> Any:
-        """The object store, connected once a process; on first contact it is asked whether it is
-        there at all.
-        """
+        """The object store, connected once a process; the first contact checks that it exists."""
         with _opening:
             if self.root not in _clients:
                 with in_words(self):
@@ -138,7 +136,7 @@ class ObjectPath:
         return None if head is None else float(head["last_modified"].timestamp())
 
     def read_bytes(self) -> bytes:
-        """The object whole."""
+        """Return the object whole."""
         with in_words(self):
             return bytes(self.client.get(self.key).bytes())
 
@@ -174,7 +172,7 @@ class ObjectPath:
         return [self / name for name in self._children() if fnmatch(name, pattern)]
 
     def read_tagged(self) -> tuple[bytes, Tag] | None:
-        """The object and the tag of what it holds; None where there is none."""
+        """Return the object and the tag of what it holds; None where there is none."""
         with in_words(self), suppress(FileNotFoundError):
             found = self.client.get(self.key)
             return bytes(found.bytes()), _tag(found.meta)
@@ -225,14 +223,14 @@ def in_words(where: object) -> Iterator[None]:
 
 
 def worded(error: Exception) -> Exception:
-    """An error as it is, or in words where an object store raised it through Zarr or xarray."""
+    """Put an error into words if an object store raised it through Zarr or xarray."""
     if type(error).__module__.partition(".")[0] != "obstore":
         return error
     return ObjectStoreError(*explained(str(error), ""), "the store")
 
 
 def explained(text: str, root: str) -> tuple[int, str]:
-    """Number and words of what an object store's library says, of a kind and bucket."""
+    """Return the number and words of what an object store's library says, of a kind and bucket."""
     bucket, at = root.partition("://")[2], _endpoint() or f"the service of {root.split(':')[0]}://"
     said = text.partition("\n\nDebug source")[0]
     status = re.search(r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", said)
@@ -269,7 +267,7 @@ Location = Path | ObjectPath
 
 
 def located(where: str | Location) -> Location:
-    """A place from how it is written: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``.
+    """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``.
 
     Raises
     ------
@@ -294,7 +292,7 @@ def located(where: str | Location) -> Location:
 
 
 def zarr_store(location: Location) -> Any:
-    """A place as Zarr and xarray open it."""
+    """Return a place as Zarr and xarray open it."""
     if isinstance(location, Path):
         return location
     from zarr.storage import ObjectStore, StorePath
@@ -305,7 +303,7 @@ def zarr_store(location: Location) -> Any:
 def each(
     location: Location, function: Callable[[Item], Found], items: Iterable[Item]
 ) -> list[Found]:
-    """A function's results, in order; side by side where each is a request over the network."""
+    """Map a function, in order; concurrently if each call is a request over the network."""
     if isinstance(location, Path):
         return [function(item) for item in items]
     return list(_requests().map(function, items))

@@ -1,9 +1,9 @@
 """Logs of lines that tell whether they are as they were written, and digests of stored objects.
 
 A line is JSON with its own digest at the end. A log is a file that is appended to; objects can't be
-appended to, so in an object store it is a row of them, numbered, each written whole and holding
-the lines of some seconds. The log of receipts, some 300 bytes a line, is read a million lines in a
-few seconds, into a few bytes a block.
+appended to. In an object store it is a row of numbered objects, each written whole, with the lines
+of some seconds. The log of receipts, some 300 bytes a line, is read a million lines in a few
+seconds, into a few bytes a block.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ _WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
 
 
 def sealed(record: dict[str, Any]) -> bytes:
-    """A record, not empty, as one line of JSON whose last field is a digest of the others."""
+    """Write a record, not empty, as a line of JSON that ends with a digest of the others."""
     return closed(json.dumps(record, separators=(",", ":")).encode()[:-1])
 
 
 def closed(body: bytes) -> bytes:
-    """A line of the fields of a record, written without the last brace."""
+    """Return a line of the fields of a record, written without the last brace."""
     return body + _SUM + _digest(body) + _END
 
 
 def unsealed(line: bytes) -> dict[str, Any] | None:
-    """The record of a line; None where any byte of it is not as it was written."""
+    """Return the record of a line, or None if any byte of it has changed."""
     body = body_of(line)
     if body is None:
         return None
@@ -66,7 +66,7 @@ def unsealed(line: bytes) -> dict[str, Any] | None:
 
 
 def body_of(line: bytes) -> bytes | None:
-    """The fields of a line, unread, without the last brace; None as of :func:`unsealed`."""
+    """Return the fields of a line, unread, without the last brace; None as of :func:`unsealed`."""
     body, found, end = line.rpartition(_SUM)
     return body if found and end == _digest(body) + _END else None
 
@@ -85,7 +85,7 @@ def read_sealed(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]
 
 
 def read_lines(path: Location) -> Iterator[dict[str, Any]]:
-    """Records of a log, in order; a line that is damaged or cut short is passed over."""
+    """Read the records of a log, in order; damaged or truncated lines are skipped."""
     return (record for _, record in read_sealed(path) if record is not None)
 
 
@@ -208,7 +208,7 @@ class ObjectLog:
 
 
 def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectLog:
-    """A log to append to; the caller sees to it that nobody else does."""
+    """Open a log to append to; the caller ensures that nobody else does."""
     if isinstance(path, ObjectPath):
         return ObjectLog(path)
     path.parent.mkdir(exist_ok=True)
@@ -273,7 +273,7 @@ class Receipts:
 
 
 def read_receipts(store: Location, n_blocks: int, *, since: float = np.inf) -> Receipts:
-    """Sums of the log of a store; damaged lines count for nothing, and nor do other blocks.
+    """Sum the log of a store; damaged lines and other blocks do not count.
 
     Points and workers are counted from the time `since` on [s since the epoch].
     """

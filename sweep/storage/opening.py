@@ -85,7 +85,7 @@ class NotAStoreError(StoreError, ValueError):
 
 
 def open_group(path: Location, mode: Any = "r") -> zarr.Group:
-    """The arrays of a store, by its checked document; raises as :func:`read_document`."""
+    """Open the arrays of a store by its checked document; raises as :func:`read_document`."""
     import zarr
 
     read_document(path)
@@ -99,7 +99,7 @@ def read_attributes(path: Location) -> dict[str, Any]:
 
 
 def read_document(path: Location) -> dict[str, Any]:
-    """The document of a store's root, with the metadata of all its arrays, checked.
+    """Read the document of a store's root, with the metadata of all its arrays, checked.
 
     NotAStoreError where there is no store, or one that this version of the program does not write.
     """
@@ -151,7 +151,7 @@ def _ours(path: Location, attributes: Any) -> dict[str, Any]:
 
 
 def _document(path: Location) -> dict[str, Any]:
-    """The document of a store's root, a group."""
+    """Read the document of a store's root, a group."""
     settle(path)
     try:
         if isinstance(path, Path) and not (path / "zarr.json").is_file():
@@ -305,7 +305,7 @@ class Unreplaced(LocalStore):
         self._seen: tuple[int, ...] | None = None
 
     async def get(self, *key: Any, **options: Any) -> Any:
-        """The bytes of a file; which store it is is looked at after they are read."""
+        """Return the bytes of a file; the identity of the store is checked afterwards."""
         found = await super().get(*key, **options)
         now = stamp(self.root)
         if now is None or now != self._seen:  # repaired, or another's
@@ -319,5 +319,5 @@ class Unreplaced(LocalStore):
 
 
 def readable(location: Location, held: str) -> Any:
-    """The store of a study as xarray opens it to read it lazily."""
+    """Open the store of a study for xarray, to read it lazily."""
     return Unreplaced(location, held) if isinstance(location, Path) else zarr_store(location)

@@ -61,9 +61,9 @@ class RunOptions:
     Parameters
     ----------
     client
-        Dask client to compute with; without one, `scheduler` and `workers` say what to use. Where
-        nothing is said, little work is done here, in a plain loop, and more of it by workers on
-        all cores of this machine.
+        Dask client to compute with; without one, `scheduler` and `workers` say what to use. By
+        default little work is done here, in a plain loop, and more of it by workers on all cores of
+        this machine.
     workers, processes
         Workers to start on this machine, as processes or as threads.
     scheduler
@@ -98,7 +98,7 @@ class RunOptions:
     evaluate: Evaluate | None = None
 
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
-        """The cluster asked for, here or by the spec's `execution`; None for a plain loop.
+        """Return the cluster given here or by the spec's `execution`; None for a plain loop.
 
         ClusterError where both a scheduler and a cluster are named, or workers that are not ours to
         start.
@@ -222,7 +222,7 @@ def cores() -> int:
 
 
 def of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
-    """The same cluster with a fixed number of workers, where one is given and they are ours."""
+    """Fix the number of workers of a cluster, if one is given and they are ours."""
     if workers is None:
         return cluster
     if isinstance(cluster, Address):
@@ -236,7 +236,7 @@ def of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
 def connected(
     cluster: AnyCluster, *, most: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[Reached]:
-    """A client of a cluster; where it is started here it ends with it.
+    """Connect a client to a cluster; a cluster that is started here ends with it.
 
     No more workers are started than there can be tasks at once (`most`); those of this machine are
     processes, or threads of this one. `say` takes where the cluster is, and its dashboard.
@@ -277,7 +277,7 @@ def _bounds(cluster: Any, most: int) -> Bounds:
 
 
 def _reached(address: str, cluster: AnyCluster) -> Client:
-    """A client that is nobody's default: one that fails to connect would stay it."""
+    """Make a client that is not Dask's default: one that fails to connect would stay it."""
     from distributed import Client
 
     try:

@@ -144,8 +144,8 @@ def extend(
     """Turn a store into that of a larger study, and compute only what is new.
 
     The larger study has further values on its axes, further axes, more draws or a tighter
-    tolerance. It is computed beside the store and takes its place when it is complete; its bytes
-    are those of the larger study run at once.
+    tolerance. It is computed in the same folder and replaces the store when it is complete; its
+    bytes are those of the larger study run at once.
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
 
 
 def _locked(path: Location, eyepoints: EyepointStudy, pool: Pool) -> Lock | None:
-    """The lock of an eyepoint store, made if need be, once no other run casts the same rays.
+    """Lock an eyepoint store, made if need be, once no other run casts its rays.
 
     None where the run is interrupted before.
     """

@@ -1,4 +1,4 @@
-"""Effects that points call for: planned tile by tile, told point by point.
+"""Effects that points need: planned tile by tile, told point by point.
 
 Tiles are boxes of neighbouring points of a grid, or shots of a flight that follow each other. They
 are fixed by the study alone, not by its blocks: what is simulated at a point does not depend on how
@@ -64,11 +64,11 @@ class Selected(NamedTuple):
     """Largest change of a probability that all that is left out may make."""
 
     def some(self, index: slice | np.ndarray) -> Selected:
-        """The same of some of the points."""
+        """Select some of the points."""
         return Selected(self.flags[index], self.error[index])
 
     def groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        """Points that call for the same effects, and these."""
+        """Points with the same effects, and these."""
         for flags in np.unique(self.flags):
             yield np.flatnonzero(self.flags == flags), names_of(int(flags))
 
@@ -185,7 +185,7 @@ class EffectSelection:
         return Selected(flags[place] & ~absent, errors[place])
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
-        """Flags of effects that points have nothing of, whatever their tiles have and modes say."""
+        """Return the flags of effects absent from points, whatever their tiles have."""
         flags = np.zeros(count, np.uint32)
         for k, effect in enumerate(ALL):
             absent = effect.absent(DEFAULTS | dict(parameters))
@@ -195,8 +195,8 @@ class EffectSelection:
     def plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
         """Plans of some tiles: places among them, and the plan of these.
 
-        A few of the points are looked at first: where these call for all that there is, the others
-        cannot call for more.
+        A few of the points are looked at first: if these need all effects, the others cannot need
+        more.
         """
         sides = [side for side in self.tiles.block_shape if side > 1]
         few = max(int((math.prod(sides) / FEW_POINTS) ** (1 / max(len(sides), 1))), 1)
@@ -216,7 +216,7 @@ class EffectSelection:
             rest = np.concatenate(left) if left else rest[:0]
 
     def _plan(self, alike: Alike) -> Plan:
-        """The plan of tiles that share words and sizes."""
+        """Return the plan of tiles that share words and sizes."""
         from sweep.model.effects.planning import plan
 
         parameters, number = alike.parameters, len(alike.tiles)

@@ -102,7 +102,7 @@ class EyepointStudy(Study):
         return shots * self.beamlets + shots // self.shots_a_cycle
 
     def attributes(self) -> dict[str, Any]:
-        """The geometry, as it was hashed."""
+        """Return the geometry, as it was hashed."""
         return {
             "kind": "eyepoints",
             "geometry": json.dumps(self.spec.geometry(self.scanner), sort_keys=True),
@@ -211,7 +211,7 @@ class EyepointStudy(Study):
 
 @lru_cache(maxsize=1)
 def world_of(spec: SceneSpec) -> World:
-    """The scene of a study; the last one is kept, for building one can take seconds."""
+    """Build the scene of a study; the last one is cached, as building can take seconds."""
     return spec.world()
 
 
@@ -237,7 +237,7 @@ def refine(
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
 
-    How many that are follows from each shot alone. What the ``rays`` of each so far leave is its
+    Their number follows from each shot alone. What the ``rays`` of each so far leave is its
     ``error``, (n,); ``again`` looks at shots, by place, with more, and says what these leave.
     """
     needed = more_rays(rays, error, accuracy)

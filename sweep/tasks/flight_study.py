@@ -100,12 +100,12 @@ class ScannerBlocks(LatticeGrid):
         return self.shots_a_cycle >= LEAST_BEAMS
 
     def part(self, number: int) -> Part:
-        """A block of this scanner by its number."""
+        """Return a block of this scanner by its number."""
         *axes, draws, cycles = (range(s.start, s.stop) for s in self.block(number))
         return Part(self.scanner, tuple(along.start for along in axes), draws, cycles)
 
     def first_part(self, axes: tuple[int, ...]) -> Part:
-        """The first block at a place along the axes."""
+        """Return the first block at a place along the axes."""
         return self.part(self.number((*axes, 0, 0)))
 
 
@@ -121,7 +121,7 @@ class KnownCloud(NamedTuple):
 class FlightStudy(GrowingStudy):
     """The point clouds of a flight, a group of arrays for each scanner.
 
-    Its eyepoints are beside its store. The scene, built, is by default that of the spec.
+    Its eyepoints are in the folder of its store. The scene, built, is by default that of the spec.
     """
 
     unit = "shots"
@@ -140,11 +140,11 @@ class FlightStudy(GrowingStudy):
         return list(self.scanners.values())
 
     def follows_tolerance(self, block: int) -> np.ndarray | bool:
-        """True if a tighter tolerance computes shots more closely, effects apart."""
+        """Tell whether a tighter tolerance computes shots more closely, effects apart."""
         return bool(self.spec.rays_by_tolerance or by_tolerance(self.spec.parameters()))
 
     def part(self, block: int) -> tuple[ScannerBlocks, Part]:
-        """The blocks of a block's scanner, and which one it is; IndexError where there is none."""
+        """Return the blocks of a block's scanner, and its number; IndexError if there is none."""
         grid, number = self.find(block)
         blocks = self.scanners[grid.group]
         return blocks, blocks.part(number)
@@ -169,7 +169,7 @@ class FlightStudy(GrowingStudy):
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """A group for each scanner."""
+        """Return a group for each scanner."""
         names = " ".join(member.name for axis in self.spec.axes for member in axis.members)
         return {
             name: {
@@ -181,7 +181,7 @@ class FlightStudy(GrowingStudy):
         }
 
     def known_arrays(self) -> list[ArrayLayout]:
-        """The map of the scene, and every scanner's coordinates."""
+        """Return the map of the scene, and every scanner's coordinates."""
         return scene_map(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanners
@@ -307,7 +307,7 @@ class FlightStudy(GrowingStudy):
         rows: np.ndarray,
         cloud: Cloud,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Results of some of the shots, those together that call for much the same.
+        """Results of some of the shots, those together that need much the same.
 
         With more rays of those whose own tell that they are too few.
         """
@@ -484,7 +484,7 @@ class FlightStudy(GrowingStudy):
         return shots, from_arrays(shots | beamlets, self._eyepoints(scanner)["weight"])
 
     def eyepoint_studies(self) -> list[EyepointStudy]:
-        """The studies that this one looks with."""
+        """Return the studies that this one looks with."""
         return [self.caster(scanner) for scanner in self.scanners]
 
     @property

@@ -46,7 +46,7 @@ MOST_BLOCKS = 1 << 14
 
 
 def is_geometric(axis: Axis) -> bool:
-    """True if any member of an axis changes where the beamlets fall."""
+    """Tell whether any member of an axis changes where the beamlets fall."""
     return any(
         member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
         for member in axis.members

@@ -115,7 +115,7 @@ class GridStudy(GrowingStudy):
         return arrays
 
     def outputs(self) -> list[ArrayLayout]:
-        """An array for each output of the model, and those that say what was simulated."""
+        """Return an array for each output of the model, and for the effects simulated."""
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
         found = []
         for name, output in outputs_of(self.spec).items():
@@ -140,7 +140,7 @@ class GridStudy(GrowingStudy):
         begun: Known = Known(),  # noqa: B008
         stop: Stop | None = None,
     ) -> Results:
-        """Outputs of a block; fills, where all of a point is beyond the model."""
+        """Return the outputs of a block; fill values where a point is beyond the model."""
         selected = self.selection.of_block(block)
         known = self._known(block, selected)
         extent, size = self.grid.extent(block), self.grid.block_size(block)
@@ -190,8 +190,8 @@ class GridStudy(GrowingStudy):
     def compile(self) -> None:
         """Compile what the model compiles, once, before workers find it on disk.
 
-        One draw of a point with every effect that may be called for, and one with none. Random
-        effects are not for every instrument: of these, only what the point itself calls for.
+        One draw of a point with every effect that may be needed, and one with none. Random effects
+        are not for every instrument: of these, only those that the point itself needs.
         """
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
@@ -234,7 +234,7 @@ DOMAIN = "sweep.draws"
 def evaluated(
     spec: Spec, grid: Grid, block: int, selected: Selected, known: Known, begun: Known, stop: Stop
 ) -> Iterator[Found]:
-    """Outputs of a block's points that are not done, those together that call for the same.
+    """Compute a block's points that are not done, grouped by their effects.
 
     Those that need not be computed are ``known``, of another study, or ``begun`` by a call that
     was stopped. Raises Unfinished where it is stopped, with at least some draws taken; the next
@@ -375,12 +375,12 @@ def _drawn(
 
 
 def no_sums(spec: Spec, count: int) -> Results:
-    """Running sums of points that have none, where any point of the study may have some."""
+    """Return empty running sums, if any point of the study may have some."""
     some = spec.has_random_effects and not spec.draws.whole_spectra
     return {RUNNING: np.zeros((count, RUNNING_COLUMNS))} if some else {}
 
 
 def with_few_draws(spec: Spec, most: int) -> Spec:
-    """The same study with so many draws at the most, where it has any."""
+    """Limit the draws of a study, if it has any."""
     fewer = {"number": min(spec.draws.number, most), "limit": min(spec.draws.limit, most)}
     return spec.model_copy(update={"draws": spec.draws.model_copy(update=fewer)})

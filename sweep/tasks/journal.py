@@ -6,12 +6,12 @@ store's lock; a receipt whose chunks were later found damaged is withdrawn by a 
 line carries its own digest, and one that is damaged counts for nothing.
 
 Chunks are seen by listing folders, one look a folder. Sizes of files are asked of the operating
-system one by one, some 3 us each: 27 arrays of a million blocks take more than a minute. The look
-goes on in threads, beside what else there is to do; its memory is a few bytes a block.
+system one by one, some 3 us each: 27 arrays of a million blocks take more than a minute. The check
+runs in threads, concurrently with the work; its memory is a few bytes a block.
 
-The recipe beside the logs is what a store's own bytes do not say: where its study's files are, and
-which store it extends. A study is the same wherever its files are, and however much of it was
-computed before. It is written anew by whoever runs the study from its spec.
+The recipe is the part that a store's own bytes do not say: where its study's files are, and which
+store it extends. A study is the same wherever its files are, and however much of it was computed
+before. It is written anew by whoever runs the study from its spec.
 
 Blocks that take long are computed in pieces. A worker draws for some seconds, saves what it has in
 a file of the journal, and whoever takes up the block next goes on from there, to the same bytes.
@@ -274,7 +274,7 @@ def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _is_chunk(found: os.stat_result) -> bool:
-    """True for a file with something in it; a directory in a chunk's place has a size, too."""
+    """Tell whether a path is a file with something in it, and no directory."""
     return stat.S_ISREG(found.st_mode) and found.st_size > 0
 
 
@@ -346,7 +346,7 @@ def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None
 
 
 def read_begun(path: Location, study_id: str, block: int) -> Begun:
-    """The saved part of a block of a study."""
+    """Return the saved part of a block of a study."""
     try:
         line, _, content = _begun_file(path, block).read_bytes().partition(b"\n")
     except (FileNotFoundError, NotADirectoryError):

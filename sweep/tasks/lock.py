@@ -55,7 +55,7 @@ class Holder:
 
     @classmethod
     def myself(cls) -> Holder:
-        """The running process, with a token of its own."""
+        """Return the running process, with a token of its own."""
         pid = os.getpid()
         return cls(
             host=socket.gethostname(),

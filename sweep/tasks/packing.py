@@ -106,7 +106,7 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
 
 
 def _without_host(record: dict[str, Any]) -> bytes:
-    """A line of a log without the machine that it was written on: copies are given away."""
+    """Remove the machine from a line of a log: copies are given away."""
     return sealed({name: value for name, value in record.items() if name not in ("host", "pid")})
 
 

@@ -89,7 +89,7 @@ def plan(
     spec
         The study.
     store
-        Where it would be stored: eyepoints are looked for beside it.
+        Where it would be stored: eyepoints are searched for in its folder.
     workers
         Workers it would run on; default those of the spec, else all cores.
     """
@@ -129,9 +129,8 @@ def plan(
 def measured(study: GridStudy) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
-    Whole sets of points that share a geometry are taken, so that sharing shows as it will. Where
-    points are drawn until their accuracy is met, those that are not after few draws are taken to
-    reach their limit.
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will. With an
+    accuracy to be met, points that miss it after few draws are taken to reach their limit.
     """
     grid = study.grid
     blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))
@@ -159,7 +158,7 @@ class Round(NamedTuple):
 
 
 def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
-    """A look at so much of a study that it takes long enough, or at all of it."""
+    """Compute so much of a study that the time can be measured, or all of it."""
     from numba.core.event import install_recorder
 
     amount, begun = 1, time.perf_counter()
@@ -176,7 +175,7 @@ def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
 
 
 def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]:
-    """Number of points evaluated, and the time [s] that draws left out of them would take."""
+    """Return the number of points evaluated, and the time [s] of their skipped draws."""
     spec, grid, left_out, sharing = study.spec, study.grid, 0.0, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
@@ -393,7 +392,7 @@ def _table(
     cost: Callable[[str, np.ndarray], float],
     looked_at: float,
 ) -> EffectsTable:
-    """The table, from what is kept and changed in tiles."""
+    """Return the table, from what is kept and changed in tiles."""
     modes = spec.modes()
     rows = tuple(
         EffectRow(
@@ -420,7 +419,7 @@ def _times(times: np.ndarray) -> str:
 
 
 def _region(spec: Spec, selection: EffectSelection, tiles: np.ndarray) -> str:
-    """The least box of the grid that holds some tiles, in the user's units."""
+    """Return the smallest box of the grid that holds some tiles, in the user's units."""
     slices = [selection.tiles.block(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):

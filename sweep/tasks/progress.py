@@ -33,7 +33,7 @@ class Progress:
     """Listener to a run, told of how far it is; this one shows nothing."""
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """The run begins, with so many points of the study done already, some in part."""
+        """Begin a run, with so many points of the study done already, some in part."""
 
     def advance(self, *, points: float, failed: int) -> None:
         """Points that were computed and blocks that were given up; both 0 as time passes."""
@@ -45,11 +45,11 @@ class Progress:
         """Something to know, in words."""
 
     def end(self) -> None:
-        """The run is over."""
+        """End the run."""
 
 
 def chosen(progress: bool | Progress) -> Progress:
-    """The progress asked for: none, the one given, or what standard error can show."""
+    """Return the progress asked for: none, the one given, or a display on standard error."""
     if progress is True:
         return Bar() if sys.stderr.isatty() else Lines()
     return Progress() if progress is False else progress
@@ -153,7 +153,7 @@ class Late(_Counting):
         self._shown.say(text)
 
     def end(self) -> None:
-        """The run is over."""
+        """End the run."""
         if self._showing:
             self._shown.end()
         self._showing = False
@@ -178,7 +178,7 @@ class Lines(_Counting):
             self._line()
 
     def say(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line of its own."""
         print(text, file=sys.stderr, flush=True)
 
     def end(self) -> None:
@@ -222,29 +222,29 @@ class Bar(_Counting):
         self._task: TaskID | None = None
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """The bar appears."""
+        """Show the bar."""
         super().begin(points=points, done=done, unit=unit)
         self._task = self._bar.add_task(unit, total=points, completed=int(done), **self._words)
         self._bar.start()
 
     def advance(self, *, points: float, failed: int) -> None:
-        """The bar moves."""
+        """Move the bar."""
         super().advance(points=points, failed=failed)
         if self._task is not None and (points or failed):
             self._bar.update(self._task, completed=self._done, **self._words)
 
     def at_work(self, *, workers: int, stored: int) -> None:
-        """Shown beside the rate."""
+        """Shown next to the rate."""
         super().at_work(workers=workers, stored=stored)
         if self._task is not None:
             self._bar.update(self._task, **self._words)
 
     def say(self, text: str) -> None:
-        """A line above the bar."""
+        """Print a line above the bar."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def end(self) -> None:
-        """The bar stays as it is."""
+        """Leave the bar as it is."""
         self._bar.stop()
 
 
@@ -281,7 +281,7 @@ def amount(points: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in words: `45 s`, `3 min 20 s`, `5 h 02 min`, `12 days`, `5,950 years`."""
+    """Put a time into words: `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
     whole = int(seconds + 0.5)
     if whole < 60:
         return f"{whole} s"

@@ -110,7 +110,7 @@ class Reuse:
         self._matching = cache(self._match)
 
     def shares(self, block: int) -> Iterator[Share]:
-        """The committed older blocks that have points of a block of the larger study."""
+        """Return the committed older blocks that have points of a block of the larger study."""
         ours, number = self._study.find(block)
         older = {grid.group: grid for grid in self.older.grids}
         if not (self.is_whole or self.is_begun) or ours.group not in older:
@@ -145,7 +145,7 @@ class Reuse:
             return None
 
     def chunk(self, name: str, block: int) -> np.ndarray:
-        """An older block's chunk of an array, whether damaged or not."""
+        """Return an older block's chunk of an array, whether damaged or not."""
         array: Any = self._group[name]
         return np.asarray(array.blocks[self.older.chunks(block)[name]])
 
@@ -174,7 +174,7 @@ class Reuse:
 
 
 def what_is_there(path: Location, study: GrowingStudy) -> str:
-    """Number of points that there are of a larger study, here and in the store it extends."""
+    """Count the points of a larger study that are done, here or in the store it extends."""
     done = committed(path, study)
     there, remark = study.points_in(done), ""
     if study.earlier is not None:
@@ -197,13 +197,13 @@ def ignored(older: Declared, spec: Declared) -> tuple[str, ...]:
 
 
 def other_tolerance(older: Declared, spec: Declared) -> bool:
-    """True if all points have another tolerance; one on an axis tells points apart."""
+    """Tell whether all points have another tolerance; one on an axis identifies points."""
     theirs, ours = _tolerance(older), _tolerance(spec)
     return theirs is not None and ours is not None and theirs != ours
 
 
 def are_alike(older: Declared, spec: Declared) -> bool:
-    """True if points of two studies that are computed as finely have the same results.
+    """Tell whether points of two studies that are computed as finely have the same results.
 
     Of a flight each draw stands by itself.
     """
@@ -215,7 +215,7 @@ def are_alike(older: Declared, spec: Declared) -> bool:
 
 
 def goes_on(older: Spec, spec: Spec) -> bool:
-    """True if the draws of a study are the first ones of another.
+    """Tell whether the draws of a study are the first ones of another.
 
     Not of whole spectra: there what a user's own function sees depends on how draws are cut.
     """
@@ -233,13 +233,13 @@ def goes_on(older: Spec, spec: Spec) -> bool:
 
 
 def _tolerance(spec: Declared) -> float | None:
-    """The tolerance of all points; None where an axis varies it."""
+    """Return the tolerance of all points; None where an axis varies it."""
     value = spec.parameters_off_axes().get(TOLERANCE)
     return None if value is None else float(value)
 
 
 def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
-    """A study with values by dotted path, as in a file: ``{"axes.target.range": ["1 km"]}``.
+    """Set values of a study by dotted path: ``{"axes.target.range": ["1 km"]}``.
 
     SpecError with every mistake in what comes out; where a path goes through a single value.
     """

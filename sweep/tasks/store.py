@@ -71,10 +71,10 @@ def create(
     recipe: Mapping[str, Any] | None = None,
     durable: bool = False,
 ) -> Location:
-    """A new store without results: every array's metadata, what is known beforehand, and the spec.
+    """Make a new store without results: metadata, known arrays, and the spec.
 
-    It is built beside its place and renamed into it, so that a creation cut short leaves nothing
-    that looks like a store; one in an object store is built here and sent, its root last. It may
+    It is built in the same folder and renamed, so that a creation cut short leaves nothing that
+    looks like a store; one in an object store is built here and sent, its root last. It may
     `replace` what is there, on disk, and be on the disk, where it is `durable`, before it is in its
     place. The `recipe` is facts for its journal.
 
@@ -117,7 +117,7 @@ def _send(built: Path, path: ObjectPath) -> None:
 
 @contextmanager
 def making(path: ObjectPath) -> Iterator[None]:
-    """A place while a store is made there: nobody else's, and marked as half made till the end.
+    """Reserve a place while a store is made there, marked as half made till the end.
 
     StoreError where something is there, or somebody makes a store there.
     """
@@ -240,9 +240,9 @@ def _consolidate(path: Path) -> None:
 class Chunked(NamedTuple):
     """Cut of an array into chunks, and their bytes, as Zarr writes them.
 
-    Zarr works these out anew whenever asked, and hands every chunk to an event loop, and its
-    compression and its writing to threads of that: nearly a millisecond, ten times what it takes
-    here, which for a block of 26 arrays is 2 % of a second's work.
+    Zarr recomputes these every time, and hands every chunk to an event loop with threads. That
+    takes nearly a millisecond, ten times as long as here; for a block of 26 arrays it is 2 % of a
+    second's work.
     """
 
     shape: tuple[int, ...]
@@ -252,7 +252,7 @@ class Chunked(NamedTuple):
 
     @classmethod
     def of(cls, array: zarr.Array[Any]) -> Self:
-        """That of an array."""
+        """Return the layout of an array."""
         return cls(array.shape, array.chunks, array.dtype, array.fill_value)
 
     @property
@@ -371,8 +371,8 @@ def chunk_object(name: str, position: tuple[int, ...]) -> str:
 def sync(path: Location) -> None:
     """Have everything written to a store so far on its disk, not only with the operating system.
 
-    One call for the whole file system, which costs as much as syncing the files one by one costs
-    for a few of them. What an object store has taken it keeps.
+    One call syncs the whole file system, which costs as much as syncing the files one by one costs
+    for a few of them. An object store keeps all it has taken.
 
     OSError where the disk did not take it.
     """
@@ -390,7 +390,7 @@ def sync(path: Location) -> None:
 
 
 def remove_partials(path: Location) -> None:
-    """Remove what writers that were killed in the midst of a file have left."""
+    """Remove the remains of writers that were killed within a file."""
     if isinstance(path, Path):
         for entry in _entries(str(path)):
             if entry.name.endswith(locations.PARTIAL):
@@ -495,7 +495,7 @@ def refuse_to_replace(path: Location) -> None:
 
 
 def under_way(path: Location) -> Path | None:
-    """The store that is to take the place of the one at a path, where one was begun.
+    """Return the unfinished store that is to replace the one at a path, if any.
 
     StoreError where it was begun to take the place of another store than is there now.
     """

@@ -28,7 +28,7 @@ AnyStudy = GridStudy | EyepointStudy | FlightStudy
 def study_of(
     spec: Spec | SceneSpec, path: Location, extends: Location | None = None
 ) -> GridStudy | FlightStudy:
-    """The study that a spec declares, to be stored at a path.
+    """Return the study that a spec declares, to be stored at a path.
 
     ``extends``: the store of a smaller one, whose results are taken; by default there is none.
     """
@@ -62,7 +62,7 @@ def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
 
 
 def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
-    """The study that a store's attributes tell of; StoreError where it can't be read."""
+    """Read the study of a store from its attributes; StoreError if it can't be read."""
     recipe = read_recipe(path)
     if attributes["kind"] == "eyepoints":
         if "spec" not in recipe:
@@ -76,7 +76,7 @@ def described(path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
 
 def _spec(path: Location, recipe: dict[str, Any], text: str) -> Any:
-    """A spec that a store holds; StoreError where this program can't read it."""
+    """Read the spec of a store; StoreError if this program can't read it."""
     try:
         return from_stored(text, base=Path(recipe["base"]) if "base" in recipe else None)
     except (SpecError, ValueError) as error:

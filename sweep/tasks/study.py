@@ -72,7 +72,7 @@ class ArrayLayout:
         *,
         fill: float | None = None,
     ) -> ArrayLayout:
-        """An array whose values are known as the store is made, in a single chunk."""
+        """Return an array whose values are known as the store is made, in a single chunk."""
         text = values.dtype.kind in "UOT"
         return cls(
             name=name, shape=values.shape, chunks=values.shape, dims=dims,
@@ -164,7 +164,7 @@ class BlockGrid:
         return tuple(reversed(position))
 
     def number(self, position: tuple[int, ...]) -> int:
-        """Number of the block at a position."""
+        """Return the number of the block at a position."""
         return int(np.ravel_multi_index(position, self.along)) if position else 0
 
     def block(self, block: int) -> tuple[slice, ...]:
@@ -177,11 +177,11 @@ class BlockGrid:
         )
 
     def extent(self, block: int) -> tuple[int, ...]:
-        """Steps of a block along each dimension."""
+        """Return steps of a block along each dimension."""
         return tuple(s.stop - s.start for s in self.block(block))
 
     def block_size(self, block: int) -> int:
-        """Number of points of a block."""
+        """Return the number of points of a block."""
         return math.prod(self.extent(block)) * self.each
 
     def points_in(self, blocks: np.ndarray) -> int:
@@ -219,7 +219,7 @@ class BlockGrid:
         sizes: Mapping[str, int],
         attributes: Mapping[str, Any] | None = None,
     ) -> ArrayLayout:
-        """An array of the model's, cut along the dimensions that follow the grid.
+        """Return an array of the model's, cut along the dimensions that follow the grid.
 
         ``sizes``: of its further dimensions, along which it is whole.
         """
@@ -266,7 +266,7 @@ class Content(Protocol):
         """Attributes of its store, but for versions; the same wherever it is made."""
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Groups of its store and their attributes."""
+        """Return groups of its store and their attributes."""
 
     def arrays(self) -> list[ArrayLayout]:
         """Every array of its store."""
@@ -283,7 +283,7 @@ class Study(Content, ABC):
     """Name of its points, in the plural."""
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Groups of its store and their attributes; none but the root."""
+        """Return groups of its store and their attributes; none but the root."""
         return {}
 
     @property
@@ -345,7 +345,7 @@ class Study(Content, ABC):
         return sum(grid.n_blocks for grid in self.grids)
 
     def find(self, block: int) -> tuple[BlockGrid, int]:
-        """The grid that a block is of, and its number there.
+        """Return the grid that a block is of, and its number there.
 
         Raises
         ------
@@ -366,7 +366,7 @@ class Study(Content, ABC):
         return {g.group: (end - g.n_blocks, g) for g, end in zip(self.grids, ends, strict=True)}
 
     def first_block(self, group: str) -> int:
-        """Number of the first block of a group."""
+        """Return the number of the first block of a group."""
         return self._groups[group][0]
 
     def block_size(self, block: int) -> int:

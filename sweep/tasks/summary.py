@@ -56,7 +56,7 @@ class Row:
 
     @classmethod
     def of(cls, part: str, shot: np.ndarray, doppler: np.ndarray) -> Row:
-        """The row of some points, (n,) each; there may be no Doppler segment."""
+        """Return the row of some points, (n,) each; there may be no Doppler segment."""
         known = ~np.isnan(shot)
         shot, doppler = shot[known], doppler[known & np.isfinite(doppler)]
         if not shot.size:
@@ -103,7 +103,7 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
 
 
 def beyond_model(store: str | Location) -> tuple[int, str]:
-    """Number of points beyond the model, of those that are looked at; the reason for the first."""
+    """Count points beyond the model, of a sample; return the reason for the first."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
@@ -212,7 +212,7 @@ class SceneRow:
 
 
 def scene_summary(store: str | Location) -> list[SceneRow]:
-    """A row for each scanner and place along the axes; for each scanner where there are many."""
+    """Return a row for each scanner and place along the axes, or scanner if many."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, FlightStudy):
@@ -305,7 +305,7 @@ class ErrorRow:
 
 
 def accuracy_table(store: str | Location) -> list[ErrorRow]:
-    """A row for each probability that is promised; none where nothing is drawn or computed."""
+    """Return a row for each promised probability; none if nothing is drawn or computed."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
@@ -317,7 +317,7 @@ def accuracy_table(store: str | Location) -> list[ErrorRow]:
 
 
 def rays_table(store: str | Location) -> list[ErrorRow]:
-    """A row for each scanner; none where the tolerance does not say how many rays there are.
+    """Return a row for each scanner; none if the number of rays is given.
 
     Of a grid one row, with no scanner, where even the most beamlets are too few for some points.
     """

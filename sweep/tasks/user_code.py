@@ -1,9 +1,9 @@
-"""Detectors and estimators that are functions of the user's: allowed, imported, held to their word.
+"""Detectors and estimators that are functions of the user's: allowed, imported, checked.
 
-A spec names them as ``module:function``. Reading a spec or a store imports nothing. What a study
-computes is imported by the processes that compute it, and only from modules that whoever started
-them has allowed: by ``--allow-code MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``,
-which workers on this machine inherit and others need set where they run.
+A spec names them as ``module:function``. Reading a spec or a store imports nothing. Processes that
+compute a study import its functions only from modules that the user has allowed: by ``--allow-code
+MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``, which workers on this machine inherit
+and others need set where they run.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def methods(parameters: Mapping[str, Any]) -> Methods:
 
 @lru_cache(maxsize=64)
 def guarded(role: str, name: str) -> Callable[..., np.ndarray]:
-    """A function of the user's, given arrays that it can't write to, its answers checked."""
+    """Wrap a function of the user: read-only arrays, checked answers."""
     function = _imported(name)
 
     def detect(power: np.ndarray, setting: Setting) -> np.ndarray:
@@ -152,7 +152,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _whole(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An answer of the right kind."""
+    """Return an answer of the right kind."""
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
     if answer.shape != shape or answer.dtype != dtype:

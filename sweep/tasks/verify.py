@@ -121,7 +121,7 @@ def verify(
 
 
 def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
-    """The study in a store; None where it holds none, or only who made it could tell."""
+    """Return the study in a store; None if it holds none, or it can't be told."""
     try:
         attributes = _made_with(path)
     except StoreError:
@@ -181,7 +181,7 @@ def _of_logs(path: Location) -> list[Damage]:
 
 
 def _unfinished(log: Location) -> int:
-    """Number of a log's last line where it has no end, else 0."""
+    """Return the number of a log's last line where it has no end, else 0."""
     number = 0
     for number, (line, _) in enumerate(read_sealed(log), start=1):
         if not line.endswith(b"\n"):

@@ -73,7 +73,7 @@ _opening = threading.Lock()
 
 
 def study(path: str, study_id: str) -> store.Arrays:
-    """The study of a store, opened for writing its blocks, once a process.
+    """Return the study of a store, opened for writing its blocks, once a process.
 
     StoreError where the store holds another study, or was begun with other software than is here.
     """
@@ -227,7 +227,7 @@ class _Alarm:
                 os._exit(1)  # stuck in compiled code; a nanny starts another worker
 
     def put_off(self) -> None:
-        """The work is over: from here on nothing is interrupted."""
+        """End the work: from here on nothing is interrupted."""
         while not self._over:
             try:
                 with self._guard:

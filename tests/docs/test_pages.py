@@ -10,24 +10,32 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import sweep
+from sweep.cli import main
+from sweep.model import outputs
+from sweep.spec import Spec
 
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
-RUN = [DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-IN_SECONDS = ("read_results", "use_your_own_detector")
+RUN = [REPOSITORY / "README.md", DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
+IN_SECONDS = ("README", "read_results", "use_your_own_detector")
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
 """What a page has its reader install."""
+
+SETS_UP = "make "
+"""What begins a block that sets up a copy of the repository: not run by a test in that copy."""
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)
 
 
 def blocks(page):
     """Language and text of every block of a page, in order."""
-    return BLOCK.findall(page.read_text(encoding="utf-8"))
+    found = BLOCK.findall(page.read_text(encoding="utf-8"))
+    return [(language, text) for language, text in found if not text.startswith(SETS_UP)]
 
 
 def lines(text):
@@ -57,7 +65,9 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
     assert {language for language, _ in found} <= {"yaml", "sh", "python", "text"}
     assert {"sh", "python"} & {language for language, _ in found}
     for language, text in found:
-        if language == "yaml":
+        if language == "python" and text.startswith("import trimesh"):  # makes a file
+            exec(compile(text, page.name, "exec"), {})
+        elif language == "yaml":
             assert sweep.load(save(text)).title
     for (before, _), (language, _) in zip([("", ""), *found], found, strict=False):
         assert language != "text" or before == "python"
@@ -88,14 +98,46 @@ def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, here):
             assert lines(printed) == lines(text)
 
 
-def test_the_fields_page_is_as_the_models_are():
-    text = runpy.run_path(str(DOCS / "field_reference.py"))["text"]()
-    assert (DOCS / "fields.md").read_text(encoding="utf-8") == text, "make fields writes it anew"
-    for needle in ("| `wavelength` | Optical wavelength; at least 1 nm", "## scene", "`kind`"):
-        assert needle in text
+@pytest.mark.parametrize(
+    ("name", "needles"),
+    [
+        ("field", ["| `wavelength` | Optical wavelength; at least 1 nm", "## scene", "`kind`"]),
+        ("variable", ["| `radial_velocity_error` | m s-1 | axes | float64 |", "| `weight` |"]),
+    ],
+)
+def test_a_generated_reference_is_as_the_models_are(name, needles):
+    text = runpy.run_path(str(DOCS / f"{name}_reference.py"))["text"]()
+    assert (DOCS / f"{name}s.md").read_text(encoding="utf-8") == text, "make fields writes it anew"
+    assert [needle for needle in needles if needle not in text] == []
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.stem)
+def test_every_table_of_outputs_has_its_variables_in_the_reference():
+    tables = [t for t in vars(outputs).values() if isinstance(t, dict)]
+    named = {n for t in tables for n, o in t.items() if isinstance(o, outputs.Output)}
+    page = (DOCS / "variables.md").read_text(encoding="utf-8")
+    assert len(named) > 100
+    assert {name for name in named if f"| `{name}` |" not in page} == set()
+
+
+def test_the_axes_that_the_page_on_specs_shows_can_be_written():
+    found = [text for language, text in blocks(DOCS / "specs.md") if language == "yaml"]
+    (axes,) = [yaml.load(text, Loader=yaml.BaseLoader) for text in found if "axes:" in text]
+    spec = sweep.load(REPOSITORY / "experiments" / "quickstart.yaml")
+    mapping = spec.to_yaml_mapping() | axes | {"figures": []}
+    names = [axis.name for axis in Spec.from_mapping(mapping, base=Path(".")).axes]
+    assert names == ["range", "grazing_angle", "power", "cut"]
+
+
+def test_every_question_on_the_first_page_leads_to_one_page():
+    page = (DOCS / "index.md").read_text(encoding="utf-8").partition("## Ten questions")[2]
+    rows = re.findall(r"^\| (.*\?.*) \| \[[^]]+\]\(([^)#]+\.md)(?:#[-\w]+)?\) \|$", page, re.M)
+    assert len(rows) == 10
+    assert [link for _, link in rows if not (DOCS / link).exists()] == []
+
+
+@pytest.mark.parametrize(
+    "page", sorted([*DOCS.rglob("*.md"), *REPOSITORY.glob("*.md")]), ids=lambda page: page.stem
+)
 def test_links_lead_to_files_that_are_there(page):
     for link in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
         assert re.match(r"https?:", link) or (page.parent / link).exists(), link
@@ -112,6 +154,7 @@ def test_every_module_that_the_architecture_names_is_there():
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")
+    pytest.importorskip("sphinx_click")
     built = subprocess.run(
         [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-d",
          str(tmp_path / "doctrees"), str(DOCS), str(tmp_path / "site")],
@@ -120,3 +163,9 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert built.returncode == 0, built.stderr
     index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     assert 'href="tutorial.html"' in index and 'href="howto/share_a_study.html"' in index
+    commands = (tmp_path / "site" / "cli.html").read_text(encoding="utf-8")
+    interface = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    assert [name for name in main.commands if f'id="sweep-{name}"' not in commands] == []
+    public = {*sweep.__all__} - {"__version__"}
+    assert [name for name in public if f'id="sweep.{name}"' not in interface] == []
+    assert 'id="sweep.analysis.opening.SweepAccessor.maximum_range"' in interface

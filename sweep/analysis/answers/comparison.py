@@ -30,8 +30,8 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ----------
     ours, other
         As `sweep.open` gives them, or parts of them. Points are matched by the values of their
-        coordinates, whatever these are written in. Where a parameter is on an axis of one study
-        only, the value that the other has is taken, if it is there; else the axis stays.
+        coordinates, whatever these are written in. A parameter on an axis of one study only takes
+        the value of the other, if it is there; else the axis stays.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def _matched(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
 
 
 def _at_fixed(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
-    """A dataset at the values of the parameters that the reference has off its axes."""
+    """Return a dataset at the values of the parameters that the reference has off its axes."""
     paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
     study = study_of(reference)
     for array in list(dataset.coords.values()):
@@ -299,7 +299,7 @@ def compared(ours: Store, other: Store) -> dict[str, xr.Dataset]:
 
 
 def rows(found: xr.Dataset) -> list[list[str]]:
-    """A row for each quantity, in the order of `COLUMNS`; quantities without a point left out."""
+    """Return a row for each quantity with points, in the order of `COLUMNS`."""
     return [_row(found, name) for name in SHOWN if name in found and found[name].notnull().any()]
 
 
@@ -331,14 +331,14 @@ def _where(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
 
 
 def _told(coordinate: xr.DataArray) -> str:
-    """A coordinate's value; with its name where no unit tells what it is."""
+    """Return a coordinate's value; with its name where no unit tells what it is."""
     units = str(coordinate.attrs.get("units", ""))
     value = labels.quantity(coordinate.values.item(), units)
     return value if units not in ("", "1") else f"{labels.coordinate(str(coordinate.name))} {value}"
 
 
 def met(found: xr.Dataset) -> str:
-    """Number of the shots that two flights share, in words."""
+    """Return the number of the shots that two flights share, in words."""
     number, ours, other = found.sizes["shot"], found.attrs["shots"], found.attrs["other_shots"]
     if number == ours == other:
         return f"all {labels.counted(number, 'shot')}"
@@ -346,7 +346,7 @@ def met(found: xr.Dataset) -> str:
 
 
 def verdict(parts: Iterable[xr.Dataset]) -> tuple[str, str]:
-    """``same``, ``different`` or ``nothing``, and a sentence that says so."""
+    """Return ``same``, ``different`` or ``nothing``, and a sentence that says so."""
     number, apart, thing, counted = 0, 0, "point", ""
     for found in parts:
         if "shot" in found.dims:
@@ -380,7 +380,7 @@ def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
 
 
 def figure(found: Mapping[str, xr.Dataset]) -> Chart | None:
-    """The chart of the differences; none where nothing that both have is computed."""
+    """Return the chart of the differences, or None if no common point is computed."""
     parts = list(found.values())
     names = [n for n in PROMISED if any(n in part and part[n].notnull().any() for part in parts)]
     if not names:

@@ -1,4 +1,4 @@
-"""Errors of range and radial velocity beside the Cramer-Rao bounds on any estimate of them."""
+"""Errors of range and radial velocity, and the Cramer-Rao bounds on any estimate of them."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         [m], lazy: `reported`, reported less true range without noise, from whole bins;
         `resolution`, the spread that whole bins make on the average, a bin over sqrt(24) as
         two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
-        SNR in the three segments together (:mod:`sweep.model.estimators`). Where noise is
-        taken for signal, below the threshold, no estimate comes near it.
-        Of a study that draws whole spectra instead what it stores: `bias`, `rmse` and `bound`.
+        SNR in the three segments together (:mod:`sweep.model.estimators`). Below the threshold
+        noise is taken for signal, and no estimate comes near it. Of a study that draws whole
+        spectra instead what it stores: `bias`, `rmse` and `bound`.
     """
     return _errors(dataset, "range", "range_error", lambda found: found.range)
 

@@ -5,7 +5,7 @@ Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is ne
 where pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
 
 Everything is a reduction of pairs of neighbours: of those within a piece first, then of those that
-lie in two, so that it is lazy, and a store larger than memory goes through piece by piece.
+lie in two. It is lazy, and a store larger than memory goes through piece by piece.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FARTHEST = 38.0
 
 
 def deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Normal deviate z of pd = Phi(z), from the probability of a miss above one half."""
+    """Return normal deviate z of pd = Phi(z), from the probability of a miss above one half."""
     lost = 1 - pd if miss is None else miss
 
     def of(p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def limit(
 
 
 def _ordered(dataset: xr.Dataset, x: xr.DataArray, from_highest: bool) -> tuple[xr.Dataset, str]:
-    """The dataset in the order in which the coordinate is walked, and its dimension."""
+    """Sort a dataset by a coordinate, in the direction of the search; its dimension."""
     if x.ndim != 1 or x.size < 2:
         raise ValueError(f"{x.name} has a single value: there is nothing to go along")
     order = np.argsort(x.values, kind="stable")
@@ -170,7 +170,7 @@ def _marks(z: xr.DataArray, dim: str) -> xr.Dataset:
 
 
 def _marks_of_piece(z: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Marks (1, ..., 6) of a piece (n, ...) whose first value is at the step `start`."""
+    """Return marks (1, ..., 6) of a piece (n, ...) whose first value is at the step `start`."""
     steps = start.ravel()[0] + np.arange(float(len(z))).reshape(-1, *(1,) * (z.ndim - 1))
     falls, place = _falls(z[:-1], z[1:], steps[:-1])
     unknown = np.isnan(z)
@@ -186,7 +186,7 @@ def _marks_of_piece(z: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def _marks_of_all(parts: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Marks (..., 6) of pieces (k, ..., 6) together; the second to the last begin at `starts`."""
+    """Combine marks (k, ..., 6) of pieces to (..., 6); all but the first begin at `starts`."""
     first, last, break_at, left_at, first_unknown, last_unknown = np.moveaxis(parts, -1, 0)
     steps = starts.reshape(-1, *(1,) * (first.ndim - 1)) - 1.0
     falls, place = _falls(last[:-1], first[1:], steps)

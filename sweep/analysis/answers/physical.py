@@ -18,7 +18,7 @@ CLOSE = 1e-9
 
 
 def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
-    """The study that a dataset, or a flight's tree, comes from."""
+    """Return the study that a dataset, or a flight's tree, comes from."""
     text = dataset.attrs.get("spec")
     if not text:
         raise ValueError("the dataset lacks the attribute 'spec': take one that sweep.open gave")
@@ -26,7 +26,7 @@ def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
 
 
 def spec_of(dataset: xr.Dataset) -> Spec:
-    """The study of a grid that a dataset comes from."""
+    """Return the study of a grid that a dataset comes from."""
     study = study_of(dataset)
     if not isinstance(study, Spec):
         raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
@@ -45,7 +45,7 @@ def quantity(written: object, *, si_unit: str, name: str) -> float:
 
 
 def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """A coordinate by its name or by the dotted path of its parameter."""
+    """Return a coordinate by its name or by the dotted path of its parameter."""
     for known, array in dataset.coords.items():
         if name in (known, array.attrs.get("path")):
             return array
@@ -54,7 +54,7 @@ def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def shown(array: xr.DataArray, written: object) -> float | str:
-    """A written value in the units of a coordinate; a number without a unit is in them already."""
+    """Convert a written value to a coordinate's units; a number without a unit is in them."""
     rule = parameter_rules().get(array.attrs.get("path", ""))
     if isinstance(written, int | float | np.number) and not isinstance(written, bool):
         return float(written)
@@ -109,9 +109,9 @@ def select(
         As `sweep.open` gives it, or a part of it.
     wanted
         By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
-        units), a list of values, or a slice from one value to another, both included. One value
-        of a coordinate with a dimension of its own takes that dimension away; a coordinate along
-        a zipped axis keeps the points of the axis that have it.
+        units), a list of values, or a slice from one value to another, both included. One value of
+        a coordinate with a dimension of its own removes that dimension. A coordinate along a zipped
+        axis keeps the points of the axis that have it.
     method
         ``nearest`` takes the nearest value; by default it must be there, to 1e-9 of it.
 
@@ -139,7 +139,7 @@ def select(
 def _places(
     array: xr.DataArray, values: np.ndarray, written: Any, method: str | None
 ) -> np.ndarray:
-    """Indices of the values that are wanted, in the order of the coordinate for slices."""
+    """Return indices of the values that are wanted, in the order of the coordinate for slices."""
     if isinstance(written, slice):
         ends = [
             None if e is None else float(shown(array, e)) for e in (written.start, written.stop)
@@ -155,7 +155,7 @@ def _places(
 def _matching(
     array: xr.DataArray, values: np.ndarray, value: float | str, method: str | None
 ) -> np.ndarray:
-    """Indices of one value."""
+    """Return indices of one value."""
     units = array.attrs.get("units", "")
     if values.dtype.kind not in "fiu":
         words = [str(word) for word in values]

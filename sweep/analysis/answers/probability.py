@@ -50,8 +50,8 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     xarray.Dataset
         `pd`, `low` and `high`, 0..1, lazy as the store's arrays are. The interval is pd plus and
         minus the half-width that is stored, within 0..1; its attribute `confidence` says how sure
-        it is. Where a study draws nothing pd is a closed form and the interval has no width.
-        What effects that were left out may change is apart, in `effects_error`.
+        it is. Without draws pd is a closed form, and the interval has no width. The change that
+        skipped effects may make is apart, in `effects_error`.
     """
     pd = dataset[named("pd", segment)]
     reach = half_width(dataset, segment)
@@ -133,7 +133,7 @@ def false_alarms_per_kilometre(
     *,
     leakage: bool = False,
 ) -> xr.DataArray:
-    """The same for a kilometre of flight.
+    """Return the rate per kilometre of flight.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _reduced(array: xr.DataArray) -> dask.array.Array:
-    """The statistics of an array, (4,)."""
+    """Return the statistics of an array, (4,)."""
     data = array.chunk().data if array.chunks is None else array.data
     axis = data.ndim
     parts = data.map_blocks(
@@ -218,7 +218,7 @@ def _of_block(block: np.ndarray) -> np.ndarray:
 
 
 def _of_all(parts: np.ndarray) -> np.ndarray:
-    """The statistics of all blocks together, from (blocks, 4)."""
+    """Return the statistics of all blocks together, from (blocks, 4)."""
     number = parts[:, 3].sum()
     if not number:
         return np.array([np.nan, np.nan, np.nan, 0.0])
@@ -279,8 +279,8 @@ def roc(
     -------
     xarray.Dataset
         `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold to noise ratio that
-        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. Where
-        draws are made, `half_width` with the study's confidence; 0 where pd is exact.
+        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. With
+        draws, `half_width` with the study's confidence; 0 where pd is exact.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def roc(
 
 
 def _looks_of(spec: Spec) -> Looks:
-    """Looks of all points."""
+    """Return the looks of all points."""
     on_axes = (member.path for axis in spec.axes for member in axis.members)
     if varying := sorted({NUMBER, COMBINE, VOTES} & set(on_axes)):
         raise ValueError(
@@ -336,7 +336,7 @@ def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
 def _closed(
     dataset: xr.Dataset, segment: str, level: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Closed form of pd at each level, and where it holds."""
+    """Return the closed form of pd at each level, and where it holds."""
     own = _own_level(dataset, looks)
     pd = xr.ones_like(level)
     exact = (dataset["effects"] & _RANDOM) == 0
@@ -350,14 +350,14 @@ def _closed(
 
 
 def _own_level(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
-    """The study's own threshold over the noise per quadrature."""
+    """Return the study's own threshold over the noise per quadrature."""
     if looks.several:
         return xr.apply_ufunc(looks.level, np.log(10) * dataset["log10_pfa_bin"])
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
 
 
 def _own_tnr(dataset: xr.Dataset) -> xr.DataArray:
-    """The study's own threshold-to-noise ratio at each point."""
+    """Return the study's own threshold-to-noise ratio at each point."""
     spec, like = spec_of(dataset), dataset["log10_pfa_bin"]
     if TNR in spec.parameters():
         return parameter(dataset, TNR, spec)

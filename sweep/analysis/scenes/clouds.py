@@ -150,7 +150,7 @@ class Ground:
 
     @classmethod
     def of(cls, tree: xr.DataTree) -> Ground | None:
-        """The map of a store; none where it has none, or nothing is on it."""
+        """Return the map of a store, or None if it has none, or nothing is on it."""
         if "map_height" not in tree.ds:
             return None
         x, y, height = (np.asarray(tree.ds[f"map_{name}"].values) for name in ("x", "y", "height"))
@@ -159,7 +159,7 @@ class Ground:
     def cropped(
         self, x: tuple[float, float], y: tuple[float, float], most: int = 120
     ) -> Ground | None:
-        """The ground within limits, on a grid of as many nodes at the most along each side.
+        """Return the ground within limits, on a grid of as many nodes at the most along each side.
 
         Heights between the map's nodes are interpolated; none is left where limits miss the map.
         """
@@ -181,7 +181,7 @@ class Ground:
         return Ground(nodes[0], nodes[1], height)
 
     def without_walls(self) -> Ground:
-        """The ground without what is too steep to be drawn as a surface."""
+        """Return the ground without what is too steep to be drawn as a surface."""
         steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > STEEPEST
         return Ground(self.x, self.y, np.where(steep, np.nan, self.height))
 

@@ -83,12 +83,12 @@ class Names:
 
 
 def mark(marker: str, words: str, **look: Any) -> Line2D:
-    """A legend's entry for a mark."""
+    """Return a legend's entry for a mark."""
     return Line2D([], [], linestyle="", marker=marker, label=words, **{"markersize": 6} | look)
 
 
 def false_point() -> Line2D:
-    """A legend's entry for false points."""
+    """Return a legend's entry for false points."""
     return mark("x", "false point", color="0.2", markersize=5)
 
 
@@ -108,7 +108,7 @@ def chosen(
 
 
 def _ends(known: np.ndarray) -> tuple[float, float]:
-    """Ends of a scale: lowest and highest value, but no few values that lie far from all others."""
+    """Return the ends of a scale: lowest and highest value, without a few outliers."""
     if not known.size:
         return 1.0, 1.0
     low, bottom, top, high = (float(q) for q in np.quantile(known, [0.0, 0.005, 0.995, 1.0]))
@@ -159,7 +159,7 @@ class Stage:
     def rectangle(
         self, left: float, bottom: float, width: float, height: float
     ) -> tuple[float, float, float, float]:
-        """A rectangle in inches from the picture's lower left corner, in shares of the sheet."""
+        """Convert a rectangle in inches from the lower left corner to shares of the sheet."""
         across, up = self.sheet.get_size_inches()
         return left / across, (self.foot + bottom) / up, width / across, height / up
 
@@ -168,7 +168,7 @@ class Stage:
         return self.sheet.add_axes(self.rectangle(*at), **options)
 
     def explain(self, scale: Amounts | Names, handles: Sequence[Artist]) -> None:
-        """The colours' scale or names, and the marks' meaning."""
+        """Return the colours' scale or names, and the marks' meaning."""
         if isinstance(scale, Amounts):
             tall = min(0.72 * self.height, 4.2)
             axes = self.axes(self.width + 0.15, (self.height - tall) * 0.62, 0.17, tall)
@@ -221,7 +221,7 @@ def mark_size(places: np.ndarray, width: float, height: float) -> float:
 
 
 def false_marks(size: float) -> dict[str, Any]:
-    """Look of false points beside true ones of a size."""
+    """Look of false points among true ones of a size."""
     return {"marker": "x", "s": max(1.2 * size, 9.0), "linewidths": 0.7}
 
 

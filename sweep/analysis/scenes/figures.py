@@ -69,7 +69,7 @@ class SceneStudy:
 
     @classmethod
     def of(cls, store_path: str | Location) -> SceneStudy:
-        """The study in a store."""
+        """Return the study in a store."""
         tree = opened(located(store_path))
         return cls(located(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
 
@@ -94,7 +94,7 @@ class SceneStudy:
         return list(self.spec.figures) or default_figures(self.tree)
 
     def made(self, figure: SceneFigure) -> canvas.Sheet | Page | str:
-        """The sheet or the page of a figure; why there is none."""
+        """Return the sheet or the page of a figure; why there is none."""
         makers: dict[type, Callable[[SceneStudy, Any, Place], canvas.Sheet | Page | str]] = {
             CloudFigure: _cloud,
             Scatter: _scatter,

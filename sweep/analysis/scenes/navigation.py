@@ -129,8 +129,8 @@ def _with_length(parts: np.ndarray) -> np.ndarray:
 def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) -> list[Curve]:
     """Errors of scanners that navigate, all over the same bins of altitude.
 
-    Solutions are read chunk by chunk; each stretch has a tally of its own, and the tallies are
-    merged in the order of the stretches, so that the result is the same to the last bit.
+    Solutions are read chunk by chunk. Each part has a tally of its own, and the tallies are merged
+    in order, which gives the same result to the last bit.
     """
     able = [(name, own.dataset) for name, own in named if "velocity_status" in own.dataset]
     edges = _edges([dataset for _, dataset in able], bins)
@@ -227,7 +227,7 @@ def merge(tallies: Sequence[Tally]) -> Tally:
 
 
 def _add_up(values: np.ndarray, cell: np.ndarray, size: int) -> np.ndarray:
-    """Sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
+    """Return sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(cell, weights=column, minlength=size) for column in columns]
     return np.stack(sums, axis=-1).reshape(size, *values.shape[1:])
@@ -319,7 +319,7 @@ def _panel(curves: Sequence[Curve], quantity: str, statistic: str, part: int) ->
 def navigation_page(
     curves: Sequence[Curve], *, show: str, title: str, remarks: Sequence[str]
 ) -> Page:
-    """A block for each curve of a quantity, a row for each bin of altitude."""
+    """Return a block for each curve of a quantity, a row for each bin of altitude."""
     shown = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     blocks, records = [], []
     for curve in curves:

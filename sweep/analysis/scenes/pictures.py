@@ -296,7 +296,7 @@ def cloud_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """A cloud, coloured by a quantity."""
+    """Draw a cloud, coloured by a quantity."""
     values = shown(quantity, cloud.points[quantity])
     scale = colours.chosen(quantity, values, trusted=cloud.true, surfaces=surfaces)
     note = labels.joined([*cloud.remarks, *remarks])
@@ -313,7 +313,7 @@ def cloud_sheet(
 
 
 def _handles(cloud: Cloud, *, ground: bool) -> list[Any]:
-    """A legend's entries for the marks of a picture."""
+    """Return a legend's entries for the marks of a picture."""
     found: list[Any] = []
     if not cloud.true.all():
         found.append(colours.false_point())
@@ -341,7 +341,7 @@ def scatter_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """A quantity over another."""
+    """Draw one quantity over another."""
     table = found.rows()
     true = (table["flags"] & TRUE) > 0 if "flags" in table else np.ones(len(table[x]), bool)
     values = shown(colour, table[colour])
@@ -371,7 +371,7 @@ def scatter_sheet(
 
 
 def _limits(name: str, values: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Ends of an axis: those of true points, with a margin; infinite where that must be."""
+    """Return ends of an axis: those of true points, with a margin; infinite where that must be."""
     known = values[true & np.isfinite(values)]
     known = known if known.size else values[np.isfinite(values)]
     known = known[known > 0] if name in WIDE else known

@@ -1,4 +1,4 @@
-"""Recordings of scanners: quantities of shots and points, read stretch by stretch; eyepoints."""
+"""Recordings of scanners: quantities of shots and points, read part by part; eyepoints."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def stored_name(name: str, ranges: str) -> str:
 
 
 def label(name: str) -> str:
-    """A quantity in words with the units in which it is shown."""
+    """Return a quantity in words with the units in which it is shown."""
     about = QUANTITIES[name]
     return labels.with_units(about.words, "dB" if name in DECIBELS else about.units)
 
@@ -145,14 +145,14 @@ class Recording:
         return int(self.dataset.sizes["shot"])
 
     def stretches(self, time: Interval | None = None) -> Iterator[slice]:
-        """Stretches of shots, without those that are not computed or lie outside of an interval."""
+        """Ranges of shots, without those that are not computed or lie outside of an interval."""
         for part in stretches(self.dataset["flags"], "shot"):
             at = self.read("time", part)
             if np.isfinite(at).any() and (time is None or time.holds(at).any()):
                 yield part
 
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
-        """Mask (k,) of the shots of a stretch of which the points of a draw are computed.
+        """Mask (k,) of the shots of a range of which the points of a draw are computed.
 
         Geometry is stored with a study's first place and draw: that a shot's time is known says
         nothing of the others, and no point looks like none found. Only its chunk tells.
@@ -169,14 +169,14 @@ class Recording:
         return known & np.array(stored)[at]
 
     def read(self, name: str, part: slice, draw: int | None = None) -> np.ndarray:
-        """An array's values over a stretch of shots, of one draw where it has any."""
+        """Return an array's values over a range of shots, of one draw if it has any."""
         array = self.dataset[name].isel(shot=part)
         return np.asarray((array if draw is None else array.isel(draw=draw)).values)
 
     def points(
         self, names: Sequence[str], part: slice, draw: int = 0, ranges: str = QUANTISED
     ) -> Table:
-        """Quantities of every point of a stretch, (m,) each, in the order of shots and returns.
+        """Quantities of every point of a range of shots, (m,) each, in order.
 
         Names are those of :data:`QUANTITIES`, ``return_number``, and ``returns`` (points of the
         same shot). Positions follow from the ranges taken, quantised or interpolated.
@@ -237,7 +237,7 @@ class Recording:
         return position
 
     def of_shots(self, name: str, part: slice) -> np.ndarray:
-        """A quantity of every shot of a stretch, (k,)."""
+        """Return a quantity of every shot of a range, (k,)."""
         if name == "shot":
             return np.arange(part.start, part.stop)
         if name == "altitude":
@@ -254,7 +254,7 @@ class Recording:
 
 
 def several_surfaces(recording: Recording, draw: int = 0) -> int | None:
-    """Number of the first shot that tells surfaces apart.
+    """Return the number of the first shot that tells surfaces apart.
 
     The first with true points of two surfaces in a draw; where there is none, the first with two
     groups of bins above the threshold; none where there is none of those either.
@@ -317,7 +317,7 @@ class Thinned:
         self._kept += int(chosen.sum())
 
     def rows(self) -> Table:
-        """The rows kept; empty where none were added."""
+        """Return the rows kept; empty where none were added."""
         if not self._parts:
             return {}
         return {n: np.concatenate([part[n] for part in self._parts]) for n in self._parts[0]}
@@ -335,7 +335,7 @@ class Place:
     left_open: tuple[str, ...]
 
     def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
-        """Recording of a scanner there."""
+        """Return the recording of a scanner there."""
         group = tree.children[scanner].to_dataset(inherit=False)
         if PACKED in tree.attrs:
             return Recording(scanner, group.isel(self.index))
@@ -346,7 +346,7 @@ class Place:
 
 
 def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
-    """The first place at which coordinates have the values asked for.
+    """Return the first place at which coordinates have the values asked for.
 
     Values are written as in a spec, one or several of each coordinate; of an axis with a name of
     its own, the number along it. SpecError tells of all that are no coordinate or value of it.
@@ -380,13 +380,13 @@ def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
 
 
 def place_at(spec: SceneSpec, numbers: Sequence[int]) -> Place:
-    """The place at some numbers along the axes."""
+    """Return the place at some numbers along the axes."""
     index = {axis.name: number for axis, number in zip(spec.axes, numbers, strict=True)}
     return Place(index, _words(spec, index), ())
 
 
 def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray]:
-    """The axis of a coordinate, and which of its values are among those asked for."""
+    """Return the axis of a coordinate, and which of its values are among those asked for."""
     for axis in spec.axes:
         if name in [member.name for member in axis.members]:
             wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
@@ -397,7 +397,7 @@ def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np
 
 
 def _values(spec: SceneSpec, name: str) -> str:
-    """The values that there are, in words."""
+    """Return the values that there are, in words."""
     for axis in spec.axes:
         for member in axis.members:
             if name == member.name:

@@ -7,14 +7,14 @@ size 2^11 or 2^12", and samples what comes out at the bins. Here: a grid of 16 c
 the beam's centre, each beamlet's line put into the nearest cell, one FFT, a product with the
 transform of the window's own, and back.
 
-It can be done better, which is here too. Where powers add, the grid holds real numbers, and half of
+It can be done better, which is here too. If powers add, the grid holds real numbers, and half of
 their transforms is enough (`real`). Only the bins are asked for, so that a transform of one
-sixteenth of the size is enough for the way back (`folded`). And a line in the nearest cell is up
-to 1/32 bin off: 2e-2 of the peak at worst. Shared out among ten cells by Lagrange's polynomial of
+sixteenth of the size is enough for the way back (`folded`). And a line in the nearest cell is up to
+1/32 bin off: 2e-2 of the peak at worst. Shared out among ten cells by Lagrange's polynomial of
 degree 9 it is where it belongs, to 1e-12 for a window that falls off to its ends.
 
-It is here to be compared with (`sweep accuracy`), and is as fast as it can fairly be made. What
-befalls lines within a record (range walk, line width) it leaves out, and leakage beyond the grid.
+It is here to be compared with (`sweep accuracy`), and is as fast as it can fairly be made. It skips
+changes of lines within a record (range walk, line width), and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Bench(ABC):
         self._names: dict[str, frozenset[str]] = {}
 
     def effects(self, rung: Rung) -> frozenset[str]:
-        """Effects that a rung calls for anywhere in the sample."""
+        """Effects that a rung simulates anywhere in the sample."""
         if rung.name not in self._names:
             flags = np.unique(self._flags(rung)).tolist()
             self._names[rung.name] = frozenset(name for flag in flags for name in names_of(flag))
@@ -123,15 +123,15 @@ class Bench(ABC):
 
     @abstractmethod
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many points: places in it."""
+        """Return the sample in parts of about so many points: places in it."""
 
     @abstractmethod
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample, timed on stretches of so many points, if it can be."""
+        """Compute a rung on a part of the sample, timed on so many points if possible."""
 
     @abstractmethod
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        """Compute a point in the time domain, and with the rung's effects that the truth has."""
 
     @abstractmethod
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
@@ -148,8 +148,8 @@ class Bench(ABC):
 def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
     """Numbers of points of a grid, in C order over it, spread evenly along every axis.
 
-    Any stretch from the first is spread as well, so that a part of the sample stands for all. They
-    follow Halton's sequence, without repetition; all are taken where there are fewer.
+    Any first part of it is spread as well, so that a part of the sample stands for all. They follow
+    Halton's sequence, without repetition; all are taken where there are fewer.
     """
     total = math.prod(shape)
     if not shape or total <= 1:
@@ -231,14 +231,14 @@ class GridBench(Bench):
         self.most_times = min(MOST_TIMES, self._block_points)
 
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many points."""
+        """Return the sample in parts of about so many points."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample; timed on stretches of so many points, or on the part.
+        """Compute a rung on a part of the sample, timed on so many points or on the part.
 
-        What a point costs depends on those beside it, as they share what is worked out for them:
-        a stretch is what the point's block computes next to it.
+        The cost of a point depends on its neighbours, as they share intermediate results. So points
+        are timed together with those that the block computes next.
         """
         numbers = self._numbers[part]
         outputs, spent, planning = self._run(rung, numbers)
@@ -257,7 +257,7 @@ class GridBench(Bench):
         return Trial(seen, spent / timed + planning, planning)
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """A point in the time domain, and as the rung has it without what the truth lacks."""
+        """Compute a point in the time domain, and with the rung's effects that the truth has."""
         lacking = NOT_IN_TRUTH | {effect.name for effect in EFFECTS if effect.is_random}
         number = self._numbers[[place]]
         flags, _ = self._planned(rung, number)
@@ -268,7 +268,7 @@ class GridBench(Bench):
         return seen_in(in_time), seen_in(shot.evaluate(parameters, effects))
 
     def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-        """Number of each point in C order, and its place along each axis."""
+        """Return the number of each point in C order, and its place along each axis."""
         found = {"number": (self._numbers, {"long_name": "number of the point of the study"})}
         index = np.unravel_index(self._numbers, self._grid.shape) if self._grid.shape else ()
         return found | along_axes(self.spec.axes, index)
@@ -283,7 +283,7 @@ class GridBench(Bench):
         return self._calling[rung.name]
 
     def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
-        """Outputs of points, the time they take together, and that of planning one of them."""
+        """Compute points: outputs, the time of all, and that of planning one of them."""
         grid = self._selection_of(rung).tiles.grid
         flags, planning = self._planned(rung, numbers)
         selected = Selected(flags, np.zeros(flags.size)).groups()
@@ -305,7 +305,7 @@ class GridBench(Bench):
         return outputs, spent, planning
 
     def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
-        """A point and those that its block computes after it, round the block's end."""
+        """Return a point and those that its block computes after it, round the block's end."""
         grid = self._selection_of(rung).tiles.grid
         (block,), (own,) = (each.tolist() for each in grid.locate(np.array([number])))
         order = grid.geometry_order(block)
@@ -313,7 +313,7 @@ class GridBench(Bench):
         return grid.numbers(block, order.take(follows, mode="wrap"))
 
     def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
-        """Flags of points (n,), and the time that planning takes one.
+        """Return flags of points (n,), and the time that planning takes one.
 
         A plan serves a whole tile, so that a point takes its share.
         """
@@ -384,7 +384,7 @@ def find_on_grid(
 
 
 def grid_sizes(shots: Shots, least: int = SIZE) -> np.ndarray:
-    """Cells of each point's grid, (n,) int64: the lines in its middle, and room beside them."""
+    """Cells of each point's grid, (n,) int64: the lines in its middle, and room on both sides."""
     per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
     carrier = np.max([np.max(c) for c in shots.carriers])
     offset = np.abs(shots.offset).max(axis=1)[shots.row]
@@ -425,7 +425,7 @@ def magnitudes(
 
 
 def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """The convolution of amplitudes at every sixteenth cell."""
+    """Return the convolution of amplitudes at every sixteenth cell."""
     transform = fft.fft(grid, axis=1, overwrite_x=True)
     transform *= kernel
     if not folded:
@@ -435,7 +435,7 @@ def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndar
 
 
 def _real_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """The same of powers, by half of their transforms."""
+    """Convolve powers, by half of their transforms."""
     half = fft.rfft(grid, axis=1)
     half *= kernel
     if not folded:
@@ -508,7 +508,7 @@ def _deposit(p, row, footprint, segment, sizes, image, weights, origin, grid):
 
 @njit(cache=True, error_model="numpy")
 def _share_out(grid, i, at, re, im, weights, share):
-    """Adds a line to the nearest cell, or to ten by Lagrange's polynomial amid them."""
+    """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
     if weights.size == 1:
         _add(grid, i, int(np.rint(at)), re, im)
         return

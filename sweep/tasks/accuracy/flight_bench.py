@@ -79,7 +79,7 @@ class Tiles:
 class FlightBench(Bench):
     """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
-    What counts is rays, plans, spectra and probabilities; draws, points and navigation cost the
+    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost the
     same whatever the accuracy, and are left out.
     """
 
@@ -99,13 +99,13 @@ class FlightBench(Bench):
         self.whole = sum(s.total_cycles * s.shots_a_cycle * math.prod(s.axes) for s in stretches)
 
     def parts(self, points: int) -> list[np.ndarray]:
-        """The sample in parts of about so many shots, from all scanners and places in turn."""
+        """Cut the sample into parts of about so many shots, from all scanners and places."""
         number = max(1, round(points / TILE_SHOTS))
         turns = zip_longest(*(tiles.parts(number) for tiles in self._tiles))
         return [part for turn in turns for part in turn if part is not None]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """A rung on a part of the sample, timed with its rays and the tiles beside it."""
+        """Compute a rung on a part of the sample, timed with its rays and neighbouring tiles."""
         tiles, own = self._around(part, times)
         eyepoints, casting = self._see(rung, tiles)
         selected, planning = self._selected(rung, tiles, eyepoints)
@@ -126,7 +126,7 @@ class FlightBench(Bench):
         self._cast.clear()
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """A shot in the time domain, and as the rung has it without what the truth lacks."""
+        """Compute a shot in the time domain, and with the rung's effects that the truth has."""
         tiles, one = self._around(np.array([place]), 1)
         every, _ = self._see(rung, tiles)
         flags = self._selected(rung, tiles, every)[0].flags[one]

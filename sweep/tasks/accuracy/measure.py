@@ -298,7 +298,7 @@ class Measurement:
         self._begun = time.monotonic()
 
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
-        """Rounds that fit in; before that, how long the stretches are to time rungs well.
+        """Return the rounds that fit in, and the number of points that times rungs well.
 
         As long for all of them, but for those that would take far longer.
         """
@@ -356,7 +356,7 @@ class Measurement:
         return done
 
     def _truth(self, places: np.ndarray) -> tuple[dict[int, tuple[Seen, Seen]], int]:
-        """Some of these points in the time domain, as many as there is time for; their beamlets."""
+        """Compute some of these points in the time domain, as time allows; their beamlets."""
         rung, number = self._ladder.reference, "footprint.beamlets"
         found: dict[int, tuple[Seen, Seen]] = {}
         beamlets = TRUTH_BEAMLETS if number in rung.overrides else 0
@@ -375,7 +375,7 @@ class Measurement:
 
 
 def completed(rungs: Ladder, bench: Bench, tolerances: Iterable[float] = ()) -> Ladder:
-    """The ladder, with the effects that tolerances call for fixed at every point.
+    """Return the ladder, with the effects of each tolerance fixed at every point.
 
     ``tolerances``: as of :meth:`sweep.tasks.accuracy.rungs.Ladder.with_fixed`.
     """
@@ -440,11 +440,11 @@ class Content:
 
     @property
     def id(self) -> str:
-        """That of the study."""
+        """The spec of the study."""
         return self._spec.id
 
     def attributes(self) -> dict[str, Any]:
-        """The spec, what the errors are taken against, and what was measured on."""
+        """Return the spec, the reference of the errors, and the machine."""
         measured = self._measured
         return {
             "kind": ACCURACY,

@@ -105,7 +105,7 @@ class Rung:
         return self.kind in (COUNTED, IN_NOISE)
 
     def of(self, spec: Declared) -> Declared:
-        """The spec with the overrides put onto it.
+        """Return the spec with the overrides put onto it.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class Ladder:
     def with_fixed(
         self, sets: Mapping[float, frozenset[str]], tolerances: Iterable[float] = ()
     ) -> Ladder:
-        """The ladder with rungs that simulate at every point what a tolerance calls for anywhere.
+        """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
 
         ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
         """
@@ -164,12 +164,12 @@ class Ladder:
 
 
 def _modes(on: frozenset[str]) -> dict[str, str]:
-    """Some effects forced on, all others off."""
+    """Return some effects forced on, all others off."""
     return {f"effects.{name}": "on" if name in on else "off" for name in NAMES}
 
 
 def ladder(spec: Declared) -> Ladder:
-    """The rungs of a study, without those whose effects are fixed."""
+    """Return the rungs of a study, without those whose effects are fixed."""
     if _draws(spec):
         return _drawn_ladder(spec)
     notes: list[str] = []
@@ -211,7 +211,7 @@ def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, 
 
 
 def _numbers(flight: bool) -> Iterator[Rung]:
-    """Fixed numbers of beamlets: in a lattice, and in a line where the ground is a plane."""
+    """Return fixed numbers of beamlets: in a lattice, and in a line over a plane."""
     for n in NUMBERS:
         if not flight or n <= MOST_RAYS:
             yield Rung(name=f"{n} beamlets", kind=BEAMLETS, overrides={_BEAMLETS: n})
@@ -221,7 +221,7 @@ def _numbers(flight: bool) -> Iterator[Rung]:
 
 
 def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
-    """The thesis's way: in the nearest of 2^11 or 2^12 cells; and with what would improve it.
+    """Return the thesis's way, with 2^11 or 2^12 cells, and its improvements.
 
     Before them the same beamlets with the same effects in closed form, like for like. ``powers``:
     whether beamlets add as such, which then are transformed as real numbers.
@@ -273,7 +273,7 @@ def _every_effect(spec: Declared) -> dict[str, Any]:
 
 
 def _draws(spec: Declared) -> bool:
-    """True where probabilities are means over draws: of a flight they are not."""
+    """Return true where probabilities are means over draws: of a flight they are not."""
     return not isinstance(spec, SceneSpec) and (
         spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0
     )

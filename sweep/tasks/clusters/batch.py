@@ -72,7 +72,7 @@ class _PBSCluster(_TriedAgain, PBSCluster):  # type: ignore[misc]
 
 
 def start(cluster: Batch, bounds: Bounds) -> Any:
-    """The cluster, with jobs for its least number of workers submitted.
+    """Return the cluster, with jobs for its least number of workers submitted.
 
     RuntimeError, OSError where the batch system takes no jobs.
     """

@@ -34,7 +34,7 @@ class Files(NamedTuple):
 
 
 def make(directory: Path, days: int) -> Files:
-    """New certificates in a directory, which only their owner may read.
+    """Return new certificates in a directory, which only their owner may read.
 
     ClusterError where there are some already, or the directory can't be written.
     """

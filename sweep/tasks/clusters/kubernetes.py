@@ -1,7 +1,7 @@
 """Workers in pods, which the Dask operator of a Kubernetes cluster starts.
 
-What is asked for is one custom resource, a `DaskCluster`, and where workers are to be kept between
-bounds a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
+The request is one custom resource, a `DaskCluster`, and where workers are to be kept between bounds
+a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _delete(asked: Any) -> None:
 
 
 def _wait_for(kind: Any, cluster: Kubernetes) -> Any:
-    """The scheduler's service, once its pod is ready."""
+    """Return the scheduler's service, once its pod is ready."""
     from kr8s import NotFoundError
 
     deadline = time.monotonic() + READY_SECONDS
@@ -124,7 +124,7 @@ def autoscaler(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any] | None:
 
 
 def resource(cluster: Kubernetes, bounds: Bounds) -> dict[str, Any]:
-    """The cluster as Kubernetes is asked for it."""
+    """Return the cluster as Kubernetes declares it."""
     try:
         from dask_kubernetes.operator import make_cluster_spec
     except ImportError as error:

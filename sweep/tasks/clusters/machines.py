@@ -64,7 +64,7 @@ def security_of(cluster: Cluster) -> Security | None:
 
 
 def security_settings(cluster: Cluster) -> dict[str, Any]:
-    """Settings of `distributed.Security`; empty without certificates."""
+    """Return settings of `distributed.Security`; empty without certificates."""
     paths = cluster.certificates()
     if paths is None:
         return {}

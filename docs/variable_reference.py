@@ -1,0 +1,92 @@
+"""Writes docs/variables.md from the tables of outputs that the model declares: `make fields`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from sweep.model import outputs
+from sweep.model.outputs import Output
+
+PAGE = Path(__file__).with_name("variables.md")
+
+HEAD = """\
+# Variables of every store
+
+Written by `make fields` from the tables that name the variables (`sweep/model/outputs.py`). Floats
+are nan where there is no value, signed integers -1, flags 0. "Axes" are the axes of the study.
+
+`pd_up` stands for the up-chirp, `pd_down` for the down-chirp, `pd_doppler` for the Doppler segment
+and `pd_shot` for the whole shot. Other names follow the same pattern.
+"""
+
+SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [
+    ("Grids", "`sweep.open` opens a grid.", "axes", [outputs.OUTPUTS, outputs.SIMULATED]),
+    (
+        "Grids with draws",
+        "Further variables of a study with `draws`, whose pd is a mean or a share over draws.",
+        "axes",
+        [
+            outputs.ACCURACY_OUTPUTS, outputs.ERROR_OUTPUTS, outputs.DRAW_OUTPUTS,
+            outputs.RUNNING_OUTPUTS,
+        ],
+    ),
+    (
+        "Grids with whole spectra",
+        "Variables of a study with `draws: {method: spectra}`, which replace those of a grid.",
+        "axes",
+        [outputs.SPECTRA_OUTPUTS],
+    ),
+    (
+        "Flights: shots",
+        "One group for each scanner; `sweep.open_scene` opens them. The geometry is the truth.",
+        "",
+        [outputs.SHOTS, outputs.CYCLES],
+    ),
+    (
+        "Flights: probabilities",
+        "Probabilities of each shot, before any draw.",
+        "axes",
+        [outputs.STATISTICS, outputs.SIMULATED],
+    ),
+    ("Flights: points", "The point cloud.", "axes", [outputs.POINTS]),
+    (
+        "Flights: navigation",
+        "Velocity and altitude from each measurement cycle of three shots or more.",
+        "axes",
+        [outputs.NAVIGATION],
+    ),
+    (
+        "Eyepoints",
+        "The rays of each scanner, in a store of their own next to the flight's.",
+        "",
+        [outputs.BEAMLETS, {"weight": outputs.WEIGHT}],
+    ),
+]  # fmt: skip
+
+
+def text() -> str:
+    """Return the whole page."""
+    return HEAD + "".join(_section(*section) for section in SECTIONS)
+
+
+def _section(title: str, about: str, axes: str, tables: list[Mapping[str, Output]]) -> str:
+    """Return a table of variables; those of grids have the study's axes and no shots."""
+    rows = []
+    for name, output in ((n, o) for table in tables for n, o in table.items()):
+        own = [dim for dim in output.dims if title.startswith("Fl") or axes == "" or dim != "shot"]
+        dims = ", ".join(filter(None, [axes, *(f"`{dim}`" for dim in own)]))
+        words = f"{output.long_name}; {output.comment}" if output.comment else output.long_name
+        units = "" if output.units == "1" else output.units
+        rows.append(f"| `{name}` | {units} | {dims} | {output.dtype} | {_escaped(words)} |")
+    head = ["| variable | units | dimensions | type | meaning |", "| --- | --- | --- | --- | --- |"]
+    return f"\n## {title}\n\n{about}\n\n" + "\n".join([*head, *rows]) + "\n"
+
+
+def _escaped(words: str) -> str:
+    """Words that can stand in a table."""
+    return words.replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(text(), encoding="utf-8")
