@@ -131,8 +131,12 @@ class Looks(NamedTuple):
         found, missed = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
         near = np.asarray((a - b < _SURE) & (b - a < _SURE + math.sqrt(2 * self.number)))
         degrees, share = (np.where(real, n, 2 * n)[near] for n in (self.number, 1.0))
-        values = 0.5 * share * b[near] ** 2, degrees, 0.5 * share * a[near] ** 2
-        found[near], missed[near] = stats.ncx2.sf(*values), stats.ncx2.cdf(*values)
+        x, signal = 0.5 * share * b[near] ** 2, 0.5 * share * a[near] ** 2
+        # The tail that is small, and its complement.
+        rare, tail = x > degrees + signal, np.empty(x.shape)
+        for side, law in ((rare, stats.ncx2.sf), (~rare, stats.ncx2.cdf)):
+            tail[side] = law(x[side], degrees[side], signal[side])
+        found[near], missed[near] = np.where(rare, (tail, 1 - tail), (1 - tail, tail))
         return found, missed
 
     def faded(self, signal: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +153,8 @@ class Looks(NamedTuple):
         if self.combine == BINARY:
             speckle, weight = self._speckle(level, signal)
             each = self.steady(signal[..., None] * speckle, level[..., None])
-            return (each[0] * weight).sum(axis=-1), (each[1] * weight).sum(axis=-1)
+            found, missed = (np.minimum((v * weight).sum(axis=-1), 1.0) for v in each)
+            return found, missed
         n, least = self.number, 0.5 * self.number * np.square(level)
         whole = np.maximum(0.5 * self.number * np.square(signal), 1e-200)
         first = special.gammaincc(n - 1, least)
@@ -212,7 +217,14 @@ class Looks(NamedTuple):
             step = special.gammaincc(n, np.maximum((n * z - n * (1 - shared)) / shared, 0.0))
         node, weight = _gauss(np.stack([0 * p, np.minimum(step, p), p], axis=-1))
         given = 2 * rest[..., None] * special.gammainccinv(n, np.maximum(node, 1e-300))
-        crosses = stats.ncx2.sf((2 * rest * n * z)[..., None], 2 * n, shared[..., None] * given)
+        signal, level = shared[..., None] * given, 2 * (rest * n * z)[..., None]
+        # Of a large signal the root is normal, within 1e-4.
+        apart = np.sqrt(signal + 2 * n - 1) - np.sqrt(level)
+        crosses = special.ndtr(apart * np.sqrt((signal + 2 * n) / (signal + n)))
+        few = signal < 1e4
+        crosses[few] = 1 - stats.ncx2.cdf(
+            np.broadcast_to(level, few.shape)[few], 2 * n, signal[few]
+        )
         return np.where(
             there, np.minimum((crosses * weight).sum(axis=-1), np.minimum(p, q)), np.nan
         )
@@ -278,7 +290,8 @@ class Looks(NamedTuple):
             apart = apart - marcum_q1(scaled, correlation * scaled).p
             p = np.exp(-y)
             found = self.votes_of_one(p, p, p * np.maximum(1 - apart, 0.0))
-            return found / np.maximum(np.exp(self.log_alarm(level)), 1e-300)
+            log_p = self.log_alarm(level)
+            return np.where(log_p > -600, found / np.exp(np.maximum(log_p, -600)), 1.0)
         p, least = np.exp(self.log_alarm(level)), n * y / (1 - r)
         both, j, goes_on = np.zeros_like(y), np.arange(256), np.ones(y.shape, bool)
         while True:
@@ -341,11 +354,14 @@ class Looks(NamedTuple):
         """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds."""
         square, most = np.square(level), np.full(level.shape, 7.0)
         ends = [0 * most, most]
+        # Enough votes come and go within a part of what one record takes.
+        pieces = 2 if self.combine == POWER else 2 + math.isqrt(self.number)
+        at = np.maximum(square - 2, 0.0)
+        wide = 16 * np.sqrt((at + 1) / self.averaged)
         for signal in signals:
-            at = np.maximum(square - 2, 0.0)
-            wide = 16 * np.sqrt((at + 1) / (self.averaged))
             a = np.maximum(np.square(signal), 1e-30)
-            ends += [np.minimum(np.sqrt(np.maximum(at + d, 0.0) / a), most) for d in (-wide, wide)]
+            for d in np.linspace(-1, 1, pieces):
+                ends.append(np.minimum(np.sqrt(np.maximum(at + d * wide, 0.0) / a), most))
         node, weight = _gauss(np.sort(np.stack(ends, axis=-1), axis=-1))
         return node, weight * 2 * node * np.exp(-np.square(node))
 

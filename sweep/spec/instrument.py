@@ -254,7 +254,6 @@ class Processing(Part):
         return self
 
 
-@with_parameters("instrument.looks")
 class LooksOfShot(Part):
     """Several records of each segment, from which a shot is detected: the waveform N times over."""
 

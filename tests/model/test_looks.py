@@ -7,6 +7,7 @@ import pytest
 from engine import keys
 from scipy import special, stats
 
+from sweep.analysis.shot_figure import simulated
 from sweep.model import alarms, truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import RAYLEIGH_DEVIATION, fading_together
@@ -341,3 +342,37 @@ def test_a_threshold_over_the_noise_is_that_of_one_record(scene):
     assert float(tnr_of(given)) == 6.0
     found = evaluate(given, ())["log10_pfa_bin"][0]
     assert found == pytest.approx(np.log10(special.gammaincc(4, 2 * level**2)), rel=1e-9)
+
+
+def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
+    """Speckle of beamlets, drawn once a shot for all its looks: 5 sigma of 6000 draws."""
+    rough = scene(**{NUMBER: 8, "footprint.beamlets": 19, "target.roughness": 1e-3})
+    smooth = {path: v for path, v in rough.items() if path != "target.roughness"}
+    light = dimmed(smooth, ("image", "fading"), 0.6)["instrument.laser.power"]
+    told = evaluate(smooth | {"instrument.laser.power": light}, ("image", "fading"))
+    found = simulate(
+        rough | {"instrument.laser.power": light}, ("image", "speckle"), keys=keys(1),
+        batch_sizes=[6000], method="probabilities",
+    )  # fmt: skip
+    for which in ("pd_up", "pd_shot"):
+        error = found[f"{which}_error"][0]
+        assert found[which][0] == pytest.approx(told[which][0], abs=5 * error)
+        assert 0.4 < told[which][0] < 0.8
+
+
+@pytest.mark.parametrize("combine", ["power", "binary", "coherent"])
+def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
+    """Noise: mean power within 5 sigma, a spread less by the root of 16; or any bin's votes."""
+    given = scene(**{NUMBER: 16, COMBINE: combine, VOTES: 4, "target.reflectance": 1e-12})
+    shot = simulated(given, ("image",), seed=3)
+    power = (shot.segments[0].magnitude[8:-8] / shot.deviation) ** 2 / 2
+    looks = shot.prepared.looks
+    if combine == "binary":  # the fourth largest of 16
+        levels = np.array([0.8, 1.4, 2.0])
+        told = looks.steady(np.zeros(3), np.sqrt(2 * levels))[0]
+        shares = (power[:, None] >= levels).mean(axis=0)
+        assert np.abs(shares - told).max() < 5 * 0.5 / np.sqrt(power.size)
+        return
+    spread = 1 / np.sqrt(looks.averaged)
+    assert power.mean() == pytest.approx(1.0, abs=5 * spread / np.sqrt(power.size))
+    assert power.std() == pytest.approx(spread, rel=5 * np.sqrt(8 / 4 / power.size))
