@@ -61,62 +61,71 @@ STUDIES = {
 
 HEAD = """# What accuracy costs
 
-How accurate is a probability of detection, and what does each digit cost? `sweep accuracy`
+How accurate is a probability of detection, and how much time does each digit take? `sweep accuracy`
 answers that for any spec, on a sample of its own points, in a minute:
 
 ```sh
 sweep accuracy experiments/range_angle.yaml
 ```
 
-This page is what it says of four studies; `make accuracy` measures and writes it anew. No number
-on it is written by hand.
+This page has its results for four studies. `make accuracy` measures and writes it; no number is
+written by hand.
 
 ## How it is measured
 
-A ladder of settings is put onto the spec. Each is computed by the machinery that computes the
-study, in one process, on one core: the spec as it is written; effects on demand (`auto`) at
-tolerances from 0.1 to 1e-6; all effects on; the same effects at every point, those that a tolerance
-calls for anywhere, with lines and leakage to three tolerances; fixed numbers of beamlets, where
-they add as powers; numbers of draws, where the study draws; and the way that the thesis describes.
-All take turns on parts of the sample, each round in an order of its own, so that whatever slows the
-machine slows them alike; a study that takes next to nothing has up to 27 rounds. What a point costs
-depends on those that are computed beside it, as they share what is worked out for them: so times
-are taken on stretches of the blocks that the study computes, some thousands of points each, around
-points of the sample. They are those that the processor spends on the work. The best round counts
-for them, and ratios are medians of those within each round, or of the best where there are but two.
-Planning is counted with what it plans. Storing is not counted, as all settings share it, but told
-beside: the processor's time for making the store and writing its blocks.
+The same code that computes the study computes a ladder of settings, in one process, on one core:
 
-The **error** of a setting is what a tolerance promises to bound: the largest, over the points, of
-the differences from the reference in a probability of detection, of the segments and the shot, in
-log10 of a probability of false alarm, and in the magnitude of a peak's bin over itself or sigma.
-What a probability of leakage is off by stands beside it: it jumps where a bin comes to the
-threshold and counts as detected, so that no error of the spectrum bounds it. A setting that leaves
-leakage out where there is some does less than is asked for, and is none of the fixed ones that are
-compared. The reference has all effects on, lines and leakage to 1e-9 and the finest footprint of
-all. The figures show as well what 90 % and half of the points stay below in pd. Where draws make
-errors random, the error is that of pd at 95 % of the points. The reference itself is held against
-the time domain, sample by sample, at some of the same points.
+- the spec as written;
+- effects on demand (`auto`) at tolerances from 0.1 to 1e-6, and all effects on;
+- the same effects at every point, those that a tolerance needs anywhere, with lines and leakage to
+  three tolerances;
+- fixed numbers of beamlets, where they add as powers, and of draws, in studies with draws;
+- the thesis's way.
+
+Settings take turns on parts of the sample, each round in an order of its own, so a slow machine
+slows all of them alike. A very short study has up to 27 rounds. The cost of a point depends on its
+neighbours, because they share intermediate results. Times are therefore measured on some thousands
+of points of a block, around points of the sample. They are processor times. The best round counts
+for them. Ratios are medians of those within each round, or of the best if there are but two.
+Planning counts with the points planned. Storing does not count, as all settings share it; the page
+gives the processor time for making the store and writing its blocks separately.
+
+The **error** of a setting is the quantity that a tolerance bounds: the largest difference from the
+reference over all points. It covers the probabilities of detection of the segments and the shot,
+log10 of a probability of false alarm, and the magnitude of a peak's bin over itself or sigma. If
+draws make errors random, the error is that of pd at 95 % of the points.
+
+The error of the leakage probability has a column of its own. It jumps where a bin comes to the
+threshold and counts as detected, so no error of the spectrum bounds it. A setting that skips
+leakage where there is some does less than the others, and is none of the fixed settings compared.
+
+The reference has all effects on, lines and leakage to 1e-9, and the finest footprint. It is
+compared with the time domain, sample by sample, at some of the same points. The figures also show
+the error in pd that 90 % and half of the points stay below.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
-cells a bin, convolves it with the window's transform by a complex FFT of 2^11 or 2^12, and samples
-that at the bins. Three things would improve it, and stand beside it: half the transform where
-powers add, which are real (`real`; [T] adds amplitudes, which are not), a way back to the bins
-alone, by an FFT of a sixteenth of the size (`folded`, which is `real` too), and lines shared out
-among ten cells, by which they are where they belong (`degree 9`). All are compiled and transform
-many spectra at once (`sweep/tasks/accuracy/bench.py`), have no leakage and no range walk to
-compute, and share preparation and detection with the rest. The same beamlets with the same effects
-in closed form stand beside them too.
+cells a bin. It convolves the grid with the window's transform by a complex FFT of 2^11 or 2^12, and
+samples the result at the bins. Three improvements are measured as well:
 
-Two things are asked of the adaptive settings, and the answers below are computed: at equal error
-they shall never be slower by more than 10 % than the best single fixed setting; and at least 5
-times as fast as the thesis's way at the error that this has.
+- `real`: half the transform, where powers add and the grid is real ([T] adds amplitudes, which are
+  complex);
+- `folded`: a way back to the bins alone, by an FFT of a sixteenth of the size, also with `real`;
+- `degree 9`: lines shared out among ten cells, which puts them at their exact place.
 
-Planning counts for adaptive settings alone. A block takes some 1 ms to be planned, which is next to
-nothing of what a thousand points take, and most of the time of a study of one or two points. Where
-adaptive settings are slower by more than 10 %, `sweep accuracy` says what is lost, and what it
-comes to with the making of the study's store. A run plans fixed settings too, as its store tells
-what they leave out, and its blocks draw points and solve for velocities besides.
+All are compiled and transform many spectra at once (`sweep/tasks/accuracy/bench.py`). They compute
+neither leakage nor range walk, and share preparation and detection with the rest. The closed form
+with the same beamlets and effects is measured too.
+
+Adaptive settings have to meet two requirements, which the numbers below test:
+
+- at equal error they are never slower by more than 10 % than the best single fixed setting;
+- they are at least 5 times as fast as the thesis's way at its error.
+
+Planning counts for adaptive settings alone. A block takes some 1 ms to be planned. This is
+negligible for a thousand points, and most of the time of a study of one or two points. If adaptive
+settings are slower by more than 10 %, `sweep accuracy` prints the loss, and the loss including the
+making of the store. A real run plans fixed settings too, because its store holds the error of
+skipped effects, and its blocks draw points and solve for velocities as well.
 """
 
 TAIL = """

@@ -28,12 +28,12 @@ DRAWS = 1000
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 HEAD = """# Effects on demand, and all of them on
 
-Written by `make effects`. For each experiment, whole: the time with every effect forced on, each
-computed with the scene's own parameters; and with effects simulated only where they are called for,
-at three tolerances: how many times faster that is, planning included, and the largest change of any
+Written by `make effects`. For each experiment the table has the time with every effect forced on,
+each computed with the scene's own parameters. The next columns have effects on demand at three
+tolerances: how many times faster that is, planning included, and the largest change of any
 probability of detection anywhere, which has to stay below the tolerance. `planning` is its share of
-that time at the tightest tolerance; it takes some milliseconds a block at the least, which is what
-shows where all blocks together take less than a second. Studies with draws take 1000 a point here.
+the time at the tightest tolerance. It takes some milliseconds a block at least, which shows where
+all blocks together take less than a second. Studies with draws take 1000 a point here.
 
 """
 

@@ -63,60 +63,59 @@ VARIANTS = {
 """Experiments with some values put onto them."""
 HEAD = """# Is the tolerance kept?
 
-Written by `make promise`. Of each experiment 1,000 points, drawn by chance (of flights, some tiles
-of shots), are computed at each `accuracy.tolerance`, with `footprint.beamlets: auto` where their
-number is accuracy's to choose, and once more with all effects on and as many beamlets as at 1e-9,
-or of flights more rays than any tolerance calls for. How far off is pd (the largest of segments and
-shot), how far log10 of the probability of a false alarm, and how far |X| of the largest bins,
-relative to itself or to sigma if that is larger? A cell has the error of the worst point; before
-it, where not all points are within the tolerance, the share of those that are: 99.9 % is what is
-asked for. Points that are drawn have a table of their own.
+Written by `make promise`. It computes 1,000 random points of each experiment (of flights, some
+tiles of shots) at each `accuracy.tolerance`, with `footprint.beamlets: auto` where their number is
+free. The reference has all effects on and as many beamlets as at 1e-9, or in flights more rays than
+any tolerance needs.
 
-Leakage has a column too, the probability in the up- or the down-chirp. What is left out of it
-itself keeps the tolerance; what other effects that are left out, and few beamlets, change of it is
-not reckoned with ([effects](effects.md)), and is seen here. It is no part of the worst errors that
-settings are compared by.
+The columns are the errors of pd (the largest of segments and shot), of log10 of the probability of
+a false alarm, and of |X| of the largest bins. The error of |X| is relative to itself, or to sigma
+if that is larger. A cell has the error of the worst point. If not all points are within the
+tolerance, it begins with the share of those that are; 99.9 % are required. Points that are drawn
+have a table of their own.
+
+Leakage has a column too, the probability in the up- or the down-chirp. Skipping leakage itself
+keeps the tolerance. The tolerance does not cover its change by other skipped effects and by few
+beamlets ([effects](effects.md)), which this column shows. Settings are not compared by it.
 
 One bin more or fewer that a detection occupies, of the 65,536 that could raise a false alarm, is
 6.6e-6 of log10 pfa.
 
-`us` is processor time a point, planning included. `fixed` is that of the cheapest setting with the
-same effects at every point, its lines and leakage to one of the six tolerances, that keeps the
-tolerance here; `front` that of the cheapest whose worst error is no larger than this row's: the
-front of the ladder of `sweep accuracy`, error against time, at the error that is had.
+`us` is processor time a point, planning included. `fixed` is that of the cheapest setting that
+keeps the tolerance here with the same effects at every point, and with lines and leakage to one of
+the six tolerances. `front` is that of the cheapest such setting whose worst error is no larger than
+this row's: the front of error against time of `sweep accuracy`.
 
 """
 RAYS = f"""
 ## Flights against many more rays
 
-Each beamlet of a flight is a ray. Where powers add, `footprint.beamlets: auto` casts few of every
-shot, and more of those whose own tell that they are too few. Rows show how many a shot has, and
-what is left against all effects on with {FINEST_RAYS:,} rays of every shot, and with more until its
-own tell of less than {FINEST_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,} at the most. A number that an
-experiment gives by hand has a row too, with all effects on. That this is enough is seen from the
-last row of each flight: it against {MORE_RAYS:,} rays and more, at one stretch of it. A cell has
-the share of shots within the tolerance, the error that 90 % of the shots keep, and the worst. `us`
-is processor time a shot, rays included.
+Each beamlet of a flight is a ray. If powers add, `footprint.beamlets: auto` casts few rays for
+every shot, and more for shots that need them. The rows show the number of rays of a shot, and the
+error against all effects on with {FINEST_RAYS:,} rays of every shot, or with more until the
+estimated error is below {FINEST_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,} at the most. A number
+given by an experiment has a row too, with all effects on. The last row of each flight shows that
+the reference suffices: it compares it with {MORE_RAYS:,} rays and more, at a part of the flight. A
+cell has the share of shots within the tolerance, the error that 90 % of the shots keep, and the
+worst. `us` is processor time a shot, rays included.
 
-Where phases are coherent the number of beamlets is part of the scene, as the thesis has it, and no
-number is enough: a smooth slope sends next to nothing back, and what is left of the sum of so many
-beamlets is their own. Of these flights there is one row, their own number against {MANY:,}.
+If phases are coherent the number of beamlets is part of the scene, as in the thesis, and no number
+is enough: a smooth slope sends next to nothing back, and the rest of the sum depends on the number.
+These flights have one row, their own number against {MANY:,}.
 """
 COSTS = """
 ## Cost and tolerance
 
-Does cost rise with accuracy no faster than the front of the ladder? The front is error against
-time, so the first table has, from one tolerance to the next, `us` a point over that of the cheapest
-setting with the same effects at every point whose worst error is no larger (`front`). It has risen
-no faster where no ratio is higher by more than {margin:.0%} than the first, or than 1 where the
-first is lower: to have begun below the front is no debt.
+Does cost rise with accuracy no faster than the front of error against time? The first table has the
+ratio of `us` to the cheapest setting with the same effects at every point whose worst error is no
+larger (`front`), from one tolerance to the next. Cost has risen no faster if no ratio is higher by
+more than {margin:.0%} than the first, or than 1 if the first is lower.
 
 {front}
 
-A stricter question: over the cheapest of these that keeps the tolerance asked for (`fixed`). How
-accurate a setting turns out to be is known once its errors are, and most are far more accurate than
-they promise; so the one for a loose tolerance often does for tighter ones too, and its cost stays
-the same while that of asking for these rises.
+A stricter test compares with the cheapest setting that keeps the tolerance (`fixed`). Its accuracy
+is known only afterwards, and most settings are far more accurate than their tolerance. So the
+setting for a loose tolerance often does for tighter ones too, at the same cost.
 
 {fixed}
 """

@@ -197,24 +197,23 @@ def text(of_blocks, of_workers):
     """Their part of the page."""
     return f"""## Blocks
 
-{platform.processor() or platform.machine()}, {os.cpu_count()} processors,
-Python {platform.python_version()}. Seconds of processor time of a process of its own; memory beyond
-what its libraries take. The log has a receipt for every block, some 330 bytes each. `sweep status`
-reads the log, and so does `sweep resume` before it begins; that opens the log, too: it checks every
-line. The folders' look goes on in threads beside the work, and takes its time for each array that
-blocks write (a grid without draws has 27), where the store has
-that many: from 10^9 points on blocks grow, so that a study has some 16,000 of them, half a million
-files, unless it asks for smaller ones.
+{platform.processor() or platform.machine()}, {os.cpu_count()} processors, Python
+{platform.python_version()}. Seconds of processor time of a process of its own; memory beyond what
+its libraries take. The log has a receipt for every block, some 330 bytes each. `sweep status` reads
+the log, and so does `sweep resume` before it begins; that opens the log, too: it checks every line.
+A check of folders runs in threads during the work, and takes its time for each array that blocks
+write (a grid without draws has 27). From 10^9 points on blocks grow, so that a study has some
+16,000 of them, half a million files, unless it asks for smaller ones.
 
 {of_blocks}
 
 ## Workers
 
-{SLOTS:,} worker slots in one process, tasks that only wait, sent and taken by the engine's own
-window through the real scheduler. "Slots busy" is what of their time they work; the last column
-is the processor time of scheduler, client and workers together. Where that times the tasks a
-second comes near one, no more go through. Longer tasks are the
-remedy, and the engine makes them so (above).
+{SLOTS:,} worker slots in one process run tasks that only wait, sent and taken by the engine's own
+window through the real scheduler. "Slots busy" is the share of time in which they work. The last
+column is the processor time of scheduler, client and workers together. Its product with the tasks a
+second is at most one: beyond, no more go through. Longer tasks are the remedy, and the engine makes
+them so (above).
 
 {of_workers}"""
 

@@ -39,14 +39,14 @@ ALIKE = 0.1
 ONE_CYCLE = 1.0
 """Cycles by which a flight's number may be off: the thesis does not say how its last one ends."""
 
-INTRODUCTION = """# Validation: the published study beside ours
+INTRODUCTION = """# Validation: the published study and ours
 
-Every table and figure with results of D. B. Chester, *A Parameterized Simulation of Doppler Lidar*,
-Utah State University, 2017, and what `sweep` makes of the same question. `make validation` writes
-this page from the stores of `experiments/`. Pictures are published without numbers; of them stands
-here what the thesis's text says in numbers, or as more and less. Where it leaves a parameter open
-(reflectance, terrain, speed), the experiment's comments say what was chosen. Verdicts follow from
-the numbers beside them, by limits that stand in `benchmarks/validation.py`.
+This page compares every table and figure with results of D. B. Chester, *A Parameterized Simulation
+of Doppler Lidar*, Utah State University, 2017, with the results of `sweep`. `make validation`
+writes it from the stores of `experiments/`. Pictures are published without numbers. For them the
+page has the numbers of the thesis's text, or its words for more and less. If the thesis leaves a
+parameter open (reflectance, terrain, speed), the experiment's comments state the choice. Verdicts
+follow from the numbers in each row, by limits in `benchmarks/validation.py`.
 """
 
 REMARK = """

@@ -18,6 +18,17 @@ are nan where there is no value, signed integers -1, flags 0. "Axes" are the axe
 
 `pd_up` stands for the up-chirp, `pd_down` for the down-chirp, `pd_doppler` for the Doppler segment
 and `pd_shot` for the whole shot. Other names follow the same pattern.
+
+Attributes follow the CF conventions: units, names in words, standard names where the CF table has
+them, `flag_masks` or `flag_values` with `flag_meanings`. With `pint-xarray` and `cf-xarray`,
+
+```python
+import cf_xarray.units  # before pint_xarray
+import pint_xarray
+
+ds.pint.quantify()  # units on every variable
+ds.effects.cf.flags  # one boolean per effect
+```
 """
 
 SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [

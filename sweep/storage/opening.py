@@ -55,8 +55,9 @@ _NOT_TEXT = {
 }  # fmt: skip
 
 _ARRAY_ATTRIBUTES = {
-    "units": str, "long_name": str, "comment": str, "path": str, "flag_meanings": str,
-    "flag_masks": list, "tolerance": float, "confidence": float,
+    "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
+    "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
+    "confidence": float,
 }  # fmt: skip
 """Attributes of arrays. xarray acts on others, such as `scale_factor`."""
 
@@ -106,8 +107,10 @@ def read_document(path: Location) -> dict[str, Any]:
     document = _document(path)
     attributes = recognised(path, document["attributes"])
     try:
-        nodes = document["consolidated_metadata"]["metadata"]
-        if (document["zarr_format"], document["node_type"]) != (3, "group"):
+        consolidated = document["consolidated_metadata"]
+        nodes = consolidated["metadata"]
+        kinds = document["zarr_format"], document["node_type"], consolidated["kind"]
+        if kinds != (3, "group", "inline"):
             raise ValueError("its root is another")
         for name, node in nodes.items():
             _check_node(name, node)

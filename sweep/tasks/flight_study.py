@@ -58,6 +58,23 @@ LEAST_BEAMS = 3
 GEOMETRY = SHOTS | CYCLES
 
 
+@cache
+def enumerated() -> dict[str, dict[str, Any]]:
+    """Attributes of the arrays that hold flags or one of some values, as the CF conventions say."""
+    from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+    from sweep.model.pairing import FLAGS
+
+    status = {
+        "flag_values": [SOLVED, EXCLUDED, WITHHELD, UNDETERMINED],
+        "flag_meanings": "solved one_beam_excluded withheld undetermined",
+    }
+    points = {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)}
+    return {
+        EFFECTS: flag_attributes(), "flags": points,
+        "velocity_status": status, "altitude_status": status,
+    }  # fmt: skip
+
+
 class Part(NamedTuple):
     """The part of a flight that a block holds, at one place along the axes."""
 
@@ -198,8 +215,7 @@ class FlightStudy(GrowingStudy):
             named = named | NAVIGATION if blocks.navigates else named
             for name, output in named.items():
                 dims = output.dims if name in GEOMETRY else axes + output.dims
-                about = flag_attributes() if name == EFFECTS else None
-                found.append(blocks.array(name, output, dims, sizes, about))
+                found.append(blocks.array(name, output, dims, sizes, enumerated().get(name)))
         return found
 
     def evaluate(self, block: int) -> Results:

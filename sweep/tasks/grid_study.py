@@ -122,7 +122,7 @@ class GridStudy(GrowingStudy):
             layout = self.grid.array(name, output, self.grid.dims + output.dims, sizes)
             about = dict(layout.attributes)
             if name == EFFECTS:
-                about = flag_attributes()
+                about |= flag_attributes()
             elif name in ACCURACY_OUTPUTS and output.dtype != "int64":
                 about |= self._promise()
             found.append(replace(layout, attributes=about))
@@ -208,7 +208,8 @@ def coordinates(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
             member.name,
             (axis.name,),
             np.asarray(member.display),
-            {**described(member.units, member.name.replace("_", " ")), "path": member.path},
+            described(member.units, member.name.replace("_", " "), name=member.name)
+            | {"path": member.path},
         )
         for axis in axes
         for member in axis.members

@@ -41,7 +41,7 @@ from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL, open_group
 from sweep.tasks.errors import BusyError, StoreError
 from sweep.tasks.journal import LOGS, REPLACES, read_recipe, write_recipe
 from sweep.tasks.lock import LOCK, Lock
-from sweep.tasks.study import ArrayLayout, Content, Study
+from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
     import zarr
@@ -175,6 +175,7 @@ def build(
 def new_attributes(study: Content) -> dict[str, Any]:
     """Attributes of the group of a new store: the study's own, and versions."""
     return study.attributes() | {
+        "Conventions": CONVENTIONS,
         "study_id": study.id,
         "model_version": model_version(),
         "software": software(),

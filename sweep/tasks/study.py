@@ -102,10 +102,24 @@ class ArrayLayout:
         )
 
 
-def described(units: str, long_name: str, comment: str = "") -> dict[str, str]:
-    """Attributes that say what an array holds."""
+CONVENTIONS = "CF-1.11"
+"""Metadata conventions of a store's attributes: units, names, flags."""
+
+_CLOSING = "radial_velocity_of_scatterers_toward_instrument"
+STANDARD_NAMES = {
+    "altitude": "height", "true_altitude": "height",
+    "beam_radial_velocity": _CLOSING, "radial_velocity": _CLOSING,
+    "radial_velocity_interpolated": _CLOSING, "true_radial_velocity": _CLOSING,
+    "sun_elevation": "solar_elevation_angle", "wavelength": "radiation_wavelength",
+}  # fmt: skip
+"""Arrays and coordinates whose quantities are in the CF standard name table (version 90)."""
+
+
+def described(units: str, long_name: str, comment: str = "", name: str = "") -> dict[str, Any]:
+    """Attributes that say what an array of this name holds, by the CF conventions."""
     attributes = {"units": units, "long_name": long_name}
-    return attributes | ({"comment": comment} if comment else {})
+    further = {"comment": comment, "standard_name": STANDARD_NAMES.get(name, "")}
+    return attributes | {key: text for key, text in further.items() if text}
 
 
 class BlockGrid:
@@ -228,7 +242,7 @@ class BlockGrid:
         if self.finer:
             last = self.dims[-1]
             whole[self.finer], cut[self.finer] = whole[last] * self.each, cut[last] * self.each
-        described_ = described(output.units, output.long_name, output.comment)
+        about = described(output.units, output.long_name, output.comment, name)
         return ArrayLayout(
             name=f"{self.group}/{name}" if self.group else name,
             shape=tuple(whole[dim] for dim in dims),
@@ -236,7 +250,7 @@ class BlockGrid:
             dims=dims,
             dtype=output.dtype,
             fill=FILLS[output.dtype[0]],
-            attributes=described_ if attributes is None else attributes,
+            attributes=about | dict(attributes or {}),
         )
 
     def follows(self, layout: ArrayLayout) -> tuple[int | None, ...]:

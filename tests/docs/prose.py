@@ -16,7 +16,7 @@ PACKAGES = ("analysis", "cli", "report", "scenes", "storage", "tasks")
 """Packages whose docstrings are checked; also the modules directly in sweep/."""
 
 LONGEST = 35
-OPENS = re.compile(r"(What|Whether|Where|How|Who|That|Which)\b(?![^.?!]*\?$)")
+OPENS = re.compile(r"(What|Whether|Where|How|Who|That|Which)\b(?!-|[^.?!]*\?$)")
 """Relative clauses that open a statement; a question may begin with the same words."""
 AVOID = re.compile(
     r"\b(amid|beside|for all that|(held|holds?|holding)( \w+)? to (its|their) word|call(s|ed)? for"
@@ -30,7 +30,7 @@ _LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 _CODE = re.compile(r"`+[^`]+`+(_+)?")
 _ITEM = re.compile(r"\s*([-*+:]|\d+\.)\s+")
 _NOT_PROSE = re.compile(r"\s*(\||#|>>>|\.\. |    |[-=+|_ ]+$)")
-_END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*]*[A-Z0-9])")
+_END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*[]*[A-Z0-9])")
 _SHORT = re.compile(r"\b(e\.g|i\.e|etc|cf|Fig|Figs|Eq|Sec|vs|al|approx|No|St)\.(?=\s)")
 
 

@@ -20,11 +20,11 @@ NYQUIST = RATE / 2
 
 FAMILY = Family(
     "Beats",
-    "Magnitudes of bins at and beside lines, to DC and to Nyquist, 4096 samples, against the exact "
-    "delay's phase and the window's transform in 40 digits; range and velocity are taken as exact. "
-    "A beat at bin nu before it is folded is known to nu eps / 2 bins, and next to a line |X| "
-    "changes by about pi/2 of the peak a bin; where a line meets its image, its phase counts as "
-    "well, in which S tau^2 / 2 is rounded; the closed form adds some roundings of the peak. (The "
+    "Magnitudes of bins at and near lines, to DC and to Nyquist, 4096 samples, against the exact "
+    "delay's phase and the window's transform in 40 digits; range and velocity are taken as "
+    "exact. A beat at bin nu before it is folded is known to nu eps / 2 bins, and next to a line "
+    "|X| changes by about pi/2 of the peak a bin. If a line meets its image, its phase counts as "
+    "well, in which S tau^2 / 2 is rounded. The closed form adds some roundings of the peak. (The "
     "rounding of R alone, not counted here, turns the optical phase at 2 km by 1e-6 rad.)",
 )
 WINDOWS = ("rectangular", "hann", "hamming", "flattop")

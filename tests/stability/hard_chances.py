@@ -9,8 +9,8 @@ from sweep.model.marcum import at_least_one, log_at_least_one
 
 FAMILY = Family(
     "Many small chances",
-    "1 - (1-p)^n, of which the plain formula returns 0 below p = 1e-16, and its logarithm. Where "
-    "np is small the chance is np, without condition; near 1 what matters is the chance of none.",
+    "1 - (1-p)^n, of which the plain formula returns 0 below p = 1e-16, and its logarithm. If np "
+    "is small the probability is np, without condition; near 1 the probability of none matters.",
 )
 DIGITS = 700
 """1 - p needs as many as p is small, twice over."""

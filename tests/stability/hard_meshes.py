@@ -13,8 +13,9 @@ from sweep.scenes.meshes import clean
 
 FAMILY = Family(
     "Meshes",
-    "The range of the first hit, against exact fractions, in units of the last place of the range: "
-    "half of one is its own rounding; a miss, or a hit where there is none, counts as infinite.",
+    "The range of the first hit, against exact fractions, in units of the last place of the "
+    "range. Half of one is its own rounding; a miss, or a hit where there is none, counts as "
+    "infinite.",
 )
 IN_PLACES = {
     "reference": "nearest triangle in exact fractions",

@@ -22,9 +22,9 @@ from sweep.model.window import samples, window
 
 FAMILY = Family(
     "Radiometry and noise",
-    "Where a quantity that others are divided by vanishes, and where what is left of a difference "
-    "is small. Powers and noise are products of ten factors or so; probabilities magnify what is "
-    "wrong with a threshold over noise b by b^2.",
+    "Cases with a vanishing denominator, or with a small difference of large numbers. Powers and "
+    "noise are products of ten factors or so; probabilities magnify what is wrong with a "
+    "threshold over noise b by b^2.",
 )
 EVERY = tuple(effect.name for effect in EFFECTS if not effect.is_random)
 BETA_SQUARED = (4 - math.pi) / 2

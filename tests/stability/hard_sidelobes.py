@@ -20,10 +20,11 @@ from sweep.model.window import COSINE_SUMS, samples, window
 
 FAMILY = Family(
     "Sidelobes",
-    "The window's transform W beside its line, image left out. Cosine sums of m terms fall as the "
-    "distance's power 1 to 2m - 1. Bins near a line come from a table and are held to the peak; "
-    "those far from it come from the record's two ends, and are held to themselves, however small. "
-    "Windows that are no sum of cosines, and short records, have a table of all bins.",
+    "The window's transform W near its line, without the image. Cosine sums of m terms fall as "
+    "the distance's power 1 to 2m - 1. Bins near a line come from a table, and their error is "
+    "relative to the peak. Those far from it come from the record's two ends, and their error is "
+    "relative to themselves, however small. Windows that are no sum of cosines, and short "
+    "records, have a table of all bins.",
 )
 SIZES = (2**12, 2**14, 2**17, 2**20, 2**24)
 OFFSETS = (0.4061, -0.49999, 0.5)

@@ -10,12 +10,12 @@ from cases import Case, Family, families
 PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
 HEAD = """# Numerical stability, case by case
 
-Written by `make stability` from the cases in `tests/stability`, which the tests hold to the same
-figures (`make test` all but the longest, `make test-all` those too). Each case is named for what is
-hard about it and held against a reference of higher precision or of another kind. `worst` is the
-largest error found, as an error of what `error in` says, `allowed` what the tests allow. `float64`
-estimates what double precision alone must be expected to cost there, for the reason that follows:
-an error of that size is as good as any computation in doubles from the same numbers.
+Written by `make stability` from the cases in `tests/stability`. The tests have the same limits
+(`make test` all but the longest, `make test-all` those too). Each case is named for its difficulty,
+and compared with a reference of higher precision or of another kind. `worst` is the largest error
+found, in the measure of `error in`, and `allowed` the limit of the tests. `float64` estimates the
+error that double precision alone must be expected to make there, for the reason that follows. An
+error of that size is as good as any computation in doubles from the same numbers.
 """
 COLUMNS = (
     "case", "against", "error in", "worst", "allowed", "float64", "because of",

@@ -1,0 +1,88 @@
+"""Attributes of stores follow the CF conventions: what cf-xarray and pint-xarray read of them."""
+
+import numpy as np
+import pytest
+from small import small
+from small_flights import small_scene
+
+import sweep
+from sweep.tasks import store
+from sweep.tasks.studies import study_of
+
+STUDIES = {
+    "grid": lambda: small(),
+    "draws": lambda: small(draws={"number": 10}),
+    "spectra": lambda: small(draws={"number": 10, "method": "spectra"}),
+    "limit": lambda: small(draws={"limit": 100}),
+    "noise density": lambda: small(
+        axes={"instrument.receiver.noise_equivalent_power": ["5 pW/rtHz", "6 pW/rtHz"]}
+    ),
+    "flight": small_scene,
+}
+
+
+@pytest.fixture(params=STUDIES)
+def datasets(request, tmp_path):
+    """Datasets of a store without results."""
+    spec, path = STUDIES[request.param](), tmp_path / "a.zarr"
+    store.create(path, study_of(spec, path))
+    if request.param == "flight":
+        return [node.to_dataset() for node in sweep.open_scene(path).subtree]
+    return [sweep.open(path)]
+
+
+def test_the_root_names_the_conventions(datasets):
+    assert datasets[0].attrs["Conventions"].startswith("CF-1.")
+
+
+def test_every_variable_has_units_and_a_name_in_words(datasets):
+    for dataset in datasets:
+        for name, variable in dataset.variables.items():
+            if variable.dtype.kind in "fiu" and name != "batch":
+                assert {"units", "long_name"} <= variable.attrs.keys(), name
+
+
+def test_every_flag_has_masks_or_values_and_as_many_meanings(datasets):
+    found = {}
+    for dataset in datasets:
+        for name, variable in dataset.variables.items():
+            if name in ("effects", "flags") or name.endswith("_status"):
+                kind = "flag_values" if name.endswith("_status") else "flag_masks"
+                bits = variable.attrs[kind]
+                meanings = variable.attrs["flag_meanings"].split()
+                assert len(set(bits)) == len(set(meanings)) == len(bits), name
+                assert np.array(bits).astype(variable.dtype).tolist() == list(bits), name
+                if kind == "flag_masks":
+                    assert [bin(bit).count("1") for bit in bits] == [1] * len(bits), name
+                found[name] = meanings
+    assert "effects" in found
+    if len(datasets) > 1:
+        assert found.keys() == {"effects", "flags", "velocity_status", "altitude_status"}
+        assert found["flags"][0] == "true" and found["velocity_status"][0] == "solved"
+
+
+def test_pint_reads_the_units_of_every_variable(datasets):
+    units = pytest.importorskip("cf_xarray.units").units
+    pytest.importorskip("pint_xarray")
+    for dataset in datasets:
+        plain = dataset.drop_vars(
+            [n for n, v in dataset.variables.items() if v.dtype.kind in "OTU"]
+        )
+        assert plain.pint.quantify(unit_registry=units).sizes == plain.sizes
+        for name, variable in plain.variables.items():
+            if name in ("radial_velocity", "radial_velocity_error"):
+                assert units.Unit(variable.attrs["units"]) == units.Unit("m / s")
+
+
+def test_cf_xarray_finds_flags_and_standard_names(datasets):
+    pytest.importorskip("cf_xarray")
+    names = set()
+    for dataset in datasets:
+        if "effects" in dataset:
+            flags = dataset.effects.cf.flags
+            assert {"footprint", "doppler", "leakage"} <= set(flags.data_vars)
+        names |= set(dataset.cf.standard_names)
+    if len(datasets) > 1:
+        velocity = "radial_velocity_of_scatterers_toward_instrument"
+        assert names == {velocity, "height"}
+        assert "true_altitude" in datasets[1].cf.standard_names["height"]
