@@ -5,16 +5,18 @@ receiver's poles, the exact delay's beat), and shares nothing with the closed fo
 budget. Further effects join where it makes its records.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from sweep.model import link, philox, shot, truth
-from sweep.model.alarms import first_circular
+from sweep.model.alarms import first_circular, neighbour_correlation
+from sweep.model.detection import found_pair, mark
 from sweep.model.detectors import main_lobe
 from sweep.model.sampling import simulate
-from sweep.model.window import samples
+from sweep.model.window import samples, window
 
 OVER, DRAWS = 8, 6_000
 NATURE = {"noise_bins": "correlated", "detection": "any_bin", "noise_shape": "receiver"}
@@ -153,6 +155,32 @@ def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, 
         leaks = outputs[f"p_leakage_{name}"][0]
         expected = 1 - (1 - outputs["pfa_segment"][0]) * (1 - leaks)
         assert expected == pytest.approx(drawn, abs=0.04 * drawn + spread(drawn)), name
+
+
+@pytest.mark.parametrize("snr", [40, 143, 1000])
+@pytest.mark.parametrize("place", [100.0, 100.25, 100.475])
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming"])
+def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
+    """One line in speckle: sidelobes that cross raise pd no further. Drawn, bin by bin."""
+    size, draws, level = 256, 20_000, 3.9
+    shape, w = window(name, size), samples(name, size)
+    line = np.exp(2j * np.pi * place * np.arange(size) / size)
+    spectrum = np.fft.fft(w * line)[70:131]
+    spectrum *= np.sqrt(2 * snr) / abs(spectrum).max()  # over the noise per quadrature
+    magnitude, echo = abs(spectrum), np.zeros(61, bool)
+    beside = math.ceil(main_lobe(shape))
+    mark(magnitude, 61, level, echo, beside)
+    rule = 0, beside, np.empty((3, 0)), neighbour_correlation(shape, size)
+    pd, _ = found_pair(magnitude, echo, int(magnitude.argmax()), 70, rule, (1.0, level))
+    rng, found = np.random.default_rng(int(10 * place) + snr), 0
+    for _ in range(draws // 2000):
+        noise = rng.normal(size=(2000, size, 2)) @ np.array([1, 1j])
+        noise = np.fft.fft(noise * w, axis=1)[:, 70:131] / np.sqrt((w**2).sum())
+        speckle = (rng.normal(size=(2000, 2)) @ np.array([1, 1j])) / np.sqrt(2)
+        crosses = abs(noise + speckle[:, None] * spectrum) >= level
+        found += crosses[:, echo].any(axis=1).sum()
+    drawn = found / draws
+    assert pd == pytest.approx(drawn, abs=0.004 + 5 * np.sqrt(drawn * (1 - drawn) / draws))
 
 
 def test_an_echo_without_light_is_found_as_often_as_its_bins_alarm(table_4_1):
