@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation docs fields scale million lock forget-kernels clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs fields scale million lock forget-kernels clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -127,6 +127,10 @@ validation: $(READY)
 	for name in $$($(BIN)/python benchmarks/validation.py --missing); do \
 	  $(BIN)/sweep run experiments/$$name.yaml || exit 1; done
 	$(BIN)/python benchmarks/validation.py
+
+# docs/instruments.md: each instrument of the library, published against simulated; a minute or two.
+instruments: $(READY)
+	$(BIN)/python benchmarks/instruments.py
 
 # The site, from the pages in docs/, in build/site; what is amiss in a page is an error.
 docs: $(READY)

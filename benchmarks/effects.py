@@ -1,7 +1,7 @@
 """All effects on against those that are called for: what it changes, what it saves.
 
-Run with `make effects`, an hour or more, most of it descents with their draws: every experiment in
-the repository, whole, with each effect forced on, and with effects on demand at three tolerances.
+Run with `make effects`, some minutes: every experiment in the repository, whole but for draws of a
+flight's noise, with each effect forced on, and with effects on demand at three tolerances.
 All in one process, one variant of an experiment after the other; quote the ratios. Writes
 docs/effects_table.md.
 """
@@ -53,6 +53,8 @@ def variant(path: Path, tolerance: float | None) -> Spec | SceneSpec:
     drawn = kind is Spec and "draws" in written
     if drawn:  # a tolerance also says how often; here all variants share their draws
         written["draws"] = {"number": DRAWS}
+    elif kind is SceneSpec:  # noise of further flights, which changes no probability
+        written.pop("draws", None)
     every = {e.name: "on" for e in EFFECTS if drawn or not e.is_random}
     written["effects"] = every if tolerance is None else {}
     written["accuracy"] = dict(written.get("accuracy", {}), tolerance=tolerance or 0.0)

@@ -92,15 +92,15 @@ def shape_of(window, fft_size, *, power=False, phase=None, view=IMAGED):
         if number:
             shapes = line_shape.shapes(window, fft_size, power, tier)
             table = np.empty((2, line_shape.places_of(shapes.sizes)))
-            form = np.zeros((7, shapes.reach.size))
+            form = np.zeros((7, shapes.reach.shape[1]))
             parts = centre, modes, count, np.empty((1, 2, 0))
             line_shape.build(0, (0, -1), parts, shapes, table, form)
             break
     if table is None:
         x = 2 * np.arange(window.length) / window.length - 1
         shapes, centre = line_shape.whole_shapes(window, fft_size, power, phase(x)[None]), None
-        table, form = shapes.whole[0], np.zeros((7, shapes.reach.size))
+        table, form = shapes.whole[0], np.zeros((7, shapes.reach.shape[1]))
         form[1:3] = shapes.outlines[0]
-    form[0] = shapes.reach
+    form[0] = shapes.reach[0]
     shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
     return table, form, np.append(shapes.sizes, (view, 0)), shift, number

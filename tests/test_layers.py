@@ -34,8 +34,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 48_078, "modules": 179, "lines of the model": 17_532, "modules of the model": 67,
-    "compiled functions": 126, "arguments of a compiled function": 10,
+    "lines": 49_687, "modules": 182, "lines of the model": 18_792, "modules of the model": 70,
+    "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 600

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.detection import RAYLEIGH_DEVIATION
 from sweep.model.detectors import DETECTORS, FIXED
+from sweep.model.looks import ONE, Looks
 from sweep.model.threshold import segment_bins, tnr_of
 
 if TYPE_CHECKING:
@@ -34,8 +36,10 @@ def bin_exponent(tnr: float) -> float:
     return (4 - math.pi) / 4 * tnr**2
 
 
-def bin_probability(tnr: float) -> float:
+def bin_probability(tnr: float, looks: Looks = ONE) -> float:
     """Probability that a bin of noise alone crosses the threshold [Table 4.2], 0..1."""
+    if looks.several:
+        return math.exp(looks.log_alarm(np.asarray(tnr * RAYLEIGH_DEVIATION)))
     return math.exp(-bin_exponent(tnr))
 
 
@@ -44,7 +48,7 @@ def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> n
 
     From SI values by dotted path; :func:`sweep.model.threshold.segment_bins`.
     """
-    level = np.sqrt(-2 * np.log(np.maximum(bin_probability, 1e-300)))
+    level = Looks.of(parameters).level(np.log(np.maximum(bin_probability, 1e-300)))
     return segment_bins(parameters, level)
 
 
@@ -78,7 +82,7 @@ def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
             parameters |= {member.path: member.values[index] for member in axis.members}
         kind = parameters.get("instrument.processing.detector.kind", FIXED)
         if kind == FIXED:
-            in_a_bin = bin_probability(float(tnr_of(parameters)))
+            in_a_bin = bin_probability(float(tnr_of(parameters)), Looks.of(parameters))
         elif kind in DETECTORS:
             in_a_bin = float(parameters["instrument.processing.detector.pfa"])
         else:

@@ -153,8 +153,16 @@ def simulated_shot(
 
 def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None) -> Segment:
     bins, signal = segment_spectrum(prepared, 0, k)
-    noise = 0.0 if seed is None else drawn_noise(prepared, seed=seed, segment=k)[bins]
-    magnitude = np.abs(signal + noise)
+    bins = bins - prepared.fft_size if prepared.complex_record else bins
+    magnitude, looks = np.abs(signal), prepared.looks
+    if seed is not None:
+        noise = np.array([
+            drawn_noise(prepared, seed=seed, segment=k, look=look).take(bins, mode="wrap")
+            for look in range(looks.number)
+        ])  # fmt: skip
+        noise = noise if looks.added == 1 else noise.mean(axis=0, keepdims=True)
+        each = np.abs(signal + noise)
+        magnitude = looks.shown(each) if looks.several else each[0]
     segment = prepared.waveform[k]
     carrier = np.asarray(segment.carrier).item()
     beat = waveform.beat_frequency(
@@ -178,17 +186,23 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     )
 
 
-def drawn_noise(prepared: model.Shots, *, seed: int, segment: int) -> np.ndarray:
-    """Spectrum (N/2 + 1,) of a record of white Gaussian noise, windowed [V].
+def drawn_noise(prepared: model.Shots, *, seed: int, segment: int, look: int = 0) -> np.ndarray:
+    """Noise of a look's windowed record, spectrum (N/2 + 1,) [V]; (N,) of a complex record.
 
     The bins' noise is complex Gaussian, and alike in neighbours as far as the window makes it.
     It is added to the signal's |X|: a common phase changes nothing in a bin, and the signal's
     phase from bin to bin is lost.
     """
     shape = prepared.window
-    stream = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(segment,)))
-    record = stream.normal(0.0, float(np.sqrt(prepared.noise_variance[0])), shape.length)
-    return np.fft.rfft(record * window.samples(shape.name, shape.length), prepared.fft_size)
+    key = (segment, look) if look else (segment,)
+    stream = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+    deviation = float(np.sqrt(prepared.noise_variance[0]))
+    record = stream.normal(0.0, deviation, shape.length)
+    taper = window.samples(shape.name, shape.length)
+    if prepared.complex_record:
+        quadrature = stream.normal(0.0, deviation, shape.length)
+        return np.fft.fft((record + 1j * quadrature) / np.sqrt(2) * taper, prepared.fft_size)
+    return np.fft.rfft(record * taper, prepared.fft_size)
 
 
 def groups(magnitude: np.ndarray, threshold: float) -> tuple[Group, ...]:
@@ -209,7 +223,8 @@ def quantity_at(shot: Shot, segment: Segment, frequency: np.ndarray) -> np.ndarr
     p = shot.prepared
     rate = float(p.sample_rate[0])
     fold = np.rint(segment.beat / rate) * rate
-    signed = fold + np.where(segment.beat < fold, -1.0, 1.0) * np.asarray(frequency)
+    turned = segment.beat < fold and not p.complex_record
+    signed = fold + (-1.0 if turned else 1.0) * np.asarray(frequency)
     if segment.sign == 0:
         return signed * SPEED_OF_LIGHT / (2 * segment.carrier)
     beta = float(np.asarray(p.beta).flat[0])
@@ -369,7 +384,7 @@ def scene_shot_sheet(
 
 
 def _beamlet_lines(shot: Shot, segment: Segment, eyepoints: Eyepoints) -> np.ndarray:
-    """Frequency at which each beamlet's line appears in a segment (b,) [Hz], 0 to half the rate."""
+    """Frequency at which each beamlet's line appears in a segment (b,) [Hz]."""
     rate = float(shot.prepared.sample_rate[0])
     beat = waveform.beat_frequency(
         segment.sign,
@@ -378,7 +393,8 @@ def _beamlet_lines(shot: Shot, segment: Segment, eyepoints: Eyepoints) -> np.nda
         range=eyepoints.range[0] + eyepoints.offset[0],
         radial_velocity=eyepoints.radial_velocity[0] + eyepoints.velocity_offset[0],
     )
-    return np.asarray(np.abs(beat / rate - np.rint(beat / rate)) * rate)
+    seen = (beat / rate - np.rint(beat / rate)) * rate
+    return np.asarray(seen if shot.prepared.complex_record else np.abs(seen))
 
 
 def blocks(shot: Shot) -> list[Block]:

@@ -35,6 +35,7 @@ from sweep.analysis.tallies import (
     search,
     tallied,
 )
+from sweep.model.looks import Looks
 from sweep.model.shot import evaluate
 from sweep.model.threshold import tnr_of
 
@@ -362,12 +363,13 @@ def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     first = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first | setting | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
-    bins = float(noise_only.bins_counted(parameters, noise_only.bin_probability(tnr)))
+    in_a_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
+    bins = float(noise_only.bins_counted(parameters, in_a_bin))
     found = evaluate(parameters)
     return Reference(
         tnr=tnr,
         bins=bins,
-        closed_form=noise_only.shot_probability(tnr, bins),
+        closed_form=float(noise_only.segment_probability(np.asarray(in_a_bin), bins)) ** 2,
         model=float(found["pfa_both_chirps"].item()),
         model_bin=float(found["pfa_bin"].item()),
     )

@@ -106,6 +106,7 @@ def main() -> None:
       sweep report results/quickstart.zarr        one page with all of it, for a browser
       sweep compare results/a.zarr results/b.zarr what differs between two studies?
       sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
+      sweep instruments                           which instruments can a spec name?
 
     A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
     them as PLY, LAS or CSV.
@@ -368,6 +369,38 @@ def certificates(directory: Path, days: int) -> None:
     click.echo("security:")
     for name, file in files._asdict().items():
         click.echo(f"  {name}: {file}")
+
+
+@main.command()
+@click.argument("name", required=False)
+def instruments(name: str | None) -> None:
+    """List the instruments that a spec may name, or tell all about NAME.
+
+    A spec takes one whole, `instrument: settembrini_2026`, or with some fields set anew:
+
+    \b
+      instrument:
+        like: settembrini_2026
+        laser: {power: 1 mW}
+
+    A result's store holds all of its fields, and a study is the same as with them written out.
+
+    \b
+      sweep instruments
+      sweep instruments settembrini_2026
+    """  # noqa: D301
+    from sweep.cli.output import instrument_lines
+    from sweep.spec.mistakes import near_miss
+    from sweep.spec.reading import library, read_document
+
+    known = library()
+    if name is not None and name not in known:
+        close = near_miss(name, known, otherwise=f"the library has {', '.join(known)}")
+        raise click.UsageError(f"{name!r} is no instrument of the library; {close}")
+    for each in [name] if name else known:
+        own = read_document(known[each]).value
+        lines = instrument_lines(own) if name else [f"{each:<24} {own['title']}"]
+        click.echo("\n".join(lines))
 
 
 @main.command()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -29,6 +29,21 @@ MEASURED = 10**7
 
 LEAST_WORDS, BETWEEN = 14, 3
 """Characters of a table: a column of sentences at the least, and between columns."""
+
+
+def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the file of an instrument of the library says."""
+    import yaml
+
+    yield own["title"]
+    yield own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else "")
+    for what in ("published", "assumed"):
+        yield f"\n{what}:"
+        yield from (f"- {each}" for each in own[what] or ["nothing"])
+    yield "\nmust reproduce (docs/instruments.md has what is simulated):"
+    for number in own["numbers"].values():
+        yield f"- {number['about']}: {number['published']} {number['unit']}".rstrip()
+    yield "\n" + yaml.safe_dump({"instrument": own["instrument"]}, sort_keys=False).rstrip()
 
 
 def conclude(outcome: Outcome, store: Location) -> None:

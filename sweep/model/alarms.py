@@ -26,6 +26,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.looks import ONE, Looks
 from sweep.model.window import Window, samples
 
 CIRCULAR = 0.01
@@ -58,7 +59,9 @@ def _correlation(window: Window, fft_size: int, apart: int) -> float:
     return float(found) if found > 1e-12 else 0.0  # none but rounding, of unpadded rectangles
 
 
-def independent_bins(bins: ArrayLike, *, level: ArrayLike, correlation: float) -> np.ndarray:
+def independent_bins(
+    bins: ArrayLike, *, level: ArrayLike, correlation: float, looks: Looks = ONE
+) -> np.ndarray:
     """Number of independent bins that raise an alarm as often as so many adjacent ones.
 
     Parameters
@@ -69,6 +72,8 @@ def independent_bins(bins: ArrayLike, *, level: ArrayLike, correlation: float) -
         Threshold over sigma, > 0.
     correlation : float
         Of neighbours, 0..1 (:func:`neighbour_correlation`).
+    looks : Looks
+        Records by which a bin is detected.
 
     Returns
     -------
@@ -76,19 +81,24 @@ def independent_bins(bins: ArrayLike, *, level: ArrayLike, correlation: float) -
         0..n; n itself for a correlation of 0.
     """
     bins = np.asarray(bins, float)
-    return np.where(bins > 0, 1 + (bins - 1) * _share(np.asarray(level, float), correlation), 0.0)
+    share = _share(np.asarray(level, float), correlation, looks)
+    return np.where(bins > 0, 1 + (bins - 1) * share, 0.0)
 
 
-def _share(level: np.ndarray, correlation: float) -> np.ndarray:
+def _share(level: np.ndarray, correlation: float, looks: Looks) -> np.ndarray:
     """ln(1 - h) / ln(1 - p), what each further bin counts for."""
     from sweep.model.marcum import marcum_q1
 
     if correlation == 0.0:
         return np.ones_like(level)
-    scaled = level / np.sqrt((1 - correlation) * (1 + correlation))
-    # Of complements, which keep their digits where thresholds are low.
-    fresh = marcum_q1(correlation * scaled, scaled).p - marcum_q1(scaled, correlation * scaled).p
-    log_p = -0.5 * np.square(level)
+    if looks.several:
+        fresh = looks.fresh(level, correlation)
+    else:
+        scaled = level / np.sqrt((1 - correlation) * (1 + correlation))
+        # Of complements, which keep their digits where thresholds are low.
+        fresh = marcum_q1(correlation * scaled, scaled).p
+        fresh = fresh - marcum_q1(scaled, correlation * scaled).p
+    log_p = looks.log_alarm(level)
     p, quiet = np.exp(log_p), -np.expm1(log_p)
     with np.errstate(divide="ignore", invalid="ignore"):
         after = np.log1p(-np.minimum(p * fresh / quiet, p)) / np.log(quiet)

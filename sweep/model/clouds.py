@@ -154,8 +154,8 @@ def _groups(
 def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     """Probabilities before any draw, (n,) each."""
     up, doppler, down = found.pd[:, :, 0].T
-    both = shots.both(up, down)
-    one = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2)[:, None]
+    both = shots.both(up, down, (found.magnitude[:, 0, 0], found.magnitude[:, 2, 0]))
+    one = np.exp(shots.looks.log_alarm(shots.threshold / shots.bin_deviation))[:, None]
     noise = at_least_one(one, shots.counted_bins(found.exempted.T[[0, 2]]).T)
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)

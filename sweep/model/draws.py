@@ -20,6 +20,7 @@ from numba import njit
 
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
+from sweep.model.looks import NUMBER
 from sweep.model.marcum import at_least_one
 from sweep.model.philox import (
     STREAM_DETECTION,
@@ -78,6 +79,7 @@ def count_by_chance(
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
     """Add the draws of some rows, in the noise of their shots, as :func:`count_by_chance` does."""
+    require_one_record(shots)
     levels = noise_levels(shots)
     mixing = np.empty((0, shots.size)) if shots.fading is None else shots.fading.mixing()
     one = np.exp(-0.5 * levels[0] ** 2)
@@ -88,6 +90,21 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         rule = echo_filter(shots, seen)
         own = levels[:, part].copy(), chances, (True, *rule), seen, mixing[:, part].copy()
         _count(some, ends, *own, counts)
+
+
+def require_one_record(shots: Shots) -> None:
+    """Refuse to add noise to bins that several records detect.
+
+    Raises
+    ------
+    ValueError
+        In several looks that are not added in amplitude.
+    """
+    if shots.looks.several:
+        raise ValueError(
+            f"draws.method: noise adds the noise of one record to bins, and {NUMBER} takes "
+            f"{shots.looks.number}: take probabilities or spectra, or combine: coherent"
+        )
 
 
 def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int]:

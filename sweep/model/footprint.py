@@ -197,6 +197,45 @@ def plane_footprint(
     return offset, cos_incidence, np.where(hits, share, 0.0), closing
 
 
+def plane_turned(
+    *,
+    turn: ArrayLike,
+    grazing_angle: ArrayLike,
+    beam_divergence: ArrayLike,
+    radial: ArrayLike,
+    transverse: ArrayLike,
+    directions: ArrayLike,
+    power: int,
+) -> np.ndarray:
+    """Mean of exp(2 pi i turn (beta_b - beta_0)) over the power of a beam on a flat plane.
+
+    To second order a beamlet x across and y along the slope, in standard deviations, has the phase
+    t y + c (x^2 + y^2), and its echo goes as 1 + k y, so that with Gaussian x and y the mean is
+
+        (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
+
+    Parameters
+    ----------
+    turn : array_like
+        [cycles per beta].
+    grazing_angle, beam_divergence, radial, transverse, directions : array_like
+        As of :func:`plane_footprint`.
+    power : int
+        Of the sine of the angle to the plane that echoes go with.
+
+    Returns
+    -------
+    complex ndarray
+        Within the unit circle.
+    """
+    phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
+    sigma = np.asarray(directions, float) / 4
+    t = phase * np.asarray(transverse, float) * sigma
+    bent = 1 / (1 + 1j * phase * np.asarray(radial, float) * sigma**2)
+    lean = power * (np.asarray(beam_divergence, float) / 4) / np.tan(grazing_angle)
+    return np.asarray((1 + 1j * lean * t * bent) * np.exp(-0.5 * t * t * bent) * bent)
+
+
 class Moments(NamedTuple):
     """Offsets from the beam's axis, weighted by echo power: sizes of mean, rms and extreme."""
 

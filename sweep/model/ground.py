@@ -100,6 +100,23 @@ class Plane:
         )
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
+    def turned(self, turn: np.ndarray) -> np.ndarray:
+        """Mean over the beam's power of exp(2 pi i turn (beta_b - beta_0)), (n,) complex.
+
+        ``turn`` [cycles per beta] is (n,) or a scalar; see :func:`footprint.plane_turned`.
+        """
+        angle, places, radial, transverse, *further = self._columns
+        found = footprint.plane_turned(
+            turn=turn,
+            grazing_angle=angle,
+            beam_divergence=places,
+            radial=radial,
+            transverse=transverse,
+            directions=further[0] if further else places,
+            power=3 if self._law == "lambert" else 2,
+        )
+        return np.asarray(found + np.zeros(self._size))
+
     def axis(self, size: int) -> Footprints:
         """One line for each point: a row for each distinct grazing angle."""
         angles, row = np.unique(self._columns[0], return_inverse=True)

@@ -24,7 +24,7 @@ class Groups(NamedTuple):
     """
 
     bin: np.ndarray
-    """(n, 3, most) int64: strongest bin, 0..N/2."""
+    """(n, 3, most) int64: strongest bin, 0..N/2; of a complex record any of its run."""
     first: np.ndarray
     """(n, 3, most) int64: first bin of the group."""
     last: np.ndarray
@@ -54,11 +54,16 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     levels = np.stack([shots.threshold, shots.line_deviation])
+    mirror = 0 if shots.complex_record else shots.fft_size // 2
     for runs in runs_of(shots, every_bin=every_bin):
         _find_groups(
             runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
-            (shots.fft_size // 2, shots.echo_rule), bins, neighbours, pd,
+            (mirror, shots.echo_rule), bins, neighbours, pd,
         )  # fmt: skip
+        if shots.looks.several:
+            seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
+            chances = shots.detected(middle.T, seen.T, runs.part)[0]
+            pd[runs.part] = chances.T
         some = np.where(runs.bins > 0, runs.exempted, np.nan)
         exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
@@ -68,7 +73,7 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
 def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
     """Groups of every run, into arrays of the shapes of :class:`Groups`.
 
-    ``how``: N/2, and :attr:`sweep.model.preparation.Shots.echo_rule`.
+    ``how``: N/2, or 0 of complex records, and :attr:`sweep.model.preparation.Shots.echo_rule`.
     """
     (low, count, peak, start), (half, rule) = runs, how
     for j in range(part.size):
@@ -98,8 +103,9 @@ def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
 @njit(cache=True, error_model="numpy")
 def _beside(magnitude, low, k, half):
     """Magnitude k of a run that starts at bin ``low``; mirrored at DC and Nyquist, 0 past it."""
-    bin_ = abs(low + k)
-    k = (2 * half - bin_ if bin_ > half else bin_) - low
+    if half > 0:
+        bin_ = abs(low + k)
+        k = (2 * half - bin_ if bin_ > half else bin_) - low
     return magnitude[k] if 0 <= k < magnitude.size else 0.0
 
 

@@ -89,13 +89,14 @@ class Shapes(NamedTuple):
     whether the table is of powers, whether it holds all bins; bins beyond which ends tell."""
     modes: np.ndarray
     """(modes, places): of each mode the real (even modes) or imaginary part (odd ones), by cell,
-    that does not come from the record's first sample."""
+    that does not come from the record's first sample. Of amplitudes then, in further places, what
+    this comes to in a table."""
     edges: np.ndarray
-    """(2, places): half of the window's first sample times cos and sin of pi r y."""
+    """(2, places): the window's first sample times cos and sin of pi r y, and likewise."""
     ends: np.ndarray
     """(modes, 4, DERIVATIVES + 2): real and imaginary parts of A and of B, lowest power first."""
     reach: np.ndarray
-    """(m,): distances [bins of fs/N] at which the envelope is known."""
+    """(2, m): distances d [bins of fs/N] at which the envelope is known; cot(pi d / N)."""
     whole: np.ndarray
     """(segments, 2, cells * columns): tables that hold all bins; else empty."""
     outlines: np.ndarray
@@ -123,11 +124,13 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
     modes = _integrals(strength, x, ratio * y)
     taylor = _taylor(COSINE_SUMS[window.name], number)
     modes += _corrections(taylor, ratio * y, length)
-    edge = float(taylor[0, 0])
+    edges = taylor[0, 0] * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)])
+    if not power:
+        modes, edges = (np.hstack([one, _in_table(one, CELLS[power])]) for one in (modes, edges))
     return Shapes(
         np.array([fft_size, length, bins, CELLS[power], power, False, math.ceil(clear / ratio)]),
         modes,
-        0.5 * edge * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)]),
+        edges,
         _ends(taylor, length),
         _distances(bins, fft_size),
         np.empty((0, 2, 0)),
@@ -152,7 +155,7 @@ def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) 
     turn = np.exp(1j * np.pi * (length / fft_size / cells) * place)
     whole = np.empty((len(phase), 2, number))
     reach = _distances(half, fft_size)
-    outlines = np.zeros((len(phase), 2, reach.size))
+    outlines = np.zeros((len(phase), 2, reach.shape[1]))
     w, x = samples(window.name, length), 2 * np.arange(length) / length - 1
     for table, outline, psi in zip(whole, outlines, phase, strict=True):
         record = w * np.exp(2j * np.pi * (psi - np.rint(psi)))
@@ -227,10 +230,23 @@ def _places(bins: int, power: bool) -> np.ndarray:
     return np.arange(-bins * cells - cells + 1 - _BEYOND, bins * cells + _BEYOND + 1) / cells
 
 
+def _in_table(values: np.ndarray, cells: int) -> np.ndarray:
+    """Values at :func:`_places` with the kernel divided out, in rows by cell of a bin."""
+    inner = values.shape[1] - 2 * _BEYOND
+    filtered = TAPS[0] * values[:, _BEYOND : _BEYOND + inner]
+    for k in range(1, TAPS.size):
+        for at in (_BEYOND - k, _BEYOND + k):
+            filtered += TAPS[k] * values[:, at : at + inner]
+    rows = [filtered[:, cells - 1 - m :: cells] for m in range(cells)]
+    return np.hstack(rows)
+
+
 def _distances(bins: int, fft_size: int) -> np.ndarray:
     """Distances at which envelopes are known: each bin of the table, then in even ratios."""
     far = np.geomspace(bins + 1, max(fft_size / 2, bins + 2), _FAR)
-    return np.append(np.arange(bins + 1.0), far)
+    reach = np.append(np.arange(bins + 1.0), far)
+    with np.errstate(divide="ignore"):
+        return np.array([reach, 1 / np.tan(np.pi * reach / fft_size)])
 
 
 @njit(cache=True, error_model="numpy")
@@ -369,6 +385,7 @@ def build(segment, numbers, parts, shapes, table, form):
         if one[0, 0] == re[0] and one[1, 0] == im[0]:
             return
     envelope, ends = form[1:3], form[3:7, : DERIVATIVES + 2]
+    power = sizes[4] != 0
     if sizes[5]:
         for i in range(2):
             for k in range(table.shape[1]):
@@ -376,94 +393,92 @@ def build(segment, numbers, parts, shapes, table, form):
             for k in range(envelope.shape[1]):
                 envelope[i, k] = shapes[6][segment, i, k]
         return
-    at_first_re, at_first_im, at_last_re, at_last_im = 0.0, 0.0, 0.0, 0.0
+    even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
     size = modes.shape[1]
     raw = np.zeros((2, size))
     ends[:] = 0.0
     for j in range(number):
         a, b = re[j], im[j]
-        sign = -1.0 if j & 1 else 1.0
-        at_first_re += sign * a
-        at_first_im += sign * b
-        at_last_re += a
-        at_last_im += b
         if j & 1:
+            odd_re, odd_im = odd_re + a, odd_im + b
             a, b = -b, a
+        else:
+            even_re, even_im = even_re + a, even_im + b
         for i in range(size):
             raw[0, i] += a * modes[j, i]
             raw[1, i] += b * modes[j, i]
-        for d in range(ends.shape[1]):
-            for k in range(0, 4, 2):
+        for k in range(0, 4, 2):
+            for d in range(ends.shape[1]):
                 one, other = mode_ends[j, k, d], mode_ends[j, k + 1, d]
                 ends[k, d] += re[j] * one - im[j] * other
                 ends[k + 1, d] += re[j] * other + im[j] * one
     # The record's first sample counts whole, its end not at all.
-    a, b = at_first_re - at_last_re, at_first_im - at_last_im
-    c, d = at_first_re + at_last_re, at_first_im + at_last_im
     for i in range(size):
         cosine, sine = edges[0, i], edges[1, i]
-        raw[0, i] += a * cosine - d * sine
-        raw[1, i] += b * cosine + c * sine
-    if sizes[4]:
-        for i in range(size):
-            raw[0, i] = raw[0, i] * raw[0, i] + raw[1, i] * raw[1, i]
-    _put_table(raw, sizes, table)
-    _put_envelope(raw, ends, sizes, reach, envelope)
+        raw[0, i] -= odd_re * cosine + even_im * sine
+        raw[1, i] += even_re * sine - odd_im * cosine
+    number = size if power else size - table.shape[1]  # places on either side of the line
+    for i in range(table.shape[1] * (not power)):
+        table[0, i], table[1, i] = raw[0, number + i], raw[1, number + i]
+    for i in range(number):
+        raw[0, i] = raw[0, i] * raw[0, i] + raw[1, i] * raw[1, i]
+    if power:
+        _put_table(raw[0], sizes, table[0])
+    _put_envelope(raw[0, :number], ends, sizes, reach, envelope)
 
 
 @njit(cache=True, error_model="numpy")
-def _put_table(raw, sizes, table):
-    """Values at cells with the kernel divided out of them, in rows by cell of a bin."""
+def _put_table(square, sizes, table):
+    """Powers at cells with the kernel divided out of them, in rows by cell of a bin."""
     cells, columns = sizes[3], 2 * sizes[2] + 1
     number = np.uint64(cells * columns)
     filtered = np.empty(cells * columns)
-    for row in range(1 if sizes[4] else 2):
+    for i in range(number):
+        filtered[i] = TAPS[0] * square[i + np.uint64(_BEYOND)]
+    for k in range(1, TAPS.size):
+        low, high = np.uint64(_BEYOND - k), np.uint64(_BEYOND + k)
         for i in range(number):
-            filtered[i] = TAPS[0] * raw[row, i + np.uint64(_BEYOND)]
-        for k in range(1, TAPS.size):
-            low, high = np.uint64(_BEYOND - k), np.uint64(_BEYOND + k)
-            for i in range(number):
-                filtered[i] += TAPS[k] * (raw[row, i + low] + raw[row, i + high])
-        for m in range(cells):
-            for q in range(columns):
-                table[row, m * columns + q] = filtered[q * cells + cells - 1 - m]
+            filtered[i] += TAPS[k] * (square[i + low] + square[i + high])
+    for m in range(cells):
+        for q in range(columns):
+            table[m * columns + q] = filtered[q * cells + cells - 1 - m]
 
 
 @njit(cache=True, error_model="numpy")
-def _put_envelope(raw, ends, sizes, reach, envelope):
-    """Envelope of values at cells, and of what is beyond them; as of :func:`build`.
+def _put_envelope(square, ends, sizes, reach, envelope):
+    """Envelope of |G|^2 at cells, and of what is beyond them; as of :func:`build`.
 
     |G|^2 goes as a sine of y with a period of a bin, so that it is nowhere more than two values
     half a bin apart have together.
     """
-    bins, cells, power = sizes[2], sizes[3], sizes[4]
-    middle = bins * cells + cells - 1 + _BEYOND
-    pairs, half = np.empty(raw.shape[1]), np.uint64(cells // 2)
-    for i in range(np.uint64(raw.shape[1])):
-        re, im = raw[0, i], 0.0 if power else raw[1, i]
-        pairs[i] = re if power else re * re + im * im
-    number = reach.size - bins - 1
-    c, parts = np.empty(number), np.zeros((4, number))
-    for i in range(number):
-        c[i] = 1.0 / math.tan(math.pi * reach[bins + 1 + i] / sizes[0])
+    bins, cells = sizes[2], sizes[3]
+    middle, half = bins * cells + cells - 1 + _BEYOND, cells // 2
+    number = reach.shape[1] - bins - 1
+    far, parts = np.empty(number), np.zeros((4, number))
     for d in range(ends.shape[1] - 1, -1, -1):
         for k in range(4):
             for i in range(number):
-                parts[k, i] = parts[k, i] * c[i] + ends[k, d]
-    most, area, before = 0.0, 0.0, 0.0
-    for i in range(reach.size - 1, -1, -1):
+                parts[k, i] = parts[k, i] * reach[1, bins + 1 + i] + ends[k, d]
+    for i in range(number):
+        first = parts[0, i] * parts[0, i] + parts[1, i] * parts[1, i]
+        last = parts[2, i] * parts[2, i] + parts[3, i] * parts[3, i]
+        far[i] = first + last + 2.0 * math.sqrt(first * last)
+    most, area, before = 0.0, 0.0, 0.0  # of the square
+    for i in range(reach.shape[1] - 1, -1, -1):
         if i <= bins:
             above, below = np.uint64(middle + i * cells), np.uint64(middle - i * cells)
             total = 0.0
             for k in range(-1, cells):  # from the cell before on
                 up, down = above + np.uint64(k), below - np.uint64(k)
-                total = max(total, pairs[up] + pairs[up + half], pairs[down] + pairs[down - half])
-            most = max(most, _MARGIN * math.sqrt(total))
+                total = max(
+                    total,
+                    square[up] + square[up + np.uint64(half)],
+                    square[down] + square[down - np.uint64(half)],
+                )
+            most = max(most, _MARGIN * _MARGIN * total)
         else:
-            j = i - bins - 1
-            first, last = math.hypot(parts[0, j], parts[1, j]), math.hypot(parts[2, j], parts[3, j])
-            most = max(most, first + last)
-        width = reach[i + 1] - reach[i] if i + 1 < reach.size else 0.0
-        area += width * 0.5 * (most * most + before)  # an upper sum, where it falls ever slower
-        before = most * most
-        envelope[0, i], envelope[1, i] = most, area
+            most = max(most, far[i - bins - 1])
+        width = reach[0, i + 1] - reach[0, i] if i + 1 < reach.shape[1] else 0.0
+        area += width * 0.5 * (most + before)  # an upper sum, where it falls ever slower
+        before = most
+        envelope[0, i], envelope[1, i] = math.sqrt(most), area

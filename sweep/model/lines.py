@@ -50,7 +50,7 @@ _X, _EVEN, _ODD, _RE, _IM, _LANES = (BLOCK_SIZE * k for k in range(6))
 LEAST_WIDTH = 14 * BLOCK_SIZE
 """Of scratch."""
 
-COMMON = 16
+COMMON = 17
 """Numbers of a point that its segments share; of each segment OWN follow."""
 
 OWN = 6
@@ -174,6 +174,16 @@ def place_lines(p, segment, footprint, row, sizes, room):
         room[RE, b] = weight * (cosine * one + sine * other)
         room[IM, b] = weight * (sine * one - cosine * other)
     return origin
+
+
+@njit(cache=True, error_model="numpy")
+def add_images(room, n, origin, gain, power):
+    """Adds the lines' images at negative frequencies, so much weaker; number of all lines."""
+    for b in range(n):
+        room[PLACE, n + b] = -2.0 * origin - room[PLACE, b]
+        room[RE, n + b] = room[RE, b] * (gain * gain if power else gain)
+        room[IM, n + b] = -room[IM, b] * gain
+    return 2 * n
 
 
 @njit(cache=True, error_model="numpy")

@@ -136,6 +136,21 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
 
 
+def noise_in_quadrature(noise: ReceiverNoise) -> ReceiverNoise:
+    """Noise of a receiver that samples I and Q, as what a real record would have in a bin.
+
+    A 90 degree hybrid gives each of the two receivers half of echo and local oscillator. The bins
+    of I + iQ then show the line that a real record's show, with the noise of two receivers: shot
+    noise of half the light each, the same altogether; all of each one's own noise, twice as much;
+    and of currents that go with the light, a quarter of the variance each, half as much.
+    """
+    sources = {
+        name: value if name == "local_oscillator_shot" else 2 * value
+        for name, value in noise.sources.items()
+    }
+    return ReceiverNoise(noise.per_ampere / 2, noise.per_watt, sources)
+
+
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
     """Noise sigma of a bin, per quadrature: sqrt(E_w sigma_x^2 / 2), [T 3.2]."""
     return np.sqrt(window_energy * noise_variance / 2)

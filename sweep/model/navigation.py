@@ -23,6 +23,13 @@ Of pointing jitter it knows the standard deviation. To first order a beam thrown
 each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity,
 v_perp the velocity across it (by a first solution without jitter), and sigma R tan(angle from
 nadir) to that of its range, on level ground.
+
+Of the floor of its errors (:mod:`sweep.model.error_floor`) it knows the standard deviations too,
+which stand in those of the points. Those of pointing and vibration are independent from beam to
+beam: they weigh, and they show in the residuals. Clock and wavelength scale all beams alike, which
+no residual shows: they are taken out of the weights, and of a relative error of s the solution's
+covariance has s^2 v v^T more, the altitude's variance s^2 h^2. The altitude is that of the points
+where pointing has put them, and its variance counts the pointing as it counts jitter.
 """
 
 import math
@@ -33,6 +40,7 @@ import numpy as np
 from numba import njit
 from scipy.special import chdtri
 
+from sweep.model.error_floor import NO_FLOOR, ErrorFloor
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import UNCONFIRMED
 
@@ -373,6 +381,7 @@ def solve(
     test_level: float | None = None,
     relief: float = 0.0,
     jitter: float = 0.0,
+    floor: ErrorFloor = NO_FLOOR,
 ) -> dict[str, np.ndarray]:
     """Velocity and altitude of every cycle and draw.
 
@@ -383,7 +392,8 @@ def solve(
         :data:`sweep.model.outputs.SHOTS`, (n, 3).
     points : mapping
         Interpolated ranges and radial velocities, their standard errors and the flags of
-        :data:`sweep.model.outputs.POINTS`, (n, draws, returns).
+        :data:`sweep.model.outputs.POINTS`, (n, draws, returns); positions too, (..., 3), where
+        the floor has an error of pointing.
     shots_a_cycle : int
         Shots of a cycle, in the order of the arrays; n is a multiple of it.
     ground_slope, relief : float
@@ -392,6 +402,9 @@ def solve(
         Level of the test for one false beam, of :func:`velocity`; None or 0: no test.
     jitter : float
         Standard deviation of the pointing jitter, of each angle [rad].
+    floor : ErrorFloor
+        Standard deviations of the instrument's errors that the points have
+        (:func:`sweep.model.error_floor.stray`).
 
     Returns
     -------
@@ -419,8 +432,8 @@ def solve(
             for name in ("platform_position", "platform_velocity", "beam_direction")
         ]
         found = _solved(
-            poses, _beams(points, part, shots_a_cycle), {"level": test_level or None},
-            {"slope": ground_slope, "relief": relief}, jitter,
+            poses, _beams(points, part, shots_a_cycle, floor), {"level": test_level or None},
+            {"slope": ground_slope, "relief": relief}, jitter, floor,
         )  # fmt: skip
         for quantity, spread, solution in found:
             beams = np.where(solution.available, solution.used.sum(axis=-1), 0)
@@ -431,20 +444,29 @@ def solve(
     return results
 
 
-def _beams(points: Arrays, part: slice, each: int) -> dict[str, np.ndarray]:
-    """Values and standard errors of trusted points, (cycles, draws, each); nan without one."""
+def _beams(points: Arrays, part: slice, each: int, floor: ErrorFloor) -> dict[str, np.ndarray]:
+    """Values and standard errors of trusted points, (cycles, draws, each); nan without one.
+
+    Standard errors without what all beams have in common. Positions, (..., 3), where pointing has
+    an error.
+    """
     flags = points["flags"][part]
     pairs: dict[str, np.ndarray] = {}
     trusted = (flags != 0) & (flags & UNCONFIRMED == 0)
-    for name in ("range", "radial_velocity"):
+    for name, common in (("range", floor.clock), ("radial_velocity", floor.scale)):
         value, error = (
             points[f"{name}_interpolated{suffix}"][part] for suffix in ("", "_standard_error")
         )
+        if common > 0:
+            error = np.sqrt(np.maximum(error**2 - (common * value) ** 2, 0.0))
         error = np.maximum(error, _INTERPOLATION * points[f"{name}_standard_error"][part])
         trusted &= np.isfinite(value) & np.isfinite(error) & (error > 0)
         pairs |= {name: value, f"{name}_standard_error": error}
     first, lost = trusted.argmax(axis=2)[..., None], ~trusted.any(axis=2)
     beams = {}
+    if floor.pointing > 0:
+        chosen = np.take_along_axis(points["position"][part], first[..., None], axis=2)[:, :, 0]
+        beams["position"] = chosen.reshape(-1, each, *chosen.shape[1:]).swapaxes(1, 2)
     for name, values in pairs.items():
         chosen = np.take_along_axis(values, first, axis=2)[..., 0]
         chosen[lost] = np.nan
@@ -454,15 +476,18 @@ def _beams(points: Arrays, part: slice, each: int) -> dict[str, np.ndarray]:
 
 def _solved(
     poses: Sequence[np.ndarray], beams: dict[str, np.ndarray], test: dict, ground: dict,
-    jitter: float,
+    jitter: float, floor: ErrorFloor,
 ) -> list[tuple[str, str, Solution]]:  # fmt: skip
     """Solutions of (cycles, draws) measurement cycles, with what they and their spread are."""
     place, moving, direction = poses
     faster = np.einsum("cbi,cbi->cb", direction, moving - moving.mean(axis=1, keepdims=True))
     beams = beams | {"radial_velocity": beams["radial_velocity"] - faster[:, None]}
-    if jitter > 0:
-        beams = beams | _jittered(direction, beams, jitter)
+    if jitter > 0 or floor.pointing > 0:
+        beams = beams | _jittered(direction, beams, jitter, floor.pointing)
     direction, offset = direction[:, None], (place - place[:, :1])[:, None]
+    known = direction
+    if floor.pointing > 0:
+        known = (beams["position"] - place[:, None]) / beams["range"][..., None]
     speed = velocity(
         direction=direction,
         radial_velocity=beams["radial_velocity"],
@@ -470,18 +495,29 @@ def _solved(
         **test,
     )
     height = altitude(
-        direction=direction,
+        direction=known,
         range=beams["range"],
         standard_error=beams["range_standard_error"],
         offset=offset,
         **ground,
         **test,
     )
+    if floor.scale > 0:
+        common = floor.scale**2 * speed.value[..., None] * speed.value[..., None, :]
+        speed = speed._replace(covariance=speed.covariance + common)
+    if floor.clock > 0:
+        common = (floor.clock * height.value) ** 2
+        height = height._replace(covariance=height.covariance + common)
     return [("velocity", "covariance", speed), ("altitude", "variance", height)]
 
 
-def _jittered(direction: np.ndarray, beams: Arrays, jitter: float) -> dict[str, np.ndarray]:
-    """Standard errors with that of the pointing in them, (cycles, draws, each)."""
+def _jittered(
+    direction: np.ndarray, beams: Arrays, jitter: float, pointing: float
+) -> dict[str, np.ndarray]:
+    """Standard errors with that of the pointing in them, (cycles, draws, each).
+
+    Those of velocities have that of `pointing`, the floor's, already.
+    """
     closing, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first = velocity(
         direction=direction[:, None], radial_velocity=closing, standard_error=error
@@ -494,6 +530,7 @@ def _jittered(direction: np.ndarray, beams: Arrays, jitter: float) -> dict[str, 
     return {
         "radial_velocity_standard_error": np.hypot(error, jitter * across),
         "range_standard_error": np.hypot(
-            beams["range_standard_error"], jitter * beams["range"] * slant[:, None]
+            beams["range_standard_error"],
+            np.hypot(jitter, pointing) * beams["range"] * slant[:, None],
         ),
     }

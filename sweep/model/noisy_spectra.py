@@ -14,6 +14,10 @@ A phase common to all bins makes no difference to circular noise and is left out
 The phase of a laser of Lorentzian line width walks randomly: of each draw a walk is taken, at every
 sample, and turns the signal's record (:func:`sweep.model.effects.line_width.walked_phase`).
 
+In several looks (:mod:`sweep.model.looks`) each record has its signal where the target has come to,
+its noise, its walk, and the speckle that all have, or its own. Flags are those of the mean of
+|X|^2, of enough records, or of the mean record; the frequency is the mean of the looks' estimates.
+
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
 |X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the
 strongest or one of the two beside it); adjacent flagged bins form a group, and a group outside the
@@ -23,7 +27,7 @@ range and radial velocity.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +38,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
 from sweep.model.draws import fading_of_draws
 from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
+from sweep.model.effects.segment_motion import looks_of
 from sweep.model.estimators import (
     DETECTOR,
     ESTIMATOR,
@@ -45,6 +50,7 @@ from sweep.model.estimators import (
     resolved_deviation,
 )
 from sweep.model.interpolation import interpolator, phasors, sub_bin
+from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
@@ -83,7 +89,8 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
     """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down."""
     _, magnitude = segment_spectrum(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
-        magnitude = magnitude / math.sqrt(seen_line(window=shots.window, **laser)[0][0])
+        kept = seen_line(window=shots.window, looks=shots.looks.added, **laser)[0][0]
+        magnitude = magnitude / math.sqrt(kept)
     half, window = shots.fft_size // 2, shots.window
     least = 0 if shots.real_ends else 1  # at DC and Nyquist, else taken for circular
     k = int(np.clip(np.argmax(magnitude), least, half - least))
@@ -149,7 +156,10 @@ def drawn_of(
             key[None], draw[None], STREAM_LASER_PHASE[segment],
             walk_steps(delay=delay, length=length),
         )  # fmt: skip
-        phase = walked_phase(normals(numbers)[0], per_sample=per_sample, delay=delay)
+        # |X| does not tell the phase that a record begins with, and their sum does.
+        phase = walked_phase(
+            normals(numbers)[0], per_sample=per_sample, delay=delay, whole=shots.looks.added > 1
+        )
         spectra.append(fft.rfft((record * np.exp(1j * phase)).real, size))
     return np.array(spectra)
 
@@ -174,6 +184,34 @@ def fading_of(shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray) -> np
     return factors
 
 
+_LOOK = np.int64(1 << 48)
+"""Draws from one look's random numbers to the next one's."""
+
+
+def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.ndarray]:
+    """Spectra (m, N/2 + 1) complex of a segment in some draws, with noise [V], look by look.
+
+    Of looks that are added in amplitude their mean alone.
+    """
+    looks, total = view.shots.looks, np.zeros(1, complex)
+    known: dict[int, Signal] = {}
+    for k, shots in enumerate(view.looks):
+        numbers = draws + k * _LOOK
+        given = {"key": view.key, "draws": numbers}
+        if id(shots) not in known:
+            known[id(shots)] = signal_of(shots, view.i, segment)
+        own = numbers if looks.independent else draws
+        factors = fading_of(shots, view.i, key=view.key, draws=own)[segment]
+        spectra = drawn_of(shots, view.i, segment, known[id(shots)], **given) * factors[:, None]
+        spectra = spectra + noise_of(shots, view.i, segment, **given)
+        if looks.added == 1:
+            yield spectra
+        else:
+            total = total + spectra
+    if looks.added > 1:
+        yield total / looks.added
+
+
 class View(NamedTuple):
     """A shot, and how it is looked at."""
 
@@ -184,6 +222,8 @@ class View(NamedTuple):
     """(2,) uint64: random key of the point."""
     signals: tuple[Signal | None, ...]
     """By segment; None for one that does not exist."""
+    looks: list[Shots]
+    """The shots as each look finds them."""
     setting: Setting
     detect: Detector
     estimate: Estimator
@@ -208,7 +248,7 @@ def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Metho
         fft_size=shots.fft_size,
         sample_rate=float(shots.sample_rate[i]),
         window=shots.window,
-        noise_power=float(shots.window.energy * shots.quiet_variance[i]),
+        noise_power=float(shots.window.energy * shots.quiet_variance[i] / shots.looks.added),
         threshold=float(shots.threshold[i]),
         training=training,
         guard=int(p[DETECTOR + "guard"]),
@@ -219,15 +259,21 @@ def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Metho
         signal_of(shots, i, s) if there else None for s, there in enumerate(shots.segments)
     )
     return View(
-        shots, i, key, signals, setting, methods.detectors[str(p[DETECTOR + "kind"])],
+        shots, i, key, signals, looks_of(shots), setting,
+        methods.detectors[str(p[DETECTOR + "kind"])],
         methods.estimators[str(p[ESTIMATOR + "kind"])],
     )  # fmt: skip
 
 
-def look(spectra: np.ndarray, signal: Signal, view: View) -> Found:
-    """What is found in spectra (m, N/2 + 1) of a segment."""
-    power = spectra.real**2 + spectra.imag**2
-    flags = np.array(view.detect(power, view.setting), bool)
+def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
+    """What is found in spectra (m, N/2 + 1) of a segment, of one or several looks."""
+    powers = [each.real**2 + each.imag**2 for each in spectra]
+    power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
+    if view.shots.looks.combine == BINARY:
+        votes = sum(np.array(view.detect(each, view.setting), np.int64) for each in powers)
+        flags = np.asarray(votes >= view.shots.looks.votes)
+    else:
+        flags = np.array(view.detect(power, view.setting), bool)
     shots, bins, half = view.shots, np.arange(power.shape[1]), power.shape[1] - 1
     low, high = max(signal.strongest - 1, 0), min(signal.strongest + 2, half + 1)
     if shots.detection == "any_bin" and signal.last >= signal.first:
@@ -243,14 +289,16 @@ def look(spectra: np.ndarray, signal: Signal, view: View) -> Found:
     false = (start > signal.last) | (end <= signal.first)
     false &= (start <= half - shots.searched_from) & (end > shots.searched_from)
     alarms, flagged = (
-        np.bincount(row[false], weights, len(spectra)).astype(np.int64)
+        np.bincount(row[false], weights, len(power)).astype(np.int64)
         for weights in (None, (end - start)[false])
     )
     own = detected[row] & (start <= hit[row]) & (hit[row] < end)
-    first, last = np.ones((len(spectra), 1)), np.full((len(spectra), 1), power.shape[1] - 1)
+    first, last = np.ones((len(power), 1)), np.full((len(power), 1), power.shape[1] - 1)
     first[row[own], 0], last[row[own], 0] = start[own], end[own]
     peak = np.where((first <= bins) & (bins < last), power, -1.0).argmax(axis=1)
-    return Found(detected, alarms, flagged, view.estimate(spectra, peak, view.setting))
+    places = [view.estimate(each, peak, view.setting) for each in spectra]
+    place = places[0] if len(places) == 1 else np.mean(places, axis=0)
+    return Found(detected, alarms, flagged, place)
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -266,13 +314,9 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nothing = np.zeros(draws.size, np.int64)
     found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3
     searched = 0
-    factors = fading_of(view.shots, view.i, key=view.key, draws=draws)
     for s, signal in enumerate(view.signals):
         if signal is not None:
-            drawn = drawn_of(view.shots, view.i, s, signal, key=view.key, draws=draws)
-            noise = noise_of(view.shots, view.i, s, key=view.key, draws=draws)
-            spectra = drawn * factors[s][:, None] + noise
-            found[s] = look(spectra, signal, view)
+            found[s] = look(list(spectra_of(view, s, draws)), signal, view)
             inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
             searched += inside - max(signal.last - signal.first + 1, 0)
     up, doppler, down = found
@@ -291,15 +335,15 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def resolved_bound(view: View) -> Deviation:
     """Bound of range and velocity that are resolved from up and down beat.
 
-    Of Cramer and Rao in white noise, and what the laser's phase adds.
+    Of Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
     """
     shots, i = view.shots, view.i
     length, rate = shots.window.length, float(shots.sample_rate[i])
-    walk = phase_deviation(**_laser(shots, i))
+    walk, looks = phase_deviation(**_laser(shots, i)), math.sqrt(shots.looks.number)
     up, _, down = (
         np.inf
         if s is None
-        else np.hypot(beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate), walk)
+        else np.hypot(beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate), walk) / looks
         for s in view.signals
     )
     return resolved_deviation(

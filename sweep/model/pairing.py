@@ -16,9 +16,12 @@ where there is none, **with the half sum as the Doppler frequency**, the order o
 
 An up (or down) peak in which two surfaces coincide serves one return only.
 
+Complex records keep their beats' signs: there is the one reading
+:data:`sweep.model.waveform.SIGNED`, and each surface's Doppler peak confirms it.
+
 Without a Doppler segment nothing tells which peaks belong together, and none is unconfirmed: the
 strongest up peak goes with the strongest down peak, and so on, by the reading
-:data:`sweep.model.waveform.FAR`.
+:data:`sweep.model.waveform.FAR`, or SIGNED.
 """
 
 import math
@@ -26,7 +29,8 @@ import math
 import numpy as np
 from numba import njit
 
-from sweep.model.waveform import FAR, FOLD_PENALTY, READINGS, reading
+from sweep.model.groups import FIRST, LAST
+from sweep.model.waveform import FAR, FOLD_PENALTY, READINGS, SIGNED, reading
 
 TOLERANCE = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
@@ -61,19 +65,24 @@ Doppler peak within the tolerance.
 """
 
 
+FALSE, ABSENT = -1, -2
+"""In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
+
+
 _reading = njit(cache=True, error_model="numpy")(reading)
 
 
 @njit(cache=True, error_model="numpy")
-def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs):
+def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
     """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
 
     Parameters
     ----------
     up, doppler, down : (any,) float64
         Positions of the peaks [bins], strongest first.
-    at_start, fft_size, tolerance : float
-        As of :func:`confirm`; N; mismatch [bins] up to which a Doppler peak confirms a pair.
+    at_start, fft_size, signed, tolerance
+        As of :func:`confirm`; N; whether peaks have signs; mismatch [bins] up to which a Doppler
+        peak confirms a pair.
     pairs : (>= min(ups, downs), 4) int64
         Result: index of up, Doppler (-1 where unconfirmed) and down peak, and reading.
 
@@ -86,7 +95,7 @@ def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs):
     for i in range(up.size):
         for j in range(down.size):
             cost[i, j], via[i, j, 0], via[i, j, 1] = confirm(
-                up[i], doppler, down[j], at_start, fft_size, tolerance
+                up[i], doppler, down[j], at_start, fft_size, signed, tolerance
             )
     chosen, used = _match(cost)
     number = 0
@@ -101,24 +110,24 @@ def pair_peaks(up, doppler, down, at_start, fft_size, tolerance, pairs):
         while j < down.size and used[j]:
             j += 1
         if chosen[i] < 0 and j < down.size:
-            _, _, code = confirm(up[i], doppler, down[j], at_start, fft_size, np.inf)
+            _, _, code = confirm(up[i], doppler, down[j], at_start, fft_size, signed, np.inf)
             pairs[number, 0], pairs[number, 1], pairs[number, 2] = i, -1, j
-            pairs[number, 3] = code if doppler.size else ASSUMED
+            pairs[number, 3] = code if doppler.size else SIGNED if signed else ASSUMED
             number, j = number + 1, j + 1
     return confirmed, number
 
 
 @njit(cache=True, error_model="numpy")
-def pair_by_strength(ups, downs, pairs):
+def pair_by_strength(ups, downs, signed, pairs):
     """Pairs of as many up and down peaks in their order, as of :func:`pair_peaks`; their number."""
-    number = min(ups, downs)
+    number, code = min(ups, downs), SIGNED if signed else FAR
     for i in range(number):
-        pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3] = i, -1, i, FAR
+        pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3] = i, -1, i, code
     return number
 
 
 @njit(cache=True, error_model="numpy")
-def confirm(up, doppler, down, at_start, fft_size, tolerance):
+def confirm(up, doppler, down, at_start, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
     ``at_start`` is the Doppler segment's carrier over that at mid-chirp, which the chirps see.
@@ -132,10 +141,13 @@ def confirm(up, doppler, down, at_start, fft_size, tolerance):
     """
     least, peak, best = np.inf, -1, -1
     for k in range(doppler.size):
-        for code in range(READINGS):
+        for code in range(SIGNED if signed else 0, SIGNED + 1 if signed else READINGS):
             shift, _ = _reading(code, up, down, fft_size)
             place = fft_size - doppler[k] if code & 4 else doppler[k]
             mismatch = abs(abs(shift) * at_start - place)
+            if signed:
+                apart = shift * at_start - place
+                mismatch = abs(apart - fft_size * math.floor(apart / fft_size + 0.5))
             folds = (code >> 3 & 1) + (code >> 2 & 1) + (code >> 1 & 1)
             cost = mismatch + folds * FOLD_PENALTY
             if cost < least and mismatch <= tolerance:
@@ -179,3 +191,39 @@ def _match(cost):
         if best[i] >= 0:
             used[best[i]] = True
     return best, used
+
+
+@njit(cache=True, error_model="numpy")
+def judge(group, centres, bins, lines, amplitude):
+    """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
+
+    Parameters
+    ----------
+    group, centres : (3,)
+        Groups and positions [bins] of the peaks of the three segments.
+    bins : (3, 3, most) int64
+        As of :class:`sweep.model.returns.Known`, at one point; and so are the last two.
+    lines, amplitude : (3, beamlets), (beamlets,)
+        Beamlets of amplitude 0 do not count.
+    """
+    if group[0] == FALSE or group[1] == FALSE or group[2] == FALSE:
+        return FALSE_ALARM, -1
+    found, nearest, holds = -1, np.inf, 0
+    for b in range(amplitude.size):
+        if not amplitude[b] > 0.0:
+            continue
+        distance = 0.0
+        for s in range(3):
+            g = group[s]
+            if g < 0:
+                holds |= 1 << s
+            elif bins[s, FIRST, g] - 1.0 <= lines[s, b] <= bins[s, LAST, g] + 1.0:
+                holds |= 1 << s
+                distance += abs(lines[s, b] - centres[s])
+            else:
+                distance = np.inf
+        if distance < nearest:
+            found, nearest = b, distance
+    if holds != 7:
+        return SIDELOBE, -1
+    return (TRUE if found >= 0 else MISPAIRED), found

@@ -21,6 +21,7 @@ from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
+from sweep.model.looks import NUMBER, VOTES, Looks
 from sweep.model.threshold import tnr_of
 from sweep.model.window import Window, canonical_name, window
 
@@ -32,13 +33,16 @@ Parameters = Mapping[str, float | int | str | np.ndarray]
 LASER, CHIRP, TELESCOPE, RECEIVER, PROCESSING = (
     f"instrument.{part}." for part in ("laser", "chirp", "telescope", "receiver", "processing")
 )
+RECORD = RECEIVER + "record"
+"""Samples of a record: ``real``, or ``complex`` from I and Q."""
+
 BEAMLETS_ERROR = "footprint.beamlets_error"
 """Error of pd that the number of beamlets leaves, where that followed from the tolerance."""
 
 APPROACH = "target.approach"
 """Speed [m/s] at which the range along the beam falls, where rays have told."""
 
-CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record")
+CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record", NUMBER, VOTES)
 """Numbers that points must share to be prepared together; words they must share all."""
 
 ADC_NOISE = "quantisation"
@@ -148,6 +152,8 @@ class Shots:
     starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
     """Time [s] from the shot's start to each segment's, in which the target moves on."""
     phase_errors: tuple[PhaseError, ...] = ()
+    look_drift: np.ndarray | float = 0.0
+    """(segments, n): bins by which lines move on from look to look."""
     walk: np.ndarray | float = 0.0
     """Seconds of closing by which the beats' range is below that at the shot's start, (n,)."""
     slowing: np.ndarray | float = 0.0
@@ -164,17 +170,26 @@ class Shots:
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
     """Whether the record is I and Q, and its spectrum has signed bins and no images."""
+    image_gain: np.ndarray | float = 0.0
+    """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
     """Of echoes in developed speckle."""
     image: bool = False
     """Whether the lines' images at negative frequencies are summed."""
     leakage: bool = False
     """Whether the bins beside the detection are looked at for groups of leaked signal."""
+    looks: Looks = Looks()  # noqa: RUF009  # a tuple
+    """Records of each segment, and how they are combined."""
 
     @property
     def size(self) -> int:
         """Number of points."""
         return self.range.size
+
+    @property
+    def bins(self) -> int:
+        """Bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
+        return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
     @property
     def chirp_rate(self) -> np.ndarray:
@@ -253,26 +268,54 @@ class Shots:
         """Signal over sigma below which bins that are taken one by one count as noise alone."""
         from sweep.model import detection
 
-        given, bins = self.leakage_floor, self.fft_size // 2 + 1
+        given, bins = self.leakage_floor, self.bins
         if not np.any(given == AUTOMATIC):
             return given
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             level = self.threshold / self.bin_deviation
-        floor = detection.quiet_below(chance=self.leakage_tolerance, level=level, bins=bins)
+        law = self.looks.quiet_below if self.looks.several else detection.quiet_below
+        floor = law(chance=self.leakage_tolerance, level=level, bins=bins)
         return np.where(given == AUTOMATIC, floor, given)
 
-    def both(self, up: np.ndarray, down: np.ndarray) -> np.ndarray:
-        """Chance that up and down segment are detected, both, by their own chances; (..., n)."""
+    def both(
+        self, up: np.ndarray, down: np.ndarray, magnitudes: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
+        """Chance that up and down segment are detected, both; (..., n).
+
+        By their own chances, and |X| of their bins [V].
+        """
         from sweep.model import detection
 
         if self.fading is None:
             return up * down
-        level = self.threshold / self.line_deviation
-        return detection.fading_together(up, down, level, np.abs(self.fading.over))
+        level, alike = self.threshold / self.line_deviation, np.abs(self.fading.over)
+        if self.looks.several:
+            one, other = (magnitude / self.line_deviation for magnitude in magnitudes)
+            return self.looks.faded_together(one, other, level, alike)
+        return detection.fading_together(up, down, level, alike)
+
+    def detected(
+        self, magnitude: np.ndarray, bins: np.ndarray, points: np.ndarray | slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Chances that a bin is detected in several looks, and that it is missed, (..., m).
+
+        ``magnitude`` [V] is nan for none; ``points`` says which points these are.
+        """
+        there, levels = np.isfinite(magnitude), (self.line_deviation, self.threshold)
+        deviation, level = (np.broadcast_to(v, self.size)[points] for v in levels)
+        signal = np.where(there, magnitude, 0.0) / deviation
+        if self.fading is not None:
+            both = self.looks.faded(signal, level / deviation)
+        else:
+            ends = np.isin(bins, (0, self.real_ends // 2)) & (self.real_ends > 0)
+            both = self.looks.steady(signal, level / deviation, ends)
+        found, missed = (np.where(there, chance, np.nan) for chance in both)
+        return found, missed
 
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
         energy = np.asarray(self.window.energy)
-        return link.bin_deviation(noise_variance=variance, window_energy=energy)
+        mean = variance / self.looks.added
+        return link.bin_deviation(noise_variance=mean, window_energy=energy)
 
     @cached_property
     def footprint(self) -> np.ndarray:
@@ -323,8 +366,13 @@ class Shots:
         """Times [s] from the shot's start to each segment's, by the waveform."""
         return waveform.segment_starts(self.order, duration=self.duration, gap=self.gap)
 
+    @property
+    def look_period(self) -> np.ndarray:
+        """Time [s] from one look to the next: that of the whole waveform."""
+        return len(self.order) * (self.duration + self.gap)
+
     def point_table(self) -> np.ndarray:
-        """Numbers of each point as compiled code takes them, (16 + 6 segments, n).
+        """Numbers of each point as compiled code takes them, (COMMON + OWN segments, n).
 
         What all segments share, and of each segment the signed chirp rate [Hz/s], the carrier,
         the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
@@ -333,7 +381,7 @@ class Shots:
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
-            self.line_deviation, self.leakage_tolerance, self.line_tolerance,
+            self.line_deviation, self.leakage_tolerance, self.line_tolerance, self.image_gain,
         )  # fmt: skip
         further = (
             x
@@ -386,7 +434,7 @@ class Shots:
         points
             Which points these are.
         """
-        searched = self.fft_size // 2
+        searched = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_ends:
             searched += 1 - 2 * self.searched_from
         bins = np.maximum(searched - exempted, 0.0)
@@ -395,7 +443,9 @@ class Shots:
         if self.noise_bins == "independent":
             return bins
         level = np.broadcast_to(self.threshold / self.bin_deviation, self.size)[points]
-        return alarms.independent_bins(bins, level=level, correlation=self.correlation)
+        return alarms.independent_bins(
+            bins, level=level, correlation=self.correlation, looks=self.looks
+        )
 
 
 def categories(
@@ -461,9 +511,11 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
-    per_ampere, per_watt, sources = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
+    in_quadrature = str(p[RECORD]) == "complex"
+    noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
+    per_ampere, per_watt, sources = link.noise_in_quadrature(noise) if in_quadrature else noise
     row, offset, doppler, echo = ground.axis(size)
-    everywhere, accuracy = np.zeros(size), Accuracy.of(p)
+    everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
         architecture=architecture,
         window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
@@ -494,7 +546,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         leakage_floor=np.asarray(accuracy.leakage_floor, float),
         leakage_tolerance=accuracy.for_leakage,
         beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
-        line_tolerance=accuracy.for_lines,
+        line_tolerance=accuracy.for_lines / math.sqrt(looks.averaged),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
         noise_scale=per_ampere,
@@ -505,6 +557,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
+        complex_record=in_quadrature,
+        looks=looks,
     )
 
 

@@ -94,6 +94,7 @@ def ray_error(
     for s in range(3):
         there = bins[:, s] >= 0 if shots.segments[s] else np.zeros(shots.size, bool)
         a, b = magnitude[:, s] / deviation, np.broadcast_to(threshold / deviation, shots.size)
+        a, b = a * shots.looks.sharper, shots.looks.scaled(b)
         # The down-chirp's lines lie as those of the up-chirp, and Doppler's closer together,
         # which makes them smoother: one magnitude tells of all.
         tells = there if s == 0 else there & ~(bins[:, 0] >= 0)

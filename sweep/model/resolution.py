@@ -44,7 +44,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import beam, ground
+from sweep.model import beam, ground, waveform
 from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.lobes import Lobe, lobe
@@ -55,6 +55,7 @@ from sweep.model.footprint import (
     plane_moments,
     velocity_to_bins,
 )
+from sweep.model.looks import Looks
 from sweep.model.preparation import (
     BEAMLETS_ERROR,
     CHIRP,
@@ -105,13 +106,13 @@ class Spread(NamedTuple):
     deviation: np.ndarray
     """(n,): most of |s|, steeper where the plane is, over the segments."""
     slope: np.ndarray
-    """(segments, n): |s| of each segment."""
+    """(rows, n): |s| of each segment, and of what turns from one to another."""
     curve: np.ndarray
-    """(segments, n): |c| of each segment."""
+    """(rows, n): |c| likewise."""
 
     @property
     def smoothing(self) -> np.ndarray:
-        """Deviation that smooths what lines miss across the slope, (segments, n).
+        """Deviation that smooths what lines miss across the slope, (rows, n).
 
         |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
         """
@@ -232,6 +233,7 @@ def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
     from sweep.model import detection
 
     b = detection.threshold(tnr=tnr_of(p), bin_deviation=np.asarray(1.0))
+    b = Looks.of(p).sharper * b
     a = 0.5 * (b + np.sqrt(b * b + 2))
     steepest = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
     return np.asarray(_SEGMENTS * steepest / 2)
@@ -260,12 +262,25 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
         bin_width=bins,
     )
     signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
-    return Spread(
+    spread = Spread(
         deviation=per_range * rms + per_speed * velocities.rms + nothing,
         slope=abs(per_speed * across * turn + signs * per_range * slope) + nothing,
         curve=abs(per_speed * along * (turn / sigma) ** 2 + signs * per_range) * (sigma**2 / 2)
         + nothing,
     )
+    if "target.roughness" not in p or not np.any(p["target.roughness"]):
+        return spread
+    # Speckle that is drawn turns by Doppler shifts until the last segment, a few records later.
+    starts = waveform.segment_starts(
+        waveform.order_of("", str(p[waveform.ORDER])),
+        duration=p[CHIRP + "duration"], gap=p[waveform.GAP],
+    )  # fmt: skip
+    later = 2 * np.maximum.reduce(starts) * bins
+    slope, curve = (
+        np.vstack([rows, later * rows[1]]) for rows in (spread.slope, spread.curve)
+    )  # by twice as much, as sums over records hardly look at their ends
+    moved = later * per_speed * velocities.rms + nothing
+    return Spread(np.maximum(spread.deviation, moved), slope, curve)
 
 
 def _window(p: Mapping[str, np.ndarray]) -> str:

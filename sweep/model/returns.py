@@ -47,19 +47,21 @@ from sweep.model.draws import (
     fading_factors,
     is_noisy,
     noise_levels,
+    require_one_record,
     seen_spectra,
 )
 from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
+from sweep.model.looks import faded_ratio, largest_of
 from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
-    FALSE_ALARM,
-    MISPAIRED,
+    ABSENT,
+    FALSE,
     MISREAD,
-    SIDELOBE,
     TOLERANCE,
     TRUE,
     UNCONFIRMED,
+    judge,
     pair_by_strength,
     pair_peaks,
 )
@@ -67,9 +69,6 @@ from sweep.model.preparation import Shots
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
-
-FALSE, ABSENT = -1, -2
-"""In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
 
 
 class Returns(NamedTuple):
@@ -137,6 +136,8 @@ def draw_returns(
         `method` is neither of the two.
     """
     noisy = is_noisy(method)
+    if noisy:
+        require_one_record(shots)
     n, _, most = found.bin.shape
     drawn = Drawn(
         np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
@@ -144,10 +145,12 @@ def draw_returns(
         np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
     )  # fmt: skip
     known = _known(shots, found)
-    one = np.exp(-0.5 * known.levels[:, 1:2] ** 2)
+    one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how = How(
         int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
+        shots.complex_record,
         shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
+        shots.looks.number if shots.looks.several else 1, shots.looks.independent,
     )  # fmt: skip
     tables = interpolator(shots.window, shots.fft_size)
     counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
@@ -175,12 +178,18 @@ class How(NamedTuple):
     """There is a Doppler segment."""
     half: int
     """N/2."""
+    signed: bool
+    """Bins are -N/2 .. N/2 - 1, of a complex record, not 1 .. N/2."""
     ends: int
     """N where noise at DC and Nyquist is real, else 0."""
     beside: int
     """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
     rule: tuple[np.ndarray, np.ndarray, int]
     """:func:`sweep.model.draws.echo_filter`"""
+    looks: int
+    """Records whose powers are averaged."""
+    apart: bool
+    """Each has its own speckle."""
 
 
 class Known(NamedTuple):
@@ -195,7 +204,8 @@ class Known(NamedTuple):
     spread: np.ndarray
     """(n, 3, most): standard deviation [bins] of the lines in a group, weighted by power."""
     lines: np.ndarray
-    """(n, 3, beamlets): place of each beamlet's line [bins, 0..N/2]."""
+    """(n, 3, beamlets): place of each beamlet's line [bins, 0..N/2]; with signs, as near to the
+    strongest group as whole FFT lengths bring it."""
     amplitude: np.ndarray
     """(n, beamlets)"""
     levels: np.ndarray
@@ -227,6 +237,9 @@ class Drawn(NamedTuple):
 def _known(shots: Shots, found: Groups) -> Known:
     n = shots.size
     lines, amplitude = beamlet_lines(shots), shots.amplitude[shots.row]
+    if shots.complex_record:
+        apart = (lines - found.bin[:, :, :1]) / shots.fft_size
+        lines = lines - shots.fft_size * np.floor(apart + 0.5)
     bins = np.stack([found.bin, found.first, found.last], axis=2)
     apart = lines[:, :, None] - found.bin[..., None]
     inside = (lines[:, :, None] >= found.first[..., None] - 1) & (
@@ -249,7 +262,7 @@ def _known(shots: Shots, found: Groups) -> Known:
 def _beside(shots: Shots, found: Groups) -> np.ndarray:
     """Chances of groups in the down segment, as of :class:`Known`."""
     up, down = found.pd[:, 0], found.pd[:, 2]
-    both = shots.both(up.T, down.T).T
+    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
     with np.errstate(divide="ignore", invalid="ignore"):
         detected = np.where(up > 0, np.minimum(both / up, 1.0), down)
         missed = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
@@ -257,7 +270,10 @@ def _beside(shots: Shots, found: Groups) -> np.ndarray:
 
 
 def beamlet_lines(shots: Shots) -> np.ndarray:
-    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets)."""
+    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets).
+
+    In spectra of complex records -N/2 .. N/2.
+    """
     per_metre = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     distance = per_metre * _columns(shots, shots.range), 1 + shots.offset[shots.row]
     own = shots.doppler[shots.row]
@@ -268,8 +284,8 @@ def beamlet_lines(shots: Shots) -> np.ndarray:
         far = distance[0] * distance[1] - per_metre * (_columns(shots, each.nearer) + drifted)
         beat = _columns(shots, each.carrier) * beta - each.sign * far * (1 + beta)
         turns = beat / _columns(shots, shots.sample_rate)
-        lines[:, s] = abs(turns - np.floor(turns + 0.5)) * shots.fft_size
-    return lines
+        lines[:, s] = (turns - np.floor(turns + 0.5)) * shots.fft_size
+    return lines if shots.complex_record else abs(lines)
 
 
 def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndarray:
@@ -347,11 +363,11 @@ def _draw(keys, how, known, seen, tables, out):
             if how.doppler:
                 confirmed, count = pair_peaks(
                     peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
-                    peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, TOLERANCE,
-                    pairs,
+                    peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.signed,
+                    TOLERANCE, pairs,
                 )  # fmt: skip
             else:
-                confirmed = count = pair_by_strength(number[0], number[2], pairs)
+                confirmed = count = pair_by_strength(number[0], number[2], how.signed, pairs)
             for r in range(min(count, most)):
                 u, k, v, out.code[i, d, r] = pairs[r]
                 group, centres = out.group[i, d, r], np.zeros(3)
@@ -407,10 +423,10 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
             if there:
                 m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
                 delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
-                if known.mixing.shape[1]:  # powers above the threshold are exponential
-                    power = 2.0 * under_lines * under_lines + ratio * ratio
-                    ratio = math.sqrt(beta * beta - power * math.log(uniform / chance))
-                error = sub_bin_error(delta, ratio / under_lines, tables)
+                if known.mixing.shape[1]:
+                    chances, levels = (uniform / chance, known.pd[i, s, g]), (beta, under_lines)
+                    ratio = faded_ratio(ratio, levels, chances, how.looks, how.apart)
+                error = sub_bin_error(delta, ratio / under_lines, tables) / math.sqrt(how.looks)
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
@@ -429,12 +445,12 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
     words = philox.words4(a, b, draw, stream, philox.FIRST_BLOCK)
     chance = philox.to_uniform(words[0])
     if chance < known.alarm[i, s]:
-        ratio = max(largest_of(seen.others[i, s], chance), beta)
+        ratio = max(largest_of(seen.others[i, s], chance, how.looks), beta)
         if place < 0 or ratio > largest:
-            place = free_bin(philox.to_uniform(words[1]), bins, how.half)
+            place = free_bin(philox.to_uniform(words[1]), bins, how.half, how.signed)
             largest = ratio
     if place >= 0:
-        error = sub_bin_error(0.0, largest, tables)
+        error = sub_bin_error(0.0, largest, tables) / math.sqrt(how.looks)
         put(peaks[count], place, place, error, largest, 0.0, how, tables)
         which[count] = FALSE
         count += 1
@@ -514,77 +530,46 @@ def look_at_all(address, at, g, how, known, seen, tables, peak):
 
 @njit(cache=True, error_model="numpy")
 def put(peak, whole, fine, error, ratio, spread, how, tables):
-    """A peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist."""
-    whole, fine, end = abs(whole), abs(fine), 2 * how.half
-    peak[WHOLE] = end - whole if whole > how.half else whole
-    peak[FINE] = end - fine if fine > how.half else fine
+    """A peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
+
+    One of a complex record goes round from N/2 to -N/2.
+    """
+    end = 2 * how.half
+    if how.signed:
+        turned = end * math.floor((whole + how.half) / end)
+        peak[WHOLE], peak[FINE] = whole - turned, fine - turned
+    else:
+        whole, fine = abs(whole), abs(fine)
+        peak[WHOLE] = end - whole if whole > how.half else whole
+        peak[FINE] = end - fine if fine > how.half else fine
     wide = spread_error(peak[FINE] - peak[WHOLE], spread, how.powers or not how.doppler, tables)
     peak[ERROR], peak[RATIO] = math.hypot(error, wide), ratio
 
 
 @njit(cache=True, error_model="numpy")
-def largest_of(number, chance):
-    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance."""
-    if not number > 0.0:
-        return 0.0
-    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
+def free_bin(chance, bins, half, signed):
+    """Bin outside the groups and the bins beside them, uniformly by a chance.
 
-
-@njit(cache=True, error_model="numpy")
-def free_bin(chance, bins, half):
-    """Bin of 1..N/2 outside the groups and the bins beside them, uniformly by a chance."""
+    One of 1..N/2, of a complex record 0..N - 1.
+    """
+    first, last = (0, 2 * half - 1) if signed else (1, half)
     number = 0
     while number < bins.shape[1] and bins[BIN, number] >= 0:
         number += 1
-    spans, free, end = np.empty((number, 2), np.int64), half, 1
+    spans, free, end = np.empty((number, 2), np.int64), last - first + 1, first
     for g in range(number):  # disjoint; in rising order
+        turned = (bins[BIN, g] // (last + 1)) * (last + 1) if signed else 0
         k = g
-        while k > 0 and spans[k - 1, 0] > bins[FIRST, g]:
+        while k > 0 and spans[k - 1, 0] > bins[FIRST, g] - turned:
             spans[k, 0], spans[k, 1] = spans[k - 1, 0], spans[k - 1, 1]
             k -= 1
-        spans[k, 0], spans[k, 1] = bins[FIRST, g], bins[LAST, g]
+        spans[k, 0], spans[k, 1] = bins[FIRST, g] - turned, bins[LAST, g] - turned
     for g in range(number):
         spans[g, 0] = max(spans[g, 0] - 1, end)
-        end = max(min(spans[g, 1] + 2, half + 1), spans[g, 0])
+        end = max(min(spans[g, 1] + 2, last + 1), spans[g, 0])
         spans[g, 1], free = end, free - (end - spans[g, 0])
-    place = 1 + int(chance * free)
+    place = first + int(chance * free)
     for g in range(number):
         if place >= spans[g, 0]:
             place += spans[g, 1] - spans[g, 0]
-    return min(place, half)
-
-
-@njit(cache=True, error_model="numpy")
-def judge(group, centres, bins, lines, amplitude):
-    """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
-
-    Parameters
-    ----------
-    group, centres : (3,)
-        Groups and positions [bins] of the peaks of the three segments.
-    bins : (3, 3, most) int64
-        As of :class:`Known`, at one point; and so are the last two.
-    lines, amplitude : (3, beamlets), (beamlets,)
-        Beamlets of amplitude 0 do not count.
-    """
-    if group[0] == FALSE or group[1] == FALSE or group[2] == FALSE:
-        return FALSE_ALARM, -1
-    found, nearest, holds = -1, np.inf, 0
-    for b in range(amplitude.size):
-        if not amplitude[b] > 0.0:
-            continue
-        distance = 0.0
-        for s in range(3):
-            g = group[s]
-            if g < 0:
-                holds |= 1 << s
-            elif bins[s, FIRST, g] - 1.0 <= lines[s, b] <= bins[s, LAST, g] + 1.0:
-                holds |= 1 << s
-                distance += abs(lines[s, b] - centres[s])
-            else:
-                distance = np.inf
-        if distance < nearest:
-            found, nearest = b, distance
-    if holds != 7:
-        return SIDELOBE, -1
-    return (TRUE if found >= 0 else MISPAIRED), found
+    return min(place, last)

@@ -26,6 +26,7 @@ from sweep.model.lines import (
     PLACE,
     RE,
     X,
+    add_images,
     fold_lines,
     nodes_for,
     place_lines,
@@ -33,6 +34,7 @@ from sweep.model.lines import (
     relative_error,
     survey,
 )
+from sweep.model.looks import MOST_PLACES
 from sweep.model.preparation import LINE_STEPS, Shots
 from sweep.model.spectrum import (
     A_IM,
@@ -73,7 +75,8 @@ class Runs(NamedTuple):
     part: np.ndarray
     """(m,): which points of the shots these are."""
     low: np.ndarray
-    """First bin; N more or less where a complex record's run passes its ends."""
+    """First bin; of complex records N more than its frequency says, or twice as many, so that no
+    bin of a run is below 0."""
     bins: np.ndarray
     """Bins in the run."""
     peak: np.ndarray
@@ -167,9 +170,27 @@ def runs_of(
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
-            runs, number = _some(shots, table, lowest, together, leaks, done, keep)
-            yield runs
+            held = keep or (shots.looks.several and bool(leaks))
+            runs, number = _some(shots, table, lowest, together, leaks, done, held)
+            yield _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
             done += number
+
+
+def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
+    """Runs with the chances that several looks have for one record's."""
+    floor, sigma, level = (
+        np.broadcast_to(v, shots.size)[runs.part]
+        for v in (shots.floor, shots.bin_deviation, shots.threshold)
+    )
+    leaked = runs.leakage.copy()
+    for s, i in np.argwhere(runs.bins > 0) if leakage and shots.leakage else ():
+        if shots.waveform[s].leaks:
+            start, end = runs.start[s, i] + np.array([0, runs.bins[s, i]])
+            signal = runs.magnitudes[start:end][~runs.exempt[start:end]] / sigma[i]
+            more = shots.looks.excess(signal[signal >= floor[i]], level[i] / sigma[i])
+            leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
+    pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
+    return runs._replace(pd=pd, miss=miss, leakage=leaked)
 
 
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
@@ -207,7 +228,7 @@ def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: i
         np.empty((count, place.size)),
     )
     table = np.empty((2, line_shape.places_of(shapes.sizes)))
-    form = np.zeros((7, shapes.reach.size))
+    form = np.zeros((7, shapes.reach.shape[1]))
     modes = np.zeros((1, 1, 2, 1))
     modes[..., 0, :] = 1.0
     parts = np.zeros((1, 1)), modes, np.ones((1, 1), np.int64), np.empty((1, 2, 0))
@@ -239,8 +260,9 @@ def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
     if not shots.leakage:
         return NO_LEAKAGE
     averaged = shots.gaussian_width is not None and not shots.incoherent
+    averaged |= shots.looks.several or every_bin
     smooth = shapes.sizes[0] == shapes.sizes[1] and not shapes.sizes[5]
-    if smooth and not averaged and not every_bin and view(shots) != COMPLEX:
+    if smooth and not averaged and view(shots) != COMPLEX:
         return INTEGRAL
     return BIN_BY_BIN
 
@@ -257,7 +279,8 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
         modes[:, :, 0] = 1.0
         number = np.ones((segments, 1), np.int64)
         centre = np.zeros((segments, 1))
-        step = max(points.size if shots.gaussian_width is None else POINTS, 1)
+        plainly = shots.gaussian_width is None and not np.any(shots.look_drift)
+        step = max(points.size if plainly else POINTS, 1)
         for first in range(0, points.size, step):
             some = points[first : first + step]
             yield Together(some, 0 * some, shapes, centre, modes, number)
@@ -343,17 +366,18 @@ def _some(
     """Runs of as many points from ``first`` on as there is room for; how many these are."""
     part = together.part[first:]
     segments, m = len(shots.waveform), part.size
-    bins = shots.fft_size // 2 + 1 if view(shots) != COMPLEX else shots.fft_size
+    bins = shots.bins
     shifts = _shifts(shots, part)
-    lines = max(shots.offset.shape[1], MOST_NODES) * max(shifts.shape[2], 1)
+    lines = max(2 * shots.offset.shape[1], MOST_NODES) * max(shifts.shape[3], 1)
     width = max(lines, bins, 2 * MOST_POINTS, LEAST_WIDTH, MOST_CELLS) + 16
     size = max(ROOM_FOR_RUNS, segments * bins) if keep else 0
     numbers = np.zeros((5, segments, m), np.int64)
     values = np.full((4, segments, m), np.nan)
     magnitudes, exempt = np.empty(size), np.empty(size, np.bool_)
     shapes = together.shapes
-    places, form = line_shape.places_of(shapes.sizes), np.zeros((segments, 7, shapes.reach.size))
-    form[:, 0] = shapes.reach
+    places = line_shape.places_of(shapes.sizes)
+    form = np.zeros((segments, 7, shapes.reach.shape[1]))
+    form[:, 0] = shapes.reach[0]
     rule = shots.echo_rule
     done = _inspect_points(
         np.ascontiguousarray(table[:, part].T),
@@ -383,16 +407,33 @@ def tangents(fft_size: int) -> np.ndarray:
 
 
 def _shifts(shots: Shots, part: np.ndarray) -> np.ndarray:
-    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, 2, shifts)."""
+    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, segments, 2, k)."""
+    segments = len(shots.waveform)
     if shots.gaussian_width is None:
-        return np.empty((part.size, 2, 0))
-    duration = np.broadcast_to(shots.record_duration, shots.size)[part]
-    shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
-    bins = shots.fft_size / shots.window.length
-    found = np.stack([bins * shifts.offset, shifts.weight], axis=1)
-    # Those of no weight, which wider lines beside a point bring, go to the end.
-    order = np.argsort(found[:, 1:] == 0, axis=2, kind="stable")
-    return np.take_along_axis(found, np.broadcast_to(order, found.shape), axis=2)
+        found = np.empty((part.size, 2, 0))
+    else:
+        duration = np.broadcast_to(shots.record_duration, shots.size)[part]
+        shifts = gaussian_shifts(fwhm=shots.gaussian_width[part], duration=duration)
+        bins = shots.fft_size / shots.window.length
+        found = np.stack([bins * shifts.offset, shifts.weight], axis=1)
+        # Those of no weight, which wider lines beside a point bring, go to the end.
+        order = np.argsort(found[:, 1:] == 0, axis=2, kind="stable")
+        found = np.take_along_axis(found, np.broadcast_to(order, found.shape), axis=2)
+    by_segment = np.repeat(found[:, None], segments, axis=1)
+    drift = np.broadcast_to(shots.look_drift, (segments, shots.size))[:, part].T
+    if shots.looks.averaged == 1 or not drift.any():
+        return by_segment
+    if not by_segment.shape[3]:
+        by_segment = np.tile([[0.0], [1.0]], (*drift.shape, 1, 1))
+    # Of looks that follow each other closely some stand for all, of the same mean square.
+    number = shots.looks.number
+    few = min(number, MOST_PLACES)
+    place = (np.arange(few) - (few - 1) / 2) * math.sqrt((number**2 - 1) / (few**2 - 1))
+    moved = (by_segment[..., :1, :, None] + drift[..., None, None, None] * place).reshape(
+        *drift.shape, 1, -1
+    )
+    weight = np.repeat(by_segment[..., 1:, :] / few, few, axis=3)
+    return np.concatenate([moved, weight], axis=2)
 
 
 @njit(cache=True, error_model="numpy")
@@ -405,6 +446,8 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     apart = centre * sizes[0] / sizes[1]
     for b in range(n):
         room[PLACE, b] += apart
+    if p[16] > 0.0:
+        n = add_images(room, n, origin, p[16], power)
     whole, squares, lowest, highest = survey(room, n, power)
     if max(-lowest, highest) > 0.5 * sizes[0]:  # lines further apart than there are bins
         fold_lines(room, n, sizes)
@@ -465,8 +508,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         Rows in the footprints; shapes.
     footprint : (3 or 3 + segments, rows, beamlets) float64
     modes, shapes
-        Of :class:`Together`, with shifts (m, 2, k); sizes with the view and half of the echo's
-        main lobe at their end.
+        Of :class:`Together`, with shifts (m, segments, 2, k); sizes with the view and half of the
+        echo's main lobe at their end.
     tables : tuple
         Limits of nodes; tangents.
     how : tuple
@@ -487,7 +530,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     keep, at = magnitudes.size > 0, np.int64(0)
     before, made_of = -1.0, np.int64(-1)  # a literal would compile what takes it once more
     for i in range(points.shape[0]):
-        p, row, which, shift = points[i], where[0, i], where[1, i], _used(shifts[i])
+        p, row, which = points[i], where[0, i], where[1, i]
         if which != made_of:
             for s in range(segments.size):
                 if segments[s]:
@@ -500,6 +543,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         for s in range(segments.size):
             if not segments[s]:
                 continue
+            shift = _used(shifts[i, s])
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )
@@ -522,7 +566,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
-            numbers[0, s, i], numbers[1, s, i] = low, count
+            turn = sizes[0] if sizes[7] == COMPLEX else 0  # never below 0
+            numbers[0, s, i], numbers[1, s, i] = low + turn, count
             numbers[2, s, i], numbers[3, s, i] = peak, exempted
             values[0, s, i], values[1, s, i] = found, missed
             values[2, s, i], values[3, s, i] = room[OUT, peak], leakage

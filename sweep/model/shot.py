@@ -143,7 +143,8 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
-    pd_shot, miss_shot = shots.both(pd[0], pd[2]), miss[0] + pd[0] * miss[2]
+    pd_shot = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
+    miss_shot = miss[0] + pd[0] * miss[2]
     if shots.fading is not None:
         miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)  # of roundings
     by_segment = {"pd": pd, "miss": miss, "snr": snr}
@@ -180,12 +181,13 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
         duration=shots.duration,
         sample_rate=shots.sample_rate,
         bin_width=shots.sample_rate / shots.fft_size,
+        signed=shots.complex_record,
     )
 
 
 def _false_alarms(shots: Shots, exempted: np.ndarray) -> dict[str, np.ndarray]:
     """False alarms of noise alone: in a bin, the up-chirp, both chirps, any segment; with log10."""
-    log_bin = -0.5 * (shots.threshold / shots.bin_deviation) ** 2
+    log_bin = shots.looks.log_alarm(shots.threshold / shots.bin_deviation)
     exists = shots.segments[:, None]
     counted = np.where(exists, shots.counted_bins(np.where(exists, exempted, 0.0)), 0.0)
     up, doppler, down = log_at_least_one(log_bin, counted)

@@ -9,7 +9,9 @@ sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
     design_pfa_segment   chance that any bin counted in a segment crosses
     design_pfa_shot      the same of a shot: of any of its segments, one after the other
 
-Design probabilities are those of noise alone, before a detection takes bins away.
+Design probabilities are those of noise alone, before a detection takes bins away. In several looks
+(:mod:`sweep.model.looks`) b is that of each record, or of the root of their mean power, over sigma
+of one record, and the chances are those of all of them together.
 """
 
 import math
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from sweep.model import alarms
+from sweep.model.looks import Looks, level_of
 from sweep.model.waveform import DEFAULTS, ORDER, order_of, record_length
 from sweep.model.window import canonical_name, window
 
@@ -33,8 +36,6 @@ TNR, TO_MEAN, PFA_BIN, PFA_SEGMENT, PFA_SHOT = WAYS = tuple(
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
-
-_HALVINGS = 60
 
 
 def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
@@ -68,9 +69,9 @@ def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
         return value
     if given[0] == TO_MEAN:
         return value * (RAYLEIGH_MEAN / RAYLEIGH_DEVIATION)
+    log_pfa, looks = np.log(value), Looks.of(p)
     if given[0] == PFA_BIN:
-        return np.sqrt(-2 * np.log(value)) / RAYLEIGH_DEVIATION
-    log_pfa = np.log(value)
+        return looks.level(log_pfa) / RAYLEIGH_DEVIATION
     if given[0] == PFA_SHOT:  # segments are independent
         order = order_of(
             str(p["instrument.receiver.architecture"]), str(p.get(ORDER, DEFAULTS[ORDER]))
@@ -79,30 +80,12 @@ def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
     return level_of(log_pfa, _law(p)) / RAYLEIGH_DEVIATION
 
 
-def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Threshold over sigma at which a segment alarms with a given probability, (n,).
-
-    Parameters
-    ----------
-    log_pfa : (n,) ndarray
-        Natural logarithm of the probability, < 0.
-    law : callable
-        Logarithm of a segment's false-alarm probability, falling, at levels (n,) from 0 up.
-    """
-    # A bin alone alarms less often than n of them, and these no oftener than n each for itself.
-    low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        above = law(middle) > log_pfa
-        low, high = np.where(above, middle, low), np.where(above, high, middle)
-    return 0.5 * (low + high)
-
-
 def _law(p: Mapping[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
     """Logarithm of the probability that noise alone raises an alarm in a segment, by the level."""
     from sweep.model.marcum import log_at_least_one
 
-    return lambda level: log_at_least_one(-0.5 * level**2, segment_bins(p, level))
+    alarm = Looks.of(p).log_alarm
+    return lambda level: log_at_least_one(alarm(level), segment_bins(p, level))
 
 
 def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
@@ -119,6 +102,8 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
     """
     size = int(np.max(p[PROCESSING + "fft_size"]))
     is_all = str(p[PROCESSING + "bins_counted"]) == "all"
+    in_quadrature = str(p.get("instrument.receiver.record", "real")) == "complex"
+    is_all |= in_quadrature
     if str(p[PROCESSING + "noise_bins"]) == "independent":
         return np.full(np.shape(level), float(size if is_all else size // 2))
     record = record_length(
@@ -130,4 +115,4 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
     taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record)))
     bins = size if is_all else max(size // 2 + 1 - 2 * alarms.first_circular(taper, size), 0)
     correlation = alarms.neighbour_correlation(taper, size)
-    return alarms.independent_bins(bins, level=level, correlation=correlation)
+    return alarms.independent_bins(bins, level=level, correlation=correlation, looks=Looks.of(p))

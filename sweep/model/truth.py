@@ -13,6 +13,7 @@ import numpy as np
 from sweep.model import link, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
+from sweep.model.effects.segment_motion import looks_of
 from sweep.model.preparation import Shots
 from sweep.model.waveform import SIGNS
 
@@ -27,6 +28,8 @@ def spectrum(
     laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
+
+    Of a complex record for k = -N/2..N/2 - 1, (N,).
 
     Parameters
     ----------
@@ -45,9 +48,9 @@ def spectrum(
     With incoherent phases: the root of the mean of |X|^2 over independent uniform phases.
     """
     w = window.samples(shots.window.name, shots.window.length)
-    half = shots.fft_size // 2 + 1
+    half, signed = shots.fft_size // 2 + 1, shots.complex_record
     total = np.zeros(shots.window.length, complex)
-    power = np.zeros(half)
+    power, image = np.zeros(shots.bins), _at(shots.image_gain, i)
     for beamlet in range(shots.offset.shape[1]):
         signal = analytic_record(
             shots, i, segment, beamlet, range_walk=range_walk, acceleration=acceleration
@@ -55,10 +58,16 @@ def spectrum(
         signal *= np.exp(1j * np.asarray(laser_phase))
         total += signal
         if shots.incoherent:
-            spectrum = np.fft.fft(w * signal, shots.fft_size) / 2
-            power += abs(spectrum[:half]) ** 2 + abs(spectrum[-np.arange(half)]) ** 2
+            spectrum = abs(np.fft.fft(w * signal, shots.fft_size) / 2) ** 2
+            if signed:
+                power += np.fft.fftshift(spectrum + image**2 * np.roll(spectrum[::-1], 1))
+            else:
+                power += spectrum[:half] + spectrum[-np.arange(half)]
     if shots.incoherent:
         return np.sqrt(power)
+    if signed:
+        record = w * (total + image * total.conj()) / 2
+        return np.abs(np.fft.fftshift(np.fft.fft(record, shots.fft_size)))
     return np.abs(np.fft.rfft(w * total.real, shots.fft_size))
 
 
@@ -69,14 +78,23 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
     """
     found, table = np.full((3, 6, shots.size), np.nan), shots.point_table()
     for i in range(shots.size):
-        bins = shots.fft_size // 2, float(shots.sample_rate[i]) / shots.fft_size
+        bins = shots.bins - 1, float(shots.sample_rate[i]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.segments)):
-            magnitude, out = spectrum(shots, i, segment, range_walk=range_walk), np.empty((6, 1))
+            each = [
+                spectrum(look, i, segment, range_walk=range_walk)
+                for look in (looks_of(shots) if np.any(shots.look_drift) else [shots])
+            ]
+            magnitude, out = np.sqrt(np.mean(np.square(each), axis=0)), np.empty((6, 1))
             detect_rows(
                 magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, table[13, [i]],
                 table[11, [i]], out,
             )  # fmt: skip
             found[segment, :, i] = out[:, 0]
+            if shots.complex_record:
+                found[segment, 3, i] -= float(shots.sample_rate[i]) / 2
+    if shots.looks.several:
+        peak = np.rint(found[:, 3] / (shots.sample_rate / shots.fft_size))
+        found[:, 0], found[:, 1] = shots.detected(found[:, 2], peak)
     return found
 
 

@@ -20,7 +20,8 @@ A shot has an up- and a down-chirp, in any order, and may have a Doppler segment
 behind them: the lander's ``up doppler down``, the triangle ``up down`` of automotive lidars. All
 last as long, with equal gaps. Without a Doppler segment two beats tell of two unknowns, and
 half sum and half difference could be exchanged: the target is taken to be further away than
-|v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded.
+|v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded. Complex records (I and Q) keep
+the sign of each beat, and two tell both unknowns.
 """
 
 from typing import NamedTuple
@@ -149,12 +150,26 @@ FAR = 1
 """Reading without folds in which the half difference is the Doppler frequency: |f_d| < f_r."""
 
 
+SIGNED = 16
+"""Reading of peaks of a complex record, which keep their signs: 2 f_r = d - u, f_d = u + f_r, each
+up to whole sample rates; range beats up to half of it, Doppler shifts to half of either sign."""
+
+_BELOW = 1 / 64
+"""Share of the sample rate by which 2 f_r may be below 0, as that of peaks rounded to bins."""
+
+
 def reading(code, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
     """(f_d, f_r): signed Doppler and range beat by one of the readings, in the unit given.
 
     The bits of ``code`` are, from the highest, folds of up, Doppler and down peak, and whether
-    half sum and half difference are exchanged: in the order in which readings are tried.
+    half sum and half difference are exchanged: in the order in which readings are tried. Or
+    :data:`SIGNED`, of peaks -N/2 .. N/2.
     """
+    if code == SIGNED:
+        turns = (down - up) / sample_rate
+        f_r = (turns - np.floor(turns + _BELOW)) * sample_rate / 2.0
+        turns = (up + f_r) / sample_rate
+        return (turns - np.floor(turns + 0.5)) * sample_rate, f_r
     u = sample_rate - up if code & 8 else up
     d = sample_rate - down if code & 2 else down
     half_sum, half_difference = (u + d) / 2.0, abs(d - u) / 2.0
@@ -181,10 +196,12 @@ def resolve(
     duration: np.ndarray,
     sample_rate: np.ndarray,
     bin_width: np.ndarray,
+    signed: bool = False,
 ) -> Resolution:
     """Range and velocity from unsigned, folded peak frequencies [Hz], (n,) each.
 
-    Without a Doppler segment, ``doppler=None``, by the reading :data:`FAR`. With it there are two
+    Frequencies with signs (``signed``), of complex records, are read by :data:`SIGNED`. Without a
+    Doppler segment, ``doppler=None``, others are read by :data:`FAR`. With it there are two
     unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
     half sum or half difference being the Doppler frequency) predicts the third peak. The reading
     that predicts it best is taken, a fold counting as :data:`FOLD_PENALTY` bins of mismatch. The
@@ -193,8 +210,8 @@ def resolve(
     PHYSICS section 2 gives the unfolded readings. That half sum and half difference belong to
     the carrier and to the range at mid-chirp is put right here.
     """
-    if doppler is None:
-        f_d, f_r = reading(FAR, up, down, sample_rate)
+    if signed or doppler is None:
+        f_d, f_r = reading(SIGNED if signed else FAR, up, down, sample_rate)
         return Resolution(*measured(f_d, f_r, carrier, bandwidth, duration))
     at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
     least, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())

@@ -25,6 +25,7 @@ from sweep.analysis.selection import (
     spread,
 )
 from sweep.model.effects.catalogue import EFFECTS, names_of
+from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS, tnr_of
 from sweep.report.page import Table
@@ -256,8 +257,10 @@ def false_alarms(study: Study, found: Sequence[Track], fewer: int) -> Chart | No
     ruler = Ruler.of(study.points, name)
     panels = charts.panels_of(named, drawn, ruler, Axis("probability", LOG))
     # The same for all points where no axis moves it, and no number of bins.
-    one = set(WAYS[:3]) & study.spec.parameters_off_axes().keys()
-    closed = noise_only.bin_probability(float(tnr_of(study.spec.parameters())))
+    off_axes = study.spec.parameters_off_axes()
+    one = set(WAYS[:3]) & off_axes.keys() and {NUMBER, COMBINE, VOTES} <= off_axes.keys()
+    values = study.spec.parameters()
+    closed = noise_only.bin_probability(float(tnr_of(values)), Looks.of(values))
     return Chart(
         "False alarms",
         charts.alternative(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -35,6 +35,7 @@ from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.report.detector import PLACES, budget_chart, budget_panel
 from sweep.report.page import COLOUR_BAR, Control, Plot, Table, layout, sentences, title, when
+from sweep.spec import SceneSpec
 
 COLOURS = ("range", "radial_velocity", "snr")
 """Quantities that points can be coloured by."""
@@ -324,7 +325,7 @@ def returns(found: Sequence[Seen]) -> Table:
     return Table("What came back", caption, pandas.DataFrame(rows), "returns")
 
 
-def navigation(found: Sequence[Seen]) -> Chart | None:
+def navigation(spec: SceneSpec, found: Sequence[Seen]) -> Chart | None:
     """Errors of velocity and altitude over altitude; none where no scanner navigates."""
     named = [(seen.words, seen.recording) for seen in found]
     every = [
@@ -332,7 +333,19 @@ def navigation(found: Sequence[Seen]) -> Chart | None:
         for quantity in ("velocity", "altitude")
         for curve in curves(named, quantity=quantity, bins=BINS)
     ]
-    return navigation_chart(every, "all") if every else None
+    if not every:
+        return None
+    chart = navigation_chart(every, "all")
+    return replace(chart, caption=[*chart.caption, *_floor(spec)])
+
+
+def _floor(spec: SceneSpec) -> list[str]:
+    """Errors that no echo lowers, where a flight has any."""
+    own = spec.to_yaml_mapping()["error_floor"]
+    named = [
+        f"{labels.coordinate(name)} {own[name]}" for name, value in spec.error_floor if value > 0
+    ]
+    return [f"errors that no echo lowers: {', '.join(named)}"] if named else []
 
 
 def noise_budget(study: SceneStudy, found: Sequence[Seen]) -> Chart | None:

@@ -196,7 +196,7 @@ def _scene_page(store: Location, say: Say) -> Page:
     cloud = flights.solid(study, seen, fewer)
     say("the flight")
     flight: list[Made] = [
-        flights.along(seen), flights.navigation(seen), flights.noise_budget(study, seen),
+        flights.along(seen), flights.navigation(spec, seen), flights.noise_budget(study, seen),
     ]  # fmt: skip
     say("effects and accuracy")
     groups = [study.tree[name].to_dataset() for name in study.scanners]

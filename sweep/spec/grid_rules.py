@@ -16,12 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam
+from sweep.model import beam, looks
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
+from sweep.model.detectors import FIXED
+from sweep.model.effects import iq_imbalance
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.model.preparation import RECORD
 from sweep.spec.axes import Axis, place_on_grid
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding
@@ -38,6 +41,9 @@ WINDOW = "instrument.processing.window"
 RESPONSIVITY = "instrument.receiver.responsivity"
 EXTINCTION = "atmosphere.extinction"
 FULL_SCALE = "instrument.processing.full_scale"
+DETECTION = "instrument.processing.detection"
+LINE_WIDTH, LINE_SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
+ROUGHNESS = "target.roughness"
 TRAINING, GUARD, RANK = (DETECTOR + name for name in ("training", "guard", "rank"))
 
 _TRIED = 16
@@ -156,7 +162,7 @@ def _is(word: str) -> Condition:
     return lambda values: values == word
 
 
-def _is_not(word: str) -> Condition:
+def _is_not(word: str | float) -> Condition:
     return lambda values: values != word
 
 
@@ -176,6 +182,8 @@ def grid_findings(grid: Grid) -> list[Finding]:
         *_beam_findings(grid),
         *_nesting_findings(grid),
         *_need_findings(grid),
+        *_record_findings(grid),
+        *_looks_findings(grid),
     ]
 
 
@@ -334,6 +342,60 @@ def _log_power(power: float, values: np.ndarray) -> np.ndarray:
         return np.asarray(power * np.log(values))
 
 
+# Looks
+
+MOST_VOTES = 64
+
+
+def _several(number: np.ndarray) -> np.ndarray:
+    return number > 1
+
+
+def _looks_findings(grid: Grid) -> Iterator[Finding]:
+    """Looks whose chances are not known, or that contradict each other."""
+    several: dict[str, Condition] = {looks.NUMBER: _several}
+    by_bin: dict[str, Condition] = {looks.COMBINE: _is_not(looks.COHERENT), **several}
+    added: dict[str, Condition] = {looks.COMBINE: _is(looks.COHERENT), **several}
+    voted: dict[str, Condition] = {looks.COMBINE: _is(looks.BINARY), **several}
+    if grid.has_point(by_bin | {DETECTION: _is("any_bin")}):
+        rule = "detects by the largest bin of an echo where several records are not added in "
+        rule += "amplitude: the chance that any of its bins does is known for one record alone"
+        yield grid.finding(DETECTION, rule, "write 'detection: peak_bin', or combine: coherent")
+    if grid.has_point(voted | {looks.NUMBER: lambda number: number > MOST_VOTES}):
+        rule = f"counts the votes of at most {MOST_VOTES} records"
+        yield grid.finding(looks.NUMBER, rule, "take fewer, or combine: power")
+    least = grid.least({looks.NUMBER: lambda n: n, looks.VOTES: lambda m: -m}, voted)
+    if least and least[looks.VOTES] > least[looks.NUMBER]:
+        rule = f"asks for more than the {least[looks.NUMBER]:g} records of instrument.looks.number"
+        yield grid.finding(looks.VOTES, rule, "lower it, or take more looks")
+    if grid.has_point(added | {looks.SPECKLE: _is(looks.INDEPENDENT)}):
+        rule = "gives each record a phase of its own, in which amplitudes do not add up"
+        yield grid.finding(looks.SPECKLE, rule, "take common, or combine: power")
+    if grid.has_point(added | {LINE_WIDTH: _given, LINE_SHAPE: _is("gaussian")}):
+        rule = "tells nothing of the phase from one record to the next, of which the sum is made"
+        yield grid.finding(LINE_SHAPE, rule, "take lorentzian, or combine: power")
+    if grid.has_point(by_bin | {looks.SPECKLE: _is(looks.INDEPENDENT), ROUGHNESS: _given}):
+        rule = "is drawn once a shot for a surface of stated roughness, for all its records"
+        remedy = "take common, or footprint.speckle: developed without target.roughness"
+        yield grid.finding(looks.SPECKLE, rule, remedy)
+    if grid.has_point(
+        {looks.COMBINE: _is(looks.POWER), **several, DETECTOR + "kind": _is_not(FIXED)}
+    ):
+        rule = "sets its threshold by the noise of one record, and here powers are averaged"
+        remedy = "take fixed, or combine: binary or coherent"
+        yield grid.finding(DETECTOR + "kind", rule, remedy)
+
+
+def _noise_of_looks(grid: Grid, method: str) -> Iterator[Finding]:
+    """Noise added to the bins of several records."""
+    if method == "noise" and grid.has_point(
+        {looks.NUMBER: _several, looks.COMBINE: _is_not(looks.COHERENT)}
+    ):
+        rule = "adds noise to the bins of one record, and instrument.looks.number asks for several"
+        remedy = "take probabilities or spectra, or combine: coherent"
+        yield Finding(("draws", "method"), rule, remedy, method)
+
+
 # Effects
 
 
@@ -366,6 +428,17 @@ NEEDS = (
         Need(path, lambda value: value != 0, other, _is(word), *_OF_ONE_MODE)
         for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
         for other, word in ((beam.COUPLING, beam.APERTURE), (beam.ARCHITECTURE, "direct"))
+    ),
+    *(
+        Need(
+            path,
+            _is_not(default),
+            RECORD,
+            _is("real"),
+            "is one of I and Q, and the record is real",
+            "set instrument.receiver.record: complex",
+        )
+        for path, default in ((iq_imbalance.GAIN, 1.0), (iq_imbalance.PHASE, 0.0))
     ),
     _above_zero("instrument.processing.bits", _given, FULL_SCALE),
     _above_zero(
@@ -422,6 +495,13 @@ def _need_findings(grid: Grid) -> Iterator[Finding]:
             yield _of_mode(owner.name, need.rule, remedy)
 
 
+def _record_findings(grid: Grid) -> Iterator[Finding]:
+    """Complex records of direct detection, which has one detector and no phase to tell."""
+    if grid.has_point({RECORD: _is("complex"), beam.ARCHITECTURE: _is("direct")}):
+        rule = "samples I and Q, of which direct detection has one"
+        yield grid.finding(RECORD, rule, "take a coherent receiver, or record: real")
+
+
 def without_draws(grid: Grid) -> Iterator[Finding]:
     """Random effects that a grid has and, without draws, can't simulate."""
     rule = "is simulated by draws, and the study has none"
@@ -436,7 +516,7 @@ def without_draws(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(parameter.path, rule, remedy)
 
 
-def not_in_flights(grid: Grid) -> Iterator[Finding]:
+def not_in_flights(grid: Grid, method: str) -> Iterator[Finding]:
     """Random effects and methods that are asked for in a flight, and that only grids draw.
 
     All other random effects are drawn; a target's own parameters are told where they stand.
@@ -447,6 +527,11 @@ def not_in_flights(grid: Grid) -> Iterator[Finding]:
         if (effect.turn or of_target) and effect.is_random and grid.modes.get(effect.name) == ON:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
+    yield from _noise_of_looks(grid, method)
+    voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
+    if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
+        rule = "counts records, and flights draw no powers of echoes that fade in several"
+        yield grid.finding(looks.COMBINE, rule, "take power, or footprint.speckle: none")
     rule = "looks at whole spectra, which flights over scenes do not draw"
     for path in _methods(grid):
         if path in grid.values:
@@ -479,6 +564,7 @@ def is_method(path: str) -> bool:
 
 def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
     """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
+    yield from _noise_of_looks(grid, draws.method)
     if not draws.whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA}, number: 1000}}, or leave it out"
         rule = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"
@@ -486,6 +572,10 @@ def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
             yield grid.finding(path, rule, remedy)
     elif not draws.any:
         rule, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
+        yield Finding(("draws", "method"), rule, remedy, draws.method)
+    elif grid.has_point({RECORD: _is("complex")}):
+        rule = "draws whole spectra of real records, and the record is complex"
+        remedy = "take draws.method: noise, or instrument.receiver.record: real"
         yield Finding(("draws", "method"), rule, remedy, draws.method)
     else:
         yield from _misfits(grid)

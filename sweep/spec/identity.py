@@ -18,12 +18,14 @@ from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
 from sweep.spec.rules import File
-from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 
 LISTED_VALUES = 64
 MOST_TOLD = 8
 """Values of an axis that are told one by one."""
-ROOTS: Models = (Scene, Platform, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner))
+ROOTS: Models = (
+    Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner)
+)  # fmt: skip
 """Sections that studies of scenes alone have."""
 
 

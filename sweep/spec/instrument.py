@@ -13,6 +13,7 @@ from sweep.model import waveform
 from sweep.model.beam import COUPLINGS, SINGLE_MODE
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
+from sweep.model.looks import COMBINED, COMMON, POWER, SPECKLES
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.spec.parts import Part, with_parameters
 from sweep.spec.rules import BROKEN_RULE, Method, Window
@@ -118,6 +119,13 @@ class Receiver(Part):
         "receiver",
     )
     architecture: str = of.choice("How the echo is detected", ARCHITECTURES, "homodyne")
+    record: str = of.choice(
+        "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
+        "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
+        "coherent receivers only",
+        ("real", "complex"),
+        "real",
+    )
     local_oscillator_power: float = of.quantity(
         "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
         default=1e-3,
@@ -246,6 +254,33 @@ class Processing(Part):
         return self
 
 
+@with_parameters("instrument.looks")
+class LooksOfShot(Part):
+    """Several records of each segment, from which a shot is detected: the waveform N times over."""
+
+    number: int = of.count(
+        "Records of each segment. A shot lasts so many times as long, and false alarms are those "
+        "of all its records together",
+        "8", "1", "256", default=1,
+    )  # fmt: skip
+    combine: str = of.choice(
+        "Detection from several records: by their mean power, by the number of those that cross, "
+        "or by their sum in amplitude, with the phases that a steady velocity makes put right. "
+        "tnr and threshold_to_mean are over the noise of one record, or of the mean of a sum",
+        COMBINED,
+        POWER,
+    )
+    votes: int = of.count(
+        "Records that must cross in a bin; binary only", "3", "1", "256", default=1
+    )
+    speckle: str = of.choice(
+        "Speckle of the records: common to all, as they follow one another at once; or "
+        "independent, where the beam moves on by its own width from one to the next",
+        SPECKLES,
+        COMMON,
+    )
+
+
 class Instrument(Part):
     """A Doppler lidar."""
 
@@ -254,3 +289,4 @@ class Instrument(Part):
     telescope: Telescope
     receiver: Receiver
     processing: Processing
+    looks: LooksOfShot = LooksOfShot()

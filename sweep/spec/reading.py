@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from sweep.model.threshold import PROCESSING, WAYS
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.mistakes import (
@@ -23,9 +24,11 @@ from sweep.spec.mistakes import (
     Finding,
     Location,
     Mistake,
+    Rejected,
     SpecError,
     dotted,
     near_miss,
+    rejected,
     shown,
 )
 from sweep.spec.parts import (
@@ -43,6 +46,10 @@ from sweep.spec.rules import BROKEN_RULE, Numeric
 LARGEST_FILE = 1_000_000
 DEEPEST = 30
 MOST_NODES = 200_000
+
+_INSTRUMENT: Location = ("instrument",)
+_LIBRARY = Path(__file__).parents[1] / "instruments"
+_THRESHOLDS = {way.removeprefix(PROCESSING) for way in WAYS}
 
 _MOST_DIGITS = 4000
 """Of a number: Python reads no more, unless it is asked to."""
@@ -222,34 +229,74 @@ class _Walk:
 
 
 def resolve_instrument(document: Document, base: Path) -> bool:
-    """Put an instrument's file in the place of its path; False where it can't be read."""
+    """Put an instrument of the library or of a file in the place of its name; False without one."""
     written = document.value.get("instrument")
-    reference: object = written
+    reference, location = written, _INSTRUMENT
     overrides: dict[str, Any] = {}
-    location: Location = ("instrument",)
-    if isinstance(written, dict) and "file" in written:
-        reference, location = written["file"], ("instrument", "file")
-        overrides = {key: value for key, value in written.items() if key != "file"}
+    if isinstance(written, dict):
+        key = next((key for key in ("like", "file") if key in written), "")
+        if not key:
+            return True
+        reference, location = written[key], ("instrument", key)
+        overrides = {name: value for name, value in written.items() if name != key}
     elif not isinstance(written, str):
         return True
-    if not isinstance(reference, str):
-        rule = "must be the path of a YAML file"
-        document.findings.append(Finding(location, rule, "", reference))
-        return False
     try:
-        read = read_document(base / os.path.expanduser(reference))
-    except SpecError as error:
-        rule = f"names a file that {error.mistakes[0].rule}"
-        document.findings.append(Finding(location, rule, error.mistakes[0].suggestion, reference))
+        inside, read = _instrument_of(reference, location, base)
+    except Rejected as error:
+        document.findings += error.findings
         return False
-    document.value["instrument"] = merged(read.value, overrides)
-    own = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
-    inside = {("instrument", *place): at for place, at in read.places.items() if place}
-    document.places = document.places | inside | own
+    own = read.value["instrument"] if inside else read.value
+    document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
+    kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
+    within = {place: at for place, at in read.places.items() if len(place) > inside}
+    if inside:
+        within = {place[1:]: at for place, at in within.items() if place[0] == "instrument"}
+    places = {("instrument", *place): at for place, at in within.items()}
+    document.places = document.places | places | kept
     document.findings += [
         Finding(("instrument", *f.location), f.rule, f.suggestion, f.written) for f in read.findings
     ]
     return True
+
+
+def _instrument_of(reference: object, location: Location, base: Path) -> tuple[int, Document]:
+    """Document that holds an instrument, and how many keys down it stands there."""
+    if not isinstance(reference, str):
+        what = "name of an instrument, see sweep instruments" if "like" in location else ""
+        raise rejected(location, f"must be the {what or 'path of a YAML file'}", "", reference)
+    file, known = base / os.path.expanduser(reference), library()
+    if "file" not in location and reference in known:
+        return 1, read_document(known[reference])
+    is_word = reference.isidentifier() and not os.path.exists(file)
+    if "like" in location or (is_word and "file" not in location):
+        remedy = f"the library has {', '.join(known)}"
+        remedy = "; ".join(filter(None, (near_miss(reference, known), remedy)))
+        raise rejected(location, "is no instrument of the library", remedy, reference)
+    try:
+        return 0, read_document(file)
+    except SpecError as error:
+        rule = f"names a file that {error.mistakes[0].rule}"
+        raise rejected(location, rule, error.mistakes[0].suggestion, reference) from None
+
+
+def library() -> dict[str, Path]:
+    """Files of the instruments that a spec may name, by name.
+
+    Each file says beside its ``instrument`` where it is published, and what it must reproduce.
+
+    >>> "settembrini_2026" in library()
+    True
+    """
+    return {file.stem: file for file in sorted(_LIBRARY.glob("*.yaml"))}
+
+
+def _without_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """An instrument without its threshold, where the overrides set one in whatever way."""
+    kept, anew = instrument.get("processing"), overrides.get("processing")
+    if not (isinstance(kept, Mapping) and isinstance(anew, Mapping) and _THRESHOLDS & anew.keys()):
+        return dict(instrument)
+    return instrument | {"processing": {k: v for k, v in kept.items() if k not in _THRESHOLDS}}
 
 
 def plain(data: Any, location: Location = ()) -> Any:
@@ -298,7 +345,7 @@ _PLAIN = {
 _FLIES = "it is for studies with a scene, in place of a target"
 _OTHER_STUDYS = {
     **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
-    **dict.fromkeys(("platform", "scanners", "navigation"), _FLIES),
+    **dict.fromkeys(("platform", "scanners", "error_floor", "navigation"), _FLIES),
 }
 """Remedy for a section that only the other kind of study has."""
 

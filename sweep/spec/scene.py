@@ -293,6 +293,29 @@ class Navigation(Part):
     )
 
 
+class ErrorFloor(Part):
+    """Standard deviations of an instrument's errors that no echo is strong enough to lower."""
+
+    pointing_error: float = of.angle(
+        "Error of each beam's known direction, on each of two axes; the same all flight long, and "
+        "independent from beam to beam. Moves points, and velocities by as much of the velocity "
+        "across the beam",
+        "0.1 mrad", "0 rad", "10 deg", default=0.0,
+    )  # fmt: skip
+    clock_error: float = of.number(
+        "Relative error of the sampling clock, common to all beams: scales ranges and velocities",
+        "1e-6", "0", "0.1", default=0.0,
+    )  # fmt: skip
+    wavelength_error: float = of.number(
+        "Relative error of the known wavelength, common to all beams: scales velocities",
+        "1e-7", "0", "0.1", default=0.0,
+    )  # fmt: skip
+    vibration: float = of.quantity(
+        "Velocity of the instrument's vibration along the beam, independent from shot to shot",
+        "m/s", "1 cm/s", "0 m/s", "1 km/s", default=0.0,
+    )  # fmt: skip
+
+
 class SceneStorage(Part):
     """Division of results in the store; part of a study's identity."""
 

@@ -18,9 +18,9 @@ from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import Grid, is_method, not_in_flights
 from sweep.spec.identity import digest, geometry_of, leaf_values
 from sweep.spec.mistakes import Finding, Location
-from sweep.spec.parts import Files, named_files
+from sweep.spec.parts import Files, named_files, read_as
 from sweep.spec.reading import Document
-from sweep.spec.scene import Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
     Arrangement,
     axis_findings,
@@ -47,6 +47,7 @@ class SceneSpec(Study):
     platform: Platform
     scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
     draws: SceneDraws = SceneDraws()
+    error_floor: ErrorFloor = ErrorFloor()
     navigation: Navigation = Navigation()
     storage: SceneStorage = SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
@@ -69,10 +70,11 @@ class SceneSpec(Study):
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
         """Mistakes in scene, flight, files, random effects and figures."""
+        draws = read_as(SceneDraws, written.get("draws", {})) or SceneDraws()
         return [
             *scene_findings(written, base),
             *axis_findings(written, grid.axes),
-            *not_in_flights(grid),
+            *not_in_flights(grid, draws.method),
             *scene_figure_findings(written, grid.axes if axes_are_whole else None),
         ]
 

@@ -10,6 +10,7 @@ from pydantic.json_schema import models_json_schema
 
 from sweep.spec.fields import parameter_rules
 from sweep.spec.parts import all_parts, fields_of, rule_of
+from sweep.spec.reading import library
 from sweep.spec.rules import Json, Numeric, Rule
 from sweep.spec.scene_spec import SceneSpec
 from sweep.spec.study import Spec
@@ -35,8 +36,13 @@ def json_schema() -> Json:
         definitions["Instrument"],
         "YAML file of the instrument, relative to this one",
     )
-    instrument["description"] = "A Doppler lidar, in whole or in overrides of a file's"
+    instrument["description"] = "A Doppler lidar: in whole, or fields set anew of a known one"
     instrument["properties"] = {
+        "like": {
+            "enum": list(library()),
+            "description": "Instrument of the library, which has all fields that are not given "
+            "here; sweep instruments tells of each",
+        },
         "file": {"type": "string", "description": file},
         **instrument["properties"],
     }
@@ -60,9 +66,10 @@ def json_schema() -> Json:
 def _complete(study: Json, rules: Mapping[str, Rule], required: tuple[str, ...]) -> None:
     """Describe a study's instrument and axes, and name what it can't do without."""
     study["properties"]["instrument"] = {
-        "description": "The instrument: the path of its file, a file with overrides, or all of it",
+        "description": "The instrument: its name in the library (sweep instruments), the path of "
+        "its file, one of these with fields set anew, or all of it",
         "anyOf": [
-            {"type": "string", "examples": ["instruments/table_4_1.yaml"]},
+            {"type": "string", "examples": ["settembrini_2026", "instruments/table_4_1.yaml"]},
             {"$ref": "#/$defs/Instrument"},
         ],
     }

@@ -248,7 +248,11 @@ class Study(Part):
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides. The order of the axes is: it lays out the arrays.
         """
-        sections = [n for n in ("draws", "navigation", "storage") if n in type(self).model_fields]
+        sections = [
+            name
+            for name in ("draws", "error_floor", "navigation", "storage")
+            if name in type(self).model_fields
+        ]
         return {
             "model": VERSION,
             "parameters": self.parameters_off_axes(),

@@ -17,6 +17,7 @@ from sweep.model.effects.catalogue import DEFAULTS, FLAGS_APART, SHARED, flags_o
 from sweep.model.effects.catalogue import EFFECTS as ALL
 from sweep.model.effects.points import Points
 from sweep.model.ground import of_rays
+from sweep.model.looks import NUMBER, VOTES
 from sweep.model.resolution import BEAMLETS, effects_tolerance
 from sweep.tasks.grid import Grid, Value
 from sweep.tasks.study import BlockGrid
@@ -48,6 +49,8 @@ UNDIVIDED = (
     "instrument.processing.acquisition_delay",
     "instrument.chirp.duration",
     "footprint.beamlets",
+    NUMBER,
+    VOTES,
     TOLERANCE,
 )
 

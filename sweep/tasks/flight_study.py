@@ -38,6 +38,7 @@ from sweep.tasks.reuse import GrowingStudy
 from sweep.tasks.study import ArrayLayout, BlockGrid, Results
 
 if TYPE_CHECKING:
+    from sweep.model.error_floor import ErrorFloor
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
     from sweep.spec import SceneSpec
@@ -345,15 +346,17 @@ class FlightStudy(GrowingStudy):
     ) -> Results:
         """Points of eyepoints, of shots with these numbers and flags."""
         from sweep.model.clouds import cloud
+        from sweep.model.error_floor import stray
         from sweep.model.philox import point_keys
 
-        rows = numbers[:, None].astype(float)
-        return cloud(
+        seed, first = int(self.spec.seed), part.draws.start + draws.start
+        keys = point_keys(numbers[:, None].astype(float), domain=DOMAIN, seed=seed)
+        found = cloud(
             eyepoints,
             parameters=self.parameters_at(part),
             surfaces=self.surfaces,
-            keys=point_keys(rows, domain=DOMAIN, seed=int(self.spec.seed)),
-            first_draw=part.draws.start + draws.start,
+            keys=keys,
+            first_draw=first,
             draws=draws.stop - draws.start,
             method=self.spec.draws.method,
             returns=int(self.spec.draws.returns),
@@ -361,6 +364,9 @@ class FlightStudy(GrowingStudy):
             flags=flags,
             estimates_rays=self.rays_accuracy is not None,
         )
+        if not any(self.error_floor):
+            return found
+        return stray(found, eyepoints, self.error_floor, keys=keys, seed=seed, first_draw=first)
 
     def _refine(
         self,
@@ -398,6 +404,7 @@ class FlightStudy(GrowingStudy):
             ground_slope=self.spec.navigation.ground_slope,
             relief=self.spec.navigation.relief,
             jitter=self.spec.platform.jitter,
+            floor=self.error_floor,
         )
 
     def _known(self, block: int, selected: Selected) -> KnownCloud:
@@ -442,6 +449,16 @@ class FlightStudy(GrowingStudy):
             for member in axis.members:
                 parameters[member.path] = np.asarray(member.values)[index].item()
         return parameters
+
+    @cached_property
+    def error_floor(self) -> ErrorFloor:
+        """Errors of the instrument that no echo lowers."""
+        from sweep.model.error_floor import ErrorFloor
+
+        floor = self.spec.error_floor
+        return ErrorFloor(
+            floor.pointing_error, floor.clock_error, floor.wavelength_error, floor.vibration
+        )
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:

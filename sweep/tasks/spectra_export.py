@@ -12,6 +12,9 @@ import numpy as np
 
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+from sweep.model.looks import NUMBER, Looks
+from sweep.model.preparation import RECORD
+from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.atomic_replace import draft
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import draw_keys
@@ -48,6 +51,16 @@ def spectra(
     from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
 
+    if str(parameters.get(RECORD, "real")) == "complex":
+        raise UnsupportedShot(
+            "instrument.receiver.record is complex, and spectra are drawn of real records: set it "
+            "to real"
+        )
+    if Looks.of(parameters).number > 1:
+        raise ValueError(
+            f"a file of spectra holds one record of each segment, and {NUMBER} takes "
+            f"{Looks.of(parameters).number}: export a point of one look"
+        )
     modes, key = spec.modes(), draw_keys(spec, parameters, 1)
     arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}
     effects = [e.name for e in EFFECTS if modes[e.name] != "off" and not e.absent(arrays).all()]

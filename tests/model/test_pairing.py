@@ -37,7 +37,7 @@ def _pair(up, doppler, down, tolerance=TOLERANCE):
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
     pairs = np.full((room, 4), -9)
-    confirmed, number = pair_peaks(*lists, AT_START, float(N), tolerance, pairs)
+    confirmed, number = pair_peaks(*lists, AT_START, float(N), False, tolerance, pairs)
     return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
 
 
@@ -48,7 +48,7 @@ def _reported(up, down, code):
 
 def _confirmed(up, doppler, down, tolerance):
     """(reading, cost) of one triple [bins]."""
-    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), tolerance)
+    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), False, tolerance)
     return code, cost
 
 

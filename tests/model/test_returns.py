@@ -237,23 +237,27 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         taken = {k for first, last in spans for k in range(first - 1, last + 2)}
         free = sorted(set(range(1, half + 1)) - taken)
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
-        places, counts = np.unique([free_bin(u, bins, half) for u in chances], return_counts=True)
+        places, counts = np.unique(
+            [free_bin(u, bins, half, False) for u in chances], return_counts=True
+        )
         assert places.tolist() == free
         assert (counts == 20).all()
 
 
 def test_the_largest_of_many_noise_bins_has_its_order_statistic():
-    """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution."""
+    """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution; Gamma's in looks."""
     for chance in (1e-9, 0.01, 0.7):
         for n in (1.0, 100.0, 65000.0):
-            x = largest_of(n, chance)
+            x = largest_of(n, chance, 1)
             assert -np.expm1(n * stats.rayleigh.logcdf(x)) == pytest.approx(chance, rel=1e-9)
+            below = stats.gamma.logcdf(4 * largest_of(n, chance, 8) ** 2, 8)
+            assert -np.expm1(n * below) == pytest.approx(chance, rel=1e-9)
 
 
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
     rule = np.empty((0, 17)), np.empty(0, np.int64), 0
-    how = How(0, True, True, True, half, 0, 0, rule)
+    how = How(0, True, True, True, half, False, 0, 0, rule, 1, False)
     known = Known(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),

@@ -40,5 +40,6 @@ SCENE = {
     "scanners": {"four": {"kind": "corners", "angle": "22.5 deg", "rate": "8 Hz"}},
     "footprint": {"beamlets": 7, "speckle": "none"},
     "draws": {"number": 2},
+    "error_floor": {"clock_error": 1e-6, "vibration": "1 cm/s"},
     "axes": {"instrument.telescope.optical_efficiency": [1, 0.01]},
 }  # fmt: skip

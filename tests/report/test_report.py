@@ -117,6 +117,13 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
         np.testing.assert_allclose(by_alarm[alarm].x, of_model[name], rtol=2e-2, atol=1e-30)
 
 
+def test_a_flight_s_page_names_the_floor_of_its_errors(scene_page):
+    """Under the chart of navigation, and field by field."""
+    page = scene_page.read_text()
+    assert "rrors that no echo lowers: clock error 1e-06, vibration 1 cm/s." in page
+    assert all(f"error_floor.{name}" in page for name in ("pointing_error", "wavelength_error"))
+
+
 def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
     missing = CliRunner().invoke(main, ["report", str(tmp_path / "none.zarr")])
     assert missing.exit_code == 2 and "there is no store at" in missing.stderr

@@ -78,6 +78,7 @@ SAME_GEOMETRY = {
     "accuracy.line_error": 0.2,
     "accuracy.leakage_error": 0.2,
     "draws": {"number": 5},
+    "error_floor": {"clock_error": 1e-6},
     "navigation": {"test_level": 0.01},
     "storage": {"block_shots": 64},
     "axes": {},

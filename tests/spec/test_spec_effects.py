@@ -30,8 +30,9 @@ RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jit
 """Parameters that bring a random effect."""
 THERE = {"target.roughness": "1 um", "target.pointing_jitter": "1 urad",
          "atmosphere.turbulence": "uniform"}  # fmt: skip
+RECORD = "instrument.receiver.record"
 NEEDED = {"instrument.processing.full_scale": "1 V", "atmosphere.extinction": "0.1 1/km",
-          "draws.number": 1, "instrument.telescope.coupling": "single_mode",
+          "draws.number": 1, "instrument.telescope.coupling": "single_mode", RECORD: "complex",
           "instrument.laser.beam_divergence": "100 urad"}  # fmt: skip
 """What parameters of effects need beside them."""
 

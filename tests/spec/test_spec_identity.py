@@ -162,8 +162,12 @@ def test_every_parameter_is_part_of_the_id(path):
     every = EVERY | spectra
     if path == "instrument.laser.beam_waist":  # one of the two that say how wide a beam is
         every |= {"instrument.laser.beam_divergence": "none", path: "4 mm"}
+    if path == "instrument.looks.number":  # several records detect by the largest bin
+        every |= {"instrument.processing.detection": "peak_bin"}
     if path == "footprint.speckle":
         every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
+    if "receiver.iq_" in path:
+        every |= {"instrument.receiver.record": "complex"}
     instead = {TNR: ...} if path in WAYS and path != TNR else {}
     base, changed = spec(every), spec(every | instead | {path: other_value(path)})
     assert changed.id != base.id

@@ -437,3 +437,11 @@ def test_what_is_broken_off_before_any_point_is_through_leaves_nothing(tmp_path,
     monkeypatch.setattr(measure.Measurement, "run", broken)
     assert not measured(small(), store_path=tmp_path / "a.zarr", progress=False)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("law", ["off", "auto"])
+def test_segments_that_begin_at_one_range_are_the_reference_s_law_too(law):
+    """The thesis's law is no omission that the reference would have to make good."""
+    reference = rungs.ladder(small(effects={"segment_motion": law})).reference
+    assert ("effects.segment_motion" in reference.overrides) == (law == "auto")
+    assert "effects.range_walk" in reference.overrides

@@ -13,6 +13,7 @@ from sweep.analysis.answers.physical import parameter, spec_of
 from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import NAMES
+from sweep.model.looks import COHERENT
 from sweep.model.window import transform, window
 
 _SEGMENTS = ("up", "doppler", "down")
@@ -24,7 +25,7 @@ _PARAMETERS = {
     "sample_rate": "processing.sample_rate",
     "fft_size": "processing.fft_size", "window": "processing.window",
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
-    "line_shape": "laser.line_shape",
+    "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
 
 
@@ -138,9 +139,10 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     deviations = []
     order = waveform.order_of(str(p["architecture"][0]), str(p["segments"][0]))
     starts = waveform.segment_starts(order, duration=p["duration"], gap=p["gap"])
+    late = 0.5 * (p["looks"] - 1) * len(order) * (p["duration"] + p["gap"])
     for segment, sign in enumerate(waveform.SIGNS):
         carrier, seen = carriers[segment], snr[segment]
-        moved = np.where(p["moves"], starts[segment] * p["radial_velocity"], 0.0)
+        moved = np.where(p["moves"], (starts[segment] + late) * p["radial_velocity"], 0.0)
         beat = waveform.beat_frequency(
             sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
             radial_velocity=p["radial_velocity"],
@@ -159,7 +161,9 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
             line_width=np.where(p["line_shape"] == "lorentzian", p["line_width"], 0.0),
             delay=2 * p["range"] / SPEED_OF_LIGHT, duration=length / rate,
         )  # fmt: skip
-        deviation = np.hypot(deviation, walked)
+        # The stored SNR is that of a sum of looks, or of each of those that tell by themselves.
+        deviation = deviation / np.sqrt(np.where(p["combine"] == COHERENT, 1.0, p["looks"]))
+        deviation = np.hypot(deviation, walked / np.sqrt(p["looks"]))
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
     found = estimators.resolved_deviation(

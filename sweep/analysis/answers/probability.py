@@ -13,7 +13,7 @@ from sweep.analysis import noise_only
 from sweep.analysis.answers.physical import parameter, quantity, si, spec_of
 from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS, names_of
-from sweep.model.marcum import marcum_q1
+from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
 from sweep.model.philox import point_keys
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate
@@ -86,7 +86,7 @@ def false_alarms_per_second(
         As `sweep.open` gives it, or a part of it.
     rate
         Shots a second, ``"20 Hz"`` or a number; by default as many as chirps leave time for,
-        one after so many segments and as many gaps as it has.
+        one after so many segments and as many gaps as it has in all its looks.
     leakage
         Whether extra groups that leaked signal raises count as well as noise. A study that draws
         whole spectra counts every false alarm of a shot, of either cause, whatever is asked.
@@ -103,15 +103,18 @@ def false_alarms_per_second(
     """
     shots: xr.DataArray | float
     if rate is None:
-        architecture, order, duration, gap = (
+        architecture, order, duration, gap, looks = (
             parameter(dataset, f"instrument.{path}", spec_of(dataset))
-            for path in ("receiver.architecture", "chirp.segments", "chirp.duration", "chirp.gap")
-        )
+            for path in (
+                "receiver.architecture", "chirp.segments", "chirp.duration", "chirp.gap",
+                "looks.number",
+            )
+        )  # fmt: skip
         segments = xr.apply_ufunc(
             lambda a, names: len(waveform.order_of(str(a), str(names))), architecture, order,
             vectorize=True, dask="parallelized", output_dtypes=[int],
         )  # fmt: skip
-        shots = 1 / (segments * (duration + gap))
+        shots = 1 / (looks * (segments * (duration + gap)))
     else:
         shots = quantity(rate, si_unit="Hz", name="the rate of shots")
         if not shots > 0:
@@ -282,7 +285,8 @@ def roc(
     Raises
     ------
     ValueError
-        Too many points, a probability that is none, or a study of whole spectra.
+        Too many points, a probability that is none, a study of whole spectra, or one whose looks
+        vary.
     """
     if "log10_pfa_bin" not in dataset:
         raise ValueError(
@@ -297,10 +301,11 @@ def roc(
         raise ValueError(
             f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
         )
+    looks = _looks_of(spec_of(dataset))
     dataset = dataset[_needed(dataset, segment)].compute()
-    level = xr.DataArray(np.sqrt(-2 * np.log(chances)), dims=["pfa_bin"])
-    pd, exact = _closed(dataset, segment, level)
-    tnr = level * _own_tnr(dataset) / _own_level(dataset)
+    level = xr.DataArray(looks.level(np.log(chances)), dims=["pfa_bin"])
+    pd, exact = _closed(dataset, segment, level, looks)
+    tnr = level * _own_tnr(dataset) / _own_level(dataset, looks)
     result = xr.Dataset(
         {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
         {"pfa_bin": ("pfa_bin", chances)},
@@ -311,6 +316,17 @@ def roc(
     return _described(result, dataset, segment)
 
 
+def _looks_of(spec: Spec) -> Looks:
+    """Return the looks of all points."""
+    on_axes = (member.path for axis in spec.axes for member in axis.members)
+    if varying := sorted({NUMBER, COMBINE, VOTES} & set(on_axes)):
+        raise ValueError(
+            f"{', '.join(varying)} varies, and with it the threshold that a chance of false alarms "
+            "makes: put the design pfa on an axis, and read pd over it"
+        )
+    return Looks.of(spec.parameters())
+
+
 def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
     """Variables that a curve is made of."""
     names = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
@@ -318,23 +334,25 @@ def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
 
 
 def _closed(
-    dataset: xr.Dataset, segment: str, level: xr.DataArray
+    dataset: xr.Dataset, segment: str, level: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return closed form of pd at each level, and where it holds."""
-    own = _own_level(dataset)
+    """Return the closed form of pd at each level, and where it holds."""
+    own = _own_level(dataset, looks)
     pd = xr.ones_like(level)
     exact = (dataset["effects"] & _RANDOM) == 0
     for name in _SEGMENTS[segment]:
         stored = dataset[f"pd_{name}"]
         amplitude = (2 * dataset[f"snr_{name}"]) ** 0.5
-        pd = pd * xr.apply_ufunc(_crossing, amplitude, level)
-        again = xr.apply_ufunc(_crossing, amplitude, own)
+        pd = pd * xr.apply_ufunc(_crossing, amplitude, level, kwargs={"looks": looks})
+        again = xr.apply_ufunc(_crossing, amplitude, own, kwargs={"looks": looks})
         exact = exact & ((abs(again - stored) <= SAME) | stored.isnull())
     return pd, exact
 
 
-def _own_level(dataset: xr.Dataset) -> xr.DataArray:
+def _own_level(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
     """Return the study's own threshold over the noise per quadrature."""
+    if looks.several:
+        return xr.apply_ufunc(looks.level, np.log(10) * dataset["log10_pfa_bin"])
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
 
 
@@ -354,12 +372,11 @@ def _parameters_of(coords: Mapping[Any, xr.DataArray], spec: Spec) -> dict[str, 
     return spec.parameters() | {path: si(value).values.item() for path, value in values.items()}
 
 
-def _crossing(amplitude: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Q_1, nan where the amplitude or the level is."""
+def _crossing(amplitude: np.ndarray, level: np.ndarray, looks: Looks) -> np.ndarray:
+    """Q_1, or its like in several looks; nan where the amplitude or the level is."""
     known = np.isfinite(amplitude) & np.isfinite(level)
-    return np.where(
-        known, marcum_q1(np.where(known, amplitude, 0), np.where(known, level, 0)).q, np.nan
-    )
+    found = looks.steady(np.where(known, amplitude, 0), np.where(known, level, 0))[0]
+    return np.where(known, found, np.nan)
 
 
 def _simulate(dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int) -> None:

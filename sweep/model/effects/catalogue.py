@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import beam, waveform
+from sweep.model import beam, looks, waveform
 from sweep.model.effects import (
     atmosphere,
     doppler,
     footprint,
+    iq_imbalance,
     lag,
     line_width,
     noise_sources,
@@ -21,6 +22,7 @@ from sweep.model.effects import (
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
+from sweep.model.preparation import RECORD
 
 EFFECTS: tuple[Effect, ...] = (
     footprint.FOOTPRINT,
@@ -42,6 +44,7 @@ EFFECTS: tuple[Effect, ...] = (
     phase_errors.CHIRP_NONLINEARITY,
     line_width.LINE_WIDTH,
     saturation.SATURATION,
+    iq_imbalance.IQ_IMBALANCE,
     sidelobes.IMAGE,
     sidelobes.LEAKAGE,
     speckle.FADING,
@@ -63,9 +66,11 @@ SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
 DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.DEFAULTS
     | waveform.DEFAULTS
+    | looks.DEFAULTS
+    | {RECORD: "real"}
     | {parameter.path: parameter.default for parameter in PARAMETERS}
 )
-"""Of the beams' parameters, the waveform's and the effects'."""
+"""Of the beams' parameters, the waveform's, the looks', the record's and the effects'."""
 
 CORE = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",

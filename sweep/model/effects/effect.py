@@ -53,7 +53,7 @@ class Parameter:
     @property
     def brings(self) -> bool:
         """Whether other values than the default bring the effect; else it says how it acts."""
-        return self.alone and self.default in (0, "none")
+        return self.alone and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
 
 
 class Scene(NamedTuple):

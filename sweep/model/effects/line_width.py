@@ -222,14 +222,23 @@ def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarr
 
 
 def seen_line(
-    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
+    *,
+    line_width: np.ndarray,
+    delay: np.ndarray,
+    duration: np.ndarray,
+    window: Window,
+    looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
+
+    Of looks that are added in amplitude the phase of a record counts too: each has its own.
 
     Parameters
     ----------
     line_width, delay, duration, window
         As of :func:`power_under_line`.
+    looks : int
+        Records that are added in amplitude.
 
     Returns
     -------
@@ -259,7 +268,7 @@ def seen_line(
     mean = gamma[:, None] * (integral(x + apart) - 2 * at + integral(x - apart))
     mean -= 0.5 * (w * mean).sum(axis=1)[:, None]
     # a line that is gone needs no care
-    mean = np.where(variance[:, None] < _GONE, mean, 0.0)
+    mean = np.where((variance[:, None] < _GONE) & (looks == 1), mean, 0.0)
     once, double = np.exp(mean), w * np.exp(2 * mean)
     sums = (w * once).sum(axis=1), double.sum(axis=1)
     nodes, weight = _gauss_legendre(128)
@@ -296,7 +305,9 @@ def walk_steps(*, delay: float, length: int) -> int:
     return 2 * (length + min(math.floor(delay), length))
 
 
-def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.ndarray:
+def walked_phase(
+    steps: np.ndarray, *, per_sample: float, delay: float, whole: bool = False
+) -> np.ndarray:
     """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
 
     Parameters
@@ -307,11 +318,13 @@ def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.nd
         Variance of theta's change from sample to sample, Gamma / fs.
     delay : float
         tau [samples].
+    whole : bool
+        With the first sample's as well, for a delay shorter than the record.
 
     Returns
     -------
     (L,) ndarray
-        0 at first.
+        0 at first, or all of it.
 
     Notes
     -----
@@ -328,7 +341,11 @@ def walked_phase(steps: np.ndarray, *, per_sample: float, delay: float) -> np.nd
     length = max(length, before.size // 2)
     now = (before + after)[before.size - length + 1 :]
     then = before[1:length] + after[: length - 1]
-    return np.concatenate([[0.0], np.cumsum(now - then)])
+    phase = np.concatenate([[0.0], np.cumsum(now - then)])
+    if whole:
+        both = (before + after)[1 : math.floor(delay) + 1]
+        phase += after[0] + both.sum()
+    return phase
 
 
 @lru_cache(maxsize=16)
@@ -407,7 +424,14 @@ def act(shots: Shots, scene: Scene) -> Shots:
         "delay": delay,
         "duration": shots.record_duration,
     }
-    share, in_phase = seen_line(window=shots.window, **timing)
+    if shots.looks.added > 1 and np.any(delay > shots.record_duration):
+        raise UnsupportedShot(
+            f"{_WIDTH} leaves of looks that are added what their phases have in common, which is "
+            f"known for echoes that come back within a record, of "
+            f"{np.min(shots.record_duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
+            "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
+        )
+    share, in_phase = seen_line(window=shots.window, looks=shots.looks.added, **timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
         shots,

@@ -4,6 +4,7 @@ Each adds a variance at the ADC, and its size is that variance over the receiver
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from sweep.model import beam, link
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
-from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE, Shots
+from sweep.model.preparation import LASER, PROCESSING, RECEIVER, RECORD, TELESCOPE, Shots
 
 # The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
 # oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
@@ -239,6 +240,7 @@ RELATIVE_INTENSITY_NOISE = Effect(
             default=1.0,
             example="25 dB",
             limits=("0 dB", "300 dB"),
+            alone=False,
         ),
     ),
 )
@@ -271,10 +273,12 @@ def variance(*, step: ArrayLike) -> np.ndarray:
     return np.asarray(step, float) ** 2 / 12
 
 
-def _rounding(p: Mapping[str, np.ndarray]) -> np.ndarray:
+def _rounding(p: Mapping[str, Any]) -> np.ndarray:
+    """Of the ADC; two of them sample I and Q (:func:`sweep.model.link.noise_in_quadrature`)."""
     bits = np.asarray(p[_BITS], float)
     lsb = step(full_scale=p[_FULL_SCALE], bits=bits)
-    return np.where(bits > 0, variance(step=lsb), 0.0)
+    both = 2 if str(p[RECORD]) == "complex" else 1
+    return np.where(bits > 0, both * variance(step=lsb), 0.0)
 
 
 def rounding_size(points: Points) -> Size | None:

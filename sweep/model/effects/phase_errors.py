@@ -58,6 +58,7 @@ import numpy as np
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, Sized
 from sweep.model.effects.points import NO_SMEAR, Points, Smear
+from sweep.model.looks import coherent_gain
 from sweep.model.preparation import CHIRP, PhaseError, Shots
 from sweep.model.window import Window, samples
 
@@ -310,8 +311,29 @@ def acceleration_smear(points: Points) -> Smear | None:
     return over_record(points, terms)
 
 
+def acceleration_size(points: Points) -> Size | None:
+    """Change of the largest bin by its drift, in a record and over looks that are added."""
+    found = phase_size(points, "acceleration")
+    if found is None or points.looks.added == 1:
+        return found
+    left = coherent_gain(
+        points.looks, acceleration=points.acceleration, carrier=points.carriers[0],
+        period=points.look_period,
+    )  # fmt: skip
+    return found._replace(magnitude=found.magnitude + 1 - left)
+
+
 def accelerate(shots: Shots, scene: Scene) -> Shots:
-    """The drift of the Doppler frequency, in the record of every segment."""
+    """The drift of the Doppler frequency, in the record of every segment.
+
+    And what it costs looks that are added in amplitude.
+    """
+    if shots.looks.added > 1:
+        left = coherent_gain(
+            shots.looks, acceleration=shots.acceleration, carrier=shots.carriers[0],
+            period=shots.look_period,
+        )  # fmt: skip
+        shots = replace(shots, beat_scale=shots.beat_scale * left)
     return _with_phase(
         shots,
         acceleration_phase,
@@ -326,7 +348,7 @@ ACCELERATION = Effect(
     name="acceleration",
     about="drift of the Doppler frequency",
     stage="record",
-    size=partial(phase_size, name="acceleration"),
+    size=acceleration_size,
     smear=acceleration_smear,
     act=accelerate,
     parameters=(

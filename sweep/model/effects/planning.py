@@ -193,10 +193,11 @@ def changes(
         leakage's own size.
     """
     low, high = plausible(sizes, points)
-    b = points.threshold
+    b = points.looks.scaled(points.threshold)
     steepest = 0.5 * (b + np.sqrt(b * b + 2))
     at = np.minimum(np.maximum(steepest, low), high)
     near = np.exp(-0.5 * (at - b) ** 2)
+    b = points.looks.sharper * points.threshold
     slope, small = np.sqrt(at * b / (2 * math.pi)) * near, np.minimum(high, 1.0)
     found = {}
     for name, size in sizes.items():
@@ -225,7 +226,7 @@ def changes(
 
 def plausible(sizes: Mapping[str, Size], points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest magnitude of the largest bin over sigma that all effects may leave."""
-    low = high = points.amplitude
+    low = high = points.amplitude * points.looks.sharper
     added: np.ndarray | float = 0.0
     for size in sizes.values():
         if _is_there(size.magnitude):

@@ -23,11 +23,13 @@ from sweep.model.footprint import (
     velocity_to_bins,
 )
 from sweep.model.ground import Extent, backscatter
+from sweep.model.looks import Looks
 from sweep.model.preparation import (
     CHIRP,
     LASER,
     PROCESSING,
     RECEIVER,
+    RECORD,
     approach,
     link_scales,
     relative_amplitude,
@@ -129,6 +131,7 @@ class Points:
         """Doppler ratio."""
         self.acceleration = self["target.acceleration"]
         """[m/s^2]."""
+        self.looks = Looks.of(parameters)
         self.signs = self.columns(*self._there(waveform.SIGNS))
         coherent = self.word("footprint.phases") == "coherent"
         self.adds_amplitudes = coherent or direct
@@ -229,7 +232,8 @@ class Points:
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
         values = {name: self[RECEIVER + name] for name in link.NOISY}
-        return link.receiver_noise(self.architecture, values)
+        found = link.receiver_noise(self.architecture, values)
+        return link.noise_in_quadrature(found) if self.word(RECORD) == "complex" else found
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
@@ -239,8 +243,8 @@ class Points:
     @cached_property
     def deviation(self) -> np.ndarray:
         """Noise sigma of a bin, per quadrature [V]."""
-        energy = np.asarray(self.window.energy)
-        return link.bin_deviation(noise_variance=self.noise_variance, window_energy=energy)
+        energy, mean = np.asarray(self.window.energy), self.noise_variance / self.looks.added
+        return link.bin_deviation(noise_variance=mean, window_energy=energy)
 
     @cached_property
     def threshold(self) -> np.ndarray:
@@ -307,13 +311,23 @@ class Points:
         """Speed at which the range along the beam falls [m/s]."""
         return np.asarray(approach(self._numbers))
 
+    @property
+    def look_period(self) -> np.ndarray:
+        """Time from look to look [s]."""
+        return np.asarray(len(self.order) * (self[CHIRP + "duration"] + self[waveform.GAP]))
+
+    @property
+    def late(self) -> np.ndarray | float:
+        """Time from the first look to the middle one [s]."""
+        return 0.5 * (self.looks.number - 1) * self.look_period if self.looks.number > 1 else 0.0
+
     @cached_property
     def starts(self) -> np.ndarray:
-        """Time from the shot's start to each segment's [s]."""
+        """Time from the shot's start to each segment's, of the middle look [s]."""
         starts = waveform.segment_starts(
             self.order, duration=self[CHIRP + "duration"], gap=self[waveform.GAP]
         )
-        return self.columns(*self._there(starts))
+        return self.columns(*self._there([start + self.late for start in starts]))
 
     @cached_property
     def faster(self) -> np.ndarray:
@@ -334,12 +348,13 @@ class Points:
     @cached_property
     def metres_between(self) -> np.ndarray:
         """Most metres by which the target moves from the shot's start to a segment's own."""
-        return (np.abs(self.approach) + np.abs(self.acceleration) * self.starts / 2) * self.starts
+        last = self.starts + self.late
+        return (np.abs(self.approach) + np.abs(self.acceleration) * last / 2) * last
 
     @cached_property
     def bins_between(self) -> np.ndarray:
         """Most bins by which its line moves in that time."""
-        faster = np.abs(self.acceleration) * self.starts
+        faster = np.abs(self.acceleration) * (self.starts + self.late)
         slope = np.abs(self.signs) * self.chirp_rate * (2 / SPEED_OF_LIGHT) / self.bin_width
         nearer = slope * (1 + np.abs(self.beta)) * self.metres_between
         return nearer + self.per_velocity * faster

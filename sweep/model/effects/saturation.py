@@ -123,8 +123,9 @@ def act(shots: Shots, scene: Scene) -> Shots:
     limited = full_scale > 0
     if not limited.any():
         return shots
-    amplitude = np.maximum(beat_amplitude(shots), _SMALLEST)
-    deviation = np.sqrt(shots.noise_variance)
+    each = 0.5 if shots.complex_record else 1.0  # I and Q have half of the light each
+    amplitude = np.maximum(beat_amplitude(shots) * each, _SMALLEST)
+    deviation = np.sqrt(shots.noise_variance * each)
     limit = np.where(limited, full_scale, _NO_LIMIT)
     with np.errstate(over="ignore"):  # a denormal limit is exceeded endlessly
         beyond = float((np.maximum(amplitude, deviation) / limit).max())

@@ -38,7 +38,8 @@ import numpy as np
 from sweep.model.effects.effect import Effect, Scene, Size
 from sweep.model.effects.lobes import lobe
 from sweep.model.effects.points import Points
-from sweep.model.preparation import PROCESSING, Shots
+from sweep.model.looks import ONE, Looks
+from sweep.model.preparation import PROCESSING, RECORD, Shots
 from sweep.model.window import window
 
 _LN_10 = math.log(10)
@@ -47,12 +48,14 @@ _SELDOM = 1e-4
 """Expected bins at the threshold of a shot that are not reckoned with."""
 
 
-def image_size(points: Points) -> Size:
-    """Change of the largest bin by images.
+def image_size(points: Points) -> Size | None:
+    """Change of the largest bin by images; complex records have none.
 
     Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
+    if points.word(RECORD) == "complex":
+        return None
     alarms, form, apart = _alarm_change(points), points.lobe, points.apart
     beside = _beside(points)
     if points.adds_amplitudes:
@@ -102,8 +105,8 @@ def _alarm_change(points: Points) -> np.ndarray | float:
 
 
 def add_images(shots: Shots, scene: Scene) -> Shots:
-    """Images summed with the lines."""
-    return replace(shots, image=True)
+    """Images summed with the lines, where the record is real."""
+    return replace(shots, image=not shots.complex_record)
 
 
 IMAGE = Effect(
@@ -141,7 +144,8 @@ def leakage_size(points: Points) -> Size:
     steps, which = np.unique(step, return_inverse=True)
     shape = points.window
     tables = np.array([
-        table(shape.name, shape.length, points.fft_size, _LEVELS**float(v)) for v in steps
+        table(shape.name, shape.length, points.fft_size, _LEVELS**float(v), points.looks)
+        for v in steps
     ])  # fmt: skip
     chance = tables[which.reshape(np.shape(b)), row, place]
     faint = np.minimum(over / 2.0**_FAINTEST, 1.0) ** 2
@@ -149,14 +153,12 @@ def leakage_size(points: Points) -> Size:
 
 
 @lru_cache(maxsize=256)
-def table(name: str, length: int, fft_size: int, level: float) -> np.ndarray:
+def table(name: str, length: int, fft_size: int, level: float, looks: Looks = ONE) -> np.ndarray:
     """Chances by reach and by octaves of A over the threshold, the last row by Parseval alone."""
-    from sweep.model.marcum import marcum_q1
-
     form, rows = lobe(name, length, fft_size), (_STRONGEST - _FAINTEST) * _OCTAVES + 1
     together = level * 2.0 ** (np.arange(rows) / _OCTAVES + _FAINTEST)
-    quiet = marcum_q1(np.zeros(1), np.array([level])).q[0]
-    enough = _crossing(np.minimum(together, level), level, quiet)
+    quiet = looks.steady(np.zeros(1), np.array([level]))[0][0]
+    enough = _crossing(np.minimum(together, level), level, quiet, looks)
     energy = window(name, length).equivalent_noise_bandwidth * form.margin
     parseval = enough * np.maximum(together / level, 1.0) ** 2 * energy
     half = fft_size / 2
@@ -165,17 +167,15 @@ def table(name: str, length: int, fft_size: int, level: float) -> np.ndarray:
     number = np.concatenate([np.ones(_NEAR - 2), np.diff(edges)])
     found = [
         2 * (_crossing(np.minimum(together[:, None] * form.tail(distance - 0.5 - reach), level),
-                       level, quiet) * number).sum(axis=1)
+                       level, quiet, looks) * number).sum(axis=1)
         for reach in _REACHES
     ]  # fmt: skip
     return np.minimum(np.minimum([*found, parseval], parseval), 1.0)
 
 
-def _crossing(signal: np.ndarray, level: float, quiet: float) -> np.ndarray:
+def _crossing(signal: np.ndarray, level: float, quiet: float, looks: Looks) -> np.ndarray:
     """Chance to cross the threshold that a bin of some signal has more than one without."""
-    from sweep.model.marcum import marcum_q1
-
-    chance = marcum_q1(signal, np.full(signal.shape, level)).q
+    chance = looks.steady(signal, np.full(signal.shape, level))[0]
     return np.maximum(chance - quiet, 0.0) / max(1 - quiet, 1e-12)
 
 

@@ -32,8 +32,9 @@ has not moved on between them: their amplitudes have the correlation
 
     mu(dt) = sum_b P_b exp(2 pi i f beta_b dt) / sum_b P_b
 
-over the beamlets' powers, which is what Doppler shifts that differ by 1/dt or more destroy. It acts
-on the detection; leaked signal keeps its mean power.
+over the beam's power, which is what Doppler shifts that differ by 1/dt or more destroy: in closed
+form, as beamlets that are enough for the power of a bin may be too few for it. It acts on the
+detection; leaked signal keeps its mean power.
 """
 
 import math
@@ -44,6 +45,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
+from sweep.model.ground import Plane
 from sweep.model.preparation import Shots
 
 _ROUGHNESS = "target.roughness"
@@ -57,8 +59,6 @@ _OF_DIRECT = (
     "speckle is simulated for homodyne and heterodyne receivers: what direct detection sees "
     "depends on how many speckles its aperture averages, of which nothing is known"
 )
-_AT_ONCE = 4096
-"""Footprints that are looked at together."""
 
 
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -206,18 +206,28 @@ def fade(shots: Shots, scene: Scene) -> Shots:
         return shots
     up, doppler, down = shots.schedule
     turns = np.stack([shots.carriers[0] * lag for lag in (doppler - up, down - up, down - doppler)])
-    whole, rows = turns.ndim == 1, shots.row  # [cycles per beta]
-    found = np.ones((3, len(shots.doppler) if whole else shots.size), complex)
-    share = shots.amplitude**2
-    share = share / np.maximum(share.sum(axis=1), _SMALLEST)[:, None]
-    if shots.doppler.any():
-        for first in range(0, found.shape[1], _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            row = some if whole else rows[some]
-            for k, turn in enumerate(turns):
-                cycles = shots.doppler[row] * (turn if whole else turn[some, None])
-                found[k, some] = (share[row] * np.exp(2j * np.pi * cycles)).sum(axis=1)
-    return replace(shots, fading=Fading(*(found[:, rows] if whole else found)))
+    if not shots.doppler.any():
+        found = np.ones((3, shots.size), complex)
+    elif isinstance(scene.ground, Plane):
+        found = np.stack([scene.ground.turned(turn) for turn in turns])
+    else:
+        found = _turned(shots, turns)
+    return replace(shots, fading=Fading(*found))
+
+
+def _turned(shots: Shots, turns: np.ndarray) -> np.ndarray:
+    """Mean turns of beamlets rays have found, (3, n): turns [cycles per beta] (3,) or (3, n).
+
+    Doppler shifts go evenly across a beam, Gaussian as it is, so that mean and deviation tell all.
+    A sum over few rays would repeat itself where their shifts are whole turns apart.
+    """
+    power, phase = shots.amplitude**2, 2 * np.pi * turns
+    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
+    mean = (share * shots.doppler).sum(axis=1)
+    square = (share * (shots.doppler - mean[:, None]) ** 2).sum(axis=1)
+    mean, square = mean[shots.row], square[shots.row]
+    phase = phase.reshape(3, -1)
+    return np.asarray(np.exp(1j * phase * mean - 0.5 * phase**2 * square))
 
 
 FADING = Effect(

@@ -9,8 +9,10 @@ from functools import partial
 from typing import Any
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.effects.segment_motion import SEGMENT_MOTION
 from sweep.model.ground import powers_add
 from sweep.spec import SceneSpec, Spec
+from sweep.spec.parts import OFF
 
 Declared = Spec | SceneSpec
 
@@ -267,9 +269,15 @@ def _drawn_ladder(spec: Declared) -> Ladder:
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
-    """All effects on, each with the scene's own parameters."""
-    random = _draws(spec)
-    return {f"effects.{e.name}": "on" for e in EFFECTS if random or not e.is_random}
+    """Return all effects on, each with the scene's own parameters.
+
+    Segments that all begin at one range are a law, not an omission: it stays as it is written.
+    """
+    random, law = _draws(spec), SEGMENT_MOTION.name
+    kept = law if spec.modes()[law] == OFF else ""
+    return {
+        f"effects.{e.name}": "on" for e in EFFECTS if (random or not e.is_random) and e.name != kept
+    }
 
 
 def _draws(spec: Declared) -> bool:

@@ -9,12 +9,14 @@ from sweep.model import philox
 from sweep.model.detection import Fading, fading_together, found_pair
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
 from sweep.model.effects.catalogue import CORE
+from sweep.model.footprint import plane_footprint
+from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.marcum import marcum_q1
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.realisations import realise
 from sweep.model.returns import draw_returns
-from sweep.model.shot import find, prepare, statistics
+from sweep.model.shot import find, prepare, prepare_cast, statistics
 
 FADING = (*CORE, "fading")
 COUNTS = list(DRAW_OUTPUTS)
@@ -101,13 +103,58 @@ def test_it_is_what_drawn_speckle_comes_to(sloping):
     "order, apart", [("up doppler down", (1, 2, 1)), ("down doppler up", (-1, -2, -1)),
                      ("up down doppler", (2, 1, -1))],
 )  # fmt: skip
-def test_correlations_are_the_sum_over_the_beamlets(order, apart, sloping):
-    """Of up and Doppler, up and down, Doppler and down segment, so many segments and gaps apart."""
-    shots = prepared(sloping | {"instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6})
-    turn = 2j * np.pi * 299792458 / 1550e-9 * shots.doppler[0] * 550e-6
-    power = shots.amplitude[0] ** 2 / (shots.amplitude[0] ** 2).sum()
+@pytest.mark.parametrize(
+    "changed, near",
+    [
+        ({}, 1e-7),
+        ({"target.radial_velocity": 150.0, "instrument.laser.beam_divergence": 2e-3,
+          "target.transverse_velocity": 0.0}, 1e-5),
+        ({"target.radial_velocity": 150.0, "instrument.laser.beam_divergence": 5e-3,
+          "target.transverse_velocity": 0.08, "target.grazing_angle": 0.6}, 1e-3),
+    ],
+)  # fmt: skip
+def test_correlations_are_the_sum_over_many_beamlets(order, apart, changed, near, sloping):
+    """Of up and Doppler, up and down, Doppler and down segment, so many segments and gaps apart.
+
+    However few the beamlets that the power of a bin needs: here two.
+    """
+    several = {"instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6}
+    shots = prepared(sloping | several | changed | {"footprint.beamlets": 2})
+    fine = prepared(sloping | changed | {"footprint.beamlets": 4096, "footprint.pattern": "square"})
+    turn = 2j * np.pi * 299792458 / 1550e-9 * fine.doppler[0] * 550e-6
+    power = fine.amplitude[0] ** 2 / (fine.amplitude[0] ** 2).sum()
     for found, segments in zip(shots.fading, apart, strict=True):
-        assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=1e-4)
+        assert found[0] == pytest.approx((power * np.exp(segments * turn)).sum(), abs=near)
+
+
+@pytest.mark.parametrize("transverse", [1.0, 12.0, 20.0, 32.0])
+def test_segments_of_a_cast_footprint_do_not_agree_by_few_rays(transverse, sloping):
+    """Nineteen rays of a hexagon repeat themselves where the Doppler shifts turn by 5 rad."""
+    p = sloping | {"target.radial_velocity": 30.0}
+    offset, cosine, weight, closing = plane_footprint(
+        grazing_angle=np.array([np.pi / 2]), beam_divergence=np.array([50e-6]), number=19,
+        radial=30.0, transverse=transverse,
+    )  # fmt: skip
+    cast = Cast(Footprints(np.zeros(1, int), offset, 2 * closing / 299792458, weight * cosine))
+    shots = prepare_cast(p, cast, FADING)
+    turn = 2 * np.pi * 2 / 1550e-9 * transverse * 12.5e-6 * 1e-3
+    assert abs(shots.fading.over[0]) == pytest.approx(np.exp(-0.5 * turn**2), abs=1e-4)
+
+
+@pytest.mark.parametrize("angle", [np.pi / 2, np.pi / 4])
+@pytest.mark.parametrize("divergence", [1e-4, 1e-3, 5e-3])
+def test_drawn_speckle_has_as_many_beamlets_as_its_segments_need(divergence, angle, sloping):
+    """Two are enough for the power of a bin; their Doppler shifts turn until the last segment."""
+    p = sloping | {
+        "footprint.beamlets": 0, "footprint.pattern": "auto", "target.transverse_velocity": 0.0,
+        "target.radial_velocity": 150.0, "accuracy.tolerance": 1e-3, "target.range": 100.0,
+        "instrument.laser.beam_divergence": divergence, "target.grazing_angle": angle,
+    }  # fmt: skip
+    drawn = prepared(p | {"target.roughness": np.inf})
+    turn = 2j * np.pi * 299792458 / 1550e-9 * drawn.doppler[0] * 1e-3
+    power = drawn.amplitude[0] ** 2 / (drawn.amplitude[0] ** 2).sum()
+    alike = abs((power * np.exp(turn)).sum()) ** 2
+    assert alike == pytest.approx(abs(prepared(p).fading.over[0]) ** 2, abs=1e-3)
 
 
 @pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])

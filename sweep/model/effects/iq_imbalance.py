@@ -1,0 +1,79 @@
+"""Imbalance of I and Q: a complex record shows each line's image at the negative frequency.
+
+With I = cos(w t) and Q = g sin(w t + p), the record is
+
+    I + i Q = (1 + g e^(i p)) / 2 e^(i w t) + (1 - g e^(-i p)) / 2 e^(-i w t),
+
+so that the image's amplitude is |1 - g e^(i p)| / |1 + g e^(i p)| of the line's; what is lost of
+the line itself is its gain's, and noise has it too. It acts on the lines: each has a second one.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size
+from sweep.model.effects.points import Points
+from sweep.model.preparation import RECEIVER, Shots
+
+GAIN, PHASE = RECEIVER + "iq_gain_imbalance", RECEIVER + "iq_phase_imbalance"
+
+
+def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
+    """Amplitude of the image over the line's, 0..1.
+
+    Parameters
+    ----------
+    gain : array_like
+        Power of Q over that of I, > 0.
+    phase : array_like
+        Departure from 90 degrees between them [rad].
+
+    Examples
+    --------
+    >>> leak = image_gain(gain=10**0.05, phase=0.0523598776)  # 0.5 dB and 3 deg
+    >>> round(float(20 * np.log10(leak)), 1)
+    -28.2
+    """
+    turned = np.sqrt(np.asarray(gain, float)) * np.exp(1j * np.asarray(phase, float))
+    return np.asarray(np.abs(1 - turned) / np.abs(1 + turned))
+
+
+def size(points: Points) -> Size | None:
+    """Anything, where there is an image: it may be a peak of its own."""
+    leak = image_gain(gain=points[GAIN], phase=points[PHASE])
+    return Size(magnitude=np.where(leak > 0, 1.0, 0.0)) if np.any(leak > 0) else None
+
+
+def act(shots: Shots, scene: Scene) -> Shots:
+    """Images of the lines, where the record is complex."""
+    if not shots.complex_record:
+        return shots
+    leak = image_gain(gain=scene.parameters[GAIN], phase=scene.parameters[PHASE])
+    return replace(shots, image_gain=leak)
+
+
+IQ_IMBALANCE = Effect(
+    name="iq_imbalance",
+    about="unequal I and Q: images at negative frequencies in a complex record",
+    stage="record",
+    size=size,
+    act=act,
+    parameters=(
+        Parameter(
+            path=GAIN,
+            about="Gain of Q over that of I, of a record that is complex",
+            default=1.0,
+            example="0.5 dB",
+            limits=("-60 dB", "60 dB"),
+        ),
+        Parameter(
+            path=PHASE,
+            about="Departure from 90 deg between I and Q, of a record that is complex",
+            example="3 deg",
+            limits=("-90 deg", "90 deg"),
+            si_unit="rad",
+        ),
+    ),
+)

@@ -1,0 +1,473 @@
+"""Looks: a shot's detection from several records of each of its segments.
+
+A shot is its waveform N times over, without a pause. Of a bin, with a and the threshold b over the
+noise per quadrature of one record,
+
+- ``power``: the N periodograms |X|^2 are averaged, and their root is held against the threshold.
+  The sum of powers is a noncentral chi square of 2 N degrees of freedom: it crosses with
+  ``Q_N(sqrt(N) a, sqrt(N) b)``, Marcum's Q of order N, and noise alone, a Gamma(N), with
+  ``Q(N, N b^2 / 2)``, the regularised incomplete Gamma function [Marcum, IRE Trans. Inf. Theory 6,
+  59, 1960].
+- ``binary``: each record is held against the threshold, and M of them must cross in the bin.
+- ``coherent``: records are added, with the phase between them that a steady velocity makes taken
+  off, and are then one record of N times less noise. What a laser's walking phase and an
+  acceleration leave of their sum stands in :func:`coherent_gain`.
+
+An echo in developed speckle fades. Looks follow one another at once, so that by default all have
+one speckle; where the beam moves on by its own width from look to look each has its own
+(``speckle: independent``). The mean of Q_N over speckle is Swerling's first case, with x = a^2 / 2
+the mean SNR of one record and Y = N b^2 / 2,
+
+    Q(N-1, Y) + (1 + 1 / (N x))^(N-1) e^(-Y / (1 + N x)) P(N-1, Y / (1 + 1 / (N x))),
+
+or, where looks fade apart, his second: Q(N, Y / (1 + x)) [Swerling, IRE Trans. Inf. Theory 6, 269,
+1960; Richards, Fundamentals of Radar Signal Processing, 2005, 6.3].
+
+Q_N is that of scipy's noncentral chi square, whose error is 1e-11 of either tail down to 1e-300.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy import special, stats
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.marcum import marcum_q1
+
+POWER, BINARY, COHERENT = COMBINED = ("power", "binary", "coherent")
+COMMON, INDEPENDENT = SPECKLES = ("common", "independent")
+NUMBER, COMBINE, VOTES, SPECKLE = (
+    f"instrument.looks.{name}" for name in ("number", "combine", "votes", "speckle")
+)
+DEFAULTS: dict[str, float | int | str | np.ndarray] = {
+    NUMBER: 1, COMBINE: POWER, VOTES: 1, SPECKLE: COMMON,
+}  # fmt: skip
+
+MOST_PLACES = 64
+"""Places of a line that moves on from look to look."""
+
+_SURE = 40.0
+"""Distance of magnitude and threshold over sigma from where on a tail is 0 to float64."""
+_HALVINGS = 60
+_NODES = 24
+"""Gauss points of each stretch of a mean over speckle."""
+
+
+class Looks(NamedTuple):
+    """Records of each segment, and how a bin is detected from them.
+
+    Examples
+    --------
+    >>> pd, miss = Looks(8).steady(np.array([1.5]), np.array([2.0]))
+    >>> bool(pd > Looks(1).steady(np.array([1.5]), np.array([2.0]))[0])
+    True
+    """
+
+    number: int = 1
+    combine: str = POWER
+    votes: int = 1
+    independent: bool = False
+
+    @classmethod
+    def of(cls, p: Mapping[str, Any]) -> "Looks":
+        """Looks of points that share them, by dotted path; one where nothing is said."""
+        number, combine, votes, speckle = (
+            np.asarray(p.get(path, value)).flat[0] for path, value in DEFAULTS.items()
+        )
+        return cls(int(number), str(combine), int(votes), str(speckle) == INDEPENDENT)
+
+    @property
+    def several(self) -> bool:
+        """True where a bin is detected by another law than that of one record."""
+        return self.number > 1 and self.combine != COHERENT
+
+    @property
+    def added(self) -> int:
+        """Records that are added in amplitude, 1 where none are."""
+        return self.number if self.combine == COHERENT else 1
+
+    @property
+    def averaged(self) -> int:
+        """Records whose powers are averaged, 1 where none are."""
+        return self.number if self.combine == POWER else 1
+
+    @property
+    def sharper(self) -> float:
+        """Factor on magnitude over sigma by which one record would be as sure, at the most."""
+        return math.sqrt(self.number) if self.several else 1.0
+
+    def scaled(self, level: np.ndarray) -> np.ndarray:
+        """Threshold over sigma of a record as sure as these, at which it detects as often."""
+        scaled = np.asarray(self.sharper * level)
+        if self.averaged == 1:
+            return scaled
+        return np.sqrt(np.maximum(np.square(scaled) - 2 * (self.number - 1), 0.0))
+
+    def steady(
+        self, signal: np.ndarray, level: np.ndarray, real: np.ndarray | bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Chances that a bin of a steady signal is detected, and that it is not.
+
+        Parameters
+        ----------
+        signal, level : ndarray
+            |X| and threshold over the noise per quadrature of one record, >= 0.
+        real : ndarray
+            True where the noise is real, with the power of both quadratures in one.
+        """
+        signal, level, real = np.broadcast_arrays(signal, level, real)
+        if not self.several or self.combine == BINARY:
+            found, missed = marcum_q1(signal, level)
+            if real.any():
+                near, far = 0.5 * (level - signal), 0.5 * (level + signal)
+                found = np.where(real, 0.5 * (special.erfc(near) + special.erfc(far)), found)
+                missed = np.where(real, 0.5 * (special.erfc(-near) - special.erfc(far)), missed)
+            return self._votes(found, missed) if self.several else (found, missed)
+        a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, level))
+        found, missed = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
+        near = np.asarray((a - b < _SURE) & (b - a < _SURE + math.sqrt(2 * self.number)))
+        degrees, share = (np.where(real, n, 2 * n)[near] for n in (self.number, 1.0))
+        values = 0.5 * share * b[near] ** 2, degrees, 0.5 * share * a[near] ** 2
+        found[near], missed[near] = stats.ncx2.sf(*values), stats.ncx2.cdf(*values)
+        return found, missed
+
+    def faded(self, signal: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same of a signal in developed speckle, of a mean power of signal^2."""
+        signal, level = np.broadcast_arrays(np.asarray(signal, float), np.asarray(level, float))
+        y = np.square(level) / (2 + np.square(signal))
+        if not self.several or (self.combine == BINARY and self.independent):
+            found, missed = np.exp(-y), -np.expm1(-y)
+            return self._votes(found, missed) if self.several else (found, missed)
+        if self.independent:
+            return special.gammaincc(self.number, self.number * y), special.gammainc(
+                self.number, self.number * y
+            )
+        if self.combine == BINARY:
+            speckle, weight = self._speckle(level, signal)
+            each = self.steady(signal[..., None] * speckle, level[..., None])
+            return (each[0] * weight).sum(axis=-1), (each[1] * weight).sum(axis=-1)
+        n, least = self.number, 0.5 * self.number * np.square(level)
+        whole = np.maximum(0.5 * self.number * np.square(signal), 1e-200)
+        first = special.gammaincc(n - 1, least)
+        # P of small arguments by its series, as it leaves float64's range and is multiplied again.
+        z = least * (whole / (1 + whole))
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            by_series = (n - 1) * np.log(z) - z - special.gammaln(n)
+            by_series = by_series + np.log(special.hyp1f1(1.0, n, np.minimum(z, n)))
+            log_p = np.where(z < n, by_series, np.log(special.gammainc(n - 1, z)))
+        log_rest = np.minimum((n - 1) * np.log1p(1 / whole) - least / (1 + whole) + log_p, 0.0)
+        found = np.minimum(first + np.exp(log_rest), 1.0)
+        return found, np.maximum(-np.expm1(log_rest) - first, 0.0)
+
+    def faded_together(
+        self, one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
+    ) -> np.ndarray:
+        """Chance that two segments in developed speckle are both detected.
+
+        Parameters
+        ----------
+        one, other : ndarray
+            |X| of their bins over the noise per quadrature; nan for a segment that is not there.
+        level : ndarray
+            Threshold over the same.
+        alike : ndarray
+            Size of the correlation of the signals' amplitudes, 0..1.
+
+        Notes
+        -----
+        Looks of their own speckle are summed over that of the first segment: given it, the second's
+        are a noncentral chi square. In one speckle of all, both segments see it: the mean over it
+        of the product. Where they share but a part of it, what they have in common is that share
+        of it which two Rayleigh magnitudes of the same chances have.
+        """
+        from sweep.model.detection import fading_together
+
+        one, other, level, alike = np.broadcast_arrays(one, other, level, alike)
+        far = np.full(level.shape, 1e100)
+        there = np.isfinite(one) & np.isfinite(other)
+        a, b = (np.where(there, v, 0.0) for v in (one, other))
+        p, q = self.faded(a, level)[0], self.faded(b, level)[0]
+        if not self.independent:
+            speckle, weight = self._speckle(level, a, b)
+            each = [self.steady(v[..., None] * speckle, level[..., None])[0] for v in (a, b)]
+            whole = (each[0] * each[1] * weight).sum(axis=-1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                part = fading_together(p, q, far, alike) - p * q
+                part = part / (np.minimum(p, q) - p * q)
+            part = np.where(alike > 1 - 1e-9, 1.0, np.clip(np.nan_to_num(part), 0.0, 1.0))
+            return np.where(there, p * q + part * (whole - p * q), np.nan)
+        means = (np.square(v) / (2 + np.square(v)) for v in (a, b))
+        shared = np.minimum(np.square(alike) * np.prod(list(means), axis=0), 1 - 1e-9)
+        y, z = (np.square(level) / (2 + np.square(v)) for v in (a, b))
+        if self.combine == BINARY:
+            both = fading_together(np.exp(-y), np.exp(-z), far, shared**0.5)
+            return np.where(there, p - self.votes_of_one(np.exp(-y), np.exp(-z), both), np.nan)
+        n, rest = self.number, 1 / (1 - shared)
+        with np.errstate(divide="ignore"):
+            # Chance of the first at which the second's mean is at its threshold: a step if alike.
+            step = special.gammaincc(n, np.maximum((n * z - n * (1 - shared)) / shared, 0.0))
+        node, weight = _gauss(np.stack([0 * p, np.minimum(step, p), p], axis=-1))
+        given = 2 * rest[..., None] * special.gammainccinv(n, np.maximum(node, 1e-300))
+        crosses = stats.ncx2.sf((2 * rest * n * z)[..., None], 2 * n, shared[..., None] * given)
+        return np.where(
+            there, np.minimum((crosses * weight).sum(axis=-1), np.minimum(p, q)), np.nan
+        )
+
+    def log_alarm(self, level: np.ndarray) -> np.ndarray:
+        """Natural logarithm of the chance that a bin of noise alone is detected.
+
+        ``level`` is the threshold over the noise per quadrature of one record. It keeps its digits
+        where the chance itself leaves float64's range.
+
+        Examples
+        --------
+        >>> round(float(Looks(4).log_alarm(np.array(2.0))), 4)  # ln Q(4, 8)
+        -3.1611
+        """
+        y, n = 0.5 * np.square(np.asarray(level, float)), self.number
+        if not self.several:
+            return np.asarray(-y)
+        with np.errstate(divide="ignore"):
+            if self.combine == POWER:
+                k, log_y = np.arange(n), np.log(n * y)[..., None]
+                terms = np.where(k > 0, k * np.where(np.isneginf(log_y), -1e300, log_y), 0.0)
+                rare = special.logsumexp(terms - special.gammaln(k + 1), axis=-1) - n * y
+                return np.where(n * y < n, np.log1p(-special.gammainc(n, n * y)), rare)
+            k, rest = np.arange(self.votes, n + 1), np.log(-np.expm1(-y))[..., None]
+            ways = special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1)
+            each = np.where(k < n, (n - k) * np.maximum(rest, -1e300), 0.0) - k * y[..., None]
+            return np.minimum(special.logsumexp(ways + each, axis=-1), 0.0)
+
+    def level(self, log_alarm: np.ndarray) -> np.ndarray:
+        """Threshold over sigma at which :meth:`log_alarm` is so much.
+
+        Examples
+        --------
+        >>> round(float(Looks(4).level(np.array(-3.1611))), 3)
+        2.0
+        """
+        if self.several:
+            return level_of(np.asarray(log_alarm, float), self.log_alarm)
+        return np.asarray(np.sqrt(-2 * np.asarray(log_alarm)))
+
+    def shown(self, magnitudes: np.ndarray) -> np.ndarray:
+        """Of |X| of each record (N, ...) that which is at or above the threshold if it detects.
+
+        The root of the mean power, or the least of the largest that are enough.
+        """
+        if self.combine == BINARY:
+            return np.asarray(np.sort(magnitudes, axis=0)[-self.votes])
+        return np.sqrt(np.mean(np.square(magnitudes), axis=0))
+
+    def fresh(self, level: np.ndarray, correlation: float) -> np.ndarray:
+        """Chance that a bin of noise is not detected where its neighbour is, by the threshold.
+
+        ``correlation`` is that of their noise, 0..1. Of sums of powers by the Gamma distribution of
+        two variables [Kibble, Sankhya 5, 137, 1941]: with r = correlation^2, both cross with
+
+            sum_j C(N+j-1, j) (1-r)^N r^j Q(N+j, Y / (1-r))^2.
+        """
+        y, r, n = 0.5 * np.square(np.asarray(level, float)), correlation**2, self.number
+        if self.combine == BINARY:
+            scaled = level / math.sqrt(1 - r)
+            apart = marcum_q1(correlation * scaled, scaled).p
+            apart = apart - marcum_q1(scaled, correlation * scaled).p
+            p = np.exp(-y)
+            found = self.votes_of_one(p, p, p * np.maximum(1 - apart, 0.0))
+            return found / np.maximum(np.exp(self.log_alarm(level)), 1e-300)
+        p, least = np.exp(self.log_alarm(level)), n * y / (1 - r)
+        both, j, goes_on = np.zeros_like(y), np.arange(256), np.ones(y.shape, bool)
+        while True:
+            log_weight = special.gammaln(n + j) - special.gammaln(j + 1) - special.gammaln(n)
+            weight = np.exp(log_weight + n * math.log1p(-r) + j * math.log(r))
+            more = (weight * special.gammaincc(n + j, least[..., None]) ** 2).sum(axis=-1)
+            both = np.where(goes_on, both + more, both)
+            past = n + j[-1] > least + n * r / (1 - r)
+            goes_on &= ~past | (more > 1e-14 * both + 1e-300)
+            if not goes_on.any():
+                return np.clip(1 - both / np.maximum(p, 1e-300), 0.0, 1.0)
+            j = j + j.size
+
+    def votes_of_one(self, p: np.ndarray, q: np.ndarray, both: np.ndarray) -> np.ndarray:
+        """Chance that the first of two bins has enough records, and the second has not.
+
+        ``p``, ``q`` and ``both`` are the chances that a record crosses in the first, in the second
+        and in both.
+        """
+        n, binomial = self.number, stats.binom
+        with np.errstate(divide="ignore", invalid="ignore"):
+            then = np.clip(np.nan_to_num(both / p), 0.0, 1.0)
+            else_ = np.clip(np.nan_to_num((q - both) / (1 - p)), 0.0, 1.0)
+        found = np.zeros(np.shape(p))
+        for k in range(self.votes, n + 1):
+            too_few = sum(
+                binomial.pmf(i, k, then) * binomial.cdf(self.votes - 1 - i, n - k, else_)
+                for i in range(min(self.votes - 1, k) + 1)
+            )
+            found = found + binomial.pmf(k, n, p) * too_few
+        return found
+
+    def excess(self, signal: np.ndarray, level: float) -> np.ndarray:
+        """What bins' own signals add to the chance of noise to cross, over that of noise to stay.
+
+        ``signal`` (m,) over the noise per quadrature of one record, at one level. By a table over
+        the signal, within 1e-4 of it.
+        """
+        nodes, excess = _excess_table(self, float(level))
+        with np.errstate(divide="ignore"):
+            place = np.log(np.asarray(signal, float))
+        found = np.interp(place, nodes, excess, left=-np.inf)
+        below = place < nodes[0]  # as the square of the signal
+        return np.exp(np.where(below, excess[0] + 2 * (place - nodes[0]), found))
+
+    def quiet_below(self, *, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarray:
+        """As of :func:`sweep.model.detection.quiet_below`, by the chances of several records."""
+        # Where tables begin chances rise as the signal's square.
+        least = np.array([self.excess(np.array([1e-3]), b)[0] for b in np.ravel(level)]) / 1e-6
+        with np.errstate(divide="ignore"):
+            quiet = np.sqrt(chance / (bins * math.exp(1 / 8) * least.reshape(np.shape(level))))
+        return np.asarray(np.minimum(quiet, 1 / (self.number * level)))
+
+    def _votes(self, crosses: np.ndarray, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Chances that enough records cross, and that they do not."""
+        enough, rest = self.votes, self.number - self.votes + 1
+        return special.betainc(enough, rest, crosses), special.betainc(rest, enough, stays)
+
+    def _speckle(self, level: np.ndarray, *signals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds."""
+        square, most = np.square(level), np.full(level.shape, 7.0)
+        ends = [0 * most, most]
+        for signal in signals:
+            at = np.maximum(square - 2, 0.0)
+            wide = 16 * np.sqrt((at + 1) / (self.averaged))
+            a = np.maximum(np.square(signal), 1e-30)
+            ends += [np.minimum(np.sqrt(np.maximum(at + d, 0.0) / a), most) for d in (-wide, wide)]
+        node, weight = _gauss(np.sort(np.stack(ends, axis=-1), axis=-1))
+        return node, weight * 2 * node * np.exp(-np.square(node))
+
+
+ONE = Looks()
+"""A record of each segment."""
+
+
+def coherent_gain(
+    looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, period: np.ndarray
+) -> np.ndarray:
+    """Amplitude of the mean of records over that of one, by the acceleration from look to look.
+
+    |mean exp(2 pi i f a t^2 / c)|, t the looks' times about their middle: what a velocity that is
+    put right leaves. A laser's walking phase leaves the root of
+    :func:`sweep.model.effects.line_width.coherent_share` besides.
+
+    Parameters
+    ----------
+    acceleration, carrier, period : ndarray
+        Rate at which the radial velocity grows a [m/s^2]; optical frequency f [Hz]; time from
+        look to look [s].
+
+    Examples
+    --------
+    >>> given = {"carrier": np.array(193.4e12), "period": np.array(1e-4)}
+    >>> gain = coherent_gain(Looks(16, "coherent"), acceleration=np.array(1.0), **given)
+    >>> round(float(gain), 4)
+    0.7356
+    """
+    place = np.arange(looks.added) - (looks.added - 1) / 2
+    turn = np.asarray(carrier * acceleration * np.square(period) / SPEED_OF_LIGHT, float)
+    return np.abs(np.exp(2j * np.pi * turn[..., None] * place**2).mean(axis=-1))
+
+
+def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Threshold over sigma at which a segment alarms with a given probability, (n,).
+
+    Parameters
+    ----------
+    log_pfa : (n,) ndarray
+        Natural logarithm of the probability, < 0.
+    law : callable
+        Logarithm of a segment's false-alarm probability, falling, at levels (n,) from 0 up.
+    """
+    # A bin alone alarms less often than n of them, and these no oftener than n each for itself.
+    low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        above = law(middle) > log_pfa
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return 0.5 * (low + high)
+
+
+def _gauss(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss points and weights of the stretches between ends (..., k), all behind one another."""
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    half = 0.5 * np.diff(ends, axis=-1)[..., None]
+    place = ends[..., :-1, None] + half * (node + 1)
+    return place.reshape(*ends.shape[:-1], -1), (half * weight).reshape(*ends.shape[:-1], -1)
+
+
+@lru_cache(maxsize=4096)
+def _excess_table(looks: Looks, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of signals and of what :meth:`Looks.excess` has for them."""
+    signal = np.geomspace(1e-3 / math.sqrt(looks.number), level + 1.0, 300)
+    quiet, stays = looks.steady(np.zeros(1), np.array([level]))
+    crosses = looks.steady(signal, np.full(signal.shape, level))[0]
+    added = np.maximum(crosses - quiet, 1e-300) / np.maximum(stays, 1e-300)
+    return np.log(signal), np.log(added)
+
+
+@njit(cache=True, error_model="numpy")
+def largest_of(number, chance, looks):
+    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance.
+
+    The root of the mean power of some looks.
+    """
+    if not number > 0.0:
+        return 0.0
+    if looks > 1:
+        each = -math.expm1(math.log1p(-chance) / number)
+        return math.sqrt(2.0 * gamma_exceeded(looks, each) / looks)
+    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
+
+
+@njit(cache=True, error_model="numpy")
+def gamma_exceeded(order, chance):
+    """Number that a Gamma variable of whole order exceeds with a chance: Q(n, x) = chance."""
+    low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(chance, 1e-300)))
+    for _ in range(60):
+        x = 0.5 * (low + high)
+        term = total = 1.0
+        for k in range(1, order):
+            term *= x / k
+            total += term
+        if math.log(total) - x > math.log(max(chance, 1e-300)):
+            low = x
+        else:
+            high = x
+    return 0.5 * (low + high)
+
+
+@njit(cache=True, error_model="numpy")
+def faded_ratio(ratio, levels, chances, looks, apart):
+    """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
+
+    Parameters
+    ----------
+    ratio : float
+        |X| / sigma without noise.
+    levels : (float, float)
+        Threshold, and noise of bins that hold lines, over sigma.
+    chances : (float, float)
+        Share of detections in which the power is as large, uniform; chance of a detection.
+    looks, apart : int, bool
+        Records, and whether each has its own speckle.
+    """
+    noise = 2.0 * levels[1] * levels[1]
+    if looks > 1 and apart:
+        sum_of_looks = gamma_exceeded(looks, chances[0] * chances[1])
+        return math.sqrt((noise + ratio * ratio) * sum_of_looks / looks)
+    # Powers above the threshold are exponential; of a common speckle where noise is behind it.
+    power = noise / looks + ratio * ratio
+    return math.sqrt(levels[0] * levels[0] - power * math.log(chances[0]))

@@ -1,0 +1,343 @@
+"""Looks: closed forms against draws and outside values; whole spectra, motion, exact records."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from engine import keys
+from scipy import special, stats
+
+from sweep.model import alarms, truth, window
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import RAYLEIGH_DEVIATION, fading_together
+from sweep.model.effects.line_width import coherent_share, seen_line
+from sweep.model.effects.segment_motion import looks_of
+from sweep.model.estimators import ESTIMATOR
+from sweep.model.looks import COMBINE, NUMBER, SPECKLE, VOTES, Looks, coherent_gain
+from sweep.model.marcum import at_least_one, marcum_q1
+from sweep.model.sampling import simulate
+from sweep.model.segments import spectrum
+from sweep.model.shot import evaluate, find, prepare
+from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, tnr_of
+from sweep.model.unsupported import UnsupportedShot
+
+A_MILLION, PIECE = 1_000_000, 50_000
+BIN = 0.5e6
+ON_A_BIN = 100 * BIN / 1e14 * SPEED_OF_LIGHT / 2
+"""Range [m] whose beat is bin 100 of a chirp of 1 GHz in 10 us."""
+
+
+def amplitudes(rng, *size):
+    """Standard circular complex normal numbers."""
+    return (rng.normal(size=size) + 1j * rng.normal(size=size)) / np.sqrt(2)
+
+
+def drawn(looks, speckle, signals, level, alike=1.0):
+    """Share of a million draws in which each of two segments is detected, and both are."""
+    rng, found = np.random.default_rng([looks.number, len(looks.combine), len(speckle)]), []
+    apart = looks.number if looks.independent else 1
+    for _ in range(A_MILLION // PIECE):
+        first = amplitudes(rng, PIECE, apart)
+        second = alike * first + np.sqrt(1 - alike**2) * amplitudes(rng, PIECE, apart)
+        pair = (1.0, 1.0) if speckle == "steady" else (first, second)
+        power = [
+            np.abs(a * z + np.sqrt(2) * amplitudes(rng, PIECE, looks.number)) ** 2
+            for a, z in zip(signals, pair, strict=True)
+        ]
+        if looks.combine == "binary":
+            found.append([(p >= level**2).sum(axis=1) >= looks.votes for p in power])
+        else:
+            found.append([p.mean(axis=1) >= level**2 for p in power])
+    up, down = np.concatenate(found, axis=1)
+    return up.mean(), down.mean(), (up & down).mean()
+
+
+@pytest.mark.parametrize("speckle", ["steady", "independent", "common"])
+@pytest.mark.parametrize(
+    ("number", "combine", "votes"),
+    [(1, "power", 1), (2, "power", 1), (8, "power", 1), (32, "power", 1),
+     (2, "binary", 1), (8, "binary", 3), (32, "binary", 12)],
+)  # fmt: skip
+def test_closed_forms_are_the_mean_over_a_million_draws(number, combine, votes, speckle):
+    looks = Looks(number, combine, votes, speckle == "independent")
+    one, other = signals = (1.6, 1.3)
+    level = np.array(2.0)
+    law = looks.steady if speckle == "steady" else looks.faded
+    told = [float(law(np.array(a), level)[0]) for a in signals]
+    together = told[0] * told[1]
+    if speckle != "steady" and number > 1:
+        together = float(looks.faded_together(one, other, level, np.array(1.0)))
+    elif speckle != "steady":
+        both = fading_together(*map(np.asarray, told), level, np.array(1.0))
+        together = float(both)
+    for share, chance in zip(drawn(looks, speckle, signals, level), [*told, together], strict=True):
+        assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / A_MILLION)
+    for a in signals:
+        found, missed = law(np.array(a), level)
+        assert found + missed == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_segments_that_share_part_of_their_speckle(apart):
+    """Exact where looks fade apart; else within 0.01, between what is shared wholly and not."""
+    looks, level, signals = Looks(8, independent=apart), np.array(2.6), (2.0, 1.6)
+    told = float(looks.faded_together(*signals, level, np.array(0.8)))
+    share = drawn(looks, "part", signals, level, alike=0.8)[2]
+    assert abs(share - told) < 5 * np.sqrt(told / A_MILLION) + (0.0 if apart else 0.01)
+    up, down = (looks.faded(np.array(a), level)[0] for a in signals)
+    alone = looks.faded_together(*signals, level, np.array(0.0))
+    assert float(alone) == pytest.approx(float(up * down), rel=1e-6)
+
+
+def test_one_look_is_marcums_q_and_swerlings_first_case():
+    signal, level = np.linspace(0, 8, 9), np.full(9, 4.0)
+    for looks in (Looks(), Looks(9, "coherent")):
+        np.testing.assert_array_equal(looks.steady(signal, level), marcum_q1(signal, level))
+        np.testing.assert_array_equal(
+            looks.faded(signal, level)[0], np.exp(-(level**2) / (2 + signal**2))
+        )
+        np.testing.assert_array_equal(looks.log_alarm(level), -(level**2) / 2)
+
+
+@pytest.mark.parametrize(
+    ("number", "signal", "level"), [(2, 0.0, 6.0), (8, 1.5, 6.0), (32, 3.0, 6.5), (8, 9.0, 4.0)]
+)
+def test_deep_tails_keep_their_digits(number, signal, level):
+    """Poisson's mixture of incomplete Gamma functions in 60 digits, by mpmath."""
+    mpmath = pytest.importorskip("mpmath")
+    mpmath.mp.dps = 120
+    x, y = number * mpmath.mpf(signal) ** 2 / 2, number * mpmath.mpf(level) ** 2 / 2
+    exact = sum(
+        mpmath.exp(-x) * x**j / mpmath.factorial(j)
+        * mpmath.gammainc(number + j, y, mpmath.inf, regularized=True)
+        for j in range(900)
+    )  # fmt: skip
+    found, missed = Looks(number).steady(np.array(signal), np.array(level))
+    if exact < 0.5:
+        assert float(found) == pytest.approx(float(exact), rel=1e-10)
+    else:
+        assert float(missed) == pytest.approx(float(1 - exact), rel=1e-10)
+
+
+def test_alarms_and_thresholds_are_those_of_gamma_and_binomial_laws():
+    level = np.array([0.3, 1.2, 1.5, 3.0, 5.0])
+    power = special.gammaincc(8, 4 * level**2)
+    np.testing.assert_allclose(np.exp(Looks(8).log_alarm(level)), power, rtol=1e-12)
+    votes = stats.binom.sf(2, 8, np.exp(-(level**2) / 2))
+    binary = Looks(8, "binary", 3)
+    np.testing.assert_allclose(np.exp(binary.log_alarm(level)), votes, rtol=1e-12)
+    far = Looks(32).log_alarm(np.array(20.0))  # ln (6400^31 / 31! (1 + 31 / 6400 + ..)) - 6400
+    terms = np.cumsum([0.0, *(np.log((32 - k) / 6400) for k in range(1, 32))])
+    expected = 31 * np.log(6400) - special.gammaln(32) + np.log(np.exp(terms).sum()) - 6400
+    assert float(far) == pytest.approx(expected, rel=1e-13)
+    for chance in (0.3, 1e-6, 1e-200):
+        for looks in (Looks(8), Looks(200)):
+            y = looks.level(np.log(chance)) ** 2 / 2 * looks.number
+            assert float(y) == pytest.approx(special.gammainccinv(looks.number, chance), rel=1e-12)
+    for chance in (0.3, 1e-6, 1e-100):
+        p = special.betaincinv(3, 6, chance)
+        assert float(binary.level(np.log(chance))) == pytest.approx(np.sqrt(-2 * np.log(p)))
+
+
+@pytest.mark.parametrize("looks", [Looks(8), Looks(8, "binary", 3)], ids=lambda it: it.combine)
+def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
+    """Hamming, 1024 bins, twice padded: 5 sigma of 4000 segments, and the 3 % of one look."""
+    rng, length, level = np.random.default_rng(7), 512, looks.level(np.log(2e-3))
+    taper = window.samples("hamming", length)
+    sigma = np.sqrt((taper**2).sum() / 2)
+    found, number = 0, 4000
+    for _ in range(number):
+        records = rng.normal(size=(looks.number, length)) * taper
+        power = np.abs(np.fft.rfft(records, 1024)[:, 16:496]) ** 2
+        if looks.combine == "binary":
+            found += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes).any()
+        else:
+            found += (power.mean(axis=0) >= (level * sigma) ** 2).any()
+    correlation = alarms.neighbour_correlation(window.window("hamming", length), 1024)
+    bins = alarms.independent_bins(480, level=level, correlation=correlation, looks=looks)
+    told = float(at_least_one(2e-3, bins))
+    assert bins < 400
+    error = 5 * np.sqrt(told * (1 - told) / number)
+    assert found / number == pytest.approx(told, abs=error + 0.03 * told)
+
+
+def instrument(**changes):
+    """Table 4.1 in chirps of 10 us with a lone line on a bin, which no neighbour shows."""
+    return {
+        "instrument.chirp.duration": 10e-6, "instrument.chirp.segments": "up down",
+        "instrument.processing.sample_rate": 512e6, "instrument.processing.fft_size": 1024,
+        "instrument.processing.window": "rectangular",
+        "instrument.processing.noise_bins": "correlated",
+        "target.range": np.array([ON_A_BIN]), "target.radial_velocity": 0.0,
+        "footprint.beamlets": 1, "footprint.phases": "incoherent", PFA_BIN: 1e-5,
+    } | changes  # fmt: skip
+
+
+@pytest.fixture
+def scene(table_4_1):
+    base = {path: v for path, v in table_4_1().items() if path != "instrument.processing.tnr"}
+    return lambda **changes: base | instrument() | changes
+
+
+def dimmed(parameters, effects, pd):
+    """The same with as little light as gives about a probability of detection."""
+    powers = np.geomspace(1e-7, 1e2, 300)
+    tried = parameters | {"instrument.laser.power": powers, "target.range": ON_A_BIN}
+    found = evaluate(tried, effects)["pd_up"]
+    return parameters | {"instrument.laser.power": float(np.interp(pd, found, powers))}
+
+
+LOOKS = {
+    "steady powers": ({NUMBER: 4}, ()),
+    "common speckle": ({NUMBER: 4}, ("fading",)),
+    "speckle apart": ({NUMBER: 4, SPECKLE: "independent"}, ("fading",)),
+    "votes": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ()),
+    "votes apart": ({NUMBER: 5, COMBINE: "binary", VOTES: 2, SPECKLE: "independent"}, ("fading",)),
+    "votes together": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ("fading",)),
+    "amplitudes": ({NUMBER: 8, COMBINE: "coherent"}, ("fading",)),
+}
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_whole_spectra_are_detected_as_often_as_the_closed_form_says(scene, name):
+    changes, effects = LOOKS[name]
+    given = dimmed(scene(**changes), ("image", *effects), 0.6)
+    told, number = evaluate(given, ("image", *effects)), 4000
+    found = simulate(
+        given, ("image", *effects), keys=keys(1), batch_sizes=[number], method="spectra"
+    )
+    for which in ("pd_up", "pd_down", "pd_shot"):
+        p = told[which][0]
+        assert 0.2 < p < 0.9
+        assert found[which][0] == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) / number))
+    searched = 2 * 509 * number  # bins of both segments
+    assert found["pfa_bin"][0] == pytest.approx(1e-5, abs=5 * np.sqrt(1e-5 / searched))
+    np.testing.assert_allclose(told["pfa_bin"], 1e-5, rtol=1e-9)
+
+
+def test_the_threshold_of_a_segment_holds_its_alarms(scene):
+    base = {path: v for path, v in scene().items() if path != PFA_BIN}
+    for changes in ({NUMBER: 8}, {NUMBER: 8, COMBINE: "binary", VOTES: 4}):
+        given = base | changes | {PFA_SEGMENT: 0.2, "instrument.processing.window": "hamming"}
+        given |= {"target.reflectance": 1e-12}
+        found = simulate(given, (), keys=keys(1), batch_sizes=[2000], method="spectra")
+        share = found["n_false_alarm_up"].sum() / 2000
+        assert share == pytest.approx(0.2, abs=5 * np.sqrt(0.16 / 2000) + 0.03 * 0.2)
+
+
+def test_estimates_err_by_the_root_of_the_number_of_looks_less(scene):
+    quiet = scene(**{ESTIMATOR + "kind": "chirp_z", "instrument.laser.power": 1e-3})
+    found = {}
+    for number in (1, 16):
+        given = quiet | {NUMBER: number}
+        found[number] = simulate(
+            given, ("image",), keys=keys(1), batch_sizes=[800], method="spectra"
+        )
+    one, many = (found[number] for number in (1, 16))
+    assert one["range_bound"] == pytest.approx(4 * many["range_bound"], rel=1e-12)
+    for each in (one, many):
+        ratio = each["range_rmse"] / each["range_bound"]
+        assert ratio == pytest.approx(1.0, abs=5 / np.sqrt(2 * 800) + 0.02)
+
+
+def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
+    """Records by the exact delay, look by look, their phases' best straight line taken off."""
+    given = scene(**{NUMBER: 8, COMBINE: "coherent", "target.acceleration": 80.0})
+    ((_, shots),) = prepare(given, ("segment_motion", "image"))
+    bins = np.exp(-2j * np.pi * 100 * np.arange(1024) / 1024)
+    record = partial(truth.analytic_record, i=0, segment=0, beamlet=0, acceleration=True)
+    sums = np.array([(record(look) * bins).sum() for look in looks_of(shots)])
+    place = np.arange(8) - 3.5
+    phase = np.unwrap(np.angle(sums))
+    turned = sums * np.exp(-1j * np.polyfit(place, phase, 1)[0] * place)
+    lost = np.abs(turned.mean()) / np.abs(sums).mean()
+    told = coherent_gain(
+        Looks(8, "coherent"), acceleration=np.array(80.0),
+        carrier=np.asarray(shots.carriers[0]), period=np.array(20e-6),
+    )  # fmt: skip
+    assert 0.5 < told < 0.9
+    assert float(told) == pytest.approx(lost, rel=2e-3)
+    magnitude = {
+        effects: find(next(prepare(given, effects))[1])[0, 2, 0]
+        for effects in (("image",), ("image", "acceleration"))
+    }
+    ratio = magnitude["image", "acceleration"] / magnitude[("image",)]
+    assert ratio == pytest.approx(lost, rel=2e-3)
+
+
+def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
+    """exp(-2 pi dnu tau) of the power adds up; what walks is noise, and new in each record."""
+    laser = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
+    effects = ("image", "line_width")
+    given = scene(**{NUMBER: 16, COMBINE: "coherent"}, **laser)
+    ((_, pure),) = prepare(given, ("image",))
+    ((_, shots),) = prepare(given, effects)
+    delay = 2 * ON_A_BIN / SPEED_OF_LIGHT
+    share = np.exp(-2 * np.pi * 1e5 * delay)
+    left = (find(shots)[0, 2, 0] / find(pure)[0, 2, 0]) ** 2
+    assert left == pytest.approx(share, rel=1e-9)
+    given = dimmed(given, effects, 0.6)
+    told, number = evaluate(given, effects)["pd_up"][0], 3000
+    found = simulate(given, effects, keys=keys(1), batch_sizes=[number], method="spectra")
+    error = 5 * np.sqrt(told * (1 - told) / number)
+    assert found["pd_up"][0] == pytest.approx(told, abs=error + 0.02)
+    without = evaluate(given, ("image",))["pd_up"][0]
+    assert without > told + 0.1
+    timing = {"line_width": np.array([1e5]), "delay": np.array([delay])}
+    own = {"duration": np.array([2e-6]), "window": shots.window}
+    assert seen_line(**timing, **own)[0] > coherent_share(**timing, duration=own["duration"])
+
+
+@pytest.mark.parametrize("combine", ["power", "binary"])
+def test_a_target_that_moves_smears_the_mean_power_of_its_looks(scene, combine):
+    """0.9 bins from first to last: the mean of each look's own spectrum, by any route."""
+    moving = scene(**{NUMBER: 32, COMBINE: combine, "target.radial_velocity": 1000.0})
+    effects = ("segment_motion", "image")
+    if combine == "binary":
+        with pytest.raises(UnsupportedShot, match=r"instrument\.looks\.number takes 32 looks"):
+            next(prepare(moving, effects))
+        return
+    ((_, shots),) = prepare(moving, effects)
+    bins, magnitude = spectrum(shots, 0, 0)
+    each = [dict(zip(*spectrum(look, 0, 0), strict=True)) for look in looks_of(shots)]
+    for k in range(95, 105):
+        expected = np.sqrt(np.mean([look[k] ** 2 for look in each]))
+        # The receiver's poles are those of the middle look's line.
+        assert magnitude[list(bins).index(k)] == pytest.approx(expected, rel=1e-4)
+    in_time = truth.find(shots, range_walk=False)
+    np.testing.assert_allclose(find(shots)[::2, 2], in_time[::2, 2], rtol=1e-4)
+    seen = [look[100] for look in each]
+    assert max(seen) > 1.2 * min(seen)
+
+
+def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
+    given = scene(**{NUMBER: 4, "accuracy.leakage_floor": -1.0})
+    given |= {"target.range": np.array([ON_A_BIN + 0.3]), "instrument.laser.power": 4e-3}
+    told = evaluate(given, ("image", "leakage"))
+    ((_, shots),) = prepare(given, ("image",))
+    bins, magnitude = spectrum(shots, 0, 0)
+    sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
+    own = magnitude >= level
+    own |= np.convolve(own, np.ones(3), "same") > 0
+    signal = 2 * (magnitude[~own & (bins > 0) & (bins < 512)] / sigma) ** 2 * 4 / 2
+    crosses = stats.ncx2.sf(4 * (level / sigma) ** 2, 8, signal)
+    quiet = special.gammaincc(4, 2 * (level / sigma) ** 2)
+    expected = 1 - np.prod(1 - (crosses - quiet) / (1 - quiet))
+    assert 1e-3 < expected < 0.9
+    assert told["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)
+
+
+def test_votes_of_one_and_of_all_are_any_and_every_record():
+    level, signal = np.array(2.0), np.array(1.5)
+    each = marcum_q1(signal, level)
+    assert Looks(6, "binary", 1).steady(signal, level)[1] == pytest.approx(each.p**6)
+    assert Looks(6, "binary", 6).steady(signal, level)[0] == pytest.approx(each.q**6)
+
+
+def test_a_threshold_over_the_noise_is_that_of_one_record(scene):
+    given = {path: v for path, v in scene().items() if path != PFA_BIN}
+    given |= {NUMBER: 4, "instrument.processing.tnr": 6.0}
+    level = 6.0 * RAYLEIGH_DEVIATION
+    assert float(tnr_of(given)) == 6.0
+    found = evaluate(given, ())["log10_pfa_bin"][0]
+    assert found == pytest.approx(np.log10(special.gammaincc(4, 2 * level**2)), rel=1e-9)

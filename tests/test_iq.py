@@ -1,0 +1,179 @@
+"""Complex records (I and Q) from a spec to answers, beside real ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_triangle import STREET, instrument
+
+import sweep
+from sweep.model import segments, truth
+from sweep.model.effects.catalogue import CORE
+from sweep.model.pairing import MISPAIRED, MISREAD, TRUE
+from sweep.model.shot import prepare, statistics
+from sweep.model.waveform import resolve
+from sweep.model.window import samples
+from sweep.spec import SceneSpec, Spec, SpecError
+
+RECORD = "instrument.receiver.record"
+GAIN, PHASE = (f"instrument.receiver.iq_{name}_imbalance" for name in ("gain", "phase"))
+CHIRP = {"carrier": np.array(1.93e14), "bandwidth": np.array(1e9), "duration": np.array(10e-6)}
+
+
+@given(
+    st.floats(0.0, 0.49), st.floats(-0.49, 0.49), st.sampled_from([None, 0, 1, -1]),
+    st.booleans(),
+)  # fmt: skip
+def test_signs_tell_range_and_velocity_whichever_is_larger(near, fast, equal, doppler):
+    """Range beats up to half the sample rate, Doppler shifts to half of either sign; also alike."""
+    rate = 512e6
+    f_r = near * rate
+    f_d = (fast if equal is None else equal * near) * rate
+    seen = [(f + rate / 2) % rate - rate / 2 for f in (f_d - f_r, f_d, f_d + f_r)]
+    up, middle, down = (np.array(f) for f in seen)
+    found = resolve(
+        up=up, doppler=middle if doppler else None, down=down, sample_rate=np.array(rate),
+        bin_width=np.array(1e5), signed=True, **CHIRP,
+    )  # fmt: skip
+    velocity = f_d * 299792458 / 2 / (1.93e14 + 5e8)
+    assert found.radial_velocity == pytest.approx(velocity, abs=1e-6)
+    delay = (f_r - 5e8 * f_d / (1.93e14 + 5e8)) / 1e14 / (1 + 2 * velocity / 299792458)
+    assert found.range == pytest.approx(299792458 / 2 * delay, abs=1e-6)
+
+
+def shots_of(scene, effects=CORE):
+    ((_, shots),) = prepare(scene, effects)
+    return shots
+
+
+@pytest.mark.parametrize("source", ["shot", "amplifier"])
+def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
+    """Simulated: a hybrid gives I and Q half of echo and local oscillator, sampled with noise."""
+    own = 0.0 if source == "shot" else 50e-9
+    quiet = table_4_1(fft_size=1024, range=200.0, beamlets=1) | {
+        "instrument.receiver.noise_equivalent_power": 0.0,
+        "instrument.receiver.amplifier_noise_current": own,
+        "instrument.receiver.local_oscillator_power": 1e-3 if source == "shot" else 1e-9,
+        "target.reflectance": 1e-4 if source == "shot" else 1.0,
+    }  # fmt: skip
+    real, both = (statistics(shots_of(quiet | {RECORD: kind})) for kind in ("real", "complex"))
+    rng, length, trials = np.random.default_rng(3), 1024, 4000
+    cycles = np.arange(length) * (100 / length)
+    tone, w = np.exp(2j * np.pi * cycles), samples("hamming", length)
+    light = 0.5 if source == "shot" else 1.0  # share of the variance in each receiver
+    noise = rng.normal(size=(2, trials, length))
+    deviation = 0.7
+    of_real = np.fft.fft(w * (tone.real + deviation * noise[0]))[:, 100]
+    of_both = np.fft.fft(w * (tone / 2 + deviation * np.sqrt(light) * (noise[0] + 1j * noise[1])))
+    seen = [
+        abs(w.sum() / 2) ** 2 / np.var(each) for each in (of_real, of_both[:, 100])
+    ]  # the same line over the noise of both quadratures
+    ratio = both["snr_up"][0] / real["snr_up"][0]
+    assert ratio == pytest.approx(seen[1] / seen[0], rel=5 * np.sqrt(2 / trials))
+    assert ratio == pytest.approx(1.0 if source == "shot" else 0.5, rel=1e-3)
+    bins = 10 ** (both["log10_pfa_segment"] - real["log10_pfa_segment"])
+    assert bins[0] == pytest.approx(1024 / 511, rel=2e-2)
+
+
+@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
+@pytest.mark.parametrize("velocity", [-40.0, 0.02, 90.0])
+def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_1):
+    """0.5 dB and 3 deg: against the record of I and Q that are so unequal, all N bins."""
+    scene = table_4_1(
+        window="hann", phases=phases, fft_size=4096, beamlets=7, range=30.0,
+        radial_velocity=velocity,
+    ) | {RECORD: "complex", GAIN: 10**0.05, PHASE: np.deg2rad(3.0)}  # fmt: skip
+    shots = replace(shots_of(scene, (*CORE, "iq_imbalance")), phase_errors=())
+    g = np.sqrt(10**0.05) * np.exp(1j * np.deg2rad(3.0))
+    leak = abs(1 - g) / abs(1 + g)
+    assert shots.image_gain == pytest.approx(leak)
+    w = samples("hann", 4096)
+    for segment in range(3):
+        exact = truth.spectrum(shots, 0, segment, range_walk=False)
+        bins, magnitude = segments.spectrum(shots, 0, segment)
+        found = np.zeros(4096)
+        found[(bins + 2048) % 4096] = magnitude
+        assert np.abs(found - exact).max() < 1e-9 * exact.max()
+        record = truth.analytic_record(shots, 0, segment, 3, range_walk=False)
+        unequal = record.real + 1j * (g * record / 1j).real  # Q by its own gain and phase
+        spectrum = np.abs(np.fft.fft(w * unequal))
+        k = spectrum.argmax()
+        if min(k, 4096 - k) > 40:  # line and image apart
+            image = spectrum[(-k) % 4096] / spectrum[k]
+            assert image == pytest.approx(leak, rel=1e-3)
+
+
+def test_a_grid_of_both_records(tmp_path):
+    """Where Doppler shift and range beat are alike the real record cannot tell their signs."""
+    spec = Spec.from_mapping({
+        "title": "Records", "instrument": instrument(),
+        "target": {"range": "100 m", "reflectance": 0.1, "radial_velocity": "-35 m/s",
+                   "grazing_angle": "90 deg"},
+        "axes": {RECORD: ["real", "complex"], "target.radial_velocity": ["-35 m/s", "60 m/s"]},
+    })  # fmt: skip
+    assert sweep.run(spec, store=tmp_path / "g.zarr", scheduler="none", progress=False).complete
+    found = sweep.open(tmp_path / "g.zarr").load()
+    assert np.abs(found.range_error).max() < 0.3
+    assert np.abs(found.radial_velocity_error).max() < 0.3
+    more = found.log10_pfa_bin.sel(record="complex") - found.log10_pfa_bin.sel(record="real")
+    assert np.abs(more).max() < 1e-5  # the threshold follows the noise, but for the echo's own
+
+
+@pytest.mark.parametrize("speed", [15, 90])
+def test_a_street_in_complex_records(speed, tmp_path):
+    """Two segments and signs: every return is read right, whichever of its beats is larger."""
+    clouds = {}
+    for kind in ("real", "complex"):
+        written = instrument(segments="up down")
+        written["receiver"] |= {"record": kind}
+        spec = SceneSpec.from_mapping({
+            "title": "A street", "instrument": written,
+            "scene": {"origin": "ground", "objects": STREET},
+            "platform": {"path": {
+                "kind": "straight", "from": ["0 m", "0 m", "90 m"], "to": ["0 m", "0 m", "60 m"],
+                "initial_speed": f"{speed} m/s", "final_speed": f"{speed} m/s",
+            }},
+            "scanners": {"frame": {"kind": "raster", "columns": 16, "rows": 16,
+                                   "half_angles": ["12 deg", "12 deg"], "rate": "200 Hz"}},
+            "footprint": {"beamlets": 1, "speckle": "none"},
+            "draws": {"number": 2, "method": "noise"},
+        })  # fmt: skip
+        store = tmp_path / f"{kind}.zarr"
+        assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
+        clouds[kind] = sweep.open_scene(store)["frame"].to_dataset().load()
+    real, both = ((cloud["flags"] & TRUE > 0).sum().item() for cloud in clouds.values())
+    wrong = (clouds["complex"]["flags"] & (MISREAD | MISPAIRED) > 0).sum().item()
+    assert (real == 0) == (speed == 90)  # |f_d| > f_r: exchanged
+    assert both > 1000 and both >= 0.99 * real and wrong <= 1e-3 * both
+
+
+@pytest.mark.parametrize(
+    "changed, told",
+    [
+        ({"receiver": {"record": "complex", "architecture": "direct"}}, "I and Q"),
+        ({"receiver": {"record": "both"}}, "real"),
+        ({"receiver": {"iq_gain_imbalance": "0.5 dB"}}, "record: complex"),
+    ],
+)
+def test_what_makes_no_complex_record_is_told(changed, told):
+    written = instrument()
+    for part, fields in changed.items():
+        written[part] |= fields
+    target = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
+              "grazing_angle": "90 deg"}  # fmt: skip
+    with pytest.raises(SpecError, match=told):
+        Spec.from_mapping({"title": "x", "instrument": written, "target": target})
+
+
+def test_whole_spectra_are_of_real_records():
+    written = instrument()
+    written["receiver"] |= {"record": "complex"}
+    target = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
+              "grazing_angle": "90 deg"}  # fmt: skip
+    with pytest.raises(SpecError, match="method: noise"):
+        Spec.from_mapping({
+            "title": "x", "instrument": written, "target": target,
+            "draws": {"method": "spectra", "number": 10},
+        })  # fmt: skip
