@@ -253,7 +253,7 @@ def half_width(estimate: ArrayLike, interval: Interval) -> np.ndarray:
 
 
 def _deviations(confidence: ArrayLike) -> np.ndarray:
-    """Standard deviations z to either side of a normal mean that hold `confidence`."""
+    """Return the z for which a standard normal |Z| <= z with probability `confidence`."""
     return np.asarray(ndtri(0.5 + np.asarray(confidence, float) / 2))
 
 

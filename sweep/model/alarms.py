@@ -62,7 +62,7 @@ def _correlation(window: Window, fft_size: int, apart: int) -> float:
 def independent_bins(
     bins: ArrayLike, *, level: ArrayLike, correlation: float, looks: Looks = ONE
 ) -> np.ndarray:
-    """Number of independent bins that raise an alarm as often as so many adjacent ones.
+    """Return the number of independent bins that raise an alarm as often as n adjacent ones.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def independent_bins(
     level : array_like
         Threshold over sigma, > 0.
     correlation : float
-        Of neighbours, 0..1 (:func:`neighbour_correlation`).
+        Correlation of neighbouring bins, 0..1 (:func:`neighbour_correlation`).
     looks : Looks
         Records by which a bin is detected.
 

@@ -133,7 +133,7 @@ def overlap(sent: Beam, received: Beam, range: ArrayLike, offset: ArrayLike = 0.
 
 
 def is_single_mode(p: Parameters) -> bool:
-    """True where the receiver of points of one category sees one mode alone."""
+    """Return true where the receiver of points of one category sees a single mode."""
     return str(p[COUPLING]) == SINGLE_MODE and str(p[ARCHITECTURE]) != "direct"
 
 
@@ -152,9 +152,9 @@ def divergence(p: Parameters) -> np.ndarray:
 
 
 def beams(p: Parameters) -> tuple[Beam, Beam]:
-    """The sent beam, and the local oscillator's at the target, which is of one mode: M^2 is 1.
+    """Return the sent beam and, with M^2 = 1, the local oscillator's at the target.
 
-    By default the latter leaves the telescope as wide as the sent one.
+    The local oscillator's waist at the telescope is that of the sent beam by default.
     """
     waist, received = np.asarray(p[WAIST], float), np.asarray(p[RECEIVED_WAIST], float)
     angle = np.asarray(p[DIVERGENCE], float)
@@ -196,7 +196,7 @@ def shape(p: Parameters) -> dict[str, Any]:
 
 
 def is_thesis(p: Parameters) -> bool:
-    """True where all footprints are as wide as divergence times range, [T]'s law."""
+    """Return true where every footprint is as wide as divergence times range, [T]'s law."""
     return not (is_single_mode(p) or np.any(p[WAIST]) or np.any(p[FOCUS]))
 
 

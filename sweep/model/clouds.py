@@ -124,7 +124,7 @@ def _groups(
     most: int,
     called: tuple[Collection[str], np.ndarray | None, np.ndarray],
 ) -> tuple[Shots, Footprints, Groups]:
-    """Prepared shots, what their rays hit, and groups in their spectra; none for no target.
+    """Return prepared shots, footprints, and groups in their spectra; no groups without a target.
 
     `called`: names of effects, flags of each shot, and the shots' keys.
     """

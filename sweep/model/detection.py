@@ -13,7 +13,7 @@ RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 
 
 def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
-    """Detection threshold on |X|: TNR standard deviations of a noise-only bin's magnitude.
+    """Compute the threshold on |X|: TNR standard deviations of a noise-only bin's magnitude.
 
     The only reading of [T]'s threshold-to-noise ratio that gives its Table 4.2 (PHYSICS section
     6): a noise-only bin crosses with probability exp(-(4 - pi)/4 TNR^2).
@@ -111,12 +111,12 @@ def fading_together(
 
 @njit(cache=True, error_model="numpy")
 def mark(magnitude, count, level, exempt, beside):
-    """Detection in a run of bins, and the bins that it keeps from raising a false alarm.
+    """Find the detection in a run of bins, and mark the bins that can't raise a false alarm.
 
     Adjacent bins at or above the threshold form a group; its largest bin is the detection. The
     bins of a group and the two beside it can't raise a false alarm, nor can the strongest bin
-    and its neighbours, group or not. Where any bin of the echo detects, all those can't that are
-    within a main lobe of one that has half of the largest magnitude.
+    and its neighbours, group or not. Where any bin of the echo detects, bins within a main lobe of
+    one that has half of the largest magnitude can't either.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def mark(magnitude, count, level, exempt, beside):
 
 @njit(cache=True, error_model="numpy")
 def is_end(bin_, ends):
-    """True for DC and Nyquist, where noise is real; ``ends`` is N, or 0 where none is."""
+    """Return true for DC and Nyquist, where noise is real; ``ends`` is N, or 0 where none is."""
     return ends > 0 and (bin_ == 0 or 2 * bin_ == ends)
 
 
@@ -311,7 +311,7 @@ def any_faded(magnitude, echo, beside, levels, correlation):
 
 @njit(cache=True, error_model="numpy")
 def _deviate(chance):
-    """Normal deviate that is exceeded with a chance of at most 1/2; to some 1e-4."""
+    """Compute the normal deviate exceeded with a probability of at most 1/2; to about 1e-4."""
     if chance < 1e-300:
         return 37.0
     s = math.sqrt(-2.0 * math.log(chance))
@@ -350,7 +350,7 @@ def _survey(magnitude, level):
 
 @njit(cache=True, error_model="numpy")
 def _exempt(first, last, count, exempt):
-    """Marks the bins of a group and the two beside it; how many they are."""
+    """Mark the bins of a group and the two beside it; return their number."""
     first, last = max(first - 1, 0), min(last + 1, count - 1)
     exempt[first : last + 1] = True
     return last - first + 1
@@ -358,7 +358,7 @@ def _exempt(first, last, count, exempt):
 
 @njit(cache=True, error_model="numpy")
 def detect_rows(magnitude, first, bins, rule, deviation, level, out):
-    """Detections in spectra without noise that are given bin by bin.
+    """Detect in spectra without noise that are given bin by bin.
 
     Parameters
     ----------

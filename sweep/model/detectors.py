@@ -42,7 +42,7 @@ CA, OS, GOCA = "ca_cfar", "os_cfar", "goca_cfar"
 
 @lru_cache(maxsize=8)
 def taper(window: Window) -> np.ndarray:
-    """Samples (L,) of a window, made once; not to be written to."""
+    """Return the samples (L,) of a window, computed once and read-only."""
     values = samples(window.name, window.length)
     values.flags.writeable = False
     return values
@@ -182,7 +182,7 @@ def _training_cells(power: np.ndarray, setting: Setting) -> Iterator[tuple[np.nd
 
 
 def _sums(power: np.ndarray, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of the training cells below and above each bin."""
+    """Sum the training cells below and above each bin."""
     sums = np.zeros((2, len(power), power.shape[1] - 2))
     for pair in _training_cells(power, setting):
         sums += pair

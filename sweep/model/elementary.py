@@ -20,7 +20,7 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
 
 @njit(inline="always")
 def exact_product(a, b):
-    """A * b in two doubles (high, low), by Veltkamp's and Dekker's splitting; |a|, |b| < 1e300."""
+    """Compute a * b as two doubles (high, low) [Veltkamp; Dekker]; |a|, |b| < 1e300."""
     high = a * b
     scaled = 134217729.0 * a  # 2^27 + 1
     a_high = scaled - (scaled - a)

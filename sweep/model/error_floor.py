@@ -69,11 +69,11 @@ class ErrorFloor(NamedTuple):
         return float(np.hypot(self.clock, self.wavelength))
 
     def range_error(self, range: np.ndarray) -> np.ndarray:
-        """Standard error of ranges [m]."""
+        """Return the standard error of ranges [m]."""
         return np.asarray(self.clock * np.abs(range))
 
     def velocity_error(self, radial_velocity: np.ndarray, across: np.ndarray) -> np.ndarray:
-        """Standard error of radial velocities [m/s], with the speed across the beam [m/s].
+        """Return the standard error of radial velocities [m/s] at a speed across the beam [m/s].
 
         >>> ErrorFloor(pointing=1e-3, vibration=0.03).velocity_error(0.0, 40.0).round(12).item()
         0.05

@@ -97,7 +97,7 @@ _FARTHEST = 0.5
 
 
 def peak_bin(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
-    """The bin itself."""
+    """Return the peak bin itself."""
     return peak.astype(float)
 
 
@@ -183,7 +183,7 @@ def _three(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
 
 
 def _turned(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
-    """The same, as a tone in the middle of the record would have them."""
+    """Return the same bins, with phases counted from the middle of the record."""
     turn = 0.5 * setting.window.length / setting.fft_size
     return _three(spectrum, peak) * np.exp(2j * np.pi * turn * np.array([-1, 0, 1]))
 
@@ -236,12 +236,12 @@ def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
 
 
 def _record(spectrum: np.ndarray, setting: Setting) -> np.ndarray:
-    """The windowed record (L,) of a spectrum."""
+    """Return the windowed record (L,) of a spectrum."""
     return np.asarray(fft.irfft(spectrum, setting.fft_size))[: setting.window.length]
 
 
 def _at_rest(record: np.ndarray, bin_: int, setting: Setting) -> np.ndarray:
-    """A record with a bin moved to zero frequency."""
+    """Shift a record in frequency so that a bin lies at zero."""
     turns = np.arange(record.size) * bin_ % setting.fft_size / setting.fft_size
     return np.asarray(record * np.exp(-2j * np.pi * turns))
 
@@ -306,15 +306,15 @@ def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike
 
 
 def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayLike) -> np.ndarray:
-    """Standard deviation [Hz] of a beat's frequency by the random walk of its laser's phase.
+    """Compute the standard deviation [Hz] of a beat's frequency from its laser's phase walk.
 
-    That of the straight line through theta(t) - theta(t - tau), theta a Wiener process with the
-    variance Gamma |t| = 2 pi dnu |t|, by least squares over a record of the length T: with
+    The frequency is the slope of a least-squares line through theta(t) - theta(t - tau) over a
+    record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
     r = tau / T, or 1 where the delay is longer,
 
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
-    The most likely frequency in white noise errs by that, besides
+    The maximum-likelihood frequency in white noise has this error in addition to
     :func:`beat_deviation`. Estimates that knew the walk's correlation could do better by a few
     percent for short delays, by a fifth for r = 1/3.
 
@@ -329,7 +329,7 @@ def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayL
 
 
 def windowed_deviation(*, cnr: ArrayLike, window: Window, sample_rate: ArrayLike) -> np.ndarray:
-    """Standard deviation [Hz] of the place of the largest |X(f)| of a windowed record.
+    """Compute the standard deviation [Hz] of the frequency at which a windowed |X(f)| peaks.
 
     To first order in the noise, with m = n less the middle of the record,
 

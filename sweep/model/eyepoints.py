@@ -79,7 +79,7 @@ class Eyepoints(NamedTuple):
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
     def some(self, shots: slice | np.ndarray) -> "Eyepoints":
-        """Some of the shots, by a slice, their places or a mask; neighbours are not copied."""
+        """Return some of the shots, by a slice, indices or a mask; neighbours are not copied."""
         places = np.arange(len(self.time))[shots]
         if places.size and (np.diff(places) == 1).all():
             shots = slice(places[0], places[-1] + 1)
@@ -163,9 +163,9 @@ def _radial_velocity(
     moving: Sequence[State | None],
     rotation: bool,
 ) -> np.ndarray:
-    """Closing speed of instrument and surface along every beamlet [m/s], (n, b); nan for a miss.
+    """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b); nan: a miss.
 
-    Of the rays, the first find the places, the second have the directions of the light there.
+    The first of the rays find the places; the second hold the directions of light there.
     A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
     turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
     """
@@ -195,11 +195,11 @@ def _along_beam(
     moving: Sequence[State | None],
     rotation: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Closing acceleration, speed at which the range falls, turn rate of reference beamlets, (n,).
+    """Compute closing acceleration, range rate (falling) and turn rate of reference beams, (n,).
 
     V is the velocity of the instrument against the body that is hit, which turns by w and is
-    thought to reach as far. The beam d sees the closing speed V.d, which grows by V'.d + V.d', and
-    meets the surface, a plane of normal n there, at a range that falls by
+    taken to extend to the instrument. The beam d sees the closing speed V.d, which grows by
+    V'.d + V.d'. It meets the surface, a plane of normal n there, at a range that falls by
     (V + R (d' - w x d)).n / d.n. Bodies are taken to turn at steady rates. ``turning`` is the
     scanner's part of d', (n, 3).
     """

@@ -99,7 +99,7 @@ def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.nd
 
 
 def _hexagonal(number: int) -> np.ndarray:
-    """The points of a hexagonal lattice nearest to one of its points, (2, number)."""
+    """Return the points of a hexagonal lattice nearest to one of its points, (2, number)."""
     reach = 2 + math.ceil(math.sqrt(number))
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     squared = i * i + i * j + j * j  # whole numbers, so that shells are told apart exactly
@@ -244,7 +244,7 @@ class Moments(NamedTuple):
     extreme: np.ndarray | float
 
     def times(self, factor: np.ndarray) -> "Moments":
-        """The same of what is so many times as far; infinite ones may be multiplied by 0."""
+        """Scale the offsets by a factor; infinite ones may be multiplied by 0."""
         return Moments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def plus(self, other: "Moments") -> "Moments":

@@ -237,7 +237,7 @@ def _moments(values: np.ndarray, weight: np.ndarray) -> Moments:
 
 
 def different_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """A row of each kind among rows of columns, (kinds,); the kind of each, (n,)."""
+    """Find the distinct rows of columns: a row of each kind (kinds,), and each row's kind (n,)."""
     order = np.lexsort(columns)
     rows = np.stack(columns)[:, order]
     is_new = np.append(True, (rows[:, 1:] != rows[:, :-1]).any(axis=0))

@@ -45,7 +45,7 @@ class Groups(NamedTuple):
 
 
 def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
-    """Groups of each segment's spectrum without noise, the ``most`` strongest of them.
+    """Find the groups of each segment's spectrum without noise, the ``most`` strongest of them.
 
     ``every_bin`` as of :func:`sweep.model.shot.find`.
     """
@@ -71,7 +71,7 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
-    """Groups of every run, into arrays of the shapes of :class:`Groups`.
+    """Find the groups of every run, into arrays of the shapes of :class:`Groups`.
 
     ``how``: N/2, or 0 of complex records, and :attr:`sweep.model.preparation.Shots.echo_rule`.
     """

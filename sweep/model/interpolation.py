@@ -122,10 +122,10 @@ def phasors(cycles: float, number: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def lone_tone(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Function of the distance, -2..2 bins, from a lone tone to a bin: the complex bin.
+    """Return the complex bin as a function of its distance from a lone tone, -2..2 bins.
 
-    With the phase of half a record taken off it is real for a symmetric window. A polynomial, as
-    it turns by one cycle at the most: to 1e-14 of the largest bin.
+    The phase of half a record is taken off, so it is real for a symmetric window. It turns by one
+    cycle at the most, so a polynomial gives it to 1e-14 of the largest bin.
     """
     w, middle = samples(window.name, window.length), window.length / 2
 
@@ -214,7 +214,7 @@ def _at(values, place):
 
 @njit(cache=True, error_model="numpy")
 def sub_bin_error(delta, ratio, tables):
-    """Standard error [bins] of :func:`sub_bin`, at most 1/2.
+    """Compute the standard error [bins] of :func:`sub_bin`, at most 1/2.
 
     ``ratio`` is the centre bin's magnitude over the noise sigma per quadrature.
     """

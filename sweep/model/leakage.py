@@ -209,7 +209,7 @@ def _of_run(count, left, noise, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _chances(count, noise, room, exempt, series):
-    """Added chances of a run of bins, into row CHANCE."""
+    """Compute the added crossing probabilities of a run of bins, into row CHANCE."""
     sigma, level, _ = noise
     scale = 0.5 / (sigma * sigma)
     for i in range(count):
@@ -327,7 +327,7 @@ def _near_end(side, count, chance, exempt):
 
 @njit(cache=True, error_model="numpy")
 def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
-    """Adds cotangents and weights of one side's integral to rows POINT and WEIGHT.
+    """Add cotangents and weights of one side's integral to rows POINT and WEIGHT.
 
     The integral begins half a bin beyond ``last``, counted from ``centre``. With images the
     spectrum is even about DC and Nyquist; without, it goes on, and the integral out to half a bin

@@ -108,7 +108,7 @@ _gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
 
 @lru_cache(maxsize=24)
 def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: bool = True) -> Shapes:
-    """What shapes of up to some modes (:data:`TIERS`) are made of."""
+    """Prepare the tables from which shapes of up to some modes (:data:`TIERS`) are built."""
     number, clear, beside = TIERS[tier]
     beside = SHARED if shared else beside
     ratio, length = window.length / fft_size, window.length
@@ -195,7 +195,7 @@ def _outline_of_all(square: np.ndarray, cells: int, outline: np.ndarray) -> None
 
 
 def kernel(z: np.ndarray) -> np.ndarray:
-    """The kernel by which lines are shared out, at z cells, |z| <= POINTS / 2."""
+    """Evaluate the kernel that shares lines out among cells, at z cells, |z| <= POINTS / 2."""
     root = np.sqrt(np.maximum(1 - (2 * z / POINTS) ** 2, 0.0))
     return np.asarray(i0(WIDEN * root) / i0(WIDEN))
 
@@ -359,7 +359,7 @@ def find_modes(phase, matrix, centre, found, number):
 
 @njit(cache=True, error_model="numpy")
 def build(segment, numbers, parts, shapes, table, form):
-    """A shape of its modes, or from where it is whole.
+    """Build a shape from its modes, or take it from a table that holds all bins.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def build(segment, numbers, parts, shapes, table, form):
     parts : tuple
         Modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
     shapes : Shapes
-        What they are made of, as a tuple.
+        Tables to build from, as a tuple.
     table : (2, cells * columns) float64
         Result: G, or |G|^2 in the first row.
     form : (7, >= m) float64

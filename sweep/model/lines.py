@@ -178,7 +178,7 @@ def place_lines(p, segment, footprint, row, sizes, room):
 
 @njit(cache=True, error_model="numpy")
 def add_images(room, n, origin, gain, power):
-    """Adds the lines' images at negative frequencies, so much weaker; number of all lines."""
+    """Add the lines' images at negative frequencies, scaled by ``gain``; return the new count."""
     for b in range(n):
         room[PLACE, n + b] = -2.0 * origin - room[PLACE, b]
         room[RE, n + b] = room[RE, b] * (gain * gain if power else gain)
@@ -188,7 +188,7 @@ def add_images(room, n, origin, gain, power):
 
 @njit(cache=True, error_model="numpy")
 def fold_lines(room, n, sizes):
-    """Moves n lines by whole FFT lengths to within half of one from the origin."""
+    """Move n lines by whole FFT lengths to within half of one from the origin."""
     for b in range(n):
         turns = math.floor(room[PLACE, b] / sizes[0] + 0.5)
         room[PLACE, b] -= turns * sizes[0]
@@ -280,7 +280,7 @@ def nodes_for(turn, tolerance, limits):
 
 @njit(cache=True, error_model="numpy")
 def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
-    """Moves n weights onto Chebyshev nodes ``middle`` +- ``half`` (``span``), if these are fewer.
+    """Move n weights onto Chebyshev nodes ``middle`` +- ``half`` (``span``), if these are fewer.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
 
 @njit(cache=True, error_model="numpy")
 def _add_moments(room, nodes):
-    """Adds sums over a block of lines of their weights times T_0(x) .. T_nodes(x)."""
+    """Add sums over a block of lines of their weights times T_0(x) .. T_nodes(x)."""
     for i in range(BLOCK_SIZE):
         room[BLOCK, _EVEN + i] = 1.0
         room[BLOCK, _ODD + i] = room[BLOCK, _X + i]

@@ -68,7 +68,7 @@ def shot_noise(
     responsivity: np.ndarray,
     electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Current variance 2 q M^2 F Re P B_e [A^2] of light of power P [W] on the detector."""
+    """Compute current variance 2 q M^2 F Re P B_e [A^2] of light of power P [W] on the detector."""
     gain = np.asarray(apd_gain) ** 2 * excess_noise_factor
     return 2 * ELEMENTARY_CHARGE * gain * responsivity * power * electrical_bandwidth
 

@@ -74,7 +74,7 @@ class Looks(NamedTuple):
 
     @classmethod
     def of(cls, p: Mapping[str, Any]) -> "Looks":
-        """Looks of points that share them, by dotted path; one where nothing is said."""
+        """Return the looks that points share, by dotted path; a single look by default."""
         number, combine, votes, speckle = (
             np.asarray(p.get(path, value)).flat[0] for path, value in DEFAULTS.items()
         )
@@ -140,7 +140,7 @@ class Looks(NamedTuple):
         return found, missed
 
     def faded(self, signal: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same of a signal in developed speckle, of a mean power of signal^2."""
+        """Compute :meth:`steady` for a signal in developed speckle, of mean power signal^2."""
         signal, level = np.broadcast_arrays(np.asarray(signal, float), np.asarray(level, float))
         y = np.square(level) / (2 + np.square(signal))
         if not self.several or (self.combine == BINARY and self.independent):
@@ -325,7 +325,7 @@ class Looks(NamedTuple):
         return found
 
     def excess(self, signal: np.ndarray, level: float) -> np.ndarray:
-        """What bins' own signals add to the chance of noise to cross, over that of noise to stay.
+        """Compute the crossing probability that bins' signals add, over noise's of not crossing.
 
         ``signal`` (m,) over the noise per quadrature of one record, at one level. By a table over
         the signal, within 1e-4 of it.
@@ -450,7 +450,7 @@ def largest_of(number, chance, looks):
 
 @njit(cache=True, error_model="numpy")
 def gamma_exceeded(order, chance):
-    """Number that a Gamma variable of whole order exceeds with a chance: Q(n, x) = chance."""
+    """Return the number that a Gamma variable of whole order exceeds: x of Q(n, x) = chance."""
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(chance, 1e-300)))
     for _ in range(60):
         x = 0.5 * (low + high)

@@ -514,9 +514,9 @@ def _solved(
 def _jittered(
     direction: np.ndarray, beams: Arrays, jitter: float, pointing: float
 ) -> dict[str, np.ndarray]:
-    """Standard errors with that of the pointing in them, (cycles, draws, each).
+    """Add the pointing's error to the standard errors of beams, (cycles, draws, each).
 
-    Those of velocities have that of `pointing`, the floor's, already.
+    Those of velocities already include `pointing`, the error floor's.
     """
     closing, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first = velocity(

@@ -266,7 +266,7 @@ def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Metho
 
 
 def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
-    """What is found in spectra (m, N/2 + 1) of a segment, of one or several looks."""
+    """Detect and estimate in spectra (m, N/2 + 1) of a segment, of one or several looks."""
     powers = [each.real**2 + each.imag**2 for each in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
     if view.shots.looks.combine == BINARY:
@@ -302,7 +302,7 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Counts of some draws, and what is averaged over them.
+    """Count detections and alarms in some draws, and return what is averaged over them.
 
     Returns
     -------
@@ -354,7 +354,7 @@ def resolved_bound(view: View) -> Deviation:
 
 
 def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]:
-    """Reported less true range [m] and radial velocity [m/s], (m,) each."""
+    """Compute reported less true range [m] and radial velocity [m/s], (m,) each."""
     shots, i = view.shots, view.i
     width = view.setting.sample_rate / view.setting.fft_size
     up, doppler, down = (segment.frequency * width for segment in found)

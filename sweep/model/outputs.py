@@ -200,7 +200,7 @@ SPECTRA_OUTPUTS: dict[str, Output] = {
 
 
 def _over(dims: tuple[str, ...], outputs: dict[str, Output]) -> dict[str, Output]:
-    """Outputs with these dimensions before their own."""
+    """Put dimensions before those of outputs."""
     return {name: replace(each, dims=(*dims, *each.dims)) for name, each in outputs.items()}
 
 

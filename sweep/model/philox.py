@@ -108,7 +108,7 @@ def to_normals(word0, word1):
 
 @njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
-    """Number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
+    """Return uniform number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
 
     A chance below 1.1e-16 can not be drawn by comparison. One block of four costs one evaluation.
     """
@@ -123,7 +123,7 @@ def normal_pair(key0, key1, draw, stream, index):
 
 
 def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, number: int) -> np.ndarray:
-    """The first so many of `uniform`, (m, number), in a draw (m,) of each key (m, 2)."""
+    """Return the first ``number`` of `uniform`, (m, number), in a draw (m,) of each key (m, 2)."""
     out = np.empty((draws.size, (number + 3) // 4 * 4))
     _fill(np.ascontiguousarray(keys), np.asarray(draws, np.int64), stream, out)
     return out[:, :number]

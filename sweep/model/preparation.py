@@ -319,8 +319,9 @@ class Shots:
 
     @cached_property
     def footprint(self) -> np.ndarray:
-        """(R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases by segment where there are
-        any: (3 or 6, rows, beamlets).
+        """Offsets, amplitudes and phases of beamlets, (3 or 6, rows, beamlets).
+
+        (R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases by segment if there are any.
         """
         phases = self.phase if self.phase.size else ()
         return np.stack([self.offset, self.doppler, self.amplitude, *phases])
@@ -451,7 +452,7 @@ class Shots:
 def categories(
     parameters: Parameters, further: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Splits points by category: (indices, parameters as arrays) for each.
+    """Split points by category: (indices, parameters as arrays) for each.
 
     Among the parameters is ``record``, the length of the record in samples. ``further`` names
     numbers that points must share besides :data:`CATEGORIES`.

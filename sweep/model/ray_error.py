@@ -159,7 +159,7 @@ def _in_bin(
 
 @lru_cache(maxsize=16)
 def folded(number: int) -> Rule:
-    """The lattice of so many beamlets, whole shells of them, folded."""
+    """Fold the lattice of ``number`` beamlets, whole shells of them."""
     from scipy.spatial import cKDTree  # which takes longer to import than all else
 
     offsets, weight = beamlets(number)

@@ -94,7 +94,7 @@ def _drawn(p: dict[str, np.ndarray], effects: Collection[str], realisation: Real
 
 
 def certain(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Standard errors where nothing is random: 0, but nan for what there is not."""
+    """Return standard errors where nothing is random: 0, but nan for outputs that are nan."""
     return {name: 0.0 * outputs[name.removesuffix("_error")] for name in ERROR_OUTPUTS}
 
 
@@ -111,7 +111,7 @@ class Means:
         self._spread = np.zeros(shape)
 
     def add(self, point: np.ndarray, outputs: Mapping[str, np.ndarray]) -> None:
-        """Adds draws, (m,) each, in the order of their numbers for each point."""
+        """Add draws, (m,) each, in the order of their numbers for each point."""
         values = np.array([outputs[name] for name in OUTPUTS])
         add(point, values, LOGARITHMS, self._count, self._mean, self._spread)
 
@@ -129,7 +129,7 @@ class Means:
             return np.where(n > 0, self._mean[rows], np.nan), self._spread[rows] / (n - 1.0), n
 
     def running(self) -> np.ndarray:
-        """What further draws are added to, besides the means, (n, RUNNING_COLUMNS)."""
+        """Return the sums that further draws are added to, besides means, (n, RUNNING_COLUMNS)."""
         kept = self._count, self._spread[SPREAD_OF], self._mean[LOGARITHMS]
         return np.concatenate(kept).T
 
@@ -152,7 +152,7 @@ class Means:
         self._count[...], self._mean[...], self._spread[...] = np.split(sums, 3)
 
     def results(self) -> dict[str, np.ndarray]:
-        """The means by the names of OUTPUTS, standard errors by those of ERROR_OUTPUTS, (n,)."""
+        """Return means by the names of OUTPUTS, standard errors by ERROR_OUTPUTS, (n,)."""
         n = self._count
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = self._mean + np.log10(self._spread / n)

@@ -192,7 +192,7 @@ def more_rays(rays: int, error: np.ndarray, accuracy: Accuracy) -> np.ndarray:
 
 
 def effects_tolerance(words: Mapping[str, Any], number: int) -> float:
-    """What is left of a study's tolerance for the effects that are left out."""
+    """Return the part of a study's tolerance that is for skipped effects."""
     counts_beamlets = number == 0 and is_open(words)
     return float(Accuracy.of(words).for_effects(counts_beamlets=counts_beamlets))
 

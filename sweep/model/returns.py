@@ -115,18 +115,18 @@ def draw_returns(
     draws: int = 1,
     method: str = "probabilities",
 ) -> Returns:
-    """Returns of every shot, draw by draw.
+    """Draw returns of every shot, draw by draw.
 
     Parameters
     ----------
     shots : Shots
         n prepared points.
     found : Groups
-        Theirs, by :func:`groups`.
+        Groups in their spectra, by :func:`groups`.
     keys : (n, 2) uint64
         Random key of each.
     first_draw, draws : int
-        Number of the first draw, number of draws; any stretch of draws can be had alone.
+        Number of the first draw, number of draws; any range of draws can be computed alone.
     method : str
         ``probabilities`` or ``noise``.
 
@@ -294,7 +294,7 @@ def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndar
 
 
 def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
-    """Returns from pairs of peaks, those flagged that misread their common beamlet."""
+    """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
     carrier, bandwidth, duration, rate, deepest, walk = (
         _columns(shots, column, 3)
         for column in (
@@ -530,9 +530,9 @@ def look_at_all(address, at, g, how, known, seen, tables, peak):
 
 @njit(cache=True, error_model="numpy")
 def put(peak, whole, fine, error, ratio, spread, how, tables):
-    """A peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
+    """Write a peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
 
-    One of a complex record goes round from N/2 to -N/2.
+    A peak of a complex record wraps from N/2 to -N/2.
     """
     end = 2 * how.half
     if how.signed:

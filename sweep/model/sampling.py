@@ -111,7 +111,7 @@ class Drawn(ABC):
 
     @abstractmethod
     def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
-        """Outputs, their errors and their accuracy, (n,) each; what further draws are added to."""
+        """Return outputs, errors and accuracy, (n,) each, and the sums for further draws."""
 
     def some(self, points: np.ndarray | int) -> dict[str, Any]:
         """Parameters of some of the points."""
@@ -180,7 +180,7 @@ def simulate(
     before: Before | None = None,
     stop: Callable[[], bool] = never,
 ) -> dict[str, np.ndarray]:
-    """Outputs, their errors, and counts of draws, with all effects.
+    """Simulate draws with all effects: outputs, their errors, and counts of draws.
 
     Parameters
     ----------
@@ -195,20 +195,20 @@ def simulate(
     method : str
         ``probabilities``, ``noise`` or ``spectra``.
     batch_sizes : sequence of int
-        Draws of each point in each batch; without them as many as keep the promise.
+        Draws of each point in each batch; without them as many as `accuracy` needs.
     batch, limit : int
-        Draws of which a look at the promise comes after a whole number; draws of a point at most,
-        where the promise may still be broken.
+        The accuracy is checked at multiples of ``batch`` draws; a point has at most ``limit``
+        draws, by which the accuracy may not be met.
     accuracy : Accuracy
-        What half-widths are held against.
+        Half-widths that are to be reached.
     methods : Methods
-        What the names of detectors and estimators in the parameters mean.
+        Detectors and estimators by their names in the parameters.
     before : Before, optional
-        What was drawn before, from ``first_draw`` on, for the same promise or a looser one, or up
-        to a lower limit.
+        Earlier draws, from ``first_draw`` on, for the same accuracy or a looser one, or up to a
+        lower limit.
     stop : callable
-        Asked between draws: whether to return with those taken so far. They make a `before` from
-        which another call goes on, and at least some are taken.
+        Called between draws; true ends with the draws taken so far, at least some. They make a
+        `before` from which another call continues.
 
     Returns
     -------
@@ -387,7 +387,7 @@ class SpectraSample(Drawn):
                 add(np.full(draws.size, point), values, _NO_LOGARITHMS, *sums)
 
     def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
-        """What is looked at of a point, with the numbers of draws that are looked at together."""
+        """Yield views of a point, with the numbers of the draws that each is for."""
         p = self.some(point)
         if self._prepared:
             view = view_of(*self._prepared[point], p, self.keys[point], self._methods)

@@ -119,7 +119,7 @@ class Together(NamedTuple):
 
 
 def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
-    """What each segment's spectrum holds: (3, fields, n) by segment and SEGMENT_FIELDS.
+    """Evaluate each segment's spectrum: (3, fields, n) by segment and SEGMENT_FIELDS.
 
     ``every_bin``: look at each bin by itself where leakage could be summed as an integral.
     """
@@ -144,7 +144,7 @@ def runs_of(
     every_bin: bool = False,
     keep: bool = True,
 ) -> Iterator[Runs]:
-    """Runs of all points, some points at a time, which are not in their order.
+    """Yield runs of all points, some points at a time, in any order.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def runs_of(
 
 
 def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
-    """Runs with the chances that several looks have for one record's."""
+    """Replace one record's probabilities in runs by those of several looks."""
     floor, sigma, level = (
         np.broadcast_to(v, shots.size)[runs.part]
         for v in (shots.floor, shots.bin_deviation, shots.threshold)
@@ -268,7 +268,7 @@ def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
 
 
 def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
-    """Some points in groups whose shapes can be told together, in an order of any kind."""
+    """Yield groups of points whose line shapes can be computed together, in any order."""
     window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
     simple = line_shape.has_modes(window, fft_size)
     segments = len(shots.waveform)
@@ -363,7 +363,7 @@ def _some(
     shots: Shots, table: np.ndarray, levels: np.ndarray, together: Together, leaks: int,
     first: int, keep: bool,
 ) -> tuple[Runs, int]:  # fmt: skip
-    """Runs of as many points from ``first`` on as there is room for; how many these are."""
+    """Compute runs of as many points from ``first`` on as there is room for; return how many."""
     part = together.part[first:]
     segments, m = len(shots.waveform), part.size
     bins = shots.bins
@@ -498,7 +498,7 @@ def _keep(at, count, room, exempt, magnitudes, exempts):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
-    """Runs of points; how many points there was room for.
+    """Compute runs of points; return the number of points that there was room for.
 
     Parameters
     ----------

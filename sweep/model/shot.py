@@ -134,9 +134,9 @@ def evaluate(
 
 
 def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Outputs of prepared shots, each (n,); without an echo, nan for what is then unknown.
+    """Compute outputs of prepared shots, each (n,); nan for what is unknown without an echo.
 
-    ``found`` is what :func:`find` finds, if that is known.
+    ``found`` is the result of :func:`find`, if that is known.
     """
     found = find(shots) if found is None else found
     pd, miss, magnitude, _, exempted, leakage = np.moveaxis(found, 1, 0)
@@ -186,7 +186,7 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
 
 
 def _false_alarms(shots: Shots, exempted: np.ndarray) -> dict[str, np.ndarray]:
-    """False alarms of noise alone: in a bin, the up-chirp, both chirps, any segment; with log10."""
+    """Compute noise's Pfa in a bin, the up-chirp, both chirps and any segment, with log10."""
     log_bin = shots.looks.log_alarm(shots.threshold / shots.bin_deviation)
     exists = shots.segments[:, None]
     counted = np.where(exists, shots.counted_bins(np.where(exists, exempted, 0.0)), 0.0)

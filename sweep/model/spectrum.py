@@ -87,7 +87,7 @@ BASIS = np.array([
 
 @njit(cache=True, error_model="numpy")
 def add_near(first, count, lines, table, sizes, room):
-    """Adds n lines to F in bins ``first`` .. where their shape's table holds these.
+    """Add n lines to F in bins ``first`` .. where their shape's table holds these.
 
     Each line is shared out among cells; each of these has a row of the table.
     """
@@ -116,7 +116,7 @@ def add_near(first, count, lines, table, sizes, room):
 
 @njit(cache=True, error_model="numpy")
 def _share_out(number, room):
-    """Adds a block of lines to cells, POINTS of them each."""
+    """Share a block of lines out among cells, POINTS of them each."""
     for j in range(POINTS):
         for i in range(number):
             weight, part = BASIS[DEGREE, j], room[BLOCK, _PART + i]
@@ -141,7 +141,7 @@ def held_of(start, lap, sizes):
 
 @njit(cache=True, error_model="numpy")
 def _add_cells(first, count, window, table, sizes, room):
-    """Adds a window's cells, which begin six before it, to F; as of :func:`add_near`."""
+    """Add a window's cells, which begin six before it, to F; arguments as of :func:`add_near`."""
     start, number, lap = window
     cells, power = sizes[3], sizes[4]
     columns = table.shape[1] // cells
@@ -201,7 +201,7 @@ def take_sources(n, lowest, highest, distance, digits, sizes, room):
 
 @njit(cache=True, error_model="numpy")
 def weight_afar(total, sources, sizes, room):
-    """Summed weight of lines as bins beyond the table see them; for powers its root."""
+    """Sum the weight of lines as bins beyond the table see them; for powers, take its root."""
     first, last = 0.0, 0.0
     for b in range(sources):
         first += math.hypot(room[S_A_RE, b], room[S_A_IM, b])
@@ -236,7 +236,7 @@ def prepare_far(first, count, sizes, tangent, room):
 
 @njit(cache=True, error_model="numpy")
 def add_far(start, end, at, rows, b, digits, form, sizes, room):
-    """Adds line or source b to F, from ``at`` on, in prepared bins start .. end - 1, to e^-digits.
+    """Add line or source b to F, from ``at`` on, in prepared bins start .. end - 1, to e^-digits.
 
     ``rows`` are those of places and strengths: LINES or SOURCES.
     """
@@ -427,7 +427,7 @@ def reach_of(level, weight, form):
 
 @njit(cache=True, error_model="numpy")
 def is_turned(origin, lowest, highest, view):
-    """True where lines are seen at the bins of their negative frequencies."""
+    """Return true where lines appear at the bins of their negative frequencies."""
     return origin + 0.5 * (lowest + highest) < 0.0 and view != COMPLEX
 
 

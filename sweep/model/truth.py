@@ -72,9 +72,9 @@ def spectrum(
 
 
 def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
-    """What each segment's spectrum holds, as :func:`sweep.model.shot.find`; no leakage.
+    """Evaluate each segment's spectrum as :func:`sweep.model.shot.find` does; no leakage.
 
-    Of what befalls lines within a record, the walk alone; the records know no other.
+    Range walk is the only change of lines within a record that is included.
     """
     found, table = np.full((3, 6, shots.size), np.nan), shots.point_table()
     for i in range(shots.size):

@@ -93,7 +93,7 @@ def order_of(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Times [s] from the shot's start to that of up, Doppler and down segment; 0 for none.
+    """Return times [s] from the shot's start to that of up, Doppler and down segment; 0 for none.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def record_length(
     acquisition_delay: np.ndarray,
     sample_rate: np.ndarray,
 ) -> np.ndarray:
-    """Samples of the record that exist: the FFT's, or what the chirp leaves after the delay."""
+    """Return the record's length [samples]: the FFT's, or what the chirp leaves after the delay."""
     available = np.floor((duration - acquisition_delay) * sample_rate + 1e-6)
     return np.minimum(fft_size, available).astype(np.int64)
 

@@ -122,7 +122,7 @@ def samples(name: str, length: int) -> np.ndarray:
 
 
 def _cosine_samples(name: str, length: int) -> np.ndarray:
-    """A cosine sum's samples, the very bits of scipy.signal's."""
+    """Compute a cosine sum's samples, bit for bit those of scipy.signal."""
     c = [float(t) for t in COSINE_SUMS[name]]
     if len(c) == 2:
         c[1] = 1.0 - c[0]
@@ -137,7 +137,7 @@ def _cosine_samples(name: str, length: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def window(name: str, length: int) -> Window:
-    """The window of this name and length, prepared once and kept."""
+    """Return the window of this name and length, prepared once and cached."""
     name = canonical_name(name)
     if name in COSINE_SUMS and length >= _SHORTEST_CLOSED_FORM:
         return _closed_form(name, length)
@@ -183,7 +183,7 @@ def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, n
 
 
 def _thinned(y: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The envelope at some 2 % steps of distance, each a bound for all beyond it.
+    """Thin the envelope to some 2 % steps of distance, each a bound for all beyond it.
 
     The 3 % on top is for sidelobes whose peaks lie between samples.
     """

@@ -241,12 +241,12 @@ def _read_piece(piece: object, location: Location) -> dict[str, list[Any]]:
 
 
 def _length(pieces: list[Any]) -> int:
-    """Number of values in pieces."""
+    """Count the values in pieces."""
     return sum(1 if isinstance(piece, str) else len(piece.si) for piece in pieces)
 
 
 def _repeated(single: Values | str, number: int) -> list[Any]:
-    """A single value, as often as the rest of its piece is long."""
+    """Repeat a single value as often as the rest of its piece is long."""
     if isinstance(single, str):
         return [single] * number
     assert single.progression is not None

@@ -33,7 +33,7 @@ class Bounds(NamedTuple):
 
 
 def _read_number(written: object) -> Bounds:
-    """A number of workers, or bounds that it is kept within."""
+    """Read a number of workers, or bounds that it is kept within."""
     if not isinstance(written, Mapping):
         try:
             return Bounds(_COUNT.read(written), _COUNT.read(written))
@@ -94,7 +94,7 @@ def _lines(about: str, example: str) -> Any:
 
 
 def _memory(about: str, default: Any = ...) -> Any:
-    """An amount of memory [byte]."""
+    """Declare an amount of memory [byte]."""
     return of.quantity(about, "byte", "4 GB", "64 MB", "100 TB", default=default)
 
 

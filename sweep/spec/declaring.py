@@ -51,7 +51,7 @@ def quantity(
     word: str = "",
     **more: Any,
 ) -> Any:
-    """Number with a unit; the word, if there is one, stands for the default."""
+    """Declare a number with a unit; the word, if there is one, stands for the default."""
     more |= {"word": word, "means": more.get("means", default)} if word else {}
     return field(measure(about, unit, example, at_least, at_most, **more), default)
 
@@ -147,7 +147,7 @@ def choice(about: str, options: tuple[str, ...], default: Any = ...) -> Any:
 
 
 def flag(about: str, *, default: bool) -> Any:
-    """True or false."""
+    """Declare a field that is true or false."""
     return field(Flag(about=about), default)
 
 

@@ -217,7 +217,7 @@ _EYE = {
 
 
 def _read_view(written: object) -> str | dict[str, float]:
-    """A word, or azimuth and elevation of the eye [rad]."""
+    """Read a word, or azimuth and elevation of the eye [rad]."""
     if not isinstance(written, dict):
         return _VIEW.read(written)
     if set(written) != set(_EYE):
@@ -244,7 +244,7 @@ _FROM = Special(
 
 
 def _quantity(about: str, default: Any = ...) -> Any:
-    """A quantity of shots or points."""
+    """Declare a quantity of shots or points."""
     usual = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
     rule = "is no quantity of shots or points"
     return of.field(Choice(about=about, options=QUANTITIES, rule=rule, remedy=usual), default)
@@ -452,7 +452,7 @@ def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> I
 
 
 def _variable_findings(figure: Any, draws: object, at: Location) -> Iterator[Finding]:
-    """A variable that the study does not store."""
+    """Report a variable that the study does not store."""
     variable = getattr(figure, "variable", None)
     asked = ("number", "limit") if isinstance(draws, Mapping) else ()
     with_draws = any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
@@ -467,7 +467,7 @@ def _variable_findings(figure: Any, draws: object, at: Location) -> Iterator[Fin
 
 
 def _spectra_findings(figure: Any, at: Location) -> Iterator[Finding]:
-    """Closed forms that a study of whole spectra does not store."""
+    """Report closed forms that a study of whole spectra does not store."""
     stored = SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
     variable = getattr(figure, "variable", None)
     if variable is None:
@@ -496,7 +496,7 @@ def _scanner_findings(figure: Any, scanners: Mapping[str, Any], at: Location) ->
 
 
 def _navigates(written: object) -> bool:
-    """True if a scanner has shots enough in a cycle, or can't be read."""
+    """Return true if a scanner has enough shots a cycle for navigation, or can't be read."""
     scanner = read_as(AnyScanner, written)
     try:
         return scanner is None or shots_a_cycle(scanner.pattern()) >= LEAST_BEAMS
@@ -518,7 +518,7 @@ def _where_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> Iterat
 
 
 def _draw_findings(figure: Any, written: object, at: Location) -> Iterator[Finding]:
-    """A draw that the study does not make; none where its draws can't be read."""
+    """Report a draw that the study does not make; none where its draws can't be read."""
     draw, draws = getattr(figure, "draw", 0), read_as(SceneDraws, written or {})
     if draws is not None and draw >= draws.number:
         rule = f"is beyond the study's draws, 0 to {draws.number - 1}"

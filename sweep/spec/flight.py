@@ -30,7 +30,7 @@ class Straight(Part):
     final_speed: float | None = of.speed("Speed at the end; the initial one", default=None)
 
     def path(self, files: Files, span: Span | None = None) -> laws.Path:
-        """The path."""
+        """Return the straight path."""
         return laws.straight(
             begin=self.begin,
             end=self.to,
@@ -49,7 +49,7 @@ class Acceleration(Part):
     duration: float = of.duration("How long it lasts", at_least="1 ns")
 
     def path(self, files: Files, span: Span | None = None) -> laws.Path:
-        """The path."""
+        """Return the path of constant acceleration."""
         law = laws.ConstantAcceleration
         return law(self.position, self.velocity, self.acceleration, self.duration)
 
@@ -62,7 +62,7 @@ class WaypointPath(Part):
     smooth: bool = of.flag("Join them by a cubic spline, not by straight lines", default=True)
 
     def path(self, files: Files, span: Span | None = None) -> laws.Path:
-        """The path."""
+        """Return the path through the file's waypoints."""
         from sweep.scenes.waypoints import read_waypoints
 
         table = read_waypoints(files.path(self.file))
@@ -79,7 +79,7 @@ class Still(Part):
     )
 
     def path(self, files: Files, span: Span | None = None) -> laws.Path:
-        """The path."""
+        """Return the path of a platform that stays in place."""
         if self.duration is not None:
             span = (0.0, self.duration)
         if span is None:
@@ -101,12 +101,12 @@ class Turn(Part):
     )
 
     def turn(self) -> np.ndarray:
-        """Unit quaternion (4,).
+        """Return the unit quaternion (4,).
 
         Raises
         ------
         ValueError
-            For a quaternion without length, or beside angles.
+            For a quaternion of length zero, or one given along with angles.
         """
         if self.quaternion is None:
             return quaternion.from_heading(heading=self.heading, pitch=self.pitch, roll=self.roll)
@@ -125,7 +125,7 @@ class Nadir(Part):
     )  # fmt: skip
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
-        """The law of attitude."""
+        """Return the law of attitude."""
         return laws.Nadir(None if self.heading == "track" else float(self.heading))
 
 
@@ -136,7 +136,7 @@ class AlongTrack(Part):
     roll: float = of.angle("Left side up", default=0.0)
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
-        """The law of attitude."""
+        """Return the law of attitude."""
         return laws.AlongTrack(self.roll)
 
 
@@ -146,7 +146,7 @@ class FixedAttitude(Turn):
     kind: Literal["fixed"]
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
-        """The law of attitude."""
+        """Return the law of attitude."""
         return laws.Fixed(self.turn())
 
 
@@ -159,7 +159,7 @@ class Spin(Turn):
     )
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
-        """The law of attitude."""
+        """Return the law of attitude."""
         return laws.Spin(self.angular_velocity, self.turn(), path.start)
 
 
@@ -172,7 +172,7 @@ class Tracked(Part):
     )
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
-        """The law of attitude."""
+        """Return the law of attitude."""
         from sweep.scenes.files import SceneError
         from sweep.scenes.waypoints import read_waypoints
 
@@ -202,7 +202,7 @@ class Motion(Part):
         return laws.Flight(path, self.law(files, path))
 
     def law(self, files: Files, path: laws.Path) -> laws.Attitude:
-        """The law of attitude along a path."""
+        """Return the law of attitude along a path."""
         law = self.attitude
         if isinstance(law, Tracked) and law.file is None and isinstance(self.path, WaypointPath):
             law = law.model_copy(update={"file": self.path.file})
@@ -272,7 +272,7 @@ class Cone(Part):
     interval: float = _together()
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         pointed = patterns.cone(self.beams, half_angle=self.half_angle, azimuth=self.azimuth)
         return patterns.fixed(pointed, rate=self.rate, interval=self.interval)
 
@@ -288,7 +288,7 @@ class FixedBeams(Part):
     interval: float = _together()
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         pointed = [patterns.steered(*b) if len(b) == 2 else np.array(b) for b in self.beams]  # type: ignore[arg-type]
         return patterns.fixed(np.array(pointed), rate=self.rate, interval=self.interval)
 
@@ -302,7 +302,7 @@ class Corners(Part):
     interval: float | None = _spread()
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         return patterns.fixed(patterns.corners(self.angle), rate=self.rate, interval=self.interval)
 
 
@@ -318,7 +318,7 @@ class Squares(Part):
     interval: float | None = _spread()
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         directions, visited = patterns.squares(self.elements)
         return patterns.BeamCycle(directions, visited, self.rate, self.interval)
 
@@ -336,7 +336,7 @@ class RasterScan(Part):
     both_ways: bool = of.flag("Every other row runs backwards", default=True)
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         across, along = self.half_angles
         return patterns.raster(
             columns=self.columns,
@@ -362,7 +362,7 @@ class Line(Part):
     interval: float = _together()
 
     def pattern(self) -> Scanner:
-        """The scan pattern."""
+        """Return the scan pattern."""
         return patterns.LineScan(**self.model_dump(exclude={"kind"}))
 
 

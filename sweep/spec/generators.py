@@ -38,7 +38,7 @@ class Progression:
     number: int = 1
 
     def mapped(self, factor: Fraction, offset: Fraction) -> Progression:
-        """The progression of ``factor * value + offset``."""
+        """Return the progression of ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
     def values(self) -> np.ndarray:

@@ -97,7 +97,7 @@ class Grid:
         return cls(values, axes, modes)
 
     def knows(self, *paths: str) -> bool:
-        """True if parameters could be read."""
+        """Return true if all parameters could be read."""
         return all(self.span(path).size for path in paths)
 
     def span(self, path: str) -> np.ndarray:
@@ -113,7 +113,7 @@ class Grid:
         return Finding(place_on_grid(path, self.axes), rule, remedy)
 
     def has_point(self, conditions: Mapping[str, Condition]) -> bool:
-        """True if some point meets conditions on parameters by path, all of them."""
+        """Return true if some point meets all conditions on parameters by path."""
         on_axes = {member.path for axis in self.axes for member in axis.members}
         for path in set(conditions) - on_axes:
             if path not in self.values or not conditions[path](np.asarray(self.values[path])):
@@ -150,7 +150,7 @@ def at(written: Mapping[str, Any], path: str, otherwise: object = ABSENT) -> Any
 
 
 def _met(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
-    """True if each place along an axis (n,) meets the conditions on the axis's own parameters."""
+    """Return true for places along an axis (n,) that meet the conditions on its own parameters."""
     met = np.ones(axis.size, bool)
     for member in axis.members:
         if member.path in conditions:
@@ -228,7 +228,7 @@ def _fewest_samples(grid: Grid) -> float | None:
 
 
 def _window_findings(grid: Grid) -> Iterator[Finding]:
-    """A window for the shortest record: some have none of a few samples."""
+    """Report a window that does not exist at the length of the shortest record."""
     samples = _fewest_samples(grid)
     if samples is None or not grid.knows(WINDOW, FFT_SIZE):
         return
@@ -352,7 +352,7 @@ def _several(number: np.ndarray) -> np.ndarray:
 
 
 def _looks_findings(grid: Grid) -> Iterator[Finding]:
-    """Looks whose chances are not known, or that contradict each other."""
+    """Report looks whose probabilities are not known, or that contradict each other."""
     several: dict[str, Condition] = {looks.NUMBER: _several}
     by_bin: dict[str, Condition] = {looks.COMBINE: _is_not(looks.COHERENT), **several}
     added: dict[str, Condition] = {looks.COMBINE: _is(looks.COHERENT), **several}
@@ -558,7 +558,7 @@ def _random_and_there(grid: Grid) -> Iterator[tuple[Effect, Parameter]]:
 
 
 def is_method(path: str) -> bool:
-    """True if a parameter says how whole spectra are looked at."""
+    """Return true if a parameter sets the detector or estimator for whole spectra."""
     return path.startswith((DETECTOR, ESTIMATOR))
 
 

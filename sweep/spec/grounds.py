@@ -112,7 +112,7 @@ class Ground(Material, ABC):
     craters: Craters | None = None
 
     def terrain(self, files: Files) -> Terrain:
-        """The ground in its own coordinates; files are found by `files`.
+        """Return the ground in its own coordinates; files are found by `files`.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class Ground(Material, ABC):
 
     @abstractmethod
     def survey(self, files: Files) -> Terrain:
-        """The ground before anything is done to it."""
+        """Return the ground before smoothing, refining, relief and craters."""
 
     def check(self) -> None:
         """Raise a ValueError for a grid that, by its fields alone, can not be."""
@@ -155,7 +155,7 @@ class PlacedGround(Ground):
     )
 
     def survey(self, files: Files) -> Terrain:
-        """The ground before anything is done to it."""
+        """Return the ground before smoothing, refining, relief and craters."""
         from sweep.scenes.terrain import Terrain
 
         grid = self.grid(files)
@@ -297,7 +297,7 @@ class SquareGround(PlacedGround):
         return float(self.spacing)  # type: ignore[attr-defined]
 
     def flat(self) -> Terrain:
-        """The grid, of heights 0."""
+        """Return the grid, with heights of 0."""
         from sweep.scenes.terrain import Terrain
 
         self.check()
@@ -334,7 +334,7 @@ class Plane(SquareGround):
         return self.size if self.spacing is None else self.spacing
 
     def grid(self, files: Files) -> Terrain:
-        """The plane."""
+        """Return the sloping plane."""
         grid = self.flat()
         rise, steps = math.tan(self.slope), np.arange(len(grid.heights))
         along = (steps - steps.mean()) * grid.spacing[0] * rise
@@ -349,7 +349,7 @@ class ReliefGround(Relief, SquareGround):
     spacing: float = of.size("Grid step", "5 m")
 
     def grid(self, files: Files) -> Terrain:
-        """The ground as drawn."""
+        """Return the fractal ground, drawn by its seed."""
         grid = self.flat()
         shape = len(grid.heights), len(grid.heights)
         return replace(grid, heights=self.heights(shape, grid.spacing))
@@ -373,7 +373,7 @@ class Hills(SquareGround):
             raise ValueError("hills need a correlation length over three grid steps")
 
     def grid(self, files: Files) -> Terrain:
-        """The ground as drawn."""
+        """Return the hills, drawn by their seed."""
         from sweep.scenes.terrain import hills
 
         grid = self.flat()

@@ -146,7 +146,7 @@ def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _told(path: str, value: Any) -> str:
-    """A leaf of an identity in words."""
+    """Format a leaf of an identity in words."""
     rules = parameter_rules()
     rule = rules.get(path) or next(
         (rules[known] for known in rules if path.endswith("." + known)), None

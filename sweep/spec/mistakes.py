@@ -128,7 +128,7 @@ def dotted(location: Location) -> str:
 
 
 def shown(written: object) -> str:
-    """A written value on one short line; empty for ``ABSENT`` and for whole sections."""
+    """Format a written value on one short line; empty for ``ABSENT`` and for whole sections."""
     if written is ABSENT or isinstance(written, dict | list | tuple):
         return ""
     if written is None:

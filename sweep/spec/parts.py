@@ -36,7 +36,7 @@ class Part(BaseModel):
 
 
 def with_parameters(path: str) -> Callable[[type[Section]], type[Section]]:
-    """Decorator that gives the section at a dotted path the parameters of effects within it."""
+    """Return a decorator that adds effects' parameters to the section at a dotted path."""
     fields = {
         parameter.path.removeprefix(f"{path}."): (
             Annotated[str if parameter.options else float, _rule_of(parameter)],
@@ -49,7 +49,7 @@ def with_parameters(path: str) -> Callable[[type[Section]], type[Section]]:
 
 
 def with_modes(section: type[Section]) -> type[Section]:
-    """The section with a mode for every effect, `auto` by default."""
+    """Add a mode for every effect to the section, `auto` by default."""
     modes = {e.name: Mode(about=e.about[0].upper() + e.about[1:], options=MODES) for e in EFFECTS}
     return _completed(section, {n: (Annotated[str, mode], AUTO) for n, mode in modes.items()})
 
@@ -67,7 +67,7 @@ def _rule_of(parameter: Parameter) -> Rule:
 
 
 def _completed(section: type[Section], fields: dict[str, Any]) -> type[Section]:
-    """The section with further fields, by the same name."""
+    """Return the section with further fields, by the same name."""
     if taken := sorted(set(fields) & set(section.model_fields)):
         raise TypeError(f"{section.__name__} has {', '.join(taken)} already")
     completed: type[Section] = create_model(
@@ -84,7 +84,7 @@ def _completed(section: type[Section], fields: dict[str, Any]) -> type[Section]:
 
 
 def rule_of(field: Any) -> Rule | None:
-    """The rule in a field's metadata, if it has one."""
+    """Return the rule in a field's metadata, if it has one."""
     return next((item for item in field.metadata if isinstance(item, Rule)), None)
 
 
@@ -123,7 +123,7 @@ def models_at(annotation: Any) -> Models:
 
 
 def kind_of(model: type[BaseModel]) -> str:
-    """The word that a model goes by among others."""
+    """Return the word that a model goes by among others."""
     field = model.model_fields.get("kind")
     return str(get_args(field.annotation)[0]) if field is not None else ""
 
@@ -186,7 +186,7 @@ def place_of(location: Location, root: type[BaseModel]) -> Place:
 
 
 def read_as(kind: Any, written: object) -> Any:
-    """A part as written, read by itself as a model or one of several; None where it can't be."""
+    """Read a part by itself as a model or one of several; None where it can't be read."""
     try:
         return _adapter(kind).validate_python(written)
     except ValidationError:

@@ -75,7 +75,7 @@ class Document:
     """The file read; empty where there is none."""
 
     def mistake(self, finding: Finding) -> Mistake:
-        """A finding with its file and line; those of the nearest place around it that has any."""
+        """Give a finding its file and line; those of the nearest place around it that has any."""
         location = finding.location
         while location and location not in self.places:
             location = location[:-1]
@@ -84,13 +84,13 @@ class Document:
         return Mistake(path, finding.rule, value, finding.suggestion, line, file)
 
     def mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
-        """Findings as they stand in the file, each once; those in other files come last."""
+        """Return findings as they stand in the file, each once; those in other files come last."""
         mistakes = dict.fromkeys(self.mistake(finding) for finding in findings)
         return sorted(mistakes, key=lambda m: (m.file != self.file, m.file, m.line or 0))
 
 
 def read_document(path: Path) -> Document:
-    """Mapping in a YAML file; lesser mistakes in it are left in the document.
+    """Read the mapping in a YAML file; lesser mistakes in it are left in the document.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def read_document(path: Path) -> Document:
 
 
 def parsed(text: str, path: Path) -> Document:
-    """Mapping in YAML text, mistakes in which are told as those of a file."""
+    """Parse a mapping in YAML text; mistakes in it are reported as those of a file."""
     try:
         root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -194,7 +194,7 @@ class _Walk:
         return self.scalar(node, location)
 
     def mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
-        """Mapping with text keys; of a key given twice the first counts."""
+        """Read a mapping with text keys; of a key given twice the first counts."""
         values: dict[str, Any] = {}
         for key_node, child in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
@@ -212,7 +212,7 @@ class _Walk:
         return values
 
     def scalar(self, node: yaml.Node, location: Location) -> Any:
-        """Number, truth value, nothing or text; numbers in decimal notation only."""
+        """Read a number, truth value, nothing or text; numbers in decimal notation only."""
         kind = node.tag.rsplit(":", 1)[-1]
         if kind == "null":
             return None
@@ -224,7 +224,7 @@ class _Walk:
         return node.value
 
     def finding(self, location: Location, rule: str, suggestion: str) -> None:
-        """A mistake to be reported with all the others."""
+        """Record a mistake, to be reported with all the others."""
         self.document.findings.append(Finding(location, rule, suggestion))
 
 
@@ -292,7 +292,7 @@ def library() -> dict[str, Path]:
 
 
 def _without_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """An instrument without its threshold, where the overrides set one in whatever way."""
+    """Return an instrument without its threshold, where the overrides set one in any way."""
     kept, anew = instrument.get("processing"), overrides.get("processing")
     if not (isinstance(kept, Mapping) and isinstance(anew, Mapping) and _THRESHOLDS & anew.keys()):
         return dict(instrument)
@@ -300,7 +300,7 @@ def _without_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[st
 
 
 def plain(data: Any, location: Location = ()) -> Any:
-    """A copy of plain data as YAML would give it: dicts with text keys, and lists."""
+    """Copy plain data as YAML would give it: dicts with text keys, and lists."""
     if len(location) > DEEPEST:
         raise SpecError([Mistake(dotted(location), "is nested too deeply")])
     if isinstance(data, int) and data.bit_length() > _MOST_DIGITS:
@@ -313,7 +313,7 @@ def plain(data: Any, location: Location = ()) -> Any:
 
 
 def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Mapping with the overrides laid over it, field by field."""
+    """Lay overrides over a mapping, field by field."""
     result = dict(base)
     for key, value in overrides.items():
         below = result.get(key)
@@ -323,7 +323,7 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, A
 
 
 def _is_leaf(value: Any, location: Location) -> bool:
-    """True if the location holds something other than a mapping."""
+    """Return true if the location holds something other than a mapping."""
     for part in location:
         try:
             value = value[part]

@@ -260,7 +260,7 @@ class Choice(Rule):
     remedy: str = ""
 
     def read(self, written: object) -> str:
-        """The word written."""
+        """Return the word written."""
         if written in self.options and isinstance(written, str):
             return written
         rule = self.rule or f"must be one of {', '.join(self.options)}"
@@ -276,7 +276,7 @@ class Method(Choice):
     """One of several words, or ``module:function``, which reading does not import."""
 
     def read(self, written: object) -> str:
-        """The word or the function's name."""
+        """Return the word or the function's name."""
         if isinstance(written, str) and re.fullmatch(_FUNCTION, written):
             return written
         try:
@@ -297,7 +297,7 @@ class Mode(Choice):
     """One of several words, two of which YAML makes truth values of: a bare `on` or `off`."""
 
     def read(self, written: object) -> str:
-        """The word."""
+        """Return the word; true and false stand for on and off."""
         if isinstance(written, bool):
             return "on" if written else "off"
         return super().read(written)
@@ -312,7 +312,7 @@ class Flag(Rule):
     """True or false."""
 
     def read(self, written: object) -> bool:
-        """True or False."""
+        """Return true or false."""
         if not isinstance(written, bool):
             raise QuantityError("must be true or false", "write 'true' or 'false'")
         return written
@@ -339,7 +339,7 @@ class Text(Rule):
     remedy: str = "write at most 5000 characters that can be printed"
 
     def read(self, written: object) -> str:
-        """The text."""
+        """Return the text."""
         if isinstance(written, bool) or not isinstance(written, str | int | float):
             raise QuantityError("must be text")
         if re.fullmatch(self.pattern, str(written)) is None:
@@ -364,7 +364,7 @@ class File(Rule):
     digest: Callable[[Path], str] = file_digest
 
     def read(self, written: object) -> str:
-        """The path, as written."""
+        """Return the path, as written."""
         if not isinstance(written, str) or not 0 < len(written.strip()) <= 4096:
             raise QuantityError("must be the path of a file", "write it relative to this file")
         if "\0" in written:
@@ -471,7 +471,7 @@ class Beams(Rule):
         return tuple(_read_element(_rule_of_beam(b), i, b) for i, b in enumerate(written))
 
     def written(self, value: Any) -> Any:
-        """Lists that read back as exactly `value`."""
+        """Return lists that read back as exactly `value`."""
         return [_rule_of_beam(beam).written(beam) for beam in value]
 
     def schema(self) -> Json:

@@ -42,7 +42,7 @@ _LOOKS = 257
 
 
 def _section(written: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
-    """A mapping in a spec; empty where there is none."""
+    """Return a mapping in a spec; empty where there is none."""
     found = written_at(written, ".".join(map(str, path)))
     return dict(found) if isinstance(found, Mapping) else {}
 
@@ -101,7 +101,7 @@ def _name_findings(
 def _reference_findings(
     written: Mapping[str, Any], objects: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """References to objects that are not there, or no ground; a position of the origin."""
+    """Report references to objects that are missing or no ground, and a position of the origin."""
     named = _section(written, *OBJECTS)
     if not named:
         return
@@ -180,7 +180,7 @@ def _size_findings(thing: Boulders | Craters, location: Location) -> Iterator[Fi
 
 
 def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
-    """A grid that can not be, or that can not hold its craters."""
+    """Report a grid that can not be made, or that can not hold its craters."""
     section = "middle" if isinstance(ground, Jacksboro) else "spacing"
     unfit = _refused(ground.check, (*location, section))
     yield from unfit
@@ -195,7 +195,7 @@ def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
 
 
 def _solid_findings(thing: Solid, location: Location) -> Iterator[Finding]:
-    """A solid that is placed twice or nowhere, or whose lengths have no unit."""
+    """Report a solid that is placed twice or nowhere, or whose lengths have no unit."""
     place = (*location, "position")
     if thing.motion is not None and thing.position is not None:
         rule = "stands beside a motion, whose path places the object"
@@ -238,14 +238,14 @@ def _flight_findings(
 
 
 def _on_files(motion: Motion) -> bool:
-    """True if a movement is that of a table."""
+    """Return true if a path or an attitude is read from a table."""
     return isinstance(motion.path, WaypointPath) or isinstance(motion.attitude, Tracked)
 
 
 def _motion_findings(
     motion: Motion, location: Location, files: Files, span: Span | None
 ) -> Iterator[Finding]:
-    """A path or an attitude that can not be, or a target's path that is shorter than the flight."""
+    """Report a path or attitude that can not be flown, or a path shorter than the flight."""
     section = "path"
     try:
         path = motion.path.path(files, span)
@@ -270,7 +270,7 @@ def _motion_findings(
 
 
 def _pattern_findings(scanner: Any, location: Location, span: Span | None) -> Iterator[Finding]:
-    """A scan pattern that can not be, or that makes no whole cycle in the flight."""
+    """Report a scan pattern that can not be made, or that makes no whole cycle in the flight."""
     unfit = _refused(scanner.pattern, location)
     yield from unfit
     if unfit or span is None:

@@ -80,7 +80,7 @@ class SceneSpec(Study):
 
     @classmethod
     def may_vary(cls, path: str) -> bool:
-        """True if the parameter at a path is one of this kind of study that an axis may set."""
+        """Return true if an axis of this kind of study may set the parameter at a path."""
         return not why_not(path)[0]
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
@@ -118,7 +118,7 @@ class SceneSpec(Study):
         return surfaces_of(self.scene)
 
     def world(self) -> World:
-        """The scene, built.
+        """Build the scene.
 
         Raises
         ------
@@ -141,7 +141,7 @@ class SceneSpec(Study):
         return self.platform.flight(self.files)
 
     def scan(self, name: str) -> Scanner:
-        """The scan pattern of a scanner."""
+        """Return the scan pattern of a scanner."""
         return self.scanners[name].pattern()
 
     def shots_a_cycle(self, name: str) -> int:

@@ -88,12 +88,12 @@ def _show_written_defaults(properties: Json, model: type[BaseModel]) -> None:
 
 
 def _reference(path: str, part: str) -> Json:
-    """Reference to what a field may hold."""
+    """Return a reference to what a field may hold."""
     return {"$ref": f"#/$defs/{path}.{part}"}
 
 
 def _object(properties: Json, *required: str, **more: Any) -> Json:
-    """A mapping with properties of its own and no other ones."""
+    """Return the schema of a mapping with properties of its own and no other ones."""
     needed = {"required": list(required)} if required else {}
     return (
         {"type": "object", "properties": properties, "additionalProperties": False} | needed | more
@@ -105,7 +105,7 @@ def _list(items: Json, least: int = 1, **more: Any) -> Json:
 
 
 def _values_schema(path: str, rule: Rule) -> Json:
-    """A list of values and generators, or one generator."""
+    """Return the schema of a list of values and generators, or of one generator."""
     single = _reference(path, "value")
     generators = list(_generators(single)) if isinstance(rule, Numeric) else []
     pieces = _list({"anyOf": [single, *generators]})
@@ -113,7 +113,7 @@ def _values_schema(path: str, rule: Rule) -> Json:
 
 
 def _generators(single: Json) -> Iterator[Json]:
-    """The three generators."""
+    """Yield the schemas of the three generators."""
     number = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for kind in ("linear", "log"):
         bounds = _list(single, 2, maxItems=2)

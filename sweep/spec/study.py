@@ -141,7 +141,7 @@ class Study(Part):
 
     @classmethod
     def may_vary(cls, path: str) -> bool:
-        """True if the parameter at a path is one of this kind of study."""
+        """Return true: an axis may set every parameter of this kind of study."""
         return True
 
     @classmethod
@@ -275,14 +275,14 @@ class Study(Part):
         return hash(self.id)
 
     def to_yaml_mapping(self) -> dict[str, Any]:
-        """The spec as a user would write it whole: no instrument's file, no default left out.
+        """Return the spec as a user would write it whole: no instrument file, no default left out.
 
         Execution is left out, as it is no part of what a study is.
         """
         return copy.deepcopy(self._written)
 
     def _completed(self, written: dict[str, Any]) -> dict[str, Any]:
-        """The spec as written, with its defaults written out and its execution left out."""
+        """Return the spec with its defaults written out and its execution left out."""
         mapping = {key: value for key, value in written.items() if key != "execution"}
         for path, rule, value in leaves(self):
             if path[0] not in _UNSTORED:
@@ -290,7 +290,7 @@ class Study(Part):
         return mapping
 
     def to_json(self) -> str:
-        """The spec as JSON text, for a store to hold, with the digests of its files."""
+        """Return the spec as JSON text, for a store to hold, with the digests of its files."""
         mapping = self.to_yaml_mapping() | ({FILES: self._digests} if self._digests else {})
         return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
 
@@ -303,7 +303,7 @@ def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None
 
 
 def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:
-    """A grid too large to count."""
+    """Report a grid too large to count."""
     points = math.prod(axis.size for axis in axes)
     if points <= LARGEST_GRID:
         return []
@@ -353,7 +353,7 @@ class Spec(Study):
 
 
 def _number_findings(draws: Draws) -> Iterator[Finding]:
-    """A fixed number of draws beside a limit."""
+    """Report a fixed number of draws given along with a limit."""
     if draws.number and draws.limit:
         rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to "
         remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many "

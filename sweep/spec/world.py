@@ -45,16 +45,16 @@ def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
 
 
 def build(scene: Scene, files: Files, span: Span) -> World:
-    """A scene, built.
+    """Build a scene.
 
     Parameters
     ----------
     scene : Scene
-        What it holds.
+        Objects, their surfaces and motions.
     files : Files
         Where its files are.
     span : (start, stop) of float
-        Time of the flight [s], throughout which what stays stays.
+        Time of the flight [s], which the path of an object that stays in place lasts.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def _unfit(name: str, error: Exception) -> SceneError:
 
 
 def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]]:
-    """The scene's origin, and its grounds in the scene's frame."""
+    """Return the scene's origin, and its grounds in the scene's frame."""
     own: dict[str, Terrain] = {}
     for name, thing in scene.objects.items():
         if isinstance(thing, Ground):

@@ -348,10 +348,10 @@ def scatter_back(shots: Shots, scene: Scene) -> Shots:
 
 
 def backscatter_size(points: Points) -> Size | None:
-    """The most that backscatter can be; the threshold is set on it.
+    """Return an upper bound on backscatter; the threshold follows it.
 
-    All the path with the air at its lower end, undimmed; or all the light that it takes, sent back
-    from the beam's own end.
+    It is the lesser of two: the whole path with the air of its lower end, without extinction; or
+    all the light that is lost on the path, sent back from the beam's near end.
     """
     air = profile_of(points.parameters)
     if air is None:

@@ -83,7 +83,7 @@ FLAGS_APART = np.uint32(sum(1 << k for k, effect in enumerate(EFFECTS) if effect
 
 
 def flags_of(kept: np.ndarray) -> np.ndarray:
-    """Flags (m,) uint32 of effects that are kept, (effects, m) bool in the catalogue's order."""
+    """Pack effects that are kept, (effects, m) bool in the catalogue's order, as (m,) uint32."""
     masks = np.uint32(1) << np.arange(kept.shape[0], dtype=np.uint32)
     return np.bitwise_or.reduce(np.where(kept, masks[:, None], np.uint32(0)), axis=0)
 

@@ -190,7 +190,7 @@ def power_under_line(
 
 
 def _by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """The sum over the lags that are left, the first one by one."""
+    """Sum over the lags directly, up to where the terms have decayed."""
     j = np.arange(min(int(_GONE / _FEW_LAGS), window.length))
     gone = (gamma / window.length)[:, None] * j
     left = np.maximum((gamma * lag)[:, None] - gone, 0.0)
@@ -200,7 +200,7 @@ def _by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
 
 
 def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """The integral over the lag, and what its kinks alias to.
+    """Integrate over the lag, and correct for what the integrand's kinks alias to.
 
     The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with
     B_2(x) = x^2 - x + 1/6.
@@ -289,7 +289,7 @@ def seen_line(
 
 @lru_cache(maxsize=16)
 def _places(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """The window at places of the record, of sum 1, and its integral's integral, of slope 1."""
+    """Return the window over the record, of sum 1, and its double integral, of end slope 1."""
     from scipy.interpolate import CubicSpline  # slow to import
 
     w, x = samples(window.name, _PLACES), np.arange(_PLACES + 1) / _PLACES
@@ -298,9 +298,9 @@ def _places(window: Window) -> "tuple[np.ndarray, CubicSpline]":
 
 
 def walk_steps(*, delay: float, length: int) -> int:
-    """Steps of a random walk that :func:`walked_phase` takes for a delay [samples], an even number.
+    """Return the steps that :func:`walked_phase` takes for a delay [samples], an even number.
 
-    One that is longer than the record is none of its samples' past: the record's length will do.
+    A delay beyond the record counts as its length: the delayed record then shares none of it.
     """
     return 2 * (length + min(math.floor(delay), length))
 
@@ -363,7 +363,7 @@ _WIDTH, _SHAPE = LASER + "line_width", LASER + "line_shape"
 
 
 def _deviation(points: Points) -> np.ndarray:
-    """Standard deviation of a Gaussian line [bins of fs/L]."""
+    """Return the standard deviation of a Gaussian line [bins of fs/L]."""
     return DEVIATION_OF_FWHM * points[_WIDTH] * points.record_duration
 
 
@@ -414,7 +414,7 @@ def _lorentzian(points: Points) -> Size:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """A Gaussian line of the beat; or a pure line, dimmed, over a pedestal of noise."""
+    """Give the beat a Gaussian line; or dim the pure line and add a pedestal of noise."""
     width = np.asarray(scene.parameters[_WIDTH], float)
     if str(scene.parameters[_SHAPE]) == "gaussian":
         return replace(shots, gaussian_width=width + np.zeros(shots.size))

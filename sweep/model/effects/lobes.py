@@ -72,7 +72,7 @@ class Lobe(NamedTuple):
 
 @lru_cache(maxsize=32)
 def lobe(name: str, length: int, fft_size: int) -> Lobe:
-    """The lobe of the window of this name over an FFT, prepared once and kept."""
+    """Return the lobe of the window of this name over an FFT, prepared once and cached."""
     shape = window(name, length)
     w = samples(shape.name, length)
     place = np.arange(length) / length - 0.5

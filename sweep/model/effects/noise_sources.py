@@ -165,7 +165,7 @@ def current_variance(
     responsivity: ArrayLike,
     electrical_bandwidth: ArrayLike,
 ) -> np.ndarray:
-    """Current variance [A^2] by intensity noise of the local oscillator.
+    """Compute the current variance [A^2] from intensity noise of the local oscillator.
 
     One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
     fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
@@ -193,7 +193,7 @@ def current_variance(
 
 
 def _current(p: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Current variance of points by their parameters [A^2]."""
+    """Compute the current variance [A^2] of points from their parameters."""
     own = ("local_oscillator_power", "apd_gain", "responsivity")
     return current_variance(
         relative_intensity_noise=p[_RIN],
@@ -282,7 +282,7 @@ def _rounding(p: Mapping[str, Any]) -> np.ndarray:
 
 
 def rounding_size(points: Points) -> Size | None:
-    """Rounding, without clipping; the threshold is set on it."""
+    """Return the noise of rounding, without clipping; the threshold follows it."""
     if not points.has(_BITS):
         return None
     return Size(noise=_rounding(points.numbers) / points.noise_variance)

@@ -109,12 +109,12 @@ def means(window: Window) -> Means:
 
 
 def over_record(points: Points, terms: Mapping[int, np.ndarray]) -> Smear:
-    """A sum of powers of the time over the record.
+    """Express a polynomial in time by powers of the place in the record, -1..1.
 
     Parameters
     ----------
     points : Points
-        Those.
+        Points that are planned.
     terms : mapping
         Coefficients [cycles/s^j] by power j, 2..4, of the time since the segment's start.
     """
@@ -233,7 +233,7 @@ def walk_phase(
 
 
 def walk_smear(points: Points) -> Smear | None:
-    """The phase that range walk adds."""
+    """Return the phase that range walk adds over the record; None for none."""
     slide = points.approach - points.radial_velocity
     beta = points.beta + points.faster
     each = beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT
@@ -243,7 +243,7 @@ def walk_smear(points: Points) -> Smear | None:
 
 
 def walk(shots: Shots, scene: Scene) -> Shots:
-    """The drift of the beat, in the record of the two chirps: at t that of R - 2 v_r t."""
+    """Let the beats of the two chirps drift over the record: at t as for R - 2 v_r t."""
     velocity, slide = shots.motion["radial_velocity"], shots.approach - shots.radial_velocity
     shots = _with_phase(
         shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
@@ -298,7 +298,7 @@ def acceleration_phase(
 
 
 def acceleration_smear(points: Points) -> Smear | None:
-    """The phase that acceleration adds."""
+    """Return the phase that acceleration adds over the record; None for none."""
     if not points.has(_ACCELERATION):
         return None
     alpha = points[_ACCELERATION] / SPEED_OF_LIGHT
@@ -324,9 +324,9 @@ def acceleration_size(points: Points) -> Size | None:
 
 
 def accelerate(shots: Shots, scene: Scene) -> Shots:
-    """The drift of the Doppler frequency, in the record of every segment.
+    """Let the Doppler frequency drift over the record of every segment.
 
-    And what it costs looks that are added in amplitude.
+    The loss that it causes in looks that are added in amplitude is included.
     """
     if shots.looks.added > 1:
         left = coherent_gain(
@@ -411,10 +411,9 @@ def sweep_phase(
 
 
 def sweep_smear(points: Points) -> Smear | None:
-    """The phase that the sweep's error adds.
+    """Return the phase that the sweep's error adds over the record; None for none.
 
-    That of square and cube is a polynomial in the place in the record; the sine's is taken at its
-    largest.
+    Square and cube are polynomials in the place in the record; the sine is taken at its largest.
     """
     if not points.has(*_PEAKS):
         return None
@@ -451,7 +450,7 @@ def _product(one: Sequence[Sized], other: Sequence[Sized]) -> list[Sized]:
 
 
 def bend_sweep(shots: Shots, scene: Scene) -> Shots:
-    """The sweep's error in the record of the two chirps."""
+    """Add the sweep's error to the record of the two chirps."""
     p = scene.parameters
     return _with_phase(
         shots,

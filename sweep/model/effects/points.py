@@ -139,7 +139,7 @@ class Points:
         """Whether roots of echoes add."""
 
     def __getitem__(self, path: str) -> np.ndarray:
-        """A parameter that is a number."""
+        """Return a parameter that is a number."""
         return self._numbers[path]
 
     @property
@@ -153,16 +153,16 @@ class Points:
         return self._numbers | {path: np.asarray(word) for path, word in self._words.items()}
 
     def word(self, path: str) -> str:
-        """A parameter that is a word."""
+        """Return a parameter that is a word."""
         return self._words[path]
 
     def whole(self, path: str) -> int:
-        """A parameter that is a number shared by all points.
+        """Return a whole number that all points share.
 
         Raises
         ------
         ValueError
-            They do not share it.
+            The points' values differ.
         """
         value = self._numbers[path]
         if value.ndim and (value != value.flat[0]).any():
@@ -484,11 +484,11 @@ class Points:
         return self.power_range(self.spread)
 
     def power_range(self, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
-        """The same of lines that are spread so; images are in it.
+        """Bound the largest bin's power for lines of a spread, over that of all lines on a bin.
 
-        By Taylor's series; and by Chebyshev's inequality a share 1 - 1/t^2 of the power lies
-        within t s, whose largest bin holds the mean at least; nor is any less than the line of
-        the strongest beamlet.
+        Images are included. The bounds come from Taylor's series, the line of the strongest
+        beamlet, and Chebyshev's inequality: a share 1 - 1/t^2 of the power lies within t s, whose
+        largest bin holds the mean at least.
         """
         form, tilt, (mean, rms, extreme) = self.lobe, self.tilt, moments
         on_axis = form.near(self.offset) ** 2
@@ -526,9 +526,9 @@ class Points:
         return double * np.exp(np.minimum(away, 50.0)) * change / least
 
     def in_phase(self, bins: np.ndarray | float) -> np.ndarray:
-        """What moving lines by some bins changes of a sum of amplitudes, over that in phase.
+        """Bound the relative change of a sum of amplitudes whose lines move by some bins.
 
-        |W'|, |H'| and the phase at the record's middle, of line and image.
+        Relative to the sum in phase; by |W'|, |H'| and the phase at mid-record, line and image.
         """
         turn = 2 * np.pi * (self.start + 0.5 * self.record_duration) * self.bin_width
         each = (np.sqrt(self.lobe.curvature) + 2 * self.tilt + turn) * bins

@@ -260,7 +260,7 @@ def size(points: Points) -> Size | None:
 
 
 def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
-    """An echo that twinkles, alike in all segments of a shot."""
+    """Draw the scintillation of each shot's echo, the same in all its segments."""
     p = scene.parameters
     air = turbulence_of(p)
     if air is None:

@@ -146,12 +146,12 @@ _SMALLEST = 1e-300
 
 
 def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
-    """A footprint of its own for each point, its beamlets' amplitudes speckled.
+    """Draw a footprint of its own for each point, with speckled amplitudes of its beamlets.
 
     Raises
     ------
     ValueError
-        Of direct detection. It adds up the intensities of all speckles in the aperture, in each of
+        For direct detection. It adds up the intensities of all speckles in the aperture, in each of
         which beamlets interfere: that is no factor on each beamlet's own echo.
     """
     if shots.architecture == "direct":
@@ -195,7 +195,7 @@ def fading_size(points: Points) -> Size | None:
 
 
 def fade(shots: Shots, scene: Scene) -> Shots:
-    """Detection in developed speckle, where the spec asks for it and no phases are in common.
+    """Set detection in developed speckle, where the spec asks for it and no phases are in common.
 
     Direct detection averages over the speckles in its aperture, of which nothing is known.
     """

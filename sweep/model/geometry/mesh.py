@@ -201,7 +201,7 @@ def _cross(a: Pair, b: Pair) -> Pair:
 
 
 def normals(corners: np.ndarray) -> Pair:
-    """Normals (3, n) of facets, of twice their areas' lengths, by their winding.
+    """Compute normals (3, n) of facets by their winding, of twice their areas' lengths.
 
     Parameters
     ----------

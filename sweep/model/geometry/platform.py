@@ -246,7 +246,7 @@ class State(NamedTuple):
 
 
 def _within(t: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Times as floats, held to the path.
+    """Return times as floats, those just off the path's ends clipped to it.
 
     Raises
     ------
@@ -380,7 +380,7 @@ class Waypoints:
 
 
 def rising_times(time: Vector) -> np.ndarray:
-    """Times as an array.
+    """Return times as an array.
 
     Raises
     ------

@@ -226,7 +226,7 @@ class _Frame(NamedTuple):
 
 
 def _met_on(mesh, frame, bundle, origins, directions, face):
-    """What `_met` says, of rays that meet one body, (6, m)."""
+    """Compute what `_met` returns, for rays that meet one body, (6, m)."""
     is_new = np.ones(len(bundle), bool)  # the ray before may have met the same facet
     is_new[1:] = (np.diff(bundle) != 0) | (np.diff(face) != 0)
     first, of = np.flatnonzero(is_new), np.cumsum(is_new) - 1

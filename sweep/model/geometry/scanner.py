@@ -297,7 +297,7 @@ def beamlet_rays(
     along: np.ndarray,
     sigma: float | np.ndarray,
 ) -> np.ndarray:
-    """Unit vectors of every beamlet in the world frame, (n, b, 3).
+    """Return unit vectors of every beamlet in the world frame, (n, b, 3).
 
     Parameters
     ----------
