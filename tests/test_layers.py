@@ -38,7 +38,7 @@ LARGEST_HOUSE = {
     "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
-LARGEST_MODULE = 600
+LARGEST_MODULE = 620
 LARGEST_FUNCTION = 50
 
 

@@ -398,3 +398,58 @@ def _cross(address, stream, index, line, words, found):
         re, im = philox.to_normals(words[lane, d], words[lane + 1, d])
         re, im = ratio * factors[d] + re * deviation[0], im * deviation[1]
         found[d] |= re**2 + im**2 >= threshold
+
+
+@njit(cache=True, error_model="numpy")
+def largest_of(number, chance, looks):
+    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance.
+
+    The root of the mean power of some looks.
+    """
+    if not number > 0.0:
+        return 0.0
+    if looks > 1:
+        each = -math.expm1(math.log1p(-chance) / number)
+        return math.sqrt(2.0 * gamma_exceeded(looks, each) / looks)
+    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
+
+
+@njit(cache=True, error_model="numpy")
+def gamma_exceeded(order, chance):
+    """Return the number that a Gamma variable of whole order exceeds: x of Q(n, x) = chance."""
+    low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(chance, 1e-300)))
+    for _ in range(60):
+        x = 0.5 * (low + high)
+        term = total = 1.0
+        for k in range(1, order):
+            term *= x / k
+            total += term
+        if math.log(total) - x > math.log(max(chance, 1e-300)):
+            low = x
+        else:
+            high = x
+    return 0.5 * (low + high)
+
+
+@njit(cache=True, error_model="numpy")
+def faded_ratio(ratio, levels, chances, looks, apart):
+    """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
+
+    Parameters
+    ----------
+    ratio : float
+        |X| / sigma without noise.
+    levels : (float, float)
+        Threshold, and noise of bins that hold lines, over sigma.
+    chances : (float, float)
+        Share of detections in which the power is as large, uniform; chance of a detection.
+    looks, apart : int, bool
+        Records, and whether each has its own speckle.
+    """
+    noise = 2.0 * levels[1] * levels[1]
+    if looks > 1 and apart:
+        sum_of_looks = gamma_exceeded(looks, chances[0] * chances[1])
+        return math.sqrt((noise + ratio * ratio) * sum_of_looks / looks)
+    # Powers above the threshold are exponential; of a common speckle where noise is behind it.
+    power = noise / looks + ratio * ratio
+    return math.sqrt(levels[0] * levels[0] - power * math.log(chances[0]))

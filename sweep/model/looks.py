@@ -32,11 +32,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
-from scipy import special, stats
+from scipy import special
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.marcum import marcum_q1
 
 POWER, BINARY, COHERENT = COMBINED = ("power", "binary", "coherent")
 COMMON, INDEPENDENT = SPECKLES = ("common", "independent")
@@ -119,6 +117,10 @@ class Looks(NamedTuple):
         real : ndarray
             True where the noise is real, with the power of both quadratures in one.
         """
+        from scipy import stats
+
+        from sweep.model.marcum import marcum_q1
+
         signal, level, real = np.broadcast_arrays(signal, level, real)
         if not self.several or self.combine == BINARY:
             found, missed = marcum_q1(signal, level)
@@ -189,6 +191,8 @@ class Looks(NamedTuple):
         of the product. Where they share but a part of it, what they have in common is that share
         of it which two Rayleigh magnitudes of the same chances have.
         """
+        from scipy import stats
+
         from sweep.model.detection import fading_together
 
         one, other, level, alike = np.broadcast_arrays(one, other, level, alike)
@@ -283,6 +287,8 @@ class Looks(NamedTuple):
 
             sum_j C(N+j-1, j) (1-r)^N r^j Q(N+j, Y / (1-r))^2.
         """
+        from sweep.model.marcum import marcum_q1
+
         y, r, n = 0.5 * np.square(np.asarray(level, float)), correlation**2, self.number
         if self.combine == BINARY:
             scaled = level / math.sqrt(1 - r)
@@ -311,6 +317,8 @@ class Looks(NamedTuple):
         ``p``, ``q`` and ``both`` are the chances that a record crosses in the first, in the second
         and in both.
         """
+        from scipy import stats
+
         n, binomial = self.number, stats.binom
         with np.errstate(divide="ignore", invalid="ignore"):
             then = np.clip(np.nan_to_num(both / p), 0.0, 1.0)
@@ -432,58 +440,3 @@ def _excess_table(looks: Looks, level: float) -> tuple[np.ndarray, np.ndarray]:
     crosses = looks.steady(signal, np.full(signal.shape, level))[0]
     added = np.maximum(crosses - quiet, 1e-300) / np.maximum(stays, 1e-300)
     return np.log(signal), np.log(added)
-
-
-@njit(cache=True, error_model="numpy")
-def largest_of(number, chance, looks):
-    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance.
-
-    The root of the mean power of some looks.
-    """
-    if not number > 0.0:
-        return 0.0
-    if looks > 1:
-        each = -math.expm1(math.log1p(-chance) / number)
-        return math.sqrt(2.0 * gamma_exceeded(looks, each) / looks)
-    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-chance) / number)))
-
-
-@njit(cache=True, error_model="numpy")
-def gamma_exceeded(order, chance):
-    """Return the number that a Gamma variable of whole order exceeds: x of Q(n, x) = chance."""
-    low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(chance, 1e-300)))
-    for _ in range(60):
-        x = 0.5 * (low + high)
-        term = total = 1.0
-        for k in range(1, order):
-            term *= x / k
-            total += term
-        if math.log(total) - x > math.log(max(chance, 1e-300)):
-            low = x
-        else:
-            high = x
-    return 0.5 * (low + high)
-
-
-@njit(cache=True, error_model="numpy")
-def faded_ratio(ratio, levels, chances, looks, apart):
-    """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
-
-    Parameters
-    ----------
-    ratio : float
-        |X| / sigma without noise.
-    levels : (float, float)
-        Threshold, and noise of bins that hold lines, over sigma.
-    chances : (float, float)
-        Share of detections in which the power is as large, uniform; chance of a detection.
-    looks, apart : int, bool
-        Records, and whether each has its own speckle.
-    """
-    noise = 2.0 * levels[1] * levels[1]
-    if looks > 1 and apart:
-        sum_of_looks = gamma_exceeded(looks, chances[0] * chances[1])
-        return math.sqrt((noise + ratio * ratio) * sum_of_looks / looks)
-    # Powers above the threshold are exponential; of a common speckle where noise is behind it.
-    power = noise / looks + ratio * ratio
-    return math.sqrt(levels[0] * levels[0] - power * math.log(chances[0]))

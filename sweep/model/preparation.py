@@ -512,9 +512,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
-    in_quadrature = str(p[RECORD]) == "complex"
     noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
-    per_ampere, per_watt, sources = link.noise_in_quadrature(noise) if in_quadrature else noise
+    if in_quadrature := str(p[RECORD]) == "complex":
+        noise = link.noise_in_quadrature(noise)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
@@ -550,9 +550,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         line_tolerance=accuracy.for_lines / math.sqrt(looks.averaged),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
-        noise_scale=per_ampere,
-        shot_noise_scale=per_watt,
-        noise_sources=sources,
+        noise_scale=noise.per_ampere,
+        shot_noise_scale=noise.per_watt,
+        noise_sources=noise.sources,
         row=row,
         offset=offset,
         doppler=doppler,

@@ -44,15 +44,16 @@ from sweep.model.draws import (
     Seen,
     draw_noise,
     echo_filter,
+    faded_ratio,
     fading_factors,
     is_noisy,
+    largest_of,
     noise_levels,
     require_one_record,
     seen_spectra,
 )
 from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
-from sweep.model.looks import faded_ratio, largest_of
 from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
     ABSENT,

@@ -137,6 +137,8 @@ def other_value(path):
         "instrument.processing.bits": 12,
         **dict.fromkeys((PFA_BIN, PFA_SEGMENT, PFA_SHOT), 0.01),
         "instrument.receiver.field_of_view": "1 mrad",
+        "instrument.receiver.iq_gain_imbalance": "0.5 dB",
+        "instrument.receiver.iq_phase_imbalance": "3 deg",
         "target.pointing_jitter": "1 mrad",
         "target.sun_elevation": "1 rad",
         "target.sun_distance": "1.5 au",

@@ -4,7 +4,6 @@ Each adds a variance at the ADC, and its size is that variance over the receiver
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -273,11 +272,11 @@ def variance(*, step: ArrayLike) -> np.ndarray:
     return np.asarray(step, float) ** 2 / 12
 
 
-def _rounding(p: Mapping[str, Any]) -> np.ndarray:
+def _rounding(p: Mapping[str, np.ndarray], record: str) -> np.ndarray:
     """Of the ADC; two of them sample I and Q (:func:`sweep.model.link.noise_in_quadrature`)."""
     bits = np.asarray(p[_BITS], float)
     lsb = step(full_scale=p[_FULL_SCALE], bits=bits)
-    both = 2 if str(p[RECORD]) == "complex" else 1
+    both = 2 if record == "complex" else 1
     return np.where(bits > 0, both * variance(step=lsb), 0.0)
 
 
@@ -285,12 +284,12 @@ def rounding_size(points: Points) -> Size | None:
     """Return the noise of rounding, without clipping; the threshold follows it."""
     if not points.has(_BITS):
         return None
-    return Size(noise=_rounding(points.numbers) / points.noise_variance)
+    return Size(noise=_rounding(points.numbers, points.word(RECORD)) / points.noise_variance)
 
 
 def add_rounding(shots: Shots, scene: Scene) -> Shots:
     """White noise of lsb^2/12, where the ADC has a number of bits."""
-    return noisier(shots, quantisation=_rounding(scene.parameters))
+    return noisier(shots, quantisation=_rounding(scene.parameters, str(scene.parameters[RECORD])))
 
 
 QUANTISATION = Effect(

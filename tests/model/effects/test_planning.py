@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Size
 from sweep.model.effects.planning import changes, plan
+from sweep.model.looks import ONE
 from sweep.model.marcum import log_at_least_one, marcum_q1
 
 TILES = 40
@@ -19,7 +20,7 @@ TILES = 40
 class Given:
     """What criteria need of points, given outright."""
 
-    ndim, signs = 1, np.array([[1.0], [0.0], [-1.0]])
+    ndim, signs, looks = 1, np.array([[1.0], [0.0], [-1.0]]), ONE
 
     def __init__(self, amplitude, threshold):
         self.amplitude = np.broadcast_to(amplitude, (3, np.shape(amplitude)[-1]))
