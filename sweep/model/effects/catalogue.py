@@ -6,6 +6,7 @@ import numpy as np
 
 from sweep.model import beam, looks, waveform
 from sweep.model.effects import (
+    amplifier,
     atmosphere,
     doppler,
     footprint,
@@ -38,6 +39,7 @@ EFFECTS: tuple[Effect, ...] = (
     noise_sources.SOLAR_BACKGROUND,
     atmosphere.BACKSCATTER,
     noise_sources.RELATIVE_INTENSITY_NOISE,
+    amplifier.SPONTANEOUS_EMISSION,
     noise_sources.QUANTISATION,
     phase_errors.RANGE_WALK,
     phase_errors.ACCELERATION,
