@@ -46,7 +46,7 @@ AUTOMATIC = -1.0
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How exactly points are computed; the first five are scalars or one a point."""
+    """Accuracy with which points are computed; the first five are scalars or one a point."""
 
     tolerance: ArrayLike = 1e-3
     """Largest error of a probability of detection, of log10 of one of false alarm, or of a relative
@@ -160,7 +160,7 @@ class Accuracy:
 
     @property
     def follows_tolerance(self) -> np.ndarray:
-        """Where errors of lines or leakage follow from the tolerance."""
+        """True where errors of lines or leakage follow from the tolerance."""
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
         return np.logical_or(*(error == AUTOMATIC for error in errors))
 

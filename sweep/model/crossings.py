@@ -1,4 +1,4 @@
-"""What signal adds to the chance that bins of a spectrum cross the threshold, many at a time.
+"""Threshold crossings that a signal adds to those of noise, for many bins at a time.
 
 With x = a^2/2 and y = b^2/2, a bin of amplitude a (in units of the noise per quadrature) crosses a
 threshold b with Q_1(a, b); over the e^-y of noise alone that is

@@ -58,7 +58,7 @@ def main_lobe(window: Window) -> float:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Setting:
-    """How spectra were made, and how they are to be looked at."""
+    """Settings by which spectra were made, and by which they are detected."""
 
     fft_size: int
     """Points N of the FFT; spectra have the bins 0..N/2."""

@@ -51,12 +51,12 @@ class Rows(NamedTuple):
 
 
 def is_noisy(method: str) -> bool:
-    """Whether a way to draw adds noise.
+    """Return true if a method of drawing adds noise.
 
     Raises
     ------
     ValueError
-        There is no way to draw of that name.
+        There is no method of that name.
     """
     if method not in METHODS:
         raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
@@ -152,7 +152,7 @@ ECHO = 1 << 24
 
 
 class Seen(NamedTuple):
-    """What spectra without noise hold, by point and segment (m, 3), for noise to be added to."""
+    """Spectra without noise, by point and segment (m, 3), for noise to be added to."""
 
     low: np.ndarray
     """int64: first of the bins that hold signal, from which they are numbered."""

@@ -308,8 +308,8 @@ def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike
 def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayLike) -> np.ndarray:
     """Compute the standard deviation [Hz] of a beat's frequency from its laser's phase walk.
 
-    The frequency is the slope of a least-squares line through theta(t) - theta(t - tau) over a
-    record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
+    The error is the slope over 2 pi of the least-squares line through theta(t) - theta(t - tau) in
+    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
     r = tau / T, or 1 where the delay is longer,
 
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2

@@ -58,7 +58,7 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
 
 
 class Footprints(NamedTuple):
-    """Where beamlets fall and what they send back, in rows that points share."""
+    """Places and echoes of beamlets, in rows that points share."""
 
     row: np.ndarray
     """(n,) int64: the row of each point."""
@@ -173,7 +173,7 @@ Ground = Plane | Cast
 
 
 def powers_add(p: Mapping[str, Any]) -> bool:
-    """Whether the beamlets of points of one category add as powers."""
+    """Return true if the beamlets of points of one category add as powers."""
     incoherent = str(p["footprint.phases"]) == "incoherent"
     return incoherent and str(p["instrument.receiver.architecture"]) != "direct"
 

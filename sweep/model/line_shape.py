@@ -139,7 +139,7 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
 
 
 def has_modes(window: Window, fft_size: int) -> bool:
-    """Whether a window's shapes are made of modes; else they have tables of all bins."""
+    """Return true if a window's shapes are made of modes; else they have tables of all bins."""
     return (
         window.name in COSINE_SUMS
         and window.length >= _SHORTEST
@@ -286,7 +286,7 @@ def _taylor(cosines: tuple[str, ...], modes: int) -> np.ndarray:
 
 
 def _corrections(taylor: np.ndarray, y: np.ndarray, length: int) -> np.ndarray:
-    """By which sums over samples exceed integrals (Euler's and Maclaurin's), (modes, places)."""
+    """Compute the excess of sums over integrals (Euler and Maclaurin), (modes, places)."""
     bernoulli = {1: 1 / 12, 3: -1 / 720, 5: 1 / 30240}
     turn = np.exp(-1j * np.pi * y)
     parity = (-1.0) ** np.arange(len(taylor))[:, None]

@@ -230,7 +230,7 @@ class View(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What is found in a segment of m draws, (m,) each."""
+    """Detections, alarms and frequency of a segment in m draws, (m,) each."""
 
     detected: np.ndarray
     alarms: np.ndarray

@@ -253,7 +253,7 @@ class Shots:
 
     @cached_property
     def line_deviation(self) -> np.ndarray:
-        """The same in a bin that holds lines, (n,)."""
+        """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
         return self._deviation(self.noise_variance + self.pedestal)
 
     @cached_property
@@ -319,10 +319,7 @@ class Shots:
 
     @cached_property
     def footprint(self) -> np.ndarray:
-        """Offsets, amplitudes and phases of beamlets, (3 or 6, rows, beamlets).
-
-        (R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases by segment if there are any.
-        """
+        """(R_b - R_0)/R_0, beta_b - beta_0, amplitude, phases if any: (3 or 6, rows, beamlets)."""
         phases = self.phase if self.phase.size else ()
         return np.stack([self.offset, self.doppler, self.amplitude, *phases])
 

@@ -198,13 +198,13 @@ def effects_tolerance(words: Mapping[str, Any], number: int) -> float:
 
 
 def by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Where the tolerance alone says how finely points are computed, effects apart; or a scalar."""
+    """Return true where the tolerance alone sets beamlets, lines or leakage; (n,) or scalar."""
     counts_beamlets = ~(parameters[BEAMLETS] > np.asarray(0))
     return counts_beamlets | Accuracy.of(parameters).follows_tolerance
 
 
 def is_open(words: Mapping[str, Any]) -> bool:
-    """Whether there is a number of beamlets that is enough."""
+    """Return true if there is a number of beamlets that is enough."""
     return ground.powers_add(words) and str(words[PATTERN]) not in ("hexagonal", "sunflower")
 
 

@@ -104,9 +104,9 @@ class Drawn(ABC):
 
     @abstractmethod
     def half_widths(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
-        """How far pd of some points may be off with the promised confidence, (4, points).
+        """Compute half-widths of pd of some points at the confidence of `accuracy`, (4, points).
 
-        By the names of PROMISED; nan for what there is not.
+        By the names of PROMISED; nan where there is none.
         """
 
     @abstractmethod
@@ -132,7 +132,7 @@ class Drawn(ABC):
         return half_width(counts / n, interval)
 
     def missed(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
-        """By how much the worst half-width of some points exceeds the tolerance; 0 where none."""
+        """Compute the excess of the worst half-width over the tolerance; 0 where there is none."""
         widths = self.half_widths(points, accuracy)
         over = widths - accuracy.at(points, self.number.size).tolerance
         return np.fmax.reduce(over, axis=0, initial=0.0)
@@ -214,8 +214,8 @@ def simulate(
     -------
     dict of ndarray
         (n,) by the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS of
-        :mod:`sweep.model.outputs`, (n, batches) int64 by those of DRAW_OUTPUTS (all draws in one
-        count without batches); where random effects or whole spectra are simulated RUNNING,
+        :mod:`sweep.model.outputs`; (n, batches) int64 by those of DRAW_OUTPUTS, all draws in one
+        count without batches. Where random effects or whole spectra are simulated, also RUNNING,
         (n, columns).
     """
     ends = first_draw + np.cumsum([0, *(batch_sizes or [limit])])

@@ -252,7 +252,7 @@ def _bin(shots: Shots, number: np.ndarray) -> np.ndarray:
 
 
 def view(shots: Shots) -> int:
-    """How shots see a spectrum."""
+    """Return the view of a spectrum that shots have: FOLDED, IMAGED or COMPLEX."""
     return COMPLEX if shots.complex_record else IMAGED if shots.image else FOLDED
 
 

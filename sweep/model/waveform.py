@@ -137,7 +137,7 @@ def record_length(
 
 
 def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Where a signed frequency appears in the spectrum of a real record, 0..fs/2."""
+    """Fold a signed frequency into the spectrum of a real record, 0..fs/2."""
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 
 

@@ -65,7 +65,7 @@ class Window:
 
     @cached_property
     def power_band_weights(self) -> tuple[float, ...]:
-        """The same of |w|'s autocorrelation, whose transform |W|^2 is: t is the lag over L."""
+        """Shares of the sum of |w|'s autocorrelation, of transform |W|^2: t is the lag over L."""
         if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
             return 0.0, 1.0
         w = np.abs(samples(self.name, min(self.length, _STAND_IN)))
@@ -74,7 +74,7 @@ class Window:
         return _shares(np.append(correlation, 0.0))
 
     def node_limits(self, power: bool) -> np.ndarray:
-        """How few lines stand for many under this window (:mod:`sweep.model.lines`)."""
+        """Return the limits pi h of J equivalent lines (:func:`sweep.model.lines.node_limits`)."""
         from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 
         if power:

@@ -366,7 +366,7 @@ class NavigationFigure(_OfNavigation):
 
 
 class NavigationTable(_OfNavigation):
-    """The same as a table."""
+    """Statistics of navigation over altitude, as a table."""
 
     kind: Literal["navigation_table"]
 

@@ -52,12 +52,12 @@ class Parameter:
 
     @property
     def brings(self) -> bool:
-        """Whether other values than the default bring the effect; else it says how it acts."""
+        """True if other values than the default bring the effect; else it says how it acts."""
         return self.alone and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
 
 
 class Scene(NamedTuple):
-    """What an effect may look at besides the shots."""
+    """Parameters and ground that an effect may use besides the shots."""
 
     parameters: Mapping[str, np.ndarray]
     """By dotted path, (n,) or scalar."""
@@ -145,11 +145,11 @@ class Effect:
 
     @property
     def is_random(self) -> bool:
-        """Whether it is simulated by draws."""
+        """True if it is simulated by draws."""
         return self.turn is not None or self.draw is not None
 
     def absent(self, parameters: Parameters) -> np.ndarray:
-        """Whether points have nothing of it, by the parameters that bring it; (n,) or scalar."""
+        """Return true for points without it, by the parameters that bring it; (n,) or scalar."""
         brought = [parameter for parameter in self.parameters if parameter.brings]
         absent = np.asarray(bool(brought))
         for parameter in brought:

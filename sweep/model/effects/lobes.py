@@ -1,4 +1,4 @@
-"""What sizes of effects need to know of a window: its main lobe and how its power can change.
+"""Main lobe of a window, and bounds on how its power changes, for the sizes of effects.
 
 F(x) = |W(x r)|^2 / (sum w)^2 is the power of a bin x FFT bins away from a line, r = L/N. It is a
 cosine series in the autocorrelation of the window,

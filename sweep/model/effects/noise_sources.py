@@ -167,7 +167,7 @@ def current_variance(
     """Compute the current variance [A^2] from intensity noise of the local oscillator.
 
     One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
-    fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
+    fluctuation and subtract it, all but their mismatch. The common-mode rejection (in dB 20 log10
     of the ratio of their currents) divides the variance. Both are taken to be flat over the
     electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
 

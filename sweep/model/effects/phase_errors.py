@@ -233,7 +233,7 @@ def walk_phase(
 
 
 def walk_smear(points: Points) -> Smear | None:
-    """Return the phase that range walk adds over the record; None for none."""
+    """Return the phase that range walk adds over the record; None where there is none."""
     slide = points.approach - points.radial_velocity
     beta = points.beta + points.faster
     each = beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT
@@ -243,7 +243,7 @@ def walk_smear(points: Points) -> Smear | None:
 
 
 def walk(shots: Shots, scene: Scene) -> Shots:
-    """Let the beats of the two chirps drift over the record: at t as for R - 2 v_r t."""
+    """Let the beats of the two chirps drift over the record: at t, to that of R - 2 v_r t."""
     velocity, slide = shots.motion["radial_velocity"], shots.approach - shots.radial_velocity
     shots = _with_phase(
         shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
@@ -298,7 +298,7 @@ def acceleration_phase(
 
 
 def acceleration_smear(points: Points) -> Smear | None:
-    """Return the phase that acceleration adds over the record; None for none."""
+    """Return the phase that acceleration adds over the record; None where there is none."""
     if not points.has(_ACCELERATION):
         return None
     alpha = points[_ACCELERATION] / SPEED_OF_LIGHT
@@ -411,7 +411,7 @@ def sweep_phase(
 
 
 def sweep_smear(points: Points) -> Smear | None:
-    """Return the phase that the sweep's error adds over the record; None for none.
+    """Return the phase that the sweep's error adds over the record; None where there is none.
 
     Square and cube are polynomials in the place in the record; the sine is taken at its largest.
     """

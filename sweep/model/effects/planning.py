@@ -33,7 +33,7 @@ _MOVING = ("lines", "record", "spectrum")
 
 
 class Plan(NamedTuple):
-    """What is simulated in each tile, effect by effect."""
+    """Plan of the effects that are simulated in each tile."""
 
     names: tuple[str, ...]
     """Effects in the order in which they act."""

@@ -1,8 +1,8 @@
-"""What sizes of effects look at: a link budget, lines and footprints, for many points at once.
+"""Link budget, lines and footprints of many points at once, for the sizes of effects.
 
-By the formulas that shots themselves are prepared with, for arrays that broadcast over the points;
-nothing is computed before it is asked for. By segment arrays have one axis more, in front, of those
-segments that exist. Words, and what :meth:`Points.whole` names, all points share.
+The formulas are those that shots are prepared with, for arrays that broadcast over the points;
+values are computed on first use. Arrays by segment have one more axis, in front, of the segments
+that exist. All points share words and the parameters that :meth:`Points.whole` reads.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,7 +43,7 @@ _NEAR_EDGE = 8.0
 
 
 class Smear(NamedTuple):
-    """What an effect does to lines over the record: a phase, or places in their own right.
+    """Change of lines over the record by an effect: a phase, or places in their own right.
 
     Sizes by segment, or scalars; powers are of the place x in the record, -1..1, in cycles.
     """
@@ -170,7 +170,7 @@ class Points:
         return int(value.flat[0])
 
     def has(self, *paths: str) -> bool:
-        """Whether any of some numbers is other than 0 anywhere."""
+        """Return true if any of some numbers is other than 0 anywhere."""
         return any(bool(self._numbers[path].any()) for path in paths)
 
     def _there(self, of_all: Sequence[Any]) -> list[Any]:
@@ -266,7 +266,7 @@ class Points:
 
     @cached_property
     def footprint(self) -> Extent:
-        """What the beams meet, as they all have it or on a plane."""
+        """Extent of the footprint, as given for all beams or on a plane."""
         if (found := self._footprint) is not None:
             return found if self.by_roots else found._replace(gain=1.0)
         angle = self["target.grazing_angle"]
@@ -422,7 +422,7 @@ class Points:
 
     @cached_property
     def range_spread(self) -> Moments:
-        """The same of all beamlets."""
+        """Bins off the axis's line by the ranges of all beamlets."""
         return self.footprint.ranges.times(self.per_range)
 
     @cached_property
@@ -432,7 +432,7 @@ class Points:
 
     @cached_property
     def spread(self) -> Moments:
-        """By both."""
+        """Bins off the axis's line by ranges and velocities of beamlets."""
         return self.range_spread.plus(self.velocity_spread)
 
     @cached_property
@@ -455,7 +455,7 @@ class Points:
 
     @cached_property
     def near_image(self) -> np.ndarray:
-        """Where lines and their images are so close that they may add up, or cancel."""
+        """True where lines and their images are so close that they may add up, or cancel."""
         return ~(2 * self.apart >= _NEAR_EDGE * self.margin)
 
     @cached_property
@@ -468,12 +468,12 @@ class Points:
 
     @property
     def may_add(self) -> bool:
-        """Whether amplitudes add, or may."""
+        """True if amplitudes add, or may."""
         return self.adds_amplitudes or self.has("target.roughness")
 
     @cached_property
     def may_cancel(self) -> np.ndarray:
-        """Where amplitudes that add, or may, might leave next to nothing."""
+        """True where amplitudes that add, or may, might nearly cancel."""
         if not self.may_add:
             return np.zeros_like(self.near_image)
         return self.near_image | (self.number > 1)

@@ -1,4 +1,4 @@
-"""What carries the instrument: where it is, how fast, and how it is turned, against time.
+"""Platform of the instrument: position, velocity and attitude against time.
 
 Velocity and acceleration are the exact derivatives of the position; every law of attitude gives
 the quaternion (body to world) and the angular velocity that is its derivative. A moving target is

@@ -24,7 +24,7 @@ _AT_ONCE = 4096
 
 
 class Pose(NamedTuple):
-    """Where a body is and how it is turned: x_world = attitude x_body + position."""
+    """Position and attitude of a body: x_world = attitude x_body + position."""
 
     position: np.ndarray
     """(3,) or, ray by ray (bundle by bundle), (n, 3) float64 [m]."""
@@ -33,7 +33,7 @@ class Pose(NamedTuple):
 
 
 class Bundle(NamedTuple):
-    """What the beamlets of each bundle hit first."""
+    """First hits of the beamlets of each bundle."""
 
     range: np.ndarray
     """(n,) float64 [m]: range R_0 of the reference beamlet, inf where all miss."""
