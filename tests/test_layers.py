@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 49_687, "modules": 182, "lines of the model": 18_792, "modules of the model": 70,
+    "lines": 49_918, "modules": 183, "lines of the model": 18_981, "modules of the model": 71,
     "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

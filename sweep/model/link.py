@@ -92,7 +92,9 @@ NOISY = (
 """Parameters of the receiver that its noise follows from."""
 
 
-def receiver_noise(architecture: str, values: Mapping[str, np.ndarray]) -> ReceiverNoise:
+def receiver_noise(
+    architecture: str, values: Mapping[str, np.ndarray], in_quadrature: bool = False
+) -> ReceiverNoise:
     """Noise of receivers of an architecture, from :data:`NOISY`, (n,) or scalars.
 
     The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
@@ -102,11 +104,24 @@ def receiver_noise(architecture: str, values: Mapping[str, np.ndarray]) -> Recei
     A heterodyne receiver mixes an IF down: noise from both sides of the IF lands in the record,
     which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's; its RF noise
     figure multiplies all of it.
+
+    ``in_quadrature``: of two receivers that sample I and Q, as the noise of a bin of a real record.
+    A 90 degree hybrid gives each of them half of echo and local oscillator. The bins of I + iQ then
+    show a line as those of a real record do. Shot noise of half the light each is the same
+    altogether, each one's own noise twice as much, and that of currents which go with the light,
+    a quarter of the variance each, half as much.
     """
     if any(value.ndim for value in values.values()):
-        return _noise(architecture, values)
-    known = _of_one(architecture, *(values[name].item() for name in NOISY))
-    return known._replace(sources=dict(known.sources))
+        noise = _noise(architecture, values)
+    else:
+        noise = _of_one(architecture, *(values[name].item() for name in NOISY))
+    if not in_quadrature:
+        return noise._replace(sources=dict(noise.sources))
+    sources = {
+        name: value if name == "local_oscillator_shot" else 2 * value
+        for name, value in noise.sources.items()
+    }
+    return ReceiverNoise(noise.per_ampere / 2, noise.per_watt, sources)
 
 
 @lru_cache(maxsize=64, typed=True)
@@ -134,21 +149,6 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     per_watt = shot_noise(power=1.0, electrical_bandwidth=bandwidth, **light)
     sources = {source: np.asarray(value * scale) for source, value in own.items()}
     return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
-
-
-def noise_in_quadrature(noise: ReceiverNoise) -> ReceiverNoise:
-    """Noise of a receiver that samples I and Q, as what a real record would have in a bin.
-
-    A 90 degree hybrid gives each of the two receivers half of echo and local oscillator. The bins
-    of I + iQ then show the line that a real record's show, with the noise of two receivers: shot
-    noise of half the light each, the same altogether; all of each one's own noise, twice as much;
-    and of currents that go with the light, a quarter of the variance each, half as much.
-    """
-    sources = {
-        name: value if name == "local_oscillator_shot" else 2 * value
-        for name, value in noise.sources.items()
-    }
-    return ReceiverNoise(noise.per_ampere / 2, noise.per_watt, sources)
 
 
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:

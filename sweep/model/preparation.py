@@ -509,9 +509,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
-    noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY))
-    if in_quadrature := str(p[RECORD]) == "complex":
-        noise = link.noise_in_quadrature(noise)
+    in_quadrature = str(p[RECORD]) == "complex"
+    noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(

@@ -523,8 +523,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
-    segments, levels, leaks, window_sum, rule = how
-    table, form = made
+    (segments, levels, leaks, window_sum, rule), (table, form) = how, made
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
@@ -566,9 +565,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
-            turn = sizes[0] if sizes[7] == COMPLEX else 0  # never below 0
-            numbers[0, s, i], numbers[1, s, i] = low + turn, count
-            numbers[2, s, i], numbers[3, s, i] = peak, exempted
+            low += sizes[0] * (sizes[7] == COMPLEX)  # never below 0
+            numbers[0, s, i], numbers[1, s, i], numbers[2, s, i] = low, count, peak
+            numbers[3, s, i] = exempted
             values[0, s, i], values[1, s, i] = found, missed
             values[2, s, i], values[3, s, i] = room[OUT, peak], leakage
     return points.shape[0]

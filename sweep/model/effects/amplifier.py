@@ -69,7 +69,7 @@ def beat_variance(
     responsivity: ArrayLike,
     electrical_bandwidth: ArrayLike,
 ) -> np.ndarray:
-    """Current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission.
+    """Return the current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def beat_variance(
 
 
 def _current(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
-    """Current variance of points by their parameters [A^2]."""
+    """Return the current variance of points by their parameters [A^2]."""
     density = emission(wavelength=p[LASER + "wavelength"], inversion=p[_INVERSION], gain=p[_GAIN])
     oscillator = p[RECEIVER + "local_oscillator_power"]
     mixed = p[RECEIVER + "mixing_efficiency"] / p[_ISOLATION]
@@ -104,7 +104,7 @@ def _current(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
 
 
 def emission_size(points: Points) -> Size | None:
-    """The beat noise, exactly; the threshold is set on it."""
+    """Return the beat noise, exactly; the threshold is set on it."""
     if points.architecture == "direct" or not points.has(_INVERSION):
         return None
     current = _current(points.numbers, points.word(_AMPLIFIED))

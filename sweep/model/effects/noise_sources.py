@@ -273,7 +273,7 @@ def variance(*, step: ArrayLike) -> np.ndarray:
 
 
 def _rounding(p: Mapping[str, np.ndarray], record: str) -> np.ndarray:
-    """Of the ADC; two of them sample I and Q (:func:`sweep.model.link.noise_in_quadrature`)."""
+    """Of the ADC; two of them sample I and Q (:func:`sweep.model.link.receiver_noise`)."""
     bits = np.asarray(p[_BITS], float)
     lsb = step(full_scale=p[_FULL_SCALE], bits=bits)
     both = 2 if record == "complex" else 1

@@ -232,8 +232,7 @@ class Points:
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
         values = {name: self[RECEIVER + name] for name in link.NOISY}
-        found = link.receiver_noise(self.architecture, values)
-        return link.noise_in_quadrature(found) if self.word(RECORD) == "complex" else found
+        return link.receiver_noise(self.architecture, values, self.word(RECORD) == "complex")
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
