@@ -89,8 +89,8 @@ def _share(level: np.ndarray, correlation: float, looks: Looks) -> np.ndarray:
     """ln(1 - h) / ln(1 - p), what each further bin counts for."""
     from sweep.model.marcum import marcum_q1
 
-    if correlation == 0.0:
-        return np.ones_like(level)
+    if correlation in (0.0, 1.0):  # of one sample all bins are alike
+        return np.full_like(level, 1.0 - correlation)
     if looks.several:
         fresh = looks.fresh(level, correlation)
     else:

@@ -188,7 +188,8 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
             start, end = runs.start[s, i] + np.array([0, runs.bins[s, i]])
             signal = runs.magnitudes[start:end][~runs.exempt[start:end]] / sigma[i]
             more = shots.looks.excess(signal[signal >= floor[i]], level[i] / sigma[i])
-            leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
+            with np.errstate(divide="ignore"):  # sure to leak
+                leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
     pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
     return runs._replace(pd=pd, miss=miss, leakage=leaked)
 

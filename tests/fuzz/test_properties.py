@@ -86,9 +86,11 @@ def test_more_light_is_never_worse(path, factors, written):
     """SNR and pd of a segment rise with the echo E: SNR goes as E / (a + b E), as E^2 / (a + b E)
     of direct detection, where light that is noise (echo, sun, air) grows with the aperture or the
     power at the most as the echo does; and the threshold over the noise does not rise. Clipping
-    breaks it, which so is left out.
+    breaks it, which so is left out; and so does the waist of a focused beam, which a smaller aperture
+    brings nearer to a target beyond it.
     """
     written = steady(written, *CLIPPING)
+    written["instrument"]["laser"].pop("focus", None)
     base = spec_of(written).parameters()[path] if path != "target.reflectance" else 1
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
     results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
