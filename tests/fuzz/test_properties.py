@@ -86,8 +86,8 @@ def test_more_light_is_never_worse(path, factors, written):
     """SNR and pd of a segment rise with the echo E: SNR goes as E / (a + b E), as E^2 / (a + b E)
     of direct detection, where light that is noise (echo, sun, air) grows with the aperture or the
     power at the most as the echo does; and the threshold over the noise does not rise. Clipping
-    breaks it, which so is left out; and so does the waist of a focused beam, which a smaller aperture
-    brings nearer to a target beyond it.
+    breaks it, which so is left out; and so does a focus, which a smaller aperture moves nearer to a
+    target beyond it.
     """
     written = steady(written, *CLIPPING)
     written["instrument"]["laser"].pop("focus", None)
