@@ -136,7 +136,7 @@ def test_a_street_in_complex_records(speed, tmp_path):
                 "initial_speed": f"{speed} m/s", "final_speed": f"{speed} m/s",
             }},
             "scanners": {"frame": {"kind": "raster", "columns": 16, "rows": 16,
-                                   "half_angles": ["12 deg", "12 deg"], "rate": "200 Hz"}},
+                                   "half_angles": ["12 deg", "12 deg"], "rate": "20 Hz"}},
             "footprint": {"beamlets": 1, "speckle": "none"},
             "draws": {"number": 2, "method": "noise"},
         })  # fmt: skip

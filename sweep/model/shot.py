@@ -144,9 +144,9 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
     pd_shot = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
-    miss_shot = miss[0] + pd[0] * miss[2]
+    miss_shot = np.minimum(miss[0] + pd[0] * miss[2], 1.0)  # of roundings
     if shots.fading is not None:
-        miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)  # of roundings
+        miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)
     by_segment = {"pd": pd, "miss": miss, "snr": snr}
     results = {
         **{
