@@ -27,7 +27,7 @@ Values = Mapping[str, Any]
 
 
 def written(name: str) -> dict[str, Any]:
-    """What the file of an instrument says."""
+    """Content of the file of an instrument."""
     return read_document(library()[name]).value
 
 
@@ -220,7 +220,7 @@ def agrees(number: Values, found: float) -> bool:
 
 
 def allowed(number: Values) -> str:
-    """What a number may differ by, in words."""
+    """Allowed difference of a number, in words."""
     words = {"within": "+- {}", "factor": "factor {}", "at_least": ">= {}", "at_most": "<= {}"}
     ((key, value),) = [(key, number[key]) for key in words if key in number]
     return words[key].format(value)

@@ -48,22 +48,29 @@ def shots_of(scene, effects=CORE):
     return shots
 
 
-@pytest.mark.parametrize("source", ["shot", "amplifier"])
+@pytest.mark.parametrize("source", ["shot", "amplifier", "intensity"])
 def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
     """Simulated: a hybrid gives I and Q half of echo and local oscillator, sampled with noise."""
-    own = 0.0 if source == "shot" else 50e-9
+    own = 50e-9 if source == "amplifier" else 0.0
     quiet = table_4_1(fft_size=1024, range=200.0, beamlets=1) | {
         "instrument.receiver.noise_equivalent_power": 0.0,
         "instrument.receiver.amplifier_noise_current": own,
-        "instrument.receiver.local_oscillator_power": 1e-3 if source == "shot" else 1e-9,
-        "target.reflectance": 1e-4 if source == "shot" else 1.0,
+        "instrument.receiver.local_oscillator_power": 1e-9 if source == "amplifier" else 1e-3,
+        "target.reflectance": 1.0 if source == "amplifier" else 1e-4,
+        "instrument.laser.relative_intensity_noise": 1e-11 if source == "intensity" else 0.0,
     }  # fmt: skip
-    real, both = (statistics(shots_of(quiet | {RECORD: kind})) for kind in ("real", "complex"))
+    effects = (*CORE, "relative_intensity_noise")
+    real, both = (
+        statistics(shots_of(quiet | {RECORD: kind}, effects)) for kind in ("real", "complex")
+    )
     rng, length, trials = np.random.default_rng(3), 1024, 4000
     cycles = np.arange(length) * (100 / length)
     tone, w = np.exp(2j * np.pi * cycles), samples("hamming", length)
-    light = 0.5 if source == "shot" else 1.0  # share of the variance in each receiver
+    # Share of the variance in each receiver; a laser's intensity is the same in both.
+    light = {"shot": 0.5, "amplifier": 1.0, "intensity": 0.25}[source]
     noise = rng.normal(size=(2, trials, length))
+    if source == "intensity":
+        noise[1] = noise[0]
     deviation = 0.7
     of_real = np.fft.fft(w * (tone.real + deviation * noise[0]))[:, 100]
     of_both = np.fft.fft(w * (tone / 2 + deviation * np.sqrt(light) * (noise[0] + 1j * noise[1])))
@@ -72,7 +79,9 @@ def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
     ]  # the same line over the noise of both quadratures
     ratio = both["snr_up"][0] / real["snr_up"][0]
     assert ratio == pytest.approx(seen[1] / seen[0], rel=5 * np.sqrt(2 / trials))
-    assert ratio == pytest.approx(1.0 if source == "shot" else 0.5, rel=1e-3)
+    assert ratio == pytest.approx(
+        {"shot": 1.0, "amplifier": 0.5, "intensity": 2.0}[source], rel=2e-3
+    )
     bins = 10 ** (both["log10_pfa_segment"] - real["log10_pfa_segment"])
     assert bins[0] == pytest.approx(1024 / 511, rel=2e-2)
 
@@ -106,7 +115,7 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
 
 
 def test_a_grid_of_both_records(tmp_path):
-    """Where Doppler shift and range beat are alike the real record cannot tell their signs."""
+    """Both read range and velocity of a receding and of a closing target."""
     spec = Spec.from_mapping({
         "title": "Records", "instrument": instrument(),
         "target": {"range": "100 m", "reflectance": 0.1, "radial_velocity": "-35 m/s",

@@ -62,7 +62,7 @@ def _split(paragraph: str) -> list[str]:
 
 
 def fault(sentence: str) -> str:
-    """What is hard to read about a sentence, or nothing."""
+    """Faults of a sentence; none if it reads well."""
     if OPENS.match(sentence):
         return "opens with a relative clause"
     if found := AVOID.search(sentence):

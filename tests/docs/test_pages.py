@@ -27,7 +27,7 @@ NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
 """What a page has its reader install."""
 
 SETS_UP = "make "
-"""What begins a block that sets up a copy of the repository: not run by a test in that copy."""
+"""Beginning of a block that sets up a copy of the repository: not run by a test in that copy."""
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)
 
